@@ -1,0 +1,33 @@
+"""What every source of measurements offers: dataset readers, the simulated world, live sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from vislam.camera import Rig
+from vislam.imu import ImuNoise
+from vislam.messages import Frame, ImuSample, MagSample
+from vislam.trajectory import Trajectory
+
+
+class Recording(Protocol):
+    """A recording as a stream of values in time order.
+
+    Problems that can be lived with (an unreadable image, a backward stamp, an unpaired stereo frame) are skipped and
+    counted in `problems`; what makes the whole recording unusable raises DataError.
+    """
+
+    name: str
+    rig: Rig
+    imu_noise: ImuNoise | None  # None: no IMU
+    frame_count: int  # frames that `events` will yield if nothing is damaged
+    problems: dict[str, int]  # what was skipped so far, by kind, for the report
+
+    def events(self) -> Iterator[ImuSample | MagSample | Frame]:
+        """Yield samples and frames in time order; can be called again for a second pass."""
+        ...
+
+    def truth(self) -> Trajectory | None:
+        """Return the true body trajectory in a world frame, or None."""
+        ...
