@@ -65,7 +65,7 @@ def _project(points: Array, pinhole: Array, model: int, k: Array, max_r2: float)
         if not z > _MIN_Z_M:
             continue
         x, y = points[i, 0] / z, points[i, 1] / z
-        if x * x + y * y > max_r2:
+        if not x * x + y * y <= max_r2:  # NaN too
             continue
         u, v, _, _, _, _ = _distort(x, y, model, k)
         out[i, 0] = fx * u + skew * v + cx
@@ -222,10 +222,11 @@ class Camera:
 
     def undistortion_maps(self) -> tuple[MapF32, MapF32]:
         """Return maps for `cv2.remap` that turn a raw image into that of the ideal camera with the same K."""
-        return self.resampling_maps(np.linalg.inv(self.K), np.eye(3), (self.width, self.height))
+        K_inverse = np.linalg.inv(self.K).astype(np.float64)
+        return self.resampling_maps(K_inverse, np.eye(3), (self.width, self.height))
 
     def resampling_maps(self, K_inverse: Array, R_cam_new: Array, size: tuple[int, int]) -> tuple[MapF32, MapF32]:
-        """Return maps [h, w] for `cv2.remap` to a pinhole view with `K_inverse`, rotated by R_cam_new, of `size` (w, h)."""
+        """Return maps [h, w] for `cv2.remap` to a pinhole view of `size` (w, h), turned by R_cam_new."""
         u, v = np.meshgrid(np.arange(size[0], dtype=np.float64), np.arange(size[1], dtype=np.float64))
         rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ (R_cam_new @ K_inverse).T
         pixels = np.nan_to_num(self.project(rays), nan=-1.0).astype(np.float32).reshape(size[1], size[0], 2)
@@ -275,7 +276,7 @@ def _rows(values: Array, columns: int) -> Array:
 
 def _smallest_positive_root(polynomial: np.polynomial.Polynomial) -> float:
     roots = polynomial.trim().roots()
-    positive = [float(root.real) for root in roots if abs(root.imag) < 1e-9 and root.real > 0.0]
+    positive = [float(root.real) for root in np.asarray(roots, dtype=complex) if abs(root.imag) < 1e-9 < root.real]
     return min(positive, default=float("inf"))
 
 
@@ -308,7 +309,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class StereoRectification:
-    """A stereo pair as two parallel ideal cameras with common K: same rows, positive disparity = K[0, 0] * baseline / z."""
+    """A stereo pair as two parallel ideal cameras with common K: same rows, disparity = K[0, 0] * baseline / z."""
 
     K: Array  # [3, 3]
     baseline_m: float
@@ -339,7 +340,7 @@ def rectify(rig: Rig, scale: float = 1.0) -> StereoRectification:
     size = (first.width, first.height)
     none = np.zeros(4)
     R0, R1, P0, P1 = cv2.stereoRectify(
-        first.K, none, second.K, none, size, T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3],
+        first.K, none, second.K, none, size, T_cam1_cam0[:3, :3].copy(), T_cam1_cam0[:3, 3:].copy(),
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
     )[:4]  # fmt: skip
     baseline_m = float(-P1[0, 3] / P1[0, 0])

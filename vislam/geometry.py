@@ -1,8 +1,8 @@
 """Rotations and rigid motions on numpy arrays: SO(3), SE(3), Sim(3).
 
 Tangent vectors of SE(3) are ordered rotation, then translation, and perturb on the right: `T @ se3_exp(xi)`, as in
-gtsam. Formulas follow Barfoot, "State Estimation for Robotics", chapter 7, and Sola et al., "A micro Lie theory for state
-estimation in robotics", 2018. The small functions are compiled, so that numba kernels elsewhere call the same code.
+gtsam. Formulas follow Barfoot, "State Estimation for Robotics", chapter 7, and Sola et al., "A micro Lie theory for
+state estimation in robotics", 2018. The small functions are compiled, so that kernels elsewhere call the same code.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The values that flow between the rooms: frozen, numpy only, and nothing else crosses a room's wall.
 
 Conventions: `T_a_b` maps points of frame b into frame a (`p_a = T_a_b @ p_b`). Frames: `map` (gravity-aligned, z up,
-corrected by loops), `odom` (gravity-aligned, continuous), `body` (the IMU), `cam0`, `cam1` (x right, y down, z forward).
+corrected by loops), `odom` (gravity-aligned, continuous), `body` (the IMU), `cam0`, `cam1` (x right, y down, z
+forward).
 Tangents and 6x6 covariances are ordered rotation, then translation, with the perturbation on the body side:
 `T_perturbed = T @ se3_exp(xi)`. Time is integer nanoseconds.
 """
@@ -64,7 +65,7 @@ class ImuSpan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """Images taken at one instant, one grey image per camera of the rig, with colour and registered depth if there are any."""
+    """Images taken at one instant: a grey image per camera of the rig, with colour and registered depth if any."""
 
     t_ns: int
     index: int
@@ -85,7 +86,7 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoMeasurement:
-    """Motion of the body since a keyframe. Without scale, the translation is a unit direction (or zero: no parallax)."""
+    """Motion of the body since a keyframe. Without scale the translation is a unit direction, or zero: no parallax."""
 
     t_ns: int
     keyframe_id: int

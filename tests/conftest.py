@@ -1,0 +1,25 @@
+"""Fixtures every test may use."""
+
+import os
+from pathlib import Path
+
+import cv2
+import pytest
+from hypothesis import settings
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# Compilation makes first examples slow, and a build must not fail by chance: fixed examples, no deadline.
+settings.register_profile("vislam", deadline=None, derandomize=True)
+settings.load_profile("vislam")
+
+cv2.setNumThreads(1)  # as in deterministic replay
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """The folder of real recordings; tests that need it are skipped where it is absent."""
+    root = Path(os.environ.get("VISLAM_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not root.is_dir():
+        pytest.skip(f"no recordings at {root}; set VISLAM_DATA to their folder")
+    return root

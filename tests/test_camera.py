@@ -1,0 +1,139 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vislam.camera import Camera, Rig, rectify
+from vislam.errors import DataError
+from vislam.geometry import so3_exp, transform
+
+EUROC = Camera(
+    752, 480, 458.654, 457.296, 367.215, 248.375, 0.0, "radtan", (-0.28340811, 0.07395907, 0.00019359, 1.7e-05)
+)
+FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, 0.0, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+FISHEYE = Camera(512, 512, 190.9, 190.9, 254.9, 256.8, 0.0, "equidistant", (0.0034, 0.0007, -0.002, 0.0002))
+SKEWED = Camera(640, 480, 500.0, 480.0, 320.0, 240.0, 3.5, "radtan", (-0.2, 0.05, 0.001, -0.002))
+IDEAL = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+CAMERAS = {"euroc": EUROC, "fr1": FR1, "fisheye": FISHEYE, "skewed": SKEWED, "ideal": IDEAL}
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+
+
+def points_in_view(camera, seed, count=100):
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform([0, 0], [camera.width, camera.height], (count, 2))
+    rays = camera.unproject(pixels)
+    keep = np.isfinite(rays).all(axis=1)
+    return rays[keep] * rng.uniform(0.3, 30.0, (int(keep.sum()), 1)), pixels[keep]
+
+
+@pytest.mark.parametrize("camera", [EUROC, FR1, IDEAL])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_projection_agrees_with_opencv(camera, seed):
+    points, _ = points_in_view(camera, seed)
+    k = np.array(camera.coefficients) if camera.coefficients else np.zeros(4)
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, k)
+    assert np.allclose(camera.project(points), expected.reshape(-1, 2), atol=1e-6)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_equidistant_projection_agrees_with_opencv(seed):
+    points, _ = points_in_view(FISHEYE, seed)
+    expected, _ = cv2.fisheye.projectPoints(
+        points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), FISHEYE.K, np.array(FISHEYE.coefficients)
+    )
+    assert np.allclose(FISHEYE.project(points), expected.reshape(-1, 2), atol=1e-6)
+
+
+@every_camera
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_unprojection_inverts_projection(camera, seed):
+    points, pixels = points_in_view(camera, seed)
+    assert len(points) > 80  # the fisheye's corners look behind the image plane
+    assert np.allclose(camera.project(points), pixels, atol=1e-7)
+    assert np.allclose(camera.unproject(camera.project(points)), points / points[:, 2:], atol=1e-6)
+
+
+@every_camera
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_projection_jacobian_matches_finite_differences(camera, seed):
+    points, _ = points_in_view(camera, seed, 30)
+    analytic = camera.project_jacobian(points)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        numeric = (camera.project(points + step) - camera.project(points - step)) / 2e-6
+        assert np.allclose(analytic[:, :, axis], numeric, atol=1e-3, rtol=1e-4)
+
+
+def test_points_without_an_image_are_nan_not_wrong():
+    behind = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 1.0]])
+    for camera in CAMERAS.values():
+        assert np.isnan(camera.project(behind)).all()
+    folded = np.array([[3.0, 0.0, 1.0]])  # beyond the radius where this barrel distortion turns back
+    assert np.isnan(EUROC.project(folded)).all()
+    assert np.isnan(IDEAL.normalise(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).all()
+
+
+def test_undistorted_points_agree_with_opencv():
+    _, pixels = points_in_view(EUROC, 7)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-12)
+    expected = cv2.undistortPoints(pixels, EUROC.K, np.array(EUROC.coefficients), None, None, EUROC.K, criteria)
+    assert np.allclose(EUROC.undistort_points(pixels), expected.reshape(-1, 2), atol=1e-5)
+
+
+def test_undistorted_image_agrees_with_opencv():
+    image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (480, 752), dtype=np.uint8), (0, 0), 3)
+    expected = cv2.undistort(image, EUROC.K, np.array(EUROC.coefficients))
+    got = EUROC.undistort_image(image)
+    assert np.abs(got.astype(int) - expected).max() <= 2
+    with pytest.raises(DataError, match="640x480 but the calibration is for 752x480"):
+        EUROC.undistort_image(np.zeros((480, 640), np.uint8))
+
+
+def test_scaled_camera_sees_the_same_rays():
+    _, pixels = points_in_view(EUROC, 3)
+    half = EUROC.scaled(0.5)
+    assert np.allclose(half.normalise((pixels + 0.5) * 0.5 - 0.5), EUROC.normalise(pixels), atol=1e-9)
+
+
+def test_impossible_calibrations_are_refused():
+    with pytest.raises(DataError, match="finite with positive focal"):
+        Camera(640, 480, float("nan"), 500, 320, 240)
+    with pytest.raises(DataError, match="takes"):
+        Camera(640, 480, 500, 500, 320, 240, 0.0, "radtan", (0.1,))
+    with pytest.raises(DataError, match="not a rigid transform"):
+        Rig((IDEAL,), (2.0 * np.eye(4),))
+
+
+def test_rectified_points_share_a_row_and_disparity_gives_depth():
+    left_pose = transform(so3_exp(np.array([0.01, -0.02, 0.03])), np.array([0.0, 0.1, 0.0]))
+    offset = transform(so3_exp(np.array([-0.02, 0.01, 0.005])), np.array([0.11, 0.002, -0.003]))
+    rig = Rig((EUROC, SKEWED), (left_pose, left_pose @ offset))
+    stereo = rectify(rig)
+    assert stereo.baseline_m == pytest.approx(np.linalg.norm(offset[:3, 3]), abs=1e-9)
+    rng = np.random.default_rng(5)
+    rectified = np.column_stack([rng.uniform(-0.3, 0.3, 50), rng.uniform(-0.25, 0.25, 50), np.ones(50)])
+    rectified *= rng.uniform(1.0, 8.0, (50, 1))
+    first = rectified @ stereo.R_rect_cam0  # R^T p
+    second = (first - rig.T_cam0_cam1[:3, 3]) @ rig.T_cam0_cam1[:3, :3]
+    u = stereo.K[0, 0] * rectified[:, 0] / rectified[:, 2] + stereo.K[0, 2]
+    v = stereo.K[1, 1] * rectified[:, 1] / rectified[:, 2] + stereo.K[1, 2]
+    disparity = stereo.K[0, 0] * stereo.baseline_m / rectified[:, 2]
+    for maps, camera, points, columns in (
+        (stereo.maps0, EUROC, first, u),
+        (stereo.maps1, SKEWED, second, u - disparity),
+    ):
+        inside = (columns > 1) & (columns < stereo.size[0] - 2) & (v > 1) & (v < stereo.size[1] - 2)
+        assert inside.sum() > 20
+        args = (columns[inside].astype(np.float32), v[inside].astype(np.float32), cv2.INTER_LINEAR)
+        looked_up = np.column_stack([cv2.remap(m, *args).ravel() for m in maps])
+        assert np.abs(looked_up - camera.project(points[inside])).max() < 0.05
+    with pytest.raises(DataError, match="two cameras"):
+        rectify(Rig((EUROC,), (np.eye(4),)))
+    with pytest.raises(DataError, match="swap the cameras"):
+        rectify(Rig((EUROC, SKEWED), (left_pose @ offset, left_pose)))
