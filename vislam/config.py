@@ -63,9 +63,35 @@ class LoopConfig:
 
 @dataclass(frozen=True, slots=True)
 class MapConfig:
-    """Clouds and the occupancy octree."""
+    """Clouds, the occupancy octree, the navigation grid and the mesh."""
 
     enabled: bool = True
+    resolution_m: float = 0.05  # octree voxel and grid cell; fine enough for table edges, 4 ms per keyframe
+    insertion: Literal["discretised", "full"] = "discretised"  # one ray per end voxel; full: one per pixel, 10x dearer
+    hit_probability: float = 0.7  # OctoMap's sensor model, so that our maps are its maps
+    miss_probability: float = 0.4
+    clamp_min_probability: float = 0.1192  # OctoMap's clamping: a voxel changes its mind after a few contrary scans
+    clamp_max_probability: float = 0.971
+    min_range_m: float = 0.3  # nearer, structured-light depth and stereo matching are not valid
+    max_range_m: float = 4.0  # depth noise grows with the square; farther points only clear the way to here
+    pixel_step: int = 2  # keep every n-th row and column of a depth image; at 4 m still 3 pixels per voxel
+    edge_ratio: float = 0.03  # a step to a neighbour pixel of more than this share of depth is an object's border
+    speckle_pixels: int = 40  # smaller connected surfaces, in kept pixels, are noise
+    stereo_scale: float = 0.5  # image scale for dense stereo; 30 ms per 752x480 keyframe
+    stereo_disparity_sigma_px: float = 0.3  # of semi-global matching at that scale
+    stereo_max_sigma_m: float = 0.15  # farther stereo points, with a larger error of depth, only clear the way
+    move_voxels: float = 1.0  # a keyframe corrected by more than this many voxels is integrated again
+    move_deg: float = 1.0  # or turned by more than this: 7 cm at 4 m
+    rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 5 ms each
+    cloud_voxel_m: float = 0.02  # one averaged point per voxel in cloud.ply
+    cloud_min_points: int = 2  # depth pixels that must agree on a voxel of the cloud
+    cloud_neighbours: int = 12  # statistical outlier removal: mean distance to so many neighbours
+    cloud_outlier_sigma: float = 2.5  # may exceed the average by so many standard deviations
+    grid_floor_m: float | None = None  # height of the floor in map; None: the lowest large horizontal surface
+    grid_low_m: float = 0.10  # above the floor: lower things are driven over or are the floor's own noise
+    grid_high_m: float = 1.60  # above the floor: higher things are driven under
+    mesh: bool = False  # TSDF mesh by Open3D; a few seconds at export
+    mesh_voxel_m: float = 0.02  # about the noise of depth at 3 m
 
 
 @dataclass(frozen=True, slots=True)
