@@ -1,0 +1,52 @@
+"""Trajectories: the value, its files, and how one is judged against another."""
+
+from vislam.trajectory.evaluation import (
+    Alignment,
+    Pairs,
+    RelativeErrors,
+    align,
+    associate,
+    ate,
+    coverage,
+    evaluate,
+    nees,
+    rpe,
+    scale_error,
+)
+from vislam.trajectory.files import (
+    read_euroc,
+    read_kitti,
+    read_trajectory,
+    read_tum,
+    write_euroc,
+    write_kitti,
+    write_text,
+    write_tum,
+)
+from vislam.trajectory.poses import Trajectory
+from vislam.trajectory.states import read_states_csv, write_states_csv
+
+__all__ = [
+    "Alignment",
+    "Pairs",
+    "RelativeErrors",
+    "Trajectory",
+    "align",
+    "associate",
+    "ate",
+    "coverage",
+    "evaluate",
+    "nees",
+    "read_euroc",
+    "read_kitti",
+    "read_states_csv",
+    "read_trajectory",
+    "read_tum",
+    "rpe",
+    "scale_error",
+    "write_euroc",
+    "write_kitti",
+    "write_states_csv",
+    "write_text",
+    "write_tum",
+]

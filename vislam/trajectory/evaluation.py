@@ -1,0 +1,325 @@
+"""How good a trajectory is against the truth: ATE, RPE, scale, coverage and consistency (NEES).
+
+Definitions follow Sturm et al. 2012 (ATE, RPE), Zhang and Scaramuzza 2018 (yaw-only alignment for visual-inertial
+systems) and Bar-Shalom et al. 2001 (NEES); with equal association the numbers are those of evo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vislam.errors import DataError, UsageError
+from vislam.geometry import align_points, invert, invert_many, sim3, sim3_parts, transform
+from vislam.messages import NavState
+from vislam.trajectory.poses import Trajectory
+
+Array = NDArray[np.float64]
+Alignment = Literal["se3", "sim3", "yaw", "first", "none"]
+Association = Literal["interpolate", "nearest"]
+
+_MAX_TRUTH_GAP_S = 0.1  # truth is interpolated across at most two samples of 20 Hz motion capture
+_MAX_NEAREST_S = 0.01  # as evo and the TUM tools
+_MAX_HOLE_S = 1.0  # a longer hole in the estimate counts as not covered
+_SEGMENTS_M = (1.0, 5.0, 10.0)
+_SEGMENT_TOLERANCE = 0.1  # of the length, as evo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Poses of an estimate and of a reference at the same times."""
+
+    t_ns: NDArray[np.int64]  # [M]
+    estimate: Array  # [M, 4, 4]
+    reference: Array  # [M, 4, 4]
+    total: int  # poses of the estimate, matched or not
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def aligned(self, S_reference_estimate: Array) -> Pairs:
+        """Return the pairs with the estimate moved into the reference's world by a similarity [4, 4]."""
+        scale, R, t = sim3_parts(S_reference_estimate)
+        moved = self.estimate.copy()
+        moved[:, :3, :3] = R @ self.estimate[:, :3, :3]
+        moved[:, :3, 3] = scale * self.estimate[:, :3, 3] @ R.T + t
+        return Pairs(self.t_ns, moved, self.reference, self.total)
+
+    def position_errors_m(self) -> Array:
+        """Return the distances [M] in metres between estimate and reference as they stand."""
+        return np.linalg.norm(self.estimate[:, :3, 3] - self.reference[:, :3, 3], axis=1)
+
+    def rotation_errors_rad(self) -> Array:
+        """Return the angles [M] in radians between estimate and reference as they stand."""
+        return _angles_rad(self.estimate[:, :3, :3].transpose(0, 2, 1) @ self.reference[:, :3, :3])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativeErrors:
+    """Errors of relative motions over segments of equal duration or equal length."""
+
+    translation_m: Array  # [K]
+    rotation_rad: Array  # [K]
+    length_m: Array  # [K] travelled along the reference
+    t_ns: NDArray[np.int64]  # [K] start of each segment
+
+    def summary(self) -> dict[str, float | None]:
+        """Return RMS errors in m, degrees, percent of the length and degrees per metre; None where undefined."""
+        moving = self.length_m > 1e-3
+        percent = 100.0 * self.translation_m[moving] / self.length_m[moving]
+        per_metre = np.rad2deg(self.rotation_rad[moving]) / self.length_m[moving]
+        return {
+            "m": _rms(self.translation_m),
+            "deg": _rms(np.rad2deg(self.rotation_rad)),
+            "percent": _rms(percent),
+            "deg_per_m": _rms(per_metre),
+            "segments": float(len(self.translation_m)),
+        }
+
+
+def associate(
+    estimate: Trajectory, reference: Trajectory, method: Association = "interpolate", max_gap_s: float | None = None
+) -> Pairs:
+    """Pair the poses of two trajectories in time.
+
+    "interpolate" evaluates the reference at the estimate's times, across gaps of at most `max_gap_s` (0.1 s) and never
+    beyond its ends. "nearest" takes the closest pose within `max_gap_s` (0.01 s), led by the shorter one, as evo.
+    """
+    if method == "interpolate":
+        return _associate_interpolated(estimate, reference, _MAX_TRUTH_GAP_S if max_gap_s is None else max_gap_s)
+    return _associate_nearest(estimate, reference, _MAX_NEAREST_S if max_gap_s is None else max_gap_s)
+
+
+def align(pairs: Pairs, mode: Alignment) -> Array:
+    """Return the similarity [4, 4] that brings the estimate's world into the reference's.
+
+    "se3" and "sim3" are least squares over positions (Umeyama 1991), "yaw" turns about the vertical only (both worlds
+    have z up), "first" makes the first poses coincide, "none" is the identity. Raises DataError with too few pairs,
+    UsageError for an unknown mode.
+    """
+    if mode not in get_args(Alignment):
+        raise UsageError(f"no alignment '{mode}'; there are: {', '.join(get_args(Alignment))}")
+    needed = {"none": 0, "first": 1, "yaw": 2}.get(mode, 3)
+    if len(pairs) < needed:
+        raise DataError(
+            f"alignment {mode} needs {needed} matching poses, got {len(pairs)} of {pairs.total}; "
+            "do both trajectories use the same clock?"
+        )
+    if mode == "none":
+        return np.eye(4)
+    if mode == "first":
+        return np.asarray(pairs.reference[0] @ invert(pairs.estimate[0]))
+    source, target = pairs.estimate[:, :3, 3], pairs.reference[:, :3, 3]
+    if mode == "yaw":
+        return _align_yaw(source, target)
+    return align_points(source, target, with_scale=mode == "sim3")
+
+
+def ate(pairs: Pairs) -> dict[str, float]:
+    """Return RMSE, mean, median and maximum of the position errors in metres, pairs taken as already aligned."""
+    if not len(pairs):
+        raise DataError("no matching poses: do both trajectories use the same clock?")
+    errors = pairs.position_errors_m()
+    return {
+        "rmse_m": float(np.sqrt(np.mean(errors**2))),
+        "mean_m": float(errors.mean()),
+        "median_m": float(np.median(errors)),
+        "max_m": float(errors.max()),
+    }
+
+
+def rpe(pairs: Pairs, duration_s: float | None = None, length_m: float | None = None) -> RelativeErrors:
+    """Return the errors of relative motion over all segments of a duration, or of a length along the reference.
+
+    A segment ends at the pose closest to the asked duration or length and is left out when that is more than 10 % off.
+    The relative motion does not depend on the alignment, except on its scale.
+    """
+    steps = np.linalg.norm(np.diff(pairs.reference[:, :3, 3], axis=0), axis=1)
+    distance = np.concatenate(([0.0], np.cumsum(steps)))[: len(pairs)]
+    if duration_s is not None:
+        start, end = _segments((pairs.t_ns - pairs.t_ns[:1]).astype(np.float64) * 1e-9, duration_s)
+    elif length_m is not None:
+        start, end = _segments(distance, length_m)
+    else:
+        raise UsageError("rpe needs duration_s or length_m")
+    Q = invert_many(pairs.reference[start]) @ pairs.reference[end]
+    P = invert_many(pairs.estimate[start]) @ pairs.estimate[end]
+    error = invert_many(Q) @ P
+    return RelativeErrors(
+        translation_m=np.linalg.norm(error[:, :3, 3], axis=1),
+        rotation_rad=_angles_rad(error[:, :3, :3]),
+        length_m=distance[end] - distance[start],
+        t_ns=pairs.t_ns[start],
+    )
+
+
+def scale_error(pairs: Pairs) -> float:
+    """Return s - 1, s the factor that the estimate must be multiplied with to fit the reference best (Sim3).
+
+    NaN when the estimate does not move: it then has no scale. Raises DataError with fewer than 3 pairs.
+    """
+    points = pairs.estimate[:, :3, 3]
+    if len(points) >= 3 and np.ptp(points, axis=0).max() < 1e-9:
+        return float("nan")
+    return sim3_parts(align(pairs, "sim3"))[0] - 1.0
+
+
+def coverage(
+    estimate: Trajectory, reference: Trajectory, span_ns: tuple[int, int] | None = None, max_hole_s: float = _MAX_HOLE_S
+) -> float:
+    """Return which share of the time (that of the reference, or of `span_ns` within it) the estimate covers.
+
+    Holes of the estimate longer than `max_hole_s` are not covered.
+    """
+    if not len(estimate) or not len(reference):
+        return 0.0
+    first, last = int(reference.t_ns[0]), int(reference.t_ns[-1])
+    if span_ns is not None:
+        first, last = max(first, span_ns[0]), min(last, span_ns[1])
+    if last <= first:
+        return 0.0
+    stamps = np.clip(estimate.t_ns, first, last)
+    steps = np.diff(stamps)
+    held = np.diff(estimate.t_ns) <= max_hole_s * 1e9
+    return float(steps[held].sum() / (last - first))
+
+
+def nees(states: Sequence[NavState], truth: Trajectory, mode: Alignment = "yaw") -> dict[str, Array]:
+    """Return the normalised estimation error squared of keyframe states, against a truth in its own world.
+
+    The truth is brought into the states' world, so covariances stay as they are. Keys: "t_ns" [M], "rotation" [M]
+    (3 degrees of freedom), "position" [M] (3), "pose" [M] (6). Singular covariances give NaN. Raises DataError when
+    fewer states match than the alignment needs.
+    """
+    estimate = Trajectory(np.array([s.t_ns for s in states]), np.array([s.T_world_body for s in states]))
+    pairs = associate(estimate, truth)
+    scale, R, t = sim3_parts(align(pairs, mode))
+    if abs(scale - 1.0) > 1e-9:
+        raise UsageError("NEES of a rescaled trajectory means nothing; use alignment yaw, se3, first or none")
+    T_world_truth = invert(transform(R, t))
+    true_poses = T_world_truth @ pairs.reference
+    covariance = np.array([s.covariance for s in states])[np.isin(estimate.t_ns, pairs.t_ns)]
+    error = np.empty((len(pairs), 6))
+    error[:, :3] = Rotation.from_matrix(
+        pairs.estimate[:, :3, :3].transpose(0, 2, 1) @ true_poses[:, :3, :3]
+    ).as_rotvec()
+    error[:, 3:] = true_poses[:, :3, 3] - pairs.estimate[:, :3, 3]
+    return {
+        "t_ns": pairs.t_ns.astype(np.float64),
+        "rotation": _squared_mahalanobis(error[:, :3], covariance[:, :3, :3]),
+        "position": _squared_mahalanobis(error[:, 3:], covariance[:, 3:6, 3:6]),
+        "pose": _squared_mahalanobis(error, covariance[:, :6, :6]),
+    }
+
+
+def evaluate(
+    estimate: Trajectory,
+    truth: Trajectory,
+    alignment: Alignment | str = "se3",
+    *,
+    association: Association = "interpolate",
+    span_ns: tuple[int, int] | None = None,
+) -> dict[str, Any]:
+    """Return the accuracy entry of a run: ATE, RPE over 1 s and over 1, 5, 10 m, scale, coverage, path length.
+
+    `span_ns` is the time of the recording's frames; without it, coverage refers to the whole truth. Numbers that
+    cannot be computed are None. Raises DataError when too few poses match, UsageError for an unknown alignment.
+    """
+    if alignment not in get_args(Alignment):
+        raise UsageError(f"no alignment '{alignment}'; there are: {', '.join(get_args(Alignment))}")
+    mode: Alignment = alignment  # type: ignore[assignment]
+    pairs = associate(estimate, truth, association)
+    S = align(pairs, mode)
+    aligned = pairs.aligned(S)
+    errors = ate(aligned)
+    over_time = rpe(aligned, duration_s=1.0).summary()
+    scale = 1.0 + scale_error(pairs) if len(pairs) >= 3 else float("nan")
+    return {
+        **{f"ate_{name}": value for name, value in errors.items()},
+        "rotation_rmse_deg": _rms(np.rad2deg(aligned.rotation_errors_rad())),
+        "alignment": mode,
+        "association": association,
+        "scale": float(scale) if np.isfinite(scale) else None,
+        "coverage": coverage(estimate, truth, span_ns),
+        "matched": len(pairs),
+        "total": pairs.total,
+        "rpe_1s_m": over_time["m"],
+        "rpe_1s_deg": over_time["deg"],
+        "rpe_segments": {f"{length:g}": rpe(aligned, length_m=length).summary() for length in _SEGMENTS_M},
+        "path_m": float(np.linalg.norm(np.diff(pairs.reference[:, :3, 3], axis=0), axis=1).sum()),
+    }
+
+
+def _associate_interpolated(estimate: Trajectory, reference: Trajectory, max_gap_s: float) -> Pairs:
+    if not len(reference) or not len(estimate):
+        return Pairs(np.empty(0, np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)), len(estimate))
+    times = reference.t_ns
+    after = np.searchsorted(times, estimate.t_ns, side="left")  # first reference time not before the estimate's
+    inside = (estimate.t_ns >= times[0]) & (estimate.t_ns <= times[-1])
+    after = np.clip(after, 0, len(times) - 1)
+    exact = times[after] == estimate.t_ns
+    gap = times[after] - times[np.maximum(after - 1, 0)]
+    chosen = inside & (exact | (gap <= max_gap_s * 1e9))
+    t_ns = estimate.t_ns[chosen]
+    matched = reference.at(t_ns) if len(t_ns) else np.empty((0, 4, 4))
+    return Pairs(t_ns, estimate.T_world_body[chosen], matched, len(estimate))
+
+
+def _associate_nearest(estimate: Trajectory, reference: Trajectory, max_difference_s: float) -> Pairs:
+    estimate_leads = len(estimate) <= len(reference)
+    lead, other = (estimate, reference) if estimate_leads else (reference, estimate)
+    if not len(lead):
+        return Pairs(np.empty(0, np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)), len(estimate))
+    right = np.clip(np.searchsorted(other.t_ns, lead.t_ns, side="right"), 0, len(other) - 1)
+    left = np.maximum(right - 1, 0)
+    take_left = np.abs(lead.t_ns - other.t_ns[left]) <= np.abs(other.t_ns[right] - lead.t_ns)
+    nearest = np.where(take_left, left, right)
+    chosen = np.abs(other.t_ns[nearest] - lead.t_ns) <= round(max_difference_s * 1e9)
+    of_lead, of_other = lead.T_world_body[chosen], other.T_world_body[nearest[chosen]]
+    pair = (of_lead, of_other) if estimate_leads else (of_other, of_lead)
+    return Pairs(lead.t_ns[chosen], *pair, len(estimate))
+
+
+def _align_yaw(source: Array, target: Array) -> Array:
+    """Return the least-squares rotation about z and translation (Zhang and Scaramuzza 2018, section IV-A)."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    yaw = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
+    R = Rotation.from_rotvec([0.0, 0.0, yaw]).as_matrix()
+    return sim3(1.0, R, target.mean(axis=0) - R @ source.mean(axis=0))
+
+
+def _segments(along: Array, delta: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return index pairs (start, end) whose difference of the non-decreasing `along` [N] is closest to `delta`."""
+    start = np.arange(max(len(along) - 1, 0))
+    target = along[start] + delta
+    high = np.clip(np.searchsorted(along, target, side="left"), start + 1, len(along) - 1)
+    low = np.maximum(np.searchsorted(along, along[np.maximum(high - 1, start)], side="left"), start + 1)
+    low = np.minimum(low, high)
+    off_low, off_high = np.abs(along[low] - along[start] - delta), np.abs(along[high] - along[start] - delta)
+    end = np.where(off_low <= off_high, low, high)
+    good = np.minimum(off_low, off_high) <= _SEGMENT_TOLERANCE * delta
+    return start[good], end[good]
+
+
+def _angles_rad(R: Array) -> Array:
+    return np.asarray(Rotation.from_matrix(R).magnitude()) if len(R) else np.empty(0)
+
+
+def _rms(values: Array) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def _squared_mahalanobis(error: Array, covariance: Array) -> Array:
+    out = np.full(len(error), np.nan)
+    for i, (e, P) in enumerate(zip(error, covariance, strict=True)):
+        try:
+            root = np.linalg.cholesky(P)
+        except np.linalg.LinAlgError:
+            continue
+        out[i] = float(np.sum(np.linalg.solve(root, e) ** 2))
+    return out
