@@ -28,7 +28,7 @@ class ImuConfig:
     gyro_bias_walk: float | None = None  # rad/s^2/sqrt(Hz)
     accel_bias_walk: float | None = None  # m/s^3/sqrt(Hz)
     gravity_m_s2: float = 9.81
-    buffer_s: float = 5.0  # history kept for spans and replays; covers vision latency many times over
+    buffer_s: float = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
     max_gap_s: float = 0.1  # a longer hole between samples is an outage, not something to interpolate across
 
 
@@ -38,20 +38,143 @@ class FrontEndConfig:
 
     mode: Literal["auto", "mono", "stereo", "rgbd"] = "auto"  # auto: the richest the recording offers
 
+    max_tracks: int = 400  # more add little accuracy once the image is covered, and cost time
+    cell_px: int = 48  # side of the grid cells that share the tracks
+    min_distance_px: float = 12.0  # between corners; nearer ones see the same patch
+    min_corner_response: float = 1.0  # (grey levels / px)^2, smaller eigenvalue; sensor noise gives less
+    flow_window_px: int = 21  # Lucas-Kanade window: larger is robuster to blur, smaller to parallax
+    flow_levels: int = 3  # pyramid levels above the image: reach of about 80 px around the predicted place
+    max_back_px: float = 0.7  # forward-backward disagreement of a good match
+    max_misses: int = 2  # frames in a row that a track may fail before it is dropped
+    track_sigma_px: float = 0.3  # Lucas-Kanade noise in one image
+
+    min_depth_m: float = 0.3  # nearer is out of focus or out of range
+    max_depth_m: float = 8.0  # of depth images: beyond, structured light guesses
+    depth_sigma_rho: float = 2e-3  # 1/m: sigma of z is this times z^2; 1.4e-3 is a Kinect's own, the rest registration
+    depth_edge_rho: float = 0.03  # 1/m: a larger step within 4x4 px is an edge, its depth belongs to nobody
+    stereo_window_px: int = 15  # smaller than in time: depth edges hurt, blur is the same in both images
+    stereo_levels: int = 3  # pyramid levels above the image
+    stereo_sigma_px: float = 0.3  # noise of the disparity
+    epipolar_gate_px: float = 1.5  # distance from the epipolar line that calibration and noise explain
+
+    cauchy: float = 2.0  # scale of the robust kernel in standard deviations
+    min_inliers: int = 15  # fewer: lost; six unknowns need some redundancy
+    degraded_inliers: int = 40  # fewer: degraded
+    min_inlier_ratio: float = 0.3  # of the followed tracks; below, the agreement may be chance
+    degraded_inlier_ratio: float = 0.5  # of the followed tracks
+    patience_s: float = 0.4  # so long a lost keyframe is searched for before a new one starts
+    min_start_corners: int = 40  # an image with fewer cannot start a keyframe
+
+    keyframe_parallax_px: float = 25.0  # median with rotation taken out
+    keyframe_rotation_deg: float = 15.0  # patches turn with the camera and stop matching
+    keyframe_min_alive: float = 0.6  # fraction of the keyframe's tracks that are still followed
+    keyframe_min_interval_s: float = 0.15  # brisk motion: at most about six keyframes a second
+    keyframe_max_interval_s: float = 2.0  # a camera at rest still reports
+    described_features: int = 1000  # ORB keypoints per keyframe for loop closing
+
 
 @dataclass(frozen=True, slots=True)
 class InitConfig:
     """How the first gravity-aligned state is found."""
+
+    still_px: float = 0.5  # median image motion between frames below which the camera may be at rest
+    rest_s: float = 0.75  # the IMU's statistics need this long; shorter pauses happen in hand-held motion
+    rest_gyro_std_rad_s: float = 0.03  # idling EuRoC drone 0.007 to 0.03, hovering above 0.065 (0.5 s windows)
+    rest_accel_std_m_s2: float = 0.4  # idling motors shake up to 0.35; the gyro and the image decide between the two
+    rest_gyro_max_rad_s: float = 0.7  # mean rate: only the boot bias of a cheap gyro (ITG3205: 40 deg/s) may show
+    gravity_tolerance_m_s2: float = 0.5  # of the measured norm: accelerometer bias and scale of a calibrated sensor
+    window_s: float = 2.0  # metric visual odometry: gravity to 0.03 deg plus what the accelerometer bias hides
+    window_min_s: float = 1.0  # try from here on
+    mono_window_s: float = 5.0  # without scale, acceleration has to be seen against its bias, which takes longer
+    mono_window_min_s: float = 1.5
+    node_spacing_s: float = 0.1  # frames closer than this add noise and cost, not knowledge
+    vo_inflation: float = 1.5  # on the sigmas of relative motion, which share the keyframe's landmark errors
+    imu_inflation: float = 4.0  # on the white-noise sigmas: vibration and aliasing are not in the data sheets
+    accel_bias_sigma_m_s2: float = 0.2  # prior; a calibrated cheap accelerometer
+    gyro_bias_sigma_rad_s: float = 0.5  # prior for the motion start; wide enough for the ITG3205's 40 deg/s
+    max_tilt_sigma_deg: float = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
+    max_velocity_sigma_m_s: float = 0.2
+    max_gyro_bias_sigma_rad_s: float = 0.02
+    max_scale_sigma: float = 0.15  # relative, monocular only
+    max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
+    min_parallax_deg: float = 1.0  # camera displacement over scene depth is unknown; rotation-free flow stands for it
 
 
 @dataclass(frozen=True, slots=True)
 class EkfConfig:
     """The fast path."""
 
+    history_s: float = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
+    checkpoint_s: float = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
+    max_gap_s: float = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
+    gap_gyro_rad_s: float = 0.5  # what the rate may have been inside a hole, against its interpolation
+    gap_accel_m_s2: float = 2.0  # the same for specific force
+    imu_inflation: float = 4.0  # on the white-noise sigmas: vibration and aliasing are not in the data sheets
+    vo_inflation: float = 1.5  # on the sigmas of visual odometry: covariances from residuals miss model errors
+    vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
+    gate_probability: float = 0.999  # chi-square gate on every innovation
+    reset_rejects: int = 5  # this many rejections in a row ...
+    reset_s: float = 1.0  # ... over this long mean that the filter is wrong, not vision: P is inflated, counted
+    zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
+    zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
+
 
 @dataclass(frozen=True, slots=True)
 class GraphConfig:
-    """The iSAM2 pose graph."""
+    """The iSAM2 pose graph: sigmas of its factors, the gate for loops, and how much work an update may do."""
+
+    relinearize_rotation_rad: float = 0.002  # IMU factors are stiff: 0.01 left 5-13 mm against the exact optimum, this 1.4
+    relinearize_translation_m: float = 0.005  # what a voxel map can see
+    relinearize_velocity_m_s: float = 0.01
+    relinearize_bias: float = 0.001  # rad/s and m/s^2; preintegration's first-order correction is exact to far more
+    relinearize_skip: int = 5  # updates between relinearisations; 1 costs 3x the time for the same trajectory
+    loop_iterations: int = 3  # extra Gauss-Newton steps after a loop is accepted; bounds the work of an update
+    finish_iterations: int = 10  # most steps of the final convergence before batch has its try
+    moved_m: float = 0.001  # poses that moved less are not published again
+    moved_deg: float = 0.05
+
+    gauge_sigma_m: float = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
+    gauge_sigma_rad: float = 1e-3
+    tilt_sigma_max_deg: float = 5.0  # first roll and pitch follow the initialisation, within these bounds
+    tilt_sigma_min_deg: float = 0.05
+    gyro_bias_sigma_max: float = 0.05  # rad/s; bounds of the first bias prior, so that pivots stay within what gtsam takes
+    accel_bias_sigma_max: float = 0.5  # m/s^2
+    gyro_bias_walk_floor: float = 2e-5  # rad/s^2/sqrt(Hz); gtsam 4.3.0 throws when prior sigma / step sigma > 4096
+    accel_bias_walk_floor: float = 3e-4  # m/s^3/sqrt(Hz)
+    covariance_ratio_max: float = 1e6  # eigenvalue ratio of any factor; gtsam 4.3.0 throws above 1e7
+
+    vo_inflation: float = 1.5  # on sigma: residuals see no calibration error, and neighbours share landmarks
+    vo_degraded_inflation: float = 3.0  # further, when the front end says degraded
+    vo_floor_deg: float = 0.02  # no camera and calibration is better than this between keyframes
+    vo_floor_m: float = 0.0005
+    direction_floor_deg: float = 0.2  # mono: direction of motion
+    direction_soft_m: float = 0.005  # mono: baselines shorter than this lose their say on direction
+    huber_k: float = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
+    imu_inflation: float = 2.0  # on white noise sigma: data sheets know no vibration, scale error or time jitter
+    imu_integration_sigma: float = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
+    imu_max_gap_s: float = 0.1  # a longer hole is an outage
+    imu_max_outage_s: float = 1.0  # outages up to this are bridged with the sigmas below, longer ones drop the factor
+    outage_accel_sigma_m_s2: float = 3.0  # what nobody measured during an outage
+    outage_gyro_sigma_rad_s: float = 1.0
+    lost_speed_sigma_m_s: float = 1.0  # without vision and IMU the body is assumed to go on as before, this loosely
+    lost_rate_sigma_deg_s: float = 30.0
+    rest_speed_sigma_m_s: float = 0.005
+    rest_sigma_m: float = 0.001  # motion between two keyframes at rest
+    rest_sigma_deg: float = 0.05
+
+    loop_gate_probability: float = 0.999  # chi-square of a loop against the joint covariance of its two keyframes
+    loop_cauchy_k: float = 2.0  # whitened norm
+    loop_floor_m: float = 0.005
+    loop_floor_deg: float = 0.2
+    loop_min_weight: float = 0.02  # a loop that optimisation leaves with less is taken out again
+    loop_batch_m: float = 1.0  # a larger correction starts from a batch solution instead of incremental steps
+    loop_batch_deg: float = 10.0
+    parked_max: int = 200  # parked loops kept; the oldest leave first
+    parked_retest: int = 5  # newest parked loops gated again after each acceptance; each costs a joint marginal
+    consistency_min_others: int = 2  # parked loops that must agree with one another besides the first
+    consistency_inflation: float = 3.0  # on odometry sigma; loops are parked because odometry is overconfident
+    consistency_max_sigma_m: float = 0.5  # odometry looser than this between two loops proves nothing
+    consistency_max_sigma_deg: float = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +182,16 @@ class LoopConfig:
     """Loop detection and verification."""
 
     enabled: bool = True
+    match_ratio: float = 0.8  # nearest to second nearest descriptor; 0.8 keeps true matches of repeated texture out
+    match_max_distance: int = 64  # bits of 256; unrelated ORB descriptors are 128 apart
+    inlier_px: float = 3.0  # reprojection error of an inlier; ORB's coarse octaves are good to 2 px
+    min_inliers: int = 12  # of PnP; 5,735 pairs of different places gave at most 7
+    guided_radius_px: float = 8.0  # search around a point's predicted place once a pose is known
+    feature_sigma_px: float = 1.0  # of a keypoint; only its ratio to the depth sigma matters, residuals set the scale
+    inverse_depth_sigma_1_m: float = 0.01  # of the difference of two inverse depths
+    covariance_inflation: float = 1.0
+    sigma_floor_m: float = 0.0
+    sigma_floor_deg: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
