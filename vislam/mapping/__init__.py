@@ -1,0 +1,1 @@
+"""Dense maps from keyframe poses: clouds, an occupancy octree, a navigation grid, a mesh and pictures of them."""

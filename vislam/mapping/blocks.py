@@ -1,0 +1,115 @@
+"""Voxels in hashed blocks of 8x8x8: an open-addressing table from block keys to rows of float32 values.
+
+A voxel key is OctoMap's: three integers in [0, 65536), 32768 at the map's origin. A block key packs the three keys
+divided by 8, 13 bits each. Values of a block are ordered x fastest, then y, then z; NaN means never seen.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+
+KEY_ORIGIN = 32768  # the key of the voxel whose lower corner is the map's origin
+BLOCK_VOXELS = 512
+_KEY_BITS = 13
+_KEY_MASK = (1 << _KEY_BITS) - 1
+_EMPTY = -1
+_T = TypeVar("_T", bound=np.generic)
+_MAX_BLOCKS = 1 << 22  # 8 GiB of voxels: beyond any machine this is meant for
+
+
+@njit(cache=True, nogil=True, inline="always")
+def pack_block(bx: int, by: int, bz: int) -> int:
+    """Return the key of the block at block coordinates (voxel keys divided by 8)."""
+    return bx | (by << _KEY_BITS) | (bz << (2 * _KEY_BITS))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def find_slot(table: NDArray[np.int64], key: int) -> int:
+    """Return the slot of a hash table that holds the key, or the empty slot where it belongs (linear probing)."""
+    mask = table.shape[0] - 1
+    mixed = np.int64(key) * np.int64(-7046029254386353131)  # Fibonacci hashing
+    slot = (mixed ^ (mixed >> 31)) & mask
+    while table[slot] != _EMPTY and table[slot] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@njit(cache=True, nogil=True)
+def _rehash(table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.int64], count: int) -> None:
+    for row in range(count):
+        slot = find_slot(table, keys[row])
+        table[slot] = keys[row]
+        rows[slot] = row
+
+
+@njit(cache=True, nogil=True)
+def read_voxels(
+    keys: NDArray[np.int64], table: NDArray[np.int64], rows: NDArray[np.int32], values: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the value of each voxel key [N, 3]; NaN where never seen or outside the key range."""
+    out = np.full(len(keys), np.float32(np.nan), np.float32)
+    for i in range(len(keys)):
+        x, y, z = keys[i, 0], keys[i, 1], keys[i, 2]
+        if min(x, y, z) < 0 or max(x, y, z) >= 2 * KEY_ORIGIN:
+            continue
+        slot = find_slot(table, pack_block(x >> 3, y >> 3, z >> 3))
+        if table[slot] != _EMPTY:
+            out[i] = values[rows[slot], (x & 7) | (y & 7) << 3 | (z & 7) << 6]
+    return out
+
+
+class BlockPool:
+    """Growing storage of voxel blocks; `keys[:count]` and `values[:count]` are in order of first use."""
+
+    def __init__(self, capacity: int = 1 << 10) -> None:
+        self.count = 0
+        self.keys = np.zeros(capacity, np.int64)
+        self.values = np.empty((capacity, BLOCK_VOXELS), np.float32)
+        self.table = np.full(4 * capacity, _EMPTY, np.int64)
+        self.rows = np.zeros(4 * capacity, np.int32)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, in bytes."""
+        return self.keys.nbytes + self.values.nbytes + self.table.nbytes + self.rows.nbytes
+
+    def reserve(self, extra: int) -> None:
+        """Make room for `extra` more blocks; raises DataError when the map would outgrow any machine."""
+        need = self.count + extra
+        if need > _MAX_BLOCKS:
+            raise DataError(
+                f"the map would need {need} blocks of 8x8x8 voxels, at most {_MAX_BLOCKS} are allowed; "
+                "use a coarser map.resolution_m or a shorter map.max_range_m"
+            )
+        if need > len(self.keys):
+            capacity = max(need, 2 * len(self.keys))
+            self.keys = _grown(self.keys, capacity)
+            self.values = _grown(self.values, capacity)
+        if 2 * need > len(self.table):
+            size = len(self.table)
+            while size < 4 * need:
+                size *= 2
+            self.table = np.full(size, _EMPTY, np.int64)
+            self.rows = np.zeros(size, np.int32)
+            _rehash(self.table, self.rows, self.keys, self.count)
+
+    def read(self, voxel_keys: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the value at voxel keys [N, 3]; NaN where never seen."""
+        return np.asarray(read_voxels(voxel_keys, self.table, self.rows, self.values))
+
+    def block_coordinates(self) -> NDArray[np.int64]:
+        """Return the block coordinates [count, 3] (voxel keys divided by 8), in order of first use."""
+        keys = self.keys[: self.count]
+        return np.stack([keys & _KEY_MASK, (keys >> _KEY_BITS) & _KEY_MASK, keys >> (2 * _KEY_BITS)], axis=1)
+
+
+def _grown(array: NDArray[_T], capacity: int) -> NDArray[_T]:
+    out = np.empty((capacity, *array.shape[1:]), array.dtype)
+    out[: len(array)] = array
+    return out

@@ -1,0 +1,209 @@
+"""OctoMap's files: `.bt` (occupied or free, pruned) written and read, `.ot` (full log-odds) written.
+
+The format is OctoMap 1.9's: a text header, then the nodes depth first. In `.bt` each inner node is 16 bits, two per
+child: 00 unknown, 01 free leaf, 10 occupied leaf, 11 inner. In `.ot` each node is a float32 log-odds and 8 bits, one
+per child that exists.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+from vislam.mapping.octree import TREE_LEVELS, Octree, log_odds
+
+_BINARY_TITLE = b"# Octomap OcTree binary file"
+_COMMENT = "# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
+_MAX_HEADER_BYTES = 4096
+_MAX_FILE_BYTES = 1 << 28  # 256 MiB: a building at 5 cm is under 10
+_FREE, _OCCUPIED, _INNER = 1, 2, 3
+_TRUNCATED, _TOO_DEEP, _LEFT_OVER = -1, -2, -3
+_Bytes = NDArray[np.uint8]
+
+
+def encode_bt(octree: Octree) -> bytes:
+    """Return the `.bt` file of an octree whose leaves are pruned by occupied or free."""
+    data, inner = _encode_bt(octree.starts, octree.levels, octree.log_odds)
+    nodes = len(octree) + inner
+    return _header(f"{_BINARY_TITLE.decode()}\n", nodes, octree.resolution_m) + data.tobytes()
+
+
+def encode_ot(octree: Octree) -> bytes:
+    """Return the `.ot` file of an octree with its log-odds."""
+    data, inner = _encode_ot(octree.starts, octree.levels, octree.log_odds)
+    return _header("# Octomap OcTree file\n", len(octree) + inner, octree.resolution_m) + data.tobytes()
+
+
+def _header(title: str, nodes: int, resolution_m: float) -> bytes:
+    return f"{title}{_COMMENT}id OcTree\nsize {nodes}\nres {resolution_m:g}\ndata\n".encode()
+
+
+def read_bt(path: Path, occupied_probability: float = 0.971, free_probability: float = 0.1192) -> Octree:
+    """Return the octree of a `.bt` file; leaves get OctoMap's clamping thresholds unless told otherwise.
+
+    Raises DataError when the file is not a complete `.bt`. Memory is bounded by the file's size.
+    """
+    try:
+        size = path.stat().st_size
+        if size > _MAX_FILE_BYTES:
+            raise DataError(f"{path} has {size} bytes, octrees of up to {_MAX_FILE_BYTES} are read")
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    fields, offset = _parse_header(content, path)
+    resolution_m, size = _checked_header(fields, path)
+    starts, levels, is_occupied = _decode_leaves(content[offset:], size, path)
+    values = np.where(is_occupied, log_odds(occupied_probability), log_odds(free_probability))
+    return Octree(resolution_m, starts, levels, values)
+
+
+def _parse_header(content: bytes, path: Path) -> tuple[dict[str, str], int]:
+    head = content[:_MAX_HEADER_BYTES]
+    if not head.startswith(_BINARY_TITLE):
+        raise DataError(f"{path} does not start with '{_BINARY_TITLE.decode()}'; is it a .bt file?")
+    fields: dict[str, str] = {}
+    offset = 0
+    while True:
+        end = head.find(b"\n", offset)
+        if end < 0:
+            raise DataError(f"{path}: no 'data' line in the first {_MAX_HEADER_BYTES} bytes; the file is damaged")
+        line = head[offset:end].decode("ascii", errors="replace").strip()
+        offset = end + 1
+        if line == "data":
+            return fields, offset
+        if line and not line.startswith("#"):
+            name, _, value = line.partition(" ")
+            fields[name] = value.strip()
+
+
+def _checked_header(fields: dict[str, str], path: Path) -> tuple[float, int]:
+    """Return resolution in metres and number of nodes."""
+    if fields.get("id") != "OcTree":
+        raise DataError(f"{path} holds a tree of kind '{fields.get('id')}', only OcTree can be read from .bt")
+    try:
+        resolution_m, size = float(fields["res"]), int(fields["size"])
+    except (KeyError, ValueError) as error:
+        raise DataError(f"{path}: the header lacks a valid 'res' or 'size': {error}") from error
+    if not (np.isfinite(resolution_m) and resolution_m > 0.0) or size < 0:
+        raise DataError(f"{path}: impossible header, res {resolution_m} and size {size}")
+    return resolution_m, size
+
+
+def _decode_leaves(
+    data: bytes, size: int, path: Path
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return start code, level and occupied flag of every leaf; they are counted first, so a lie costs no memory."""
+    if len(data) % 2:
+        raise DataError(f"{path}: {len(data)} bytes of nodes is not a whole number of 16-bit nodes; the file is cut")
+    words = np.frombuffer(data, np.dtype("<u2")).astype(np.uint16)
+    leaf_count = int(np.bitwise_count((words ^ (words >> 1)) & np.uint16(0x5555)).sum())
+    starts, levels = np.empty(leaf_count, np.int64), np.empty(leaf_count, np.uint8)
+    is_occupied = np.empty(leaf_count, np.bool_)
+    used = _decode_bt(words, starts, levels, is_occupied)
+    if used < 0:
+        reason = {_TRUNCATED: "the file ends inside the tree", _TOO_DEEP: "a node lies below the 16th level",
+                  _LEFT_OVER: "bytes follow the end of the tree"}[used]  # fmt: skip
+        raise DataError(f"{path} is damaged: {reason}")
+    if size != leaf_count + len(words):
+        raise DataError(f"{path} is damaged: the header promises {size} nodes, found {leaf_count + len(words)}")
+    return starts, levels, is_occupied
+
+
+@njit(cache=True, nogil=True)
+def _shared_level(a: int, b: int) -> int:
+    """Return the level of the smallest node that holds both voxels."""
+    level, difference = 0, a ^ b
+    while difference:
+        difference >>= 3
+        level += 1
+    return level
+
+
+@njit(cache=True, nogil=True)
+def _encode_bt(starts: NDArray[np.int64], levels: NDArray[np.uint8], values: NDArray[np.float32]) -> tuple[_Bytes, int]:
+    """Return the nodes of a `.bt` and their number; an inner node is opened when its first leaf is met."""
+    out = np.zeros(64 + 2 * TREE_LEVELS * len(starts) // 4, np.uint8)
+    place = np.zeros(TREE_LEVELS + 1, np.int64)  # where the open inner node of each level stands in the output
+    end = 0
+    for i in range(len(starts)):
+        top = TREE_LEVELS + 1 if i == 0 else _shared_level(starts[i - 1], starts[i])
+        if end + 2 * (TREE_LEVELS + 1) > len(out):
+            larger = np.zeros(2 * len(out), np.uint8)
+            larger[:end] = out[:end]
+            out = larger
+        for level in range(top - 1, levels[i], -1):
+            if level < TREE_LEVELS:
+                child = (starts[i] >> (3 * level)) & 7
+                out[place[level + 1] + (child >> 2)] |= _INNER << (2 * (child & 3))
+            place[level] = end
+            end += 2
+        if levels[i] < TREE_LEVELS:
+            child = (starts[i] >> (3 * levels[i])) & 7
+            bits = _OCCUPIED if values[i] >= 0.0 else _FREE
+            out[place[levels[i] + 1] + (child >> 2)] |= bits << (2 * (child & 3))
+        else:
+            end += 2  # the root is a leaf: OctoMap writes it as a node without children
+    return out[:end].copy(), end // 2 if len(starts) == 0 or levels[0] < TREE_LEVELS else 0
+
+
+@njit(cache=True, nogil=True)
+def _encode_ot(starts: NDArray[np.int64], levels: NDArray[np.uint8], values: NDArray[np.float32]) -> tuple[_Bytes, int]:
+    """Return the nodes of an `.ot` and the number of inner ones; an inner node has the largest value of its leaves."""
+    capacity = len(starts) * (TREE_LEVELS + 1) + 1
+    node_value, node_children = np.empty(capacity, np.float32), np.zeros(capacity, np.uint8)
+    place = np.zeros(TREE_LEVELS + 1, np.int64)
+    count = 0
+    for i in range(len(starts)):
+        top = TREE_LEVELS + 1 if i == 0 else _shared_level(starts[i - 1], starts[i])
+        for level in range(top - 1, int(levels[i]) - 1, -1):
+            if level < TREE_LEVELS:
+                node_children[place[level + 1]] |= 1 << ((starts[i] >> (3 * level)) & 7)
+            place[level] = count
+            node_value[count] = values[i]
+            count += 1
+        for level in range(max(top, int(levels[i]) + 1), TREE_LEVELS + 1):
+            node_value[place[level]] = max(node_value[place[level]], values[i])
+    out = np.empty(5 * count, np.uint8)
+    raw = node_value.view(np.uint8)
+    for n in range(count):
+        out[5 * n : 5 * n + 4] = raw[4 * n : 4 * n + 4]
+        out[5 * n + 4] = node_children[n]
+    return out, count - len(starts)
+
+
+@njit(cache=True, nogil=True)
+def _decode_bt(
+    words: NDArray[np.uint16], starts: NDArray[np.int64], levels: NDArray[np.uint8], occupied: NDArray[np.bool_]
+) -> int:
+    """Fill the leaves of a `.bt`; return the number of inner nodes read, or a negative reason for damage."""
+    if len(words) == 0:
+        return 0
+    code = np.zeros(TREE_LEVELS + 1, np.int64)
+    mask = np.zeros(TREE_LEVELS + 1, np.int64)
+    child = np.zeros(TREE_LEVELS + 1, np.int64)
+    level, read, leaf = TREE_LEVELS, 1, 0
+    mask[level] = words[0]
+    while level <= TREE_LEVELS:
+        if child[level] == 8:
+            level += 1
+            continue
+        c = child[level]
+        child[level] += 1
+        bits = (mask[level] >> (2 * c)) & 3
+        start = code[level] | (c << (3 * (level - 1)))
+        if bits == _INNER:
+            if level == 1:
+                return _TOO_DEEP
+            if read == len(words):
+                return _TRUNCATED
+            level -= 1
+            code[level], mask[level], child[level] = start, words[read], 0
+            read += 1
+        elif bits != 0:
+            starts[leaf], levels[leaf], occupied[leaf] = start, level - 1, bits == _OCCUPIED
+            leaf += 1
+    return read if read == len(words) else _LEFT_OVER

@@ -1,0 +1,175 @@
+"""One scan as marks in a byte grid: the rays of OctoMap's insertion, bit for bit.
+
+OctoMap 1.9 (Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on octrees", Autonomous
+Robots 2013) walks each ray with the 3D-DDA of Amanatides and Woo, in float32 directions and float64 crossing
+distances. The same arithmetic in the same order gives the same cells. All cells of a scan are marked in a grid that
+covers its bounding box first, so that each voxel gets one update per scan and end points win over rays, and then merged
+into the blocks of the map.
+"""
+
+# ruff: noqa: PLR0917 - compiled kernels take plain arrays, by position
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.mapping.blocks import KEY_ORIGIN, find_slot, pack_block
+
+FREE_MARK = 1
+END_MARK = 2
+_FAR = 1.7976931348623157e308
+_Bytes = NDArray[np.uint8]
+_F32 = NDArray[np.float32]
+_I64 = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def voxel_key(inverse_resolution: float, coordinate: float) -> int:
+    """Return OctoMap's key of a coordinate along one axis."""
+    return int(np.floor(inverse_resolution * np.float64(coordinate))) + KEY_ORIGIN
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _axis(d: Any, origin: Any, key: int, stride: int, resolution: float) -> tuple[int, float, float]:
+    """Return grid step, distance to the first cell border and distance between borders along one axis of a ray."""
+    half = np.float64(np.float32(resolution * 0.5))
+    centre = (np.float64(key - KEY_ORIGIN) + 0.5) * resolution
+    if d > 0:
+        return stride, (centre + half - np.float64(origin)) / np.float64(d), resolution / np.float64(d)
+    if d < 0:
+        return -stride, (centre - half - np.float64(origin)) / np.float64(d), resolution / -np.float64(d)
+    return 0, _FAR, _FAR
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cast(ox: Any, oy: Any, oz: Any, ex: Any, ey: Any, ez: Any, resolution: float, base: _I64, nx: int, nxy: int,
+          grid: _Bytes) -> int:  # fmt: skip
+    """Mark the cells that a ray passes before its end cell; return the index of the end cell."""
+    inverse = 1.0 / resolution
+    k0, k1, k2 = voxel_key(inverse, ox), voxel_key(inverse, oy), voxel_key(inverse, oz)
+    index = (k0 - base[0]) + (k1 - base[1]) * nx + (k2 - base[2]) * nxy
+    e0, e1, e2 = voxel_key(inverse, ex), voxel_key(inverse, ey), voxel_key(inverse, ez)
+    end = (e0 - base[0]) + (e1 - base[1]) * nx + (e2 - base[2]) * nxy
+    if index == end:
+        return end
+    grid[index] = FREE_MARK
+    dx, dy, dz = ex - ox, ey - oy, ez - oz
+    length32 = np.float32(np.sqrt(np.float64(dx * dx + dy * dy + dz * dz)))
+    dx, dy, dz = dx / length32, dy / length32, dz / length32
+    s0, t0, d0 = _axis(dx, ox, k0, 1, resolution)
+    s1, t1, d1 = _axis(dy, oy, k1, nx, resolution)
+    s2, t2, d2 = _axis(dz, oz, k2, nxy, resolution)
+    length = np.float64(length32)
+    while True:  # selects instead of branches: which axis is next is as good as random
+        x_before_y = t0 < t1
+        nearest = t0 if x_before_y else t1
+        take_z = not (nearest < t2)
+        take_x = x_before_y and not take_z
+        take_y = (not x_before_y) and not take_z
+        index += s2 if take_z else (s0 if x_before_y else s1)
+        t0 += d0 if take_x else 0.0
+        t1 += d1 if take_y else 0.0
+        t2 += d2 if take_z else 0.0
+        if index == end or min(t0, t1, t2) > length:
+            return end
+        grid[index] = FREE_MARK
+
+
+@njit(cache=True, nogil=True)
+def cast_rays(points: _F32, origin: _F32, max_range_m: float, resolution: float, base: _I64, nx: int, nxy: int,
+              grid: _Bytes) -> None:  # fmt: skip
+    """Mark what one scan sees: free along the rays, occupied at ends within `max_range_m` (negative: no limit)."""
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    ends = np.full(len(points), -1, np.int64)
+    for i in range(len(points)):
+        ex, ey, ez = points[i, 0], points[i, 1], points[i, 2]
+        dx, dy, dz = ex - ox, ey - oy, ez - oz
+        distance = np.sqrt(np.float64(dx * dx + dy * dy + dz * dz))
+        if max_range_m < 0.0 or distance <= max_range_m:
+            ends[i] = _cast(ox, oy, oz, ex, ey, ez, resolution, base, nx, nxy, grid)
+        else:
+            length, reach = np.float32(distance), np.float32(max_range_m)
+            dx, dy, dz = dx / length, dy / length, dz / length
+            _cast(ox, oy, oz, ox + dx * reach, oy + dy * reach, oz + dz * reach, resolution, base, nx, nxy, grid)
+    for i in range(len(points)):
+        if ends[i] >= 0:
+            grid[ends[i]] = END_MARK
+
+
+@njit(cache=True, nogil=True)
+def end_voxels(points: _F32, resolution: float, base: _I64, nx: int, nxy: int, grid: _Bytes) -> _F32:
+    """Return the centres [M, 3] of the voxels that points fall into, once each; the grid is all zero before, after."""
+    inverse = 1.0 / resolution
+    out = np.empty((len(points), 3), np.float32)
+    cells = np.empty(len(points), np.int64)
+    count = 0
+    for i in range(len(points)):
+        a, b, c = (voxel_key(inverse, points[i, 0]), voxel_key(inverse, points[i, 1]), voxel_key(inverse, points[i, 2]))
+        cell = (a - base[0]) + (b - base[1]) * nx + (c - base[2]) * nxy
+        if grid[cell] == 0:
+            grid[cell] = END_MARK
+            cells[count] = cell
+            out[count, 0] = np.float32((np.float64(a - KEY_ORIGIN) + 0.5) * resolution)
+            out[count, 1] = np.float32((np.float64(b - KEY_ORIGIN) + 0.5) * resolution)
+            out[count, 2] = np.float32((np.float64(c - KEY_ORIGIN) + 0.5) * resolution)
+            count += 1
+    for i in range(count):
+        grid[cells[i]] = 0
+    return out[:count]
+
+
+@njit(cache=True, nogil=True)
+def marked_blocks(words: NDArray[np.uint64], blocks: _I64) -> _I64:
+    """Return the flat indices of the 8x8x8 blocks of the scan's grid that hold a mark; a row of 8 cells is one word."""
+    nbx, nby, nbz = blocks[0], blocks[1], blocks[2]
+    out = np.empty(nbx * nby * nbz, np.int64)
+    flags = np.zeros(nbx, np.uint64)
+    count = 0
+    for bz in range(nbz):
+        for by in range(nby):
+            flags[:] = 0
+            for z in range(8):
+                for y in range(8):
+                    row = (((bz * 8 + z) * nby + by) * 8 + y) * nbx
+                    for bx in range(nbx):
+                        flags[bx] |= words[row + bx]
+            for bx in range(nbx):
+                if flags[bx] != 0:
+                    out[count] = bx + nbx * (by + nby * bz)
+                    count += 1
+    return out[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def merge_blocks(marked: _I64, grid: _Bytes, words: NDArray[np.uint64], blocks: _I64, base: _I64, table: _I64,
+                 rows: NDArray[np.int32], keys: _I64, values: _F32, count: int, hit: Any, miss: Any, low: Any,
+                 high: Any) -> int:  # fmt: skip
+    """Update the map's blocks by a scan's marks, clear the marks, and return the new number of blocks."""
+    nbx, nby = blocks[0], blocks[1]
+    for i in range(len(marked)):
+        bx, by, bz = marked[i] % nbx, (marked[i] // nbx) % nby, marked[i] // (nbx * nby)
+        key = pack_block(base[0] // 8 + bx, base[1] // 8 + by, base[2] // 8 + bz)
+        slot = find_slot(table, key)
+        if table[slot] < 0:
+            table[slot], rows[slot], keys[count] = key, count, key
+            values[count, :] = np.float32(np.nan)
+            count += 1
+        voxels = values[rows[slot]]
+        for z in range(8):
+            for y in range(8):
+                word = (((bz * 8 + z) * nby + by) * 8 + y) * nbx + bx
+                if words[word] == 0:
+                    continue
+                for x in range(8):
+                    mark = grid[word * 8 + x]
+                    if mark == 0:
+                        continue
+                    old = voxels[z * 64 + y * 8 + x]
+                    new = (np.float32(0.0) if np.isnan(old) else old) + (hit if mark == END_MARK else miss)
+                    voxels[z * 64 + y * 8 + x] = min(max(new, low), high)
+                words[word] = 0
+    return count
