@@ -1,0 +1,75 @@
+"""Readers of recordings: one module per format, all yielding the same values; and the recorder of our own.
+
+`open_dataset("euroc:PATH")` gives a `vislam.recording.Recording`; a bare path is recognised by what is in it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from vislam.datasets import asl, kitti, tum, video
+from vislam.datasets.stream import FileRecording, Survey
+from vislam.errors import DataError, UsageError
+from vislam.recording import Recording
+
+__all__ = ["READERS", "Reader", "open_dataset", "survey"]
+
+
+class Reader(Protocol):
+    """What a module offers that reads one format."""
+
+    LOOKS_FOR: str
+
+    def recognises(self, path: Path, /) -> bool:
+        """Return whether the path looks like a recording in this format."""
+        ...
+
+    def survey(self, path: Path, /) -> Survey:
+        """Return what the recording holds, with what is wrong with it; never raises for bad content."""
+        ...
+
+
+READERS: dict[str, Reader] = {"euroc": asl, "tum": tum, "kitti": kitti, "video": video}
+
+
+def open_dataset(uri: str) -> Recording:
+    """Open `FORMAT:PATH` or a bare path as a recording.
+
+    Raises:
+        UsageError: there is no such format.
+        DataError: the path holds no recording of the format, or one that cannot be replayed.
+    """
+    return FileRecording(survey(uri))
+
+
+def survey(uri: str) -> Survey:
+    """Return what `FORMAT:PATH` or a bare path holds, for `open_dataset` and `vislam doctor`; raises as it does."""
+    name, path = _split(uri)
+    if not path.exists():
+        raise DataError(f"{path} does not exist; give the folder or file of a recording")
+    if path.is_dir() and not any(path.iterdir()):
+        raise DataError(f"{path} is empty; looked for {_wanted(name)}")
+    fitting = [known for known, reader in READERS.items() if reader.recognises(path)]
+    if name and name not in fitting:
+        hint = f"; it looks like {fitting[0]}:{path}" if fitting else ""
+        raise DataError(f"{path} is no {name} recording: looked for {_wanted(name)}{hint}")
+    if not fitting:
+        raise DataError(f"{path} is no recording that vislam knows: looked for {_wanted(name)}")
+    return READERS[name or fitting[0]].survey(path)
+
+
+def _split(uri: str) -> tuple[str, Path]:
+    """Return format (empty: to be recognised) and path; a path that exists may contain a colon itself."""
+    name, colon, rest = uri.partition(":")
+    if not colon or (name not in READERS and Path(uri).exists()):
+        return "", Path(uri)
+    if name not in READERS:
+        raise UsageError(f"no format '{name}' in '{uri}'; known formats: {', '.join(READERS)}")
+    return name, Path(rest)
+
+
+def _wanted(name: str) -> str:
+    if name:
+        return READERS[name].LOOKS_FOR
+    return ", ".join(f"{reader.LOOKS_FOR} ({known})" for known, reader in READERS.items())

@@ -1,0 +1,215 @@
+"""Sensor files: ASL `sensor.yaml` (read and written, with our few extra keys) and Kalibr's `camchain.yaml` (read).
+
+docs/formats.md lists every key. Poses are `T_BS`: the sensor's pose in the body frame of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from vislam.camera import Camera, Distortion
+from vislam.datasets.tables import check_size
+from vislam.errors import DataError
+from vislam.geometry import invert
+from vislam.imu import ImuNoise
+
+Array = NDArray[np.float64]
+
+DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
+_MAX_YAML_BYTES = 2**18
+_MODELS: dict[str, Distortion] = {
+    "radial-tangential": "radtan", "radtan": "radtan", "plumb_bob": "radtan",
+    "equidistant": "equidistant", "fisheye": "equidistant", "none": "none",
+}  # fmt: skip
+_MODEL_NAMES: dict[Distortion, str] = {"radtan": "radial-tangential", "equidistant": "equidistant", "none": "none"}
+_NOISE_KEYS = {
+    "gyro_noise_density": "gyroscope_noise_density",
+    "accel_noise_density": "accelerometer_noise_density",
+    "gyro_bias_walk": "gyroscope_random_walk",
+    "accel_bias_walk": "accelerometer_random_walk",
+}
+CAMERA_EXAMPLE = (
+    "T_BS: {rows: 4, cols: 4, data: [16 numbers]}, resolution: [640, 480], intrinsics: [fx, fy, cx, cy], "
+    "distortion_model: radial-tangential, distortion_coefficients: [k1, k2, p1, p2]"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraFile:
+    """What a camera's sensor file says."""
+
+    camera: Camera
+    T_body_cam: Array  # [4, 4]
+    rate_hz: float | None = None
+    depth_units_per_m: float | None = None  # for a folder whose depth images share the camera's file
+
+
+def load_yaml(path: Path) -> dict[str, Any]:
+    """Return the mapping in a YAML file (OpenCV's `%YAML:1.0` header and matrix tags are tolerated).
+
+    Raises DataError when it is missing, too large, no YAML, or no mapping.
+    """
+    check_size(path, _MAX_YAML_BYTES)
+    try:
+        text = path.read_text(encoding="utf-8")
+        lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
+        data = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"{path} cannot be read as YAML: {reason}") from error
+    if not isinstance(data, dict):
+        raise DataError(f"{path} must hold `key: value` lines, got {type(data).__name__}")
+    return data
+
+
+def read_camera(path: Path) -> CameraFile:
+    """Return the camera of an ASL sensor file; raises DataError naming the key, what was got and what is wanted."""
+    data = load_yaml(path)
+    try:
+        return CameraFile(
+            camera=_camera(data, path, "distortion_coefficients"),
+            T_body_cam=read_pose(data, path),
+            rate_hz=_optional_positive(data, "rate_hz", path),
+            depth_units_per_m=_optional_positive(data, "depth_units_per_m", path),
+        )
+    except DataError as error:
+        raise DataError(f"{error}; a camera's file holds: {CAMERA_EXAMPLE}") from error
+
+
+def read_imu(path: Path) -> tuple[ImuNoise, Array]:
+    """Return noise and pose `T_BS` [4, 4] of an ASL IMU file; raises DataError naming the key."""
+    data = load_yaml(path)
+    return _noise(data, "rate_hz", path), read_pose(data, path)
+
+
+def read_camchain(path: Path, index: int) -> CameraFile:
+    """Return camera `index` of a Kalibr camera chain; its body frame is the IMU (`T_cam_imu`). Raises DataError."""
+    data = load_yaml(path).get(f"cam{index}")
+    if not isinstance(data, dict):
+        raise DataError(f"{path} has no cam{index}")
+    T_cam_imu = np.array(_numbers(data, "T_cam_imu", path, 16)).reshape(4, 4)
+    return CameraFile(_camera(data, path, "distortion_coeffs"), invert(T_cam_imu))
+
+
+def read_imu_config(path: Path) -> ImuNoise:
+    """Return the noise in a Kalibr IMU file; raises DataError naming the key."""
+    return _noise(load_yaml(path), "update_rate", path)
+
+
+def read_pose(data: Mapping[str, Any], path: Path) -> Array:
+    """Return `T_BS` [4, 4] of a sensor file, identity when it has none; raises DataError unless it is rigid."""
+    if data.get("T_BS") is None:
+        return np.eye(4)
+    matrix = data["T_BS"]
+    holder = matrix if isinstance(matrix, dict) else {"data": matrix}
+    T = np.array(_numbers(holder, "data", path, 16)).reshape(4, 4)
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
+        raise DataError(f"{path}: T_BS is not a rigid transform: {T.tolist()}")
+    return T
+
+
+def depth_units(path: Path, camera: Camera) -> float:
+    """Return raw units per metre of a depth folder's sensor file; raises DataError unless it is registered to cam0."""
+    data = load_yaml(path)
+    resolution = [int(x) for x in _numbers(data, "resolution", path, 2)] if "resolution" in data else None
+    if resolution is not None and resolution != [camera.width, camera.height]:
+        raise DataError(
+            f"{path}: depth of {resolution} does not match cam0's {camera.width}x{camera.height}; "
+            "depth must be registered to cam0, pixel by pixel"
+        )
+    return _optional_positive(data, "depth_units_per_m", path) or DEPTH_UNITS_PER_M
+
+
+def _camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:
+    width, height = _numbers(data, "resolution", path, 2)
+    fx, fy, cx, cy = _numbers(data, "intrinsics", path, 4)
+    name = str(data.get("distortion_model", "none")).lower()
+    model = _MODELS.get(name)
+    if str(data.get("camera_model", "pinhole")).lower() != "pinhole" or model is None:
+        raise DataError(
+            f"{path}: '{data.get('camera_model')}', '{name}' is not supported; use pinhole with {[*_MODELS]}"
+        )
+    coefficients = _numbers(data, coefficients_key, path) if model != "none" else []
+    skew = _numbers({"skew_px": [data.get("skew_px", 0.0)]}, "skew_px", path, 1)[0]
+    try:
+        return Camera(int(width), int(height), fx, fy, cx, cy, skew, model, tuple(coefficients))
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _noise(data: Mapping[str, Any], rate_key: str, path: Path) -> ImuNoise:
+    values = {}
+    for name, key in _NOISE_KEYS.items():
+        value = _optional_positive(data, key, path, allow_zero=name.endswith("walk"))
+        if value is None:
+            raise DataError(f"{path}: no '{key}'; an IMU's file holds {', '.join(_NOISE_KEYS.values())} and {rate_key}")
+        values[name] = value
+    return ImuNoise(**values, rate_hz=_optional_positive(data, rate_key, path) or 0.0)
+
+
+def _optional_positive(data: Mapping[str, Any], key: str, path: Path, allow_zero: bool = False) -> float | None:
+    if data.get(key) is None:
+        return None
+    value = _numbers({key: [data[key]]}, key, path, 1)[0]
+    if value < 0.0 or (value == 0.0 and not allow_zero):
+        raise DataError(f"{path}: {key} must be positive, got {value}")
+    return value
+
+
+def _numbers(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
+    """Return a list (nested lists are joined) of finite numbers; YAML reads 5e-6 as text, so text is converted."""
+    value = data.get(key)
+    rows = value if isinstance(value, list) else [value]
+    flat: list[Any] = [x for row in rows for x in (row if isinstance(row, list) else [row])]
+    try:
+        numbers = [float(x) for x in flat]
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != (len(flat) if count is None else count) or not np.all(np.isfinite(numbers)):
+        raise DataError(f"{path}: {key} must be {count or 'a list of'} finite numbers, got {str(value)[:80]}")
+    return numbers
+
+
+def pose_text(T: Array) -> str:
+    """Return the `T_BS` block of a sensor file for a pose [4, 4]."""
+    rows = ",\n         ".join(", ".join(repr(float(x)) for x in row) for row in T)
+    return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
+
+
+def camera_text(camera: Camera, T_body_cam: Array, comment: str) -> str:
+    """Return the sensor file of a camera."""
+    return (
+        f"sensor_type: camera\ncomment: {comment}\n{pose_text(T_body_cam)}"
+        f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
+        f"intrinsics: {_list([camera.fx, camera.fy, camera.cx, camera.cy])}  # fu, fv, cu, cv in pixels\n"
+        f"skew_px: {float(camera.skew_px)!r}\n"
+        f"distortion_model: {_MODEL_NAMES[camera.distortion]}\n"
+        f"distortion_coefficients: {_list(camera.coefficients)}\n"
+    )
+
+
+def imu_text(noise: ImuNoise, comment: str) -> str:
+    """Return the sensor file of an IMU that is the body frame."""
+    lines = [f"{key}: {float(getattr(noise, name))!r}\n" for name, key in _NOISE_KEYS.items()]
+    rate = f"rate_hz: {float(noise.rate_hz)!r}\n" if noise.rate_hz > 0.0 else ""
+    return f"sensor_type: imu\ncomment: {comment}\n{pose_text(np.eye(4))}{rate}{''.join(lines)}"
+
+
+def depth_text(camera: Camera, units_per_m: float) -> str:
+    """Return the sensor file of depth images registered to `camera`."""
+    return (
+        "sensor_type: depth\ncomment: z-depth registered to cam0, 16-bit PNG, 0 where invalid\nregistered_to: cam0\n"
+        f"resolution: [{camera.width}, {camera.height}]\ndepth_units_per_m: {float(units_per_m)!r}\n"
+    )
+
+
+def _list(values: Sequence[float]) -> str:
+    return "[" + ", ".join(repr(float(value)) for value in values) + "]"

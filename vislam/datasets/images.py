@@ -1,0 +1,190 @@
+"""Images of a recording: lists with stamps, matching of two lists by time, decoding with bounds, and decoding ahead."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Camera
+from vislam.errors import DataError
+from vislam.messages import ImageF32, ImageU8
+
+Stamps = NDArray[np.int64]
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
+_HEAD_BYTES = 2**18  # enough to reach the size in a JPEG with an embedded preview and profile
+_TAIL_BYTES = 1024  # some cameras pad after the end mark
+_GREY_OR_COLOR = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_RAW_DEPTH = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+class UnreadableImageError(Exception):
+    """One image that is missing or damaged: skipped and counted by the reader, never seen by its users."""
+
+    def __init__(self, kind: str, path: Path) -> None:
+        super().__init__(f"{kind}: {path}")
+        self.kind = kind
+        self.path = path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageList:
+    """The images of one camera: strictly rising stamps [N] and a file name for each."""
+
+    name: str  # "cam0", "cam1", "depth0"
+    folder: Path
+    t_ns: Stamps
+    files: tuple[str, ...]
+    rate_hz: float | None = None  # as declared by its sensor file
+
+    def path(self, i: int) -> Path:
+        """Return the path of image `i`."""
+        return self.folder / self.files[i]
+
+
+def match_by_time(a_ns: Stamps, b_ns: Stamps, tolerance_ns: int) -> Stamps:
+    """Return for each stamp of a [N] the index of its partner in b, or -1; both rise.
+
+    The closest pair is joined first and nothing is used twice, as in the TUM benchmark's `associate.py`; joining all
+    that are each other's nearest, then looking again at the rest, comes to the same.
+    """
+    partner = np.full(len(a_ns), -1, dtype=np.int64)
+    free_a, free_b = np.arange(len(a_ns)), np.arange(len(b_ns))
+    while len(free_a) and len(free_b):
+        a, b = a_ns[free_a], b_ns[free_b]
+        a_to_b, b_to_a = _nearest(a, b), _nearest(b, a)
+        joined = (np.abs(b[a_to_b] - a) <= tolerance_ns) & (b_to_a[a_to_b] == np.arange(len(a)))
+        if not joined.any():
+            break
+        partner[free_a[joined]] = free_b[a_to_b[joined]]
+        free_b = np.delete(free_b, a_to_b[joined])
+        free_a = free_a[~joined]
+    return partner
+
+
+def _nearest(a_ns: Stamps, b_ns: Stamps) -> Stamps:
+    right = np.clip(np.searchsorted(b_ns, a_ns), 0, len(b_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    take_left = np.abs(a_ns - b_ns[left]) <= np.abs(b_ns[right] - a_ns)
+    return np.where(take_left, left, right).astype(np.int64)
+
+
+def image_size(head: bytes) -> tuple[int, int] | None:
+    """Return width and height that the head of a PNG or JPEG file declares, or None if it is neither."""
+    if head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR":
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    if not head.startswith(b"\xff\xd8"):
+        return None
+    at = 2
+    while at + 9 <= len(head) and head[at] == 0xFF:
+        marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
+        if marker == 0xFF:  # fill byte
+            at += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame, any coding
+            return int.from_bytes(head[at + 7 : at + 9], "big"), int.from_bytes(head[at + 5 : at + 7], "big")
+        else:
+            at += 2 + length
+    return None
+
+
+def probe(path: Path) -> tuple[int, int]:
+    """Return width and height of an image file from its head, without decoding; raises UnreadableImageError.
+
+    The end mark is checked too: decoders show the missing part of a file that was cut short as grey, without an error.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            file.seek(0, 2)
+            file.seek(max(0, file.tell() - _TAIL_BYTES))
+            tail = file.read(_TAIL_BYTES)
+    except FileNotFoundError as error:
+        raise UnreadableImageError("missing image", path) from error
+    except OSError as error:
+        raise UnreadableImageError("unreadable image", path) from error
+    return _checked_size(head, tail, path)
+
+
+def _checked_size(head: bytes, tail: bytes, path: Path) -> tuple[int, int]:
+    size = image_size(head)
+    if size is None or (b"IEND" if head[0] == 0x89 else b"\xff\xd9") not in tail:
+        raise UnreadableImageError("unreadable image", path)
+    return size
+
+
+def _decode(path: Path, camera: Camera, flags: int) -> NDArray[np.generic]:
+    try:
+        size_bytes = path.stat().st_size
+        data = path.read_bytes() if size_bytes <= MAX_IMAGE_BYTES else b""
+    except FileNotFoundError as error:
+        raise UnreadableImageError("missing image", path) from error
+    except OSError as error:
+        raise UnreadableImageError("unreadable image", path) from error
+    # compared before decoding, so that a forged header cannot ask for gigabytes
+    check_size_px(_checked_size(data[:_HEAD_BYTES], data[-_TAIL_BYTES:], path), camera, path)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error as error:
+        raise UnreadableImageError("unreadable image", path) from error
+    if image is None or image.shape[:2] != (camera.height, camera.width):
+        raise UnreadableImageError("unreadable image", path)
+    return np.asarray(image)
+
+
+def check_size_px(size: tuple[int, int], camera: Camera, path: Path) -> None:
+    """Raise DataError unless an image of `size` (width, height) is what the camera was calibrated for."""
+    if size != (camera.width, camera.height):
+        raise DataError(
+            f"{path} is {size[0]}x{size[1]} but its calibration is for {camera.width}x{camera.height}; "
+            "correct the calibration's resolution (and intrinsics), or use the images it was made for"
+        )
+
+
+def read_grey_or_color(path: Path, camera: Camera) -> tuple[ImageU8, ImageU8 | None]:
+    """Return the image of a file as grey [H, W] and, if it has colour, as BGR [H, W, 3]; 16-bit images lose 8 bits.
+
+    Raises UnreadableImageError when missing or damaged, DataError when it is not of the camera's size.
+    """
+    image = np.asarray(_decode(path, camera, _GREY_OR_COLOR), dtype=np.uint8)
+    if image.ndim == 2:
+        return image, None
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8), image
+
+
+def read_depth(path: Path, camera: Camera, units_per_m: float) -> ImageF32:
+    """Return depth in metres [H, W] of a 16-bit PNG, 0 where invalid; raises as `read_grey_or_color` does."""
+    raw = _decode(path, camera, _RAW_DEPTH)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise UnreadableImageError("depth image that is not 16-bit grey", path)
+    return raw.astype(np.float32) / np.float32(units_per_m)
+
+
+def decode_ahead(
+    jobs: Iterable[Job], load: Callable[[Job], Result], workers: int = 2, ahead: int = 4
+) -> Generator[Result, None, None]:
+    """Yield `load(job)` for each job in order, computed up to `ahead` jobs early in threads.
+
+    OpenCV decodes without the interpreter's lock, so this overlaps with tracking. The answer does not depend on timing:
+    order is kept, and an exception comes out at its place. Closing the generator ends the threads.
+    """
+    pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="decode")
+    pending: deque[Future[Result]] = deque()
+    try:
+        for job in jobs:
+            pending.append(pool.submit(load, job))
+            if len(pending) > ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

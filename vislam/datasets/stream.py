@@ -1,0 +1,208 @@
+"""A recording on disk as a stream of values: what the readers of all formats share."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Rig
+from vislam.config import ImuConfig
+from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, decode_ahead, match_by_time, probe
+from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoader
+from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
+from vislam.datasets.truth import Truth
+from vislam.errors import DataError
+from vislam.imu import ImuNoise
+from vislam.messages import Frame, ImuSample, MagSample
+from vislam.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+STEREO_TOLERANCE_NS = 2_000_000  # at 1 m/s the body moves 2 mm in it, far less than any baseline
+DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
+_FRAME_GAP_S = 0.5  # a hole in the images that is worth telling, unless frames are rarer anyway
+_USUAL_PERIODS = 3.5  # a hole is longer than this many usual periods
+_NAMED_GAPS = 5  # so many gaps are told one by one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What a recording holds, as found; `errors` are the reasons why it cannot be replayed, worst first."""
+
+    format: str
+    root: Path
+    cameras: tuple[ImageList, ...] = ()
+    depth: ImageList | None = None
+    depth_units_per_m: float = 1.0
+    video: Path | None = None  # the frames come from here; the files of cam0 are frame numbers
+    rig: Rig | None = None
+    imu_file: Path | None = None
+    imu_noise: ImuNoise | None = None
+    mag_file: Path | None = None
+    R_body_mag: Array = field(default_factory=lambda: np.eye(3))
+    truth: Truth | None = None
+    problems: Problems = field(default_factory=Problems)  # met while listing
+    errors: tuple[DataError, ...] = ()
+
+
+def image_list(
+    name: str, folder: Path, rows: Iterable[Row[str]], problems: Problems, rate_hz: float | None = None
+) -> ImageList:
+    """Return the images of one camera from the rows of its list, in time order; bad rows are counted."""
+    kept = list(in_time_order(rows, problems, name))
+    stamps = np.array([row[0] for row in kept], dtype=np.int64)
+    return ImageList(name, folder, stamps, tuple(row[1] for row in kept), rate_hz)
+
+
+def frame_table(survey: Survey, problems: Problems) -> FrameTable:
+    """Return which images form a frame; stereo images without a partner and frames without depth are counted."""
+    first = survey.cameras[0].t_ns
+    rows = [np.arange(len(first))]
+    for other in survey.cameras[1:]:
+        rows.append(match_by_time(first, other.t_ns, STEREO_TOLERANCE_NS))
+        problems.count("stereo image without partner", times=_unpaired(rows[-1], len(other.t_ns)))
+    camera_rows = np.stack(rows, axis=1)
+    camera_rows = camera_rows[np.all(camera_rows >= 0, axis=1)]
+    t_ns = first[camera_rows[:, 0]]
+    depth_rows = np.full(len(t_ns), -1, dtype=np.int64)
+    if survey.depth is not None:
+        depth_rows = match_by_time(t_ns, survey.depth.t_ns, DEPTH_TOLERANCE_NS)
+        problems.count("frame without depth", times=int(np.count_nonzero(depth_rows < 0)))
+    return FrameTable(t_ns, camera_rows, depth_rows)
+
+
+def _unpaired(partners: NDArray[np.int64], others: int) -> int:
+    paired = int(np.count_nonzero(partners >= 0))
+    return (len(partners) - paired) + (others - paired)
+
+
+class FileRecording:
+    """A recording on disk that implements `vislam.recording.Recording`.
+
+    Memory does not grow with its length, apart from the index of its images (some 100 bytes each).
+    """
+
+    def __init__(self, survey: Survey) -> None:
+        """Open what a survey found; raises DataError when it cannot be replayed, or images and calibration differ."""
+        if survey.errors:
+            raise survey.errors[0]
+        if survey.rig is None or not survey.cameras:
+            raise DataError(f"{survey.root} holds no camera images; `vislam doctor` shows what it holds")
+        self.name = survey.root.resolve().name
+        self.rig: Rig = survey.rig
+        self.imu_noise: ImuNoise | None = survey.imu_noise
+        self.problems: dict[str, int] = {}
+        self._survey = survey
+        self._counter = Problems()
+        self._counter.update(survey.problems)
+        self._frames = frame_table(survey, self._counter)
+        self._known = dict(self._counter)
+        self.problems = self._counter
+        self.frame_count = len(self._frames.t_ns)
+        if not self.frame_count:
+            names = " and ".join(camera.name for camera in survey.cameras)
+            raise DataError(f"{survey.root} has no frame: {names} share no image within {STEREO_TOLERANCE_NS} ns")
+        self._check_first_images()
+
+    def events(self) -> Generator[ImuSample | MagSample | Frame, None, None]:
+        """Yield samples and frames in time order, inertial ones first when stamps are equal.
+
+        A second call starts over, also the counts. Raises DataError when an image is not of the calibrated size, or
+        when most rows of a file are unusable.
+        """
+        self._counter.restart(self._known)
+        with closing(self._read_frames()) as frames, closing(self._read_imu()) as imu, closing(self._read_mag()) as mag:
+            streams: list[Iterator[ImuSample | MagSample | Frame]] = [imu, mag, frames]
+            yield from heapq.merge(*streams, key=lambda event: event.t_ns)
+
+    def truth(self) -> Trajectory | None:
+        """Return the true body trajectory, or None; raises DataError when its file is unusable."""
+        return None if self._survey.truth is None else self._survey.truth(Problems())
+
+    def _check_first_images(self) -> None:
+        """Compare the first readable image of each camera with its calibration, before a run starts."""
+        if self._survey.video is not None:
+            self._open_loader().close()
+            return
+        for column, (camera, stream) in enumerate(zip(self.rig.cameras, self._survey.cameras, strict=True)):
+            for row in self._frames.camera_rows[:100, column]:
+                try:
+                    check_size_px(probe(stream.path(int(row))), camera, stream.path(int(row)))
+                    break
+                except UnreadableImageError:
+                    continue
+
+    def _open_loader(self) -> Loader:
+        survey = self._survey
+        if survey.video is not None:
+            return VideoLoader(survey.video, survey.cameras[0].files, self.rig.cameras[0])
+        return FolderLoader(self._frames, survey.cameras, survey.depth, self.rig, survey.depth_units_per_m)
+
+    def _read_frames(self) -> Generator[Frame, None, None]:
+        gaps = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter)
+        with closing(self._open_loader()) as loader:
+            index = 0
+            with closing(decode_ahead(range(self.frame_count), loader.load, loader.workers)) as decoded:
+                for t_ns, loaded in zip(self._frames.t_ns.tolist(), decoded, strict=False):
+                    if loaded.trouble is not None:
+                        self._counter.count(loaded.trouble.kind, self._place(loaded.trouble.path))
+                    if loaded.images:
+                        gaps.see(t_ns)
+                        yield Frame(t_ns, index, loaded.images, loaded.color, loaded.depth_m)
+                        index += 1
+
+    def _read_imu(self) -> Generator[ImuSample, None, None]:
+        if self._survey.imu_file is None:
+            return
+        rate_hz = self.imu_noise.rate_hz if self.imu_noise is not None else 0.0
+        gaps = _GapWatch("imu", imu_gap_limit_s(rate_hz), self._counter)
+        rows = read_numbers(self._survey.imu_file, 6, self._counter)
+        for t_ns, values in in_time_order(rows, self._counter, "imu"):
+            gaps.see(t_ns)
+            both = np.array(values)
+            yield ImuSample(t_ns, both[:3], both[3:])
+
+    def _read_mag(self) -> Generator[MagSample, None, None]:
+        if self._survey.mag_file is None:
+            return
+        rows = read_numbers(self._survey.mag_file, 3, self._counter)
+        for t_ns, values in in_time_order(rows, self._counter, "mag"):
+            yield MagSample(t_ns, self._survey.R_body_mag @ np.array(values))
+
+    def _place(self, path: Path) -> str:
+        return str(path.relative_to(self._survey.root)) if path.is_relative_to(self._survey.root) else path.name
+
+
+def gap_limit_s(t_ns: NDArray[np.int64]) -> float:
+    """Return how long a hole between these frame stamps is usual: several of their own periods, or half a second."""
+    period_s = float(np.median(np.diff(t_ns))) * 1e-9 if len(t_ns) > 1 else 0.0
+    return max(_FRAME_GAP_S, _USUAL_PERIODS * period_s)
+
+
+def imu_gap_limit_s(rate_hz: float) -> float:
+    """Return how long a hole between inertial samples is usual: what spans are interpolated over, or a few periods."""
+    return max(ImuConfig().max_gap_s, _USUAL_PERIODS / rate_hz if rate_hz > 0.0 else 0.0)
+
+
+class _GapWatch:
+    """Tells gaps of one stream: the first few one by one, the others as a count."""
+
+    def __init__(self, what: str, limit_s: float, problems: Problems) -> None:
+        self._what = what
+        self._limit_ns = round(limit_s * 1e9)
+        self._problems = problems
+        self._last_ns: int | None = None
+        self._told = 0
+
+    def see(self, t_ns: int) -> None:
+        if self._last_ns is not None and t_ns - self._last_ns > self._limit_ns:
+            self._told += 1
+            gap = f"{self._what} gap of {(t_ns - self._last_ns) * 1e-9:.2f} s at t={self._last_ns * 1e-9:.3f} s"
+            self._problems.count(gap if self._told <= _NAMED_GAPS else f"further {self._what} gaps")
+        self._last_ns = t_ns
