@@ -30,6 +30,7 @@ class ImuConfig:
     gravity_m_s2: float = 9.81
     buffer_s: float = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
     max_gap_s: float = 0.1  # a longer hole between samples is an outage, not something to interpolate across
+    max_wait_s: float = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +98,7 @@ class InitConfig:
     max_gyro_bias_sigma_rad_s: float = 0.02
     max_scale_sigma: float = 0.15  # relative, monocular only
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
+    give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
     min_parallax_deg: float = 1.0  # camera displacement over scene depth is unknown; rotation-free flow stands for it
 
 
@@ -117,13 +119,16 @@ class EkfConfig:
     reset_s: float = 1.0  # ... over this long mean that the filter is wrong, not vision: P is inflated, counted
     zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
+    graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
 
 
 @dataclass(frozen=True, slots=True)
 class GraphConfig:
     """The iSAM2 pose graph: sigmas of its factors, the gate for loops, and how much work an update may do."""
 
-    relinearize_rotation_rad: float = 0.002  # IMU factors are stiff: 0.01 left 5-13 mm against the exact optimum, this 1.4
+    relinearize_rotation_rad: float = (
+        0.002  # IMU factors are stiff: 0.01 left 5-13 mm against the exact optimum, this 1.4
+    )
     relinearize_translation_m: float = 0.005  # what a voxel map can see
     relinearize_velocity_m_s: float = 0.01
     relinearize_bias: float = 0.001  # rad/s and m/s^2; preintegration's first-order correction is exact to far more
@@ -137,7 +142,9 @@ class GraphConfig:
     gauge_sigma_rad: float = 1e-3
     tilt_sigma_max_deg: float = 5.0  # first roll and pitch follow the initialisation, within these bounds
     tilt_sigma_min_deg: float = 0.05
-    gyro_bias_sigma_max: float = 0.05  # rad/s; bounds of the first bias prior, so that pivots stay within what gtsam takes
+    gyro_bias_sigma_max: float = (
+        0.05  # rad/s; bounds of the first bias prior, so that pivots stay within what gtsam takes
+    )
     accel_bias_sigma_max: float = 0.5  # m/s^2
     gyro_bias_walk_floor: float = 2e-5  # rad/s^2/sqrt(Hz); gtsam 4.3.0 throws when prior sigma / step sigma > 4096
     accel_bias_walk_floor: float = 3e-4  # m/s^3/sqrt(Hz)

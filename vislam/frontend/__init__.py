@@ -1,0 +1,44 @@
+"""Visual odometry: mono, stereo and RGB-D front ends behind one protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from vislam.camera import Rig
+from vislam.config import FrontEndConfig
+from vislam.errors import UsageError
+from vislam.frontend.metric import MetricFrontEnd
+from vislam.frontend.result import FrontEnd, TrackResult
+from vislam.frontend.rgbd import ImageDepth
+from vislam.frontend.stereo import StereoDepth
+
+__all__ = ["FrontEnd", "TrackResult", "make_frontend"]
+
+
+def _rgbd(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
+    if not rig.has_depth:
+        raise UsageError("front end 'rgbd' needs depth images, this recording has none; use --frontend.mode auto")
+    return MetricFrontEnd("rgbd", config, rig, ImageDepth(config), seed)
+
+
+def _stereo(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
+    if not rig.is_stereo:
+        raise UsageError("front end 'stereo' needs two cameras, this recording has one; use --frontend.mode auto")
+    return MetricFrontEnd("stereo", config, rig, StereoDepth(rig, config), seed)
+
+
+FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {
+    "rgbd": _rgbd,
+    "stereo": _stereo,
+}
+
+
+def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
+    """Return the front end that the configuration asks for; `auto` takes the richest that the rig allows.
+
+    Raises UsageError when the rig lacks what the mode needs.
+    """
+    mode = config.mode
+    if mode == "auto":
+        mode = "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else "mono"
+    return FRONT_ENDS[mode](config, rig, seed)

@@ -1,0 +1,39 @@
+"""What metric front ends need of a depth sensor: the inverse depth of pixels, with its standard deviation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from vislam.messages import Array, Frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthReading:
+    """Inverse z-depths of pixels in cam0."""
+
+    rho: Array  # [N] in 1/m, NaN where unknown
+    sigma_rho: Array  # [N] in 1/m
+    right_px: Array | None = None  # [N, 2] in cam1 for stereo, NaN where not matched
+
+    @property
+    def depth_m(self) -> Array:
+        """Return z-depths [N], NaN where unknown or at infinity."""
+        depth: Array = np.full(len(self.rho), np.nan)
+        near = np.isfinite(self.rho) & (self.rho > 1e-3)
+        depth[near] = 1.0 / self.rho[near]
+        return depth
+
+
+class DepthSensor(Protocol):
+    """A source of inverse depth for pixels of cam0."""
+
+    def available(self, frame: Frame) -> bool:
+        """Return whether this frame carries depth at all."""
+        ...
+
+    def measure(self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array) -> DepthReading:
+        """Measure the depth of raw pixels [N, 2] with directions `xy` [N, 2], where about `expected_rho` [N] is likely."""
+        ...

@@ -1,0 +1,52 @@
+"""What a front end answers for every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+
+_NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement that says nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackResult:
+    """One tracked frame: the motion since the keyframe, what was seen, and the new keyframe if it became one."""
+
+    vo: VoMeasurement
+    observations: Observations
+    keyframe: Keyframe | None
+    median_parallax_px: float  # since the keyframe that `vo` refers to, rotation taken out; 0 when nothing was followed
+    reason: str  # why tracking is not ok, or why the frame became a keyframe; empty otherwise
+
+
+class FrontEnd(Protocol):
+    """Visual odometry that is fed frame by frame."""
+
+    mode: str
+
+    def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
+        """Follow the last keyframe into `frame`; `imu` is the bias-corrected span since the previous frame.
+
+        Raises DataError when the images do not fit the rig or time does not advance.
+        """
+        ...
+
+
+def identity_motion(t_ns: int, keyframe_id: int, has_scale: bool, tracks: int) -> VoMeasurement:
+    """Return the measurement of the very first keyframe: it is where it is, exactly."""
+    return VoMeasurement(t_ns, keyframe_id, np.eye(4), np.zeros((6, 6)), has_scale, Tracking.OK, tracks)
+
+
+def lost_motion(t_ns: int, keyframe_id: int, has_scale: bool, inliers: int = 0) -> VoMeasurement:
+    """Return the measurement of a frame whose motion since keyframe `keyframe_id` (-1: none yet) is unknown."""
+    covariance: Array = np.eye(6) * _NO_KNOWLEDGE
+    return VoMeasurement(t_ns, keyframe_id, None, covariance, has_scale, Tracking.LOST, inliers)
+
+
+def no_observations() -> Observations:
+    """Return observations of nothing."""
+    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
