@@ -1,0 +1,172 @@
+"""Turns journal records into factors and first guesses; a pure function of the records and the current estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from vislam.config import GraphConfig
+from vislam.factors import motion
+from vislam.factors.imu import Preintegrated, Preintegrator
+from vislam.factors.journal import KeyframeRecord, StartRecord
+from vislam.factors.keys import B, V, X, bias_of
+from vislam.factors.noise import gaussian, huber, inflated
+from vislam.factors.priors import start_factors
+from vislam.factors.visual import direction_factor, direction_measurement, direction_model, pose_factor
+from vislam.geometry import transform
+from vislam.imu import ImuNoise
+from vislam.messages import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guess:
+    """State of one keyframe as numbers."""
+
+    T_map_body: Array  # [4, 4]
+    velocity_map_m_s: Array  # [3]
+    bias: gtsam.imuBias.ConstantBias
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """The factors of one keyframe, the guess of its state, and the uncertainty its motion adds."""
+
+    factors: list[gtsam.NonlinearFactor]
+    guess: Guess
+    variance_rad2: float  # per axis, of the motion since the previous keyframe
+    variance_m2: float
+    note: str
+
+
+class Builder:
+    """Knows the sensors; holds no state of the run."""
+
+    def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, lever_m: Array) -> None:
+        """Set up for a rig: `lever_m` [3] is cam0 in the body frame."""
+        self._config = config
+        self._lever_m = lever_m
+        self._preintegrator = None if noise is None else Preintegrator(config, noise, gravity_m_s2)
+
+    def start(self, record: StartRecord) -> tuple[list[gtsam.NonlinearFactor], Guess]:
+        """Return the priors and state of keyframe 0."""
+        bias = bias_of(record.gyro_bias_rad_s, record.accel_bias_m_s2)
+        return start_factors(record, self._config), Guess(record.T_map_body, record.velocity_map_m_s, bias)
+
+    def keyframe(
+        self, record: KeyframeRecord, previous: KeyframeRecord, before: Guess, last_motion: Array, has_imu: bool
+    ) -> Step:
+        """Return the factors that tie a keyframe to the previous one, whose state is `before`.
+
+        `last_motion` [4, 4] is the motion of the step before, the guess where neither vision nor IMU saw this one.
+        Every variable gets at least one factor that bounds it, whatever is missing.
+        """
+        config = self._config
+        duration_s = (record.t_ns - previous.t_ns) * 1e-9
+        integrated = None
+        if has_imu and self._preintegrator is not None:
+            integrated = self._preintegrator.integrate(record.imu, previous.t_ns, record.t_ns, before.bias)
+        guess = self._guess(record, before, last_motion, duration_s, integrated)
+        factors: list[gtsam.NonlinearFactor] = []
+        notes: list[str] = []
+        if record.T_previous_body is not None:
+            factors.append(self._visual(record))
+        if integrated is not None and self._preintegrator is not None:
+            factors.append(self._preintegrator.factor(record.id, integrated))
+            if integrated.outage_s > 0.0:
+                notes.append(f"IMU outage of {integrated.outage_s:.2f} s bridged")
+        elif has_imu and self._preintegrator is not None:
+            factors += self._without_imu(record, guess, duration_s)
+            notes.append("IMU missing over the span")
+        unscaled = not record.has_scale and integrated is None
+        loose_rad = np.deg2rad(config.lost_rate_sigma_deg_s) * duration_s
+        loose_m = config.lost_speed_sigma_m_s * duration_s
+        if (record.T_previous_body is None and integrated is None) or unscaled:
+            T = np.linalg.inv(before.T_map_body) @ guess.T_map_body
+            factors.append(motion.loose_motion(record.id, T, loose_rad, loose_m))
+        if record.T_previous_body is None:
+            notes.append("vision lost, bridged by " + ("IMU" if integrated is not None else "constant motion"))
+        if record.at_rest:
+            factors += self._rest(record.id, has_imu)
+        if record.covariance is None or not record.has_scale:
+            variances = (loose_rad**2, loose_m**2)
+        else:
+            covariance = self._visual_covariance(record)
+            variances = (float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0)
+        return Step(factors, guess, *variances, note="; ".join(notes))
+
+    def _visual_covariance(self, record: KeyframeRecord) -> Array:
+        assert record.covariance is not None
+        config = self._config
+        factor = config.vo_inflation * (config.vo_degraded_inflation if record.degraded else 1.0)
+        floor_m = config.vo_floor_m if record.has_scale else 0.0
+        return inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)
+
+    def _visual(self, record: KeyframeRecord) -> gtsam.NonlinearFactor:
+        assert record.T_previous_body is not None
+        config, covariance = self._config, self._visual_covariance(record)
+        a, b = X(record.id - 1), X(record.id)
+        if record.has_scale:
+            model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
+            return pose_factor(a, b, record.T_previous_body, model)
+        floor = np.deg2rad(config.direction_floor_deg)
+        measured = direction_measurement(record.T_previous_body, covariance, floor)
+        model = huber(direction_model(measured, config.covariance_ratio_max), config.huber_k)
+        return direction_factor(a, b, measured, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model)
+
+    def _without_imu(self, record: KeyframeRecord, guess: Guess, duration_s: float) -> list[gtsam.NonlinearFactor]:
+        """Keep velocity and biases bounded where the IMU factor had to be dropped."""
+        assert self._preintegrator is not None
+        walk = self._preintegrator.bias_walk_sigmas(duration_s)
+        speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, self._config.lost_speed_sigma_m_s)
+        return [speed, motion.bias_walk(record.id, walk)]
+
+    def _rest(self, k: int, has_imu: bool) -> list[gtsam.NonlinearFactor]:
+        config = self._config
+        factors: list[gtsam.NonlinearFactor] = [
+            motion.no_motion(k, np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m)
+        ]
+        if has_imu:
+            factors.append(motion.zero_velocity(k, config.rest_speed_sigma_m_s))
+        return factors
+
+    def _guess(
+        self,
+        record: KeyframeRecord,
+        before: Guess,
+        last_motion: Array,
+        duration_s: float,
+        integrated: Preintegrated | None,
+    ) -> Guess:
+        """Return where the keyframe should be: by scaled vision, else by the IMU, else by going on as before."""
+        T, velocity = before.T_map_body @ last_motion, before.velocity_map_m_s
+        if integrated is not None:
+            state = gtsam.NavState(gtsam.Pose3(before.T_map_body), before.velocity_map_m_s)
+            predicted = integrated.pim.predict(state, before.bias)
+            T, velocity = predicted.pose().matrix(), np.array(predicted.velocity())
+        measured = record.T_previous_body
+        if measured is not None and record.has_scale:
+            T = before.T_map_body @ measured
+        elif measured is not None and integrated is None:
+            step_m = float(np.linalg.norm(last_motion[:3, 3]))
+            T = before.T_map_body @ transform(measured[:3, :3].copy(), step_m * measured[:3, 3])
+        if integrated is None:
+            velocity = (T[:3, 3] - before.T_map_body[:3, 3]) / duration_s
+        return Guess(np.ascontiguousarray(T), velocity, before.bias)
+
+
+def insert_guess(values: gtsam.Values, k: int, guess: Guess, has_imu: bool) -> None:
+    """Add the variables of keyframe k to `values`."""
+    values.insert(X(k), gtsam.Pose3(guess.T_map_body))
+    if has_imu:
+        values.insert(V(k), guess.velocity_map_m_s)
+        values.insert(B(k), guess.bias)
+
+
+def read_guess(values: gtsam.Values, k: int, has_imu: bool) -> Guess:
+    """Return the state of keyframe k in `values`."""
+    T = values.atPose3(X(k)).matrix()
+    if not has_imu:
+        return Guess(T, np.zeros(3), gtsam.imuBias.ConstantBias())
+    return Guess(T, np.array(values.atVector(V(k))), values.atConstantBias(B(k)))

@@ -1,0 +1,134 @@
+"""What was measured, as plain frozen records, from which the graph can be rebuilt and a batch can redo the run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+from vislam.factors.noise import checked_covariance
+from vislam.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
+
+_RIGID = 1e-4  # how far R^T R may be from identity
+_TIME_SLACK_NS = 1_000_000  # an IMU span may overlap its keyframes by this much
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartRecord:
+    """The first state; without an IMU only the pose counts."""
+
+    T_map_body: Array  # [4, 4]
+    velocity_map_m_s: Array  # [3]
+    gyro_bias_rad_s: Array  # [3]
+    accel_bias_m_s2: Array  # [3]
+    covariance: Array  # [15, 15] as in NavState
+    has_imu: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeRecord:
+    """One keyframe: its motion since the previous one by vision (None: lost) and by IMU (None: missing)."""
+
+    id: int
+    t_ns: int
+    T_previous_body: Array | None  # [4, 4]; unscaled: the translation is cam0's unit direction in body axes, or zero
+    covariance: Array | None  # [6, 6] as the front end reported it
+    has_scale: bool
+    degraded: bool
+    imu: ImuSpan | None
+    at_rest: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopRecord:
+    """One loop edge as it was offered with keyframe `offered_with`; what became of it is in the edge report."""
+
+    id: int
+    from_id: int
+    to_id: int
+    T_from_to: Array  # [4, 4] body to body; unscaled: as in KeyframeRecord
+    covariance: Array  # [6, 6]
+    has_scale: bool
+    offered_with: int
+
+
+Record = StartRecord | KeyframeRecord | LoopRecord
+
+
+def start_record(state: NavState | None) -> StartRecord:
+    """Return the record of an initial state, identity without one; raises DataError when it cannot be used."""
+    if state is None:
+        return StartRecord(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15), False)
+    what = f"initial state at {state.t_ns} ns"
+    vectors = (state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+    if not all(np.shape(v) == (3,) and np.all(np.isfinite(v)) for v in vectors):
+        raise DataError(f"{what}: velocity and biases must be three finite numbers each")
+    return StartRecord(
+        _checked_pose(state.T_world_body, what),
+        np.array(state.velocity_world_m_s, dtype=np.float64),
+        np.array(state.gyro_bias_rad_s, dtype=np.float64),
+        np.array(state.accel_bias_m_s2, dtype=np.float64),
+        checked_covariance(state.covariance, 15, what),
+        True,
+    )
+
+
+def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> KeyframeRecord:
+    """Return the record of a packet that follows `previous`; raises DataError on anything the graph must not see."""
+    keyframe, vo = packet.keyframe, packet.vo
+    expected = 0 if previous is None else previous.id + 1
+    what = f"keyframe {keyframe.id} at {keyframe.t_ns} ns"
+    if keyframe.id != expected:
+        raise DataError(f"{what}: ids must be dense, expected {expected}")
+    if previous is None:
+        return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, packet.at_rest)
+    if keyframe.t_ns <= previous.t_ns:
+        raise DataError(f"{what}: time must increase, the previous keyframe is at {previous.t_ns} ns")
+    T: Array | None = None
+    covariance: Array | None = None
+    if vo.tracking is not Tracking.LOST and vo.T_keyframe_body is not None:
+        if vo.keyframe_id != previous.id:
+            raise DataError(f"{what}: its odometry is relative to keyframe {vo.keyframe_id}, expected {previous.id}")
+        T = _checked_pose(vo.T_keyframe_body, f"{what}: odometry")
+        covariance = checked_covariance(vo.covariance, 6, f"{what}: odometry")
+    imu = None if packet.imu is None else _checked_span(packet.imu, previous.t_ns, keyframe.t_ns, what)
+    degraded = vo.tracking is Tracking.DEGRADED
+    return KeyframeRecord(keyframe.id, keyframe.t_ns, T, covariance, vo.has_scale, degraded, imu, packet.at_rest)
+
+
+def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:
+    """Return the record of a loop edge; raises DataError when it cannot be used."""
+    what = f"loop {edge.id} from {edge.from_id} to {edge.to_id}"
+    if not 0 <= edge.from_id < edge.to_id <= newest_id:
+        raise DataError(f"{what}: must go from an older to a newer keyframe of 0..{newest_id}")
+    T = _checked_pose(edge.T_from_to, what)
+    covariance = checked_covariance(edge.covariance, 6, what)
+    return LoopRecord(edge.id, edge.from_id, edge.to_id, T, covariance, edge.has_scale, newest_id)
+
+
+def _checked_pose(T: Array, what: str) -> Array:
+    matrix = np.array(T, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
+        raise DataError(f"{what}: pose must be 4x4 and finite, got shape {matrix.shape}")
+    R = matrix[:3, :3]
+    error = float(np.max(np.abs(R.T @ R - np.eye(3))))
+    if error > _RIGID or np.linalg.det(R) < 0.0 or not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise DataError(f"{what}: pose is not a rigid motion, R^T R misses identity by {error:.3g}")
+    return matrix
+
+
+def _checked_span(span: ImuSpan, t0_ns: int, t1_ns: int, what: str) -> ImuSpan:
+    t: NDArray[np.int64] = np.array(span.t_ns, dtype=np.int64)
+    gyro = np.array(span.gyro_rad_s, dtype=np.float64)
+    accel = np.array(span.accel_m_s2, dtype=np.float64)
+    if gyro.shape != (len(t), 3) or accel.shape != (len(t), 3):
+        raise DataError(f"{what}: IMU span has {len(t)} stamps, gyro {gyro.shape} and accel {accel.shape}")
+    if not (np.all(np.isfinite(gyro)) and np.all(np.isfinite(accel))):
+        raise DataError(f"{what}: IMU span holds NaN or infinity; drop such samples before they get here")
+    if np.any(np.diff(t) <= 0):
+        raise DataError(f"{what}: IMU stamps must strictly increase")
+    if len(t) and (t[0] < t0_ns - _TIME_SLACK_NS or t[-1] > t1_ns + _TIME_SLACK_NS):
+        raise DataError(f"{what}: IMU span [{t[0]}, {t[-1]}] ns is outside the keyframes' [{t0_ns}, {t1_ns}]")
+    return ImuSpan(t, gyro, accel)

@@ -1,0 +1,41 @@
+"""Keys of the graph and the conversions between gtsam's values and numpy."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from vislam.messages import Array
+
+_INDEX_BITS = 56
+_POSE, _VELOCITY, _BIAS = (ord(c) << _INDEX_BITS for c in "xvb")
+
+
+def X(i: int) -> int:
+    """Return the key of keyframe i's pose (equal to gtsam's symbol, ten times cheaper)."""
+    return _POSE | i
+
+
+def V(i: int) -> int:
+    """Return the key of keyframe i's velocity in map, m/s."""
+    return _VELOCITY | i
+
+
+def B(i: int) -> int:
+    """Return the key of keyframe i's IMU biases."""
+    return _BIAS | i
+
+
+def bias_of(gyro_rad_s: Array, accel_m_s2: Array) -> gtsam.imuBias.ConstantBias:
+    """Return gtsam's bias, which orders accelerometer first."""
+    return gtsam.imuBias.ConstantBias(accel_m_s2, gyro_rad_s)
+
+
+def poses_of(values: gtsam.Values) -> Array:
+    """Return all poses [M, 4, 4], in the order of keyframe ids."""
+    rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
+    T = np.zeros((len(rows), 4, 4))
+    T[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    T[:, :3, 3] = rows[:, 9:]
+    T[:, 3, 3] = 1.0
+    return T

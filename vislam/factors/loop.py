@@ -1,0 +1,81 @@
+"""Loop factors, and how well a pair of poses fits a loop."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from vislam.config import GraphConfig
+from vislam.factors.journal import LoopRecord
+from vislam.factors.keys import X
+from vislam.factors.noise import cauchy, conditioned, gaussian, inflated
+from vislam.factors.visual import (
+    DirectionMeasurement,
+    direction_factor,
+    direction_measurement,
+    direction_residual,
+    pose_factor,
+)
+from vislam.geometry import invert, se3_adjoint, se3_log
+from vislam.messages import Array
+
+
+class LoopModel:
+    """One loop edge, metric or scale-free: its factor, its residual and its chi-square."""
+
+    def __init__(self, record: LoopRecord, config: GraphConfig, lever_m: Array) -> None:
+        """Prepare the edge; `lever_m` [3] is cam0 in the body."""
+        self.record = record
+        self._config = config
+        self._lever_m = lever_m
+        covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), config.loop_floor_m)
+        self._direction: DirectionMeasurement | None = None
+        if not record.has_scale:
+            floor = np.deg2rad(config.direction_floor_deg)
+            covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), 0.0)
+            self._direction = direction_measurement(record.T_from_to, covariance, floor)
+            covariance = self._direction.covariance
+        self.covariance = conditioned(covariance, config.covariance_ratio_max)
+        self.threshold = float(chi2_distribution.ppf(config.loop_gate_probability, len(self.covariance)))
+
+    def factor(self, robust: bool) -> gtsam.NonlinearFactor:
+        """Return the factor, under a Cauchy kernel when `robust`."""
+        record, config = self.record, self._config
+        model: gtsam.noiseModel.Base = gaussian(self.covariance, config.covariance_ratio_max)
+        if robust:
+            model = cauchy(model, config.loop_cauchy_k)
+        a, b = X(record.from_id), X(record.to_id)
+        if self._direction is None:
+            return pose_factor(a, b, record.T_from_to, model)
+        return direction_factor(
+            a, b, self._direction, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model
+        )
+
+    def residual(self, T_from: Array, T_to: Array) -> tuple[Array, Array]:
+        """Return the residual [n] at two map poses and its Jacobian [n, 6] by the relative pose (its end perturbed)."""
+        if self._direction is None:
+            return se3_log(invert(self.record.T_from_to) @ invert(T_from) @ T_to), np.eye(6)
+        d = self._direction
+        residual, _, J_b = direction_residual(
+            T_from, T_to, d.R_a_b, d.direction_a, d.tangent, self._lever_m, self._config.direction_soft_m
+        )
+        rows = len(self.covariance)
+        return residual[:rows], J_b[:rows]
+
+    def chi2(self, T_from: Array, T_to: Array, relative_covariance: Array | None = None) -> float:
+        """Return the chi-square of the residual; with the covariance [6, 6] of the relative pose, of the innovation."""
+        residual, J = self.residual(T_from, T_to)
+        S = self.covariance if relative_covariance is None else self.covariance + J @ relative_covariance @ J.T
+        return float(residual @ np.linalg.solve(S, residual))
+
+    def weight(self, T_from: Array, T_to: Array) -> float:
+        """Return the weight, 0 to 1, that the Cauchy kernel leaves the edge."""
+        k2 = self._config.loop_cauchy_k**2
+        return k2 / (k2 + self.chi2(T_from, T_to))
+
+
+def relative_covariance(T_a: Array, T_b: Array, joint: Array) -> Array:
+    """Return the covariance [6, 6] of T_a_b, perturbed on the b side, from the joint one [12, 12] of both poses."""
+    H = np.hstack([-se3_adjoint(invert(T_b) @ T_a), np.eye(6)])
+    return np.asarray(H @ joint @ H.T)

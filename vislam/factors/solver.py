@@ -1,0 +1,120 @@
+"""Solvers of the graph: incremental (iSAM2), and batch for where incremental elimination fails.
+
+gtsam 4.3.0 rejects some healthy systems, and an ISAM2 object that threw is unusable. Nothing here repairs one: an
+exception passes through, and the owner builds a new solver from its journal.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+import gtsam
+import numpy as np
+
+from vislam.config import GraphConfig
+from vislam.messages import Array
+
+Factorization = Literal["CHOLESKY", "QR"]
+FAILURES = (RuntimeError, ValueError, IndexError, KeyError)  # what gtsam's bindings are known to raise
+
+_BATCH_ITERATIONS = 20
+
+
+class Solver(Protocol):
+    """What the pose graph needs of a solver."""
+
+    name: str
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
+        """Add factors and new values, remove factors by slot, improve the estimate; return the slots of what is new."""
+
+    def iterate(self, count: int) -> None:
+        """Improve the estimate by up to `count` steps."""
+
+    def estimate(self) -> gtsam.Values:
+        """Return the current estimate."""
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """Return the joint marginal covariance of variables, in the order of `keys`."""
+
+
+class IncrementalSolver:
+    """iSAM2 with Gauss-Newton steps and per-type relinearisation thresholds."""
+
+    def __init__(self, config: GraphConfig, factorization: Factorization) -> None:
+        """Start empty."""
+        self.name = f"isam2-{factorization.lower()}"
+        params = gtsam.ISAM2Params()
+        params.setFactorization(factorization)
+        params.relinearizeSkip = config.relinearize_skip
+        params.findUnusedFactorSlots = True
+        thresholds = gtsam.ISAM2ThresholdMap()
+        pose = np.repeat([config.relinearize_rotation_rad, config.relinearize_translation_m], 3)
+        thresholds.insert(("x", pose))
+        thresholds.insert(("v", np.full(3, config.relinearize_velocity_m_s)))
+        thresholds.insert(("b", np.full(6, config.relinearize_bias)))
+        params.setRelinearizeThreshold(thresholds)
+        self._isam = gtsam.ISAM2(params)
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
+        """See Solver."""
+        result = self._isam.update(graph, values, remove)
+        return [int(slot) for slot in result.getNewFactorsIndices()]
+
+    def iterate(self, count: int) -> None:
+        """See Solver."""
+        for _ in range(count):
+            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], None, None, None, True)
+
+    def estimate(self) -> gtsam.Values:
+        """See Solver."""
+        return self._isam.calculateEstimate()
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """See Solver."""
+        return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
+
+
+class BatchSolver:
+    """Levenberg-Marquardt over the whole graph at each update: slow, but damping makes it hard to stop."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.name = "batch-lm"
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._values = gtsam.Values()
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
+        """See Solver."""
+        self._values.insert(values)
+        first = self._graph.size()
+        for slot in remove:
+            self._graph.remove(slot)
+        self._graph.push_back(graph)
+        self.iterate(_BATCH_ITERATIONS)
+        return list(range(first, self._graph.size()))
+
+    def iterate(self, count: int) -> None:
+        """See Solver; keeps the values it has when even LM fails."""
+        try:
+            self._values = optimize(self._graph, self._values, count)
+        except FAILURES:
+            return
+
+    def estimate(self) -> gtsam.Values:
+        """See Solver."""
+        return gtsam.Values(self._values)
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """See Solver."""
+        joint = gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(keys)
+        return np.asarray(joint.fullMatrix())
+
+
+def optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
+    """Return the values after Levenberg-Marquardt over the whole graph."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(iterations)
+    params.setRelativeErrorTol(1e-7)
+    params.setlambdaUpperBound(1e9)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()

@@ -1,0 +1,295 @@
+"""PoseGraph: keyframes, IMU, visual odometry and loops in one iSAM2 graph, whose sole owner it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.config import GraphConfig
+from vislam.errors import DataError, UsageError
+from vislam.factors.builder import Builder
+from vislam.factors.estimator import Estimator
+from vislam.factors.gate import CarPark, EdgeReport, Travel
+from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe_record, loop_record, start_record
+from vislam.factors.keys import B, V, X
+from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.geometry import invert
+from vislam.imu import ImuNoise
+from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState
+
+__all__ = ["EdgeReport", "PoseGraph"]
+
+_START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
+_COLLAPSED = 0.1  # weight below which an older loop counts as torn by newer ones
+
+
+class PoseGraph:
+    """The back end: `initialise`, then `add` each keyframe packet with its loop edges, then `finish`.
+
+    Bad input raises DataError before anything is touched. Whatever gtsam does, `add` returns an update; its note says
+    what happened when a plain one was not possible. Lost vision, IMU outages and refused loops are values.
+    """
+
+    def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, T_body_cam0: Array) -> None:
+        """Set up for a rig; without `noise` there is no IMU and only poses are estimated."""
+        self._config = config
+        self._noise = noise
+        self._lever_m = np.array(T_body_cam0[:3, 3], dtype=np.float64)
+        self._estimator = Estimator(config, Builder(config, noise, gravity_m_s2, self._lever_m))
+        self._start: StartRecord | None = None
+        self._start_t_ns: int | None = None
+        self._journal: list[Record] = []
+        self._keyframes: list[KeyframeRecord] = []
+        self._travel = Travel()
+        self._park = CarPark(config)
+        self._reports: dict[int, EdgeReport] = {}
+        self._published: Array = np.zeros((0, 4, 4))
+        self._T_map_odom: Array = np.eye(4)
+        self._revision = 0
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """Return the ids [M] of all keyframes."""
+        return np.arange(len(self._keyframes), dtype=np.int64)
+
+    @property
+    def journal(self) -> list[Record]:
+        """Return everything that was measured, as plain records in the order of arrival."""
+        return list(self._journal)
+
+    def initialise(self, state: NavState | None) -> None:
+        """Set the state of keyframe 0 in map: gravity-aligned pose, velocity, biases; None without an IMU: identity.
+
+        Raises DataError on numbers that cannot be used and UsageError when it does not fit the graph.
+        """
+        if self._keyframes:
+            raise UsageError("the graph already has keyframes; initialise it once, before the first add")
+        if (state is None) != (self._noise is None):
+            have = "no IMU" if self._noise is None else "an IMU"
+            raise UsageError(f"the graph was set up with {have}; initialise it with a state exactly when it has an IMU")
+        self._start = start_record(state)
+        self._start_t_ns = None if state is None else state.t_ns
+
+    def add(
+        self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None
+    ) -> GraphUpdate:
+        """Add a keyframe and the loop edges that ended with it; return what changed.
+
+        `T_odom_body` [4, 4] is the keyframe's pose in odom, from which T_map_odom follows; without it the last stays.
+        Raises DataError, and changes nothing, on a packet that cannot be used.
+        """
+        if self._start is None:
+            raise UsageError("the graph needs initialise(...) before the first keyframe")
+        previous = self._keyframes[-1] if self._keyframes else None
+        record = keyframe_record(packet, previous)
+        if T_odom_body is not None and not np.all(np.isfinite(T_odom_body)):
+            raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
+        if previous is None:
+            notes = [self._begin(record)]
+        else:
+            self._journal.append(record)
+            step, note = self._estimator.extend(record)
+            moved = invert(self._estimator.poses[-2]) @ self._estimator.poses[-1]
+            self._travel.append(step.variance_rad2, step.variance_m2, float(np.linalg.norm(moved[:3, 3])))
+            notes = [step.note, note]
+        self._keyframes.append(record)
+        accepted, refused = self._close(edges, notes)
+        if T_odom_body is not None:
+            self._T_map_odom = self._estimator.poses[-1] @ invert(np.ascontiguousarray(T_odom_body, dtype=np.float64))
+        return self._publish(accepted, refused, "; ".join(n for n in notes if n))
+
+    def finish(self) -> GraphUpdate:
+        """Iterate to convergence and return all poses; the note tells the cost and how it was reached."""
+        if not self._keyframes:
+            return GraphUpdate(self._revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
+        before = self._estimator.poses[-1]
+        note = self._estimator.converge()
+        self._T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._T_map_odom
+        self._published = np.zeros((0, 4, 4))
+        return self._publish([], [], note)
+
+    def poses(self) -> Array:
+        """Return T_map_body [M, 4, 4] of all keyframes."""
+        return self._estimator.poses.copy()
+
+    def states(self) -> list[NavState]:
+        """Return the state of each keyframe with its marginal covariance, NaN where gtsam cannot give one."""
+        return [self._state(k) for k in range(len(self._keyframes))]
+
+    def relative_covariance(self, i: int, j: int) -> Array:
+        """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
+        joint = self._estimator.joint_covariance([X(i), X(j)])
+        if joint is None:
+            return self._travel.relative_covariance(i, j)
+        return relative_covariance(self._estimator.poses[i], self._estimator.poses[j], joint)
+
+    def edge_reports(self) -> list[EdgeReport]:
+        """Return what became of every offered loop, by loop id, with the weight it has now."""
+        out = []
+        for loop_id in sorted(self._reports):
+            edge = self._estimator.loops.get(loop_id)
+            weight = 0.0 if edge is None else edge.weight(*self._ends(edge))
+            out.append(replace(self._reports[loop_id], weight=weight))
+        return out
+
+    def _begin(self, record: KeyframeRecord) -> str:
+        assert self._start is not None
+        if self._start_t_ns is not None and abs(record.t_ns - self._start_t_ns) > _START_SLACK_NS:
+            raise DataError(
+                f"keyframe 0 at {record.t_ns} ns: the initial state is of {self._start_t_ns} ns; "
+                "give the state at the time of keyframe 0"
+            )
+        self._journal += [self._start, record]
+        return self._estimator.begin(self._start, record)
+
+    def _ends(self, edge: LoopModel) -> tuple[Array, Array]:
+        poses = self._estimator.poses
+        return poses[edge.record.from_id], poses[edge.record.to_id]
+
+    def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
+        """Gate loops, accept or park them, and promote parked groups; return accepted and refused ids."""
+        passed: list[LoopModel] = []
+        parked: list[LoopModel] = []
+        touched: list[int] = []
+        for edge in edges:
+            model = self._admit(edge)
+            touched.append(edge.id)
+            if model is not None:
+                (passed if self._gate(model) else parked).append(model)
+        if passed:
+            self._accept(passed, notes, "inside the gate")
+        touched += self._retest(notes) if passed else []
+        for model in parked:
+            evicted = self._park.park(model, self._estimator.poses, self._travel)
+            if evicted is not None:
+                self._report(evicted, LoopDecision.REJECTED, "left the full car park")
+                touched.append(evicted.record.id)
+        for model in parked:
+            group = self._park.group_of(model) if any(model is p for p in self._park.edges) else []
+            if group:
+                touched += [g.record.id for g in group]
+                self._promote(group, notes)
+        decided = sorted(set(touched))
+        accepted = [n for n in decided if self._reports[n].decision is LoopDecision.ACCEPTED]
+        return accepted, [n for n in decided if n not in accepted]
+
+    def _admit(self, edge: LoopEdge) -> LoopModel | None:
+        """Journal an edge; one that cannot be used is reported as rejected, not raised."""
+        try:
+            if edge.id in self._reports:
+                raise DataError(f"loop {edge.id}: its id was used before")
+            record = loop_record(edge, len(self._keyframes) - 1)
+        except DataError as error:
+            bad = EdgeReport(
+                edge.id, edge.from_id, edge.to_id, float("nan"), 0.0, LoopDecision.REJECTED, str(error)
+            )  # fmt: skip
+            self._reports.setdefault(edge.id, bad)
+            return None
+        self._journal.append(record)
+        return LoopModel(record, self._config, self._lever_m)
+
+    def _gate(self, model: LoopModel) -> bool:
+        """Test an edge against the current estimate and note the chi-square."""
+        record = model.record
+        chi2 = model.chi2(*self._ends(model), self.relative_covariance(record.from_id, record.to_id))
+        inside = bool(chi2 <= model.threshold)
+        decision = LoopDecision.ACCEPTED if inside else LoopDecision.PARKED
+        reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
+        self._reports[record.id] = EdgeReport(
+            record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason
+        )  # fmt: skip
+        return inside
+
+    def _report(self, model: LoopModel, decision: LoopDecision, reason: str) -> None:
+        old = self._reports[model.record.id]
+        self._reports[model.record.id] = replace(old, decision=decision, reason=f"{old.reason}; {reason}")
+
+    def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> None:
+        """Put loops into the graph, and take out again those that the optimised graph contradicts."""
+        notes.append(self._estimator.close(fresh, batch=promoted or any(self._is_far(m) for m in fresh)))
+        contradicted = []
+        for model in fresh:
+            if model.record.id not in self._estimator.loops:
+                self._report(model, LoopDecision.REJECTED, "the solver refused it")
+                continue
+            weight = model.weight(*self._ends(model))
+            if weight < self._config.loop_min_weight:
+                contradicted.append(model)
+                self._report(model, LoopDecision.REJECTED, f"contradicted by the graph, weight {weight:.3f}")
+            else:
+                self._report(model, LoopDecision.ACCEPTED, reason)
+        if contradicted:
+            notes.append(self._estimator.drop(contradicted))
+
+    def _is_far(self, model: LoopModel) -> bool:
+        """Return whether a loop asks for a correction beyond what incremental steps should try."""
+        residual, _ = model.residual(*self._ends(model))
+        turn = float(np.linalg.norm(residual[:3])) > np.deg2rad(self._config.loop_batch_deg)
+        return turn or (model.record.has_scale and float(np.linalg.norm(residual[3:])) > self._config.loop_batch_m)
+
+    def _retest(self, notes: list[str]) -> list[int]:
+        """Gate the newest parked loops again, after an accepted one changed the estimate; return the accepted ids."""
+        passed = [m for m in self._park.edges[::-1][: self._config.parked_retest] if self._gate(m)]
+        if not passed:
+            return []
+        self._park.remove(passed)
+        self._accept(passed, notes, "inside the gate after another loop")
+        return [m.record.id for m in passed]
+
+    def _promote(self, group: list[LoopModel], notes: list[str]) -> None:
+        """Accept a consistent group of parked loops, unless that tears more loops than it brings."""
+        self._park.remove(group)
+        older = list(self._estimator.loops.values())
+        sound = [m for m in older if m.weight(*self._ends(m)) >= 0.5]
+        snapshot = self._estimator.snapshot()
+        self._accept(group, notes, f"one of {len(group)} parked loops that agree", promoted=True)
+        torn = [m for m in sound if m.weight(*self._ends(m)) < _COLLAPSED]
+        if len(torn) >= len(group):
+            notes.append(self._estimator.revert(snapshot, group))
+            for model in group:
+                self._report(model, LoopDecision.REJECTED, f"its group tore {len(torn)} older loops")
+
+    def _state(self, k: int) -> NavState:
+        """Return the state of one keyframe; gtsam's covariance turned to NavState's order and axes."""
+        guess, has_imu = self._estimator.state(k), self._estimator.has_imu
+        R = guess.T_map_body[:3, :3]
+        covariance = np.full((15, 15), np.nan)
+        joint = self._estimator.joint_covariance([X(k), V(k), B(k)] if has_imu else [X(k)])
+        if joint is not None:
+            turn = np.eye(len(joint))
+            turn[3:6, 3:6] = R
+            if has_imu:
+                turn[9:, 9:] = np.roll(np.eye(6), 3, axis=1)
+            covariance[: len(joint), : len(joint)] = turn @ joint @ turn.T
+        velocity = guess.velocity_map_m_s if has_imu else np.full(3, np.nan)
+        gyro, accel = np.array(guess.bias.gyroscope()), np.array(guess.bias.accelerometer())
+        return NavState(self._keyframes[k].t_ns, guess.T_map_body, velocity, gyro, accel, covariance)
+
+    def _publish(self, accepted: list[int], refused: list[int], note: str) -> GraphUpdate:
+        """Return the poses that moved since they were last published, and remember them."""
+        poses = self._estimator.poses
+        old = self._published
+        moved = np.ones(len(poses), dtype=bool)
+        shift = np.linalg.norm(poses[: len(old), :3, 3] - old[:, :3, 3], axis=1)
+        chord = np.linalg.norm(poses[: len(old), :3, :3] - old[:, :3, :3], axis=(1, 2))  # 2 sqrt(2) sin(angle / 2)
+        limit = 2.0 * np.sqrt(2.0) * np.sin(0.5 * np.deg2rad(self._config.moved_deg))
+        moved[: len(old)] = (shift > self._config.moved_m) | (chord > limit)
+        self._published = np.concatenate([old, poses[len(old) :]])
+        self._published[moved] = poses[moved]
+        self._revision += 1
+        newest = self._state(len(poses) - 1) if self._estimator.has_imu else None
+        details = {"solver": self._estimator.solver_name, "parked": len(self._park.edges)}
+        return GraphUpdate(
+            self._revision,
+            np.flatnonzero(moved).astype(np.int64),
+            poses[moved],
+            self._T_map_odom,
+            newest,
+            tuple(accepted),
+            tuple(refused),
+            note,
+            details,
+        )
