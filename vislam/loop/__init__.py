@@ -1,0 +1,1 @@
+"""Loop closing: recognise places seen before and measure the relative pose, precision first."""

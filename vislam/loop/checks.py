@@ -1,0 +1,132 @@
+"""Whether a verified pose may become an edge: the rule that let no gross error through in the measurements, with its reason.
+
+Enough inliers alone do not do: what remains wrong after PnP is the right place with a bad pose, or an object that exists twice. A
+small standard deviation, or the agreement of an independent neighbour through odometry, sorts those out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.config import LoopConfig
+from vislam.geometry import invert, so3_log
+from vislam.loop.pose_table import PoseTable
+from vislam.loop.verifier import Verification
+from vislam.messages import Array, LoopDecision
+
+_REFERENCE_DEPTH_M = 2.0  # the tolerances in metres hold for scenes at this depth and grow with it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A relative pose that verification found, with the map's poses of both ends at that time."""
+
+    from_id: int
+    to_id: int
+    T_from_to: Array  # [4, 4]
+    has_scale: bool
+    median_depth_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A decision and its reason, for people."""
+
+    decision: LoopDecision
+    reason: str
+
+
+def tilt_error_rad(T_from_to: Array, T_map_from: Array, T_map_to: Array) -> float:
+    """Return by how much a relative pose disagrees with gravity, in radians; its heading plays no role.
+
+    Down is known in both keyframes of a gravity-aligned map; the relative rotation must turn one into the other.
+    """
+    measured = T_from_to[:3, :3] @ T_map_to[2, :3]
+    return float(np.arccos(np.clip(measured @ T_map_from[2, :3], -1.0, 1.0)))
+
+
+def agree(one: Measured, other: Measured, poses: PoseTable, config: LoopConfig) -> bool:
+    """Return whether two measurements say the same about one pose, going from one to the other through the map's poses.
+
+    With scale, the poses must agree; without, the rotations, and the
+    two rays must meet in front of both.
+    """
+    ahead = invert(poses[one.from_id]) @ poses[other.from_id]
+    back = invert(poses[other.to_id]) @ poses[one.to_id]
+    predicted = ahead @ other.T_from_to @ back
+    if not _angle_rad(one.T_from_to, predicted) <= np.deg2rad(config.agreement_deg):
+        return False
+    if one.has_scale and other.has_scale:
+        depth = np.nanmax([_REFERENCE_DEPTH_M, one.median_depth_m, other.median_depth_m])
+        limit = config.agreement_m * depth / _REFERENCE_DEPTH_M
+        return bool(np.linalg.norm(one.T_from_to[:3, 3] - predicted[:3, 3]) <= limit)
+    if one.has_scale or other.has_scale:
+        return False
+    offset = ahead[:3, 3] + ahead[:3, :3] @ other.T_from_to[:3, :3] @ back[:3, 3]
+    return _rays_meet(one.T_from_to[:3, 3], offset, ahead[:3, :3] @ other.T_from_to[:3, 3], config.agreement_deg)
+
+
+def _rays_meet(direction: Array, origin: Array, other_direction: Array, limit_deg: float) -> bool:
+    """Return whether `s * direction` meets `origin + u * other_direction` for some s, u > 0 within an angle."""
+    A = np.stack([direction, -other_direction], axis=1)
+    (s, u), _, rank, _ = np.linalg.lstsq(A, origin, rcond=1e-4)
+    slack = np.tan(np.deg2rad(limit_deg))
+    if rank < 2 or np.linalg.norm(origin) < 1e-9:  # parallel rays: from far away the same direction is all there is
+        return bool(direction @ other_direction > np.cos(np.deg2rad(limit_deg)))
+    gap = np.linalg.norm(s * direction - origin - u * other_direction)
+    return bool(s > 0.0 and u > 0.0 and gap <= slack * max(s, u))
+
+
+def agrees_with_map(one: Measured, poses: PoseTable, config: LoopConfig) -> bool:
+    """Return whether a measurement says what the map says already; without scale, the rotation only."""
+    T = invert(poses[one.from_id]) @ poses[one.to_id]
+    measured = Measured(one.from_id, one.to_id, T, one.has_scale, one.median_depth_m)
+    if one.has_scale:
+        return agree(one, measured, poses, config)
+    return _angle_rad(one.T_from_to, T) <= np.deg2rad(config.agreement_deg)
+
+
+def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -> str:
+    """Return what speaks against a verified pose whatever the neighbours say, or an empty string."""
+    if tilt_rad is not None and not np.rad2deg(tilt_rad) <= config.max_tilt_deg:
+        return f"{np.rad2deg(tilt_rad):.1f} deg off gravity, limit {config.max_tilt_deg:g}"
+    for name, share in (("the other way round", found.reverse_agreement), ("in depth", found.depth_agreement)):
+        if share < config.min_agreement_share:
+            return f"only {share:.0%} agree {name}, needs {config.min_agreement_share:.0%}"
+    if not found.has_scale and not np.rad2deg(found.sigma_m) <= config.max_direction_sigma_deg:
+        return f"direction good to {np.rad2deg(found.sigma_m):.1f} deg only, limit {config.max_direction_sigma_deg:g}"
+    return ""
+
+
+def judge(found: Verification, tilt_rad: float | None, agreeing: int, config: LoopConfig) -> Judgement:
+    """Decide about a candidate from its verification, its tilt against gravity (None: unknown) and agreeing neighbours."""
+    if found.T_a_b is None:
+        return Judgement(LoopDecision.REJECTED, found.reason)
+    seen = f"{found.inliers} inliers, {found.supporters} with guided matching"
+    against = objection(found, tilt_rad, config)
+    if against:
+        return Judgement(LoopDecision.REJECTED, f"{seen}, but {against}")
+    if not found.has_scale:
+        return _judge_direction(found, seen, agreeing, config)
+    limit = config.max_sigma_m * np.fmax(_REFERENCE_DEPTH_M, found.median_depth_m) / _REFERENCE_DEPTH_M
+    sigma = f"sigma {100.0 * found.sigma_m:.1f} cm"
+    if agreeing >= 1:
+        return Judgement(LoopDecision.ACCEPTED, f"{seen}, {sigma}, {agreeing} neighbours agree")
+    if found.sigma_m <= limit:
+        return Judgement(LoopDecision.ACCEPTED, f"{seen}, {sigma} within {100.0 * limit:.1f} cm")
+    return Judgement(LoopDecision.PARKED, f"{seen}, {sigma} above {100.0 * limit:.1f} cm and no neighbour agrees yet")
+
+
+def _judge_direction(found: Verification, seen: str, agreeing: int, config: LoopConfig) -> Judgement:
+    """Without scale nothing is taken alone: wrong matches fit an essential matrix too easily."""
+    seen = f"{seen}, direction good to {np.rad2deg(found.sigma_m):.1f} deg"
+    if agreeing >= config.min_agreeing_direction:
+        return Judgement(LoopDecision.ACCEPTED, f"{seen}, {agreeing} neighbours agree")
+    reason = f"{seen}, {agreeing} neighbours agree so far, needs {config.min_agreeing_direction} without depth"
+    return Judgement(LoopDecision.PARKED, reason)
+
+
+def _angle_rad(T: Array, other: Array) -> float:
+    return float(np.linalg.norm(so3_log(np.ascontiguousarray(T[:3, :3].T @ other[:3, :3]))))

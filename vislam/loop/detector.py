@@ -1,0 +1,229 @@
+"""LoopDetector: from a new keyframe to verified loop edges, with one recorded reason per candidate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.camera import Rig
+from vislam.config import LoopConfig
+from vislam.geometry import invert_many, transform_points
+from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
+from vislam.loop.checks import Judgement, Measured, agree, agrees_with_map, judge, objection, tilt_error_rad
+from vislam.loop.database import PlaceDatabase
+from vislam.loop.pose_table import PoseTable
+from vislam.loop.verifier import Verification, Verifier
+from vislam.loop.view import View, make_view
+from vislam.loop.vocabulary import Vocabulary
+from vislam.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
+
+_PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
+_NEIGHBOUR_STEPS = (-1, 1, -2, 2)  # where a second witness is looked for beside a candidate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A candidate of one keyframe and what verification made of it; `measured` only when nothing speaks against it."""
+
+    candidate: Candidate
+    to_id: int
+    found: Verification
+    tilt_rad: float | None
+    measured: Measured | None
+
+
+class LoopDetector:
+    """Finds loops: owns the vocabulary, the index, the features of old keyframes, and what is parked.
+
+    `gravity_aligned` says that the map's z axis is up (there is an IMU), so that a loop's tilt can be checked.
+    """
+
+    def __init__(self, config: LoopConfig, rig: Rig, seed: int, gravity_aligned: bool = False) -> None:
+        self._config = config
+        self._rig = rig
+        self._gravity_aligned = gravity_aligned
+        self._bounds = view_bounds(rig.cameras[0])
+        self._views: dict[int, View] = {}
+        self._poses = PoseTable()
+        self._database = PlaceDatabase(config, seed)
+        self._appearance = AppearanceCandidates(config.island_gap)
+        self._verifier = Verifier(config, rig, seed)
+        self._witnesses: list[Measured] = []  # poses that the last keyframes measured, accepted or parked
+        self._parked: list[_Trial] = []
+        self._next_edge_id = 0
+        self.counters = {"verified": 0, "accepted": 0, "parked": 0, "rejected": 0, "promoted": 0}
+
+    @property
+    def vocabulary(self) -> Vocabulary | None:
+        """The vocabulary in use; None before the first training."""
+        return self._database.vocabulary
+
+    def detect(self, keyframe: Keyframe, T_map_body: Array) -> tuple[list[LoopEdge], list[LoopCandidate]]:
+        """Look for loops that a new keyframe closes.
+
+        Args:
+            keyframe: the newest keyframe; ids ascend.
+            T_map_body: its current estimate [4, 4].
+
+        Returns:
+            Verified edges, which may end at an earlier keyframe whose parked edge was confirmed now, and every candidate
+            with its decision and reason. Raises DataError for features that cannot be used.
+        """
+        if not self._config.enabled:
+            return [], []
+        view = make_view(keyframe, self._rig)
+        self._poses.add(view.id, T_map_body)
+        trials = self._try(view)
+        self._witnesses += [trial.measured for trial in trials if trial.measured is not None]
+        edges: list[LoopEdge] = []
+        records = self._reconsider(view.id, edges)
+        for trial in trials:
+            record = self._record(trial, self._judge(trial), edges)
+            if record.decision is LoopDecision.PARKED:
+                self._parked.append(trial)
+            records.append(record)
+        self._views[view.id] = view
+        self._database.add(view)
+        self._forget(view.id)
+        return edges, records
+
+    def move(self, update: GraphUpdate) -> None:
+        """Follow the keyframes that the graph moved."""
+        self._poses.move(update)
+
+    def _candidates(self, view: View) -> list[Candidate]:
+        """Return the candidates in the order of verification: by odometry and by appearance in turn, no place twice."""
+        near, gap = self._near(view), self._config.island_gap
+        alike = [c for c in self._alike(view) if all(abs(c.id - other.id) > gap for other in near)]
+        order: list[Candidate] = []
+        for turn in range(max(len(near), len(alike))):
+            order += near[turn : turn + 1] + alike[turn : turn + 1]
+        return order
+
+    def _alike(self, view: View) -> list[Candidate]:
+        """Return candidates by appearance, leaving out what was seen just now: it always looks most alike."""
+        config = self._config
+        recent: list[int] = []
+        for old in reversed(self._views.values()):
+            age_s = (view.t_ns - old.t_ns) * 1e-9
+            if len(recent) >= config.appearance_skip_keyframes and age_s >= config.appearance_skip_s:
+                break
+            recent.append(old.id)
+        ids, scores = self._database.query(view, config.retrieved, np.array(recent, dtype=np.int64))
+        return self._appearance.select(ids, scores)[: config.max_appearance]
+
+    def _near(self, view: View) -> list[Candidate]:
+        """Return candidates by odometry: old keyframes that should see most of the same by the current map."""
+        config = self._config
+        old = len(self._poses) - 1 - config.odometry_skip_keyframes
+        if old <= 0:
+            return []
+        T_body_cam = self._rig.T_body_cams[0]
+        T_map_cam = self._poses[view.id] @ T_body_cam
+        return odometry_candidates(
+            transform_points(T_map_cam, self._probes(view)), T_map_cam[:3, 3], self._poses.ids[:old],
+            invert_many(self._poses.poses[:old] @ T_body_cam), self._bounds, config.max_odometry, config.min_overlap,
+            config.min_apart_keyframes,
+        )  # fmt: skip
+
+    def _probes(self, view: View) -> Array:
+        """Return some points [P, 3] that cam0 sees; without depth, features pushed out to a nominal one."""
+        if view.has_points:
+            points = view.points_or_nan()[view.known]
+        else:
+            rays = np.column_stack([view.xy, np.ones(len(view.xy))]).astype(np.float64)
+            points = rays * self._config.nominal_depth_m
+        return np.asarray(points[:: max(1, len(points) // _PROBES)], dtype=np.float64)
+
+    def _try(self, view: View) -> list[_Trial]:
+        """Verify candidates within the budget; what is left of it goes to neighbours of those that need a witness."""
+        budget = self._config.max_verifications
+        candidates = self._candidates(view)
+        trials = [self._trial(candidate, view) for candidate in candidates[:budget]]
+        tried = {candidate.id for candidate in candidates}
+        newest = len(self._poses) - 1 - self._config.odometry_skip_keyframes
+        allowed = set(self._poses.ids[: max(0, newest)].tolist())
+        for trial in list(trials):
+            if trial.measured is None or trial.found.T_a_b is None or self._is_settled(trial, trials):
+                continue
+            for step in _NEIGHBOUR_STEPS:
+                neighbour = trial.candidate.id + step
+                if len(trials) >= budget or neighbour in tried or neighbour not in allowed:
+                    continue
+                tried.add(neighbour)
+                extra = Candidate(neighbour, trial.candidate.source, trial.candidate.score, trial.candidate.consistency)
+                trials.append(self._trial(extra, view))
+                if self._is_settled(trial, trials):
+                    break
+        skipped = Verification(f"not verified: {budget} verifications per keyframe are spent", 0)
+        return trials + [_Trial(candidate, view.id, skipped, None, None) for candidate in candidates[budget:]]
+
+    def _trial(self, candidate: Candidate, view: View) -> _Trial:
+        self.counters["verified"] += 1
+        found = self._verifier.verify(self._views[candidate.id], view)
+        tilt_rad, measured = None, None
+        if found.T_a_b is not None:
+            if self._gravity_aligned:
+                tilt_rad = tilt_error_rad(found.T_a_b, self._poses[candidate.id], self._poses[view.id])
+            if not objection(found, tilt_rad, self._config):
+                measured = Measured(candidate.id, view.id, found.T_a_b, found.has_scale, found.median_depth_m)
+        return _Trial(candidate, view.id, found, tilt_rad, measured)
+
+    def _is_settled(self, trial: _Trial, trials: list[_Trial]) -> bool:
+        fresh = [other.measured for other in trials if other.measured is not None]
+        return self._judge(trial, fresh).decision is not LoopDecision.PARKED
+
+    def _judge(self, trial: _Trial, fresh: list[Measured] | None = None) -> Judgement:
+        """Judge a trial with all witnesses, and those of this keyframe that are not among them yet."""
+        agreeing = 0
+        if trial.measured is not None:
+            witnesses = self._witnesses + (fresh or [])
+            agreeing = sum(self._supports(witness, trial.measured) for witness in witnesses)
+            agreeing += agrees_with_map(trial.measured, self._poses, self._config)
+        return judge(trial.found, trial.tilt_rad, agreeing, self._config)
+
+    def _supports(self, witness: Measured, measured: Measured) -> bool:
+        """Return whether another measurement close by, so that odometry between them is good, says the same."""
+        reach = self._config.neighbour_keyframes
+        apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
+        return apart != (0, 0) and max(apart) <= reach and agree(measured, witness, self._poses, self._config)
+
+    def _reconsider(self, newest_id: int, edges: list[LoopEdge]) -> list[LoopCandidate]:
+        """Promote parked edges that the new keyframe, or the map that moved meanwhile, confirms."""
+        records: list[LoopCandidate] = []
+        waiting: list[_Trial] = []
+        for trial in self._parked:
+            judgement = self._judge(trial)
+            if judgement.decision is LoopDecision.ACCEPTED:
+                self.counters["promoted"] += 1
+                reason = f"{judgement.reason}; parked until keyframe {newest_id}"
+                records.append(self._record(trial, Judgement(judgement.decision, reason), edges))
+            else:
+                waiting.append(trial)
+        self._parked = waiting
+        return records
+
+    def _record(self, trial: _Trial, judgement: Judgement, edges: list[LoopEdge]) -> LoopCandidate:
+        """Return the record of a decision; an accepted one also becomes an edge."""
+        self.counters[judgement.decision.value] += 1
+        found, candidate = trial.found, trial.candidate
+        accepted = judgement.decision is LoopDecision.ACCEPTED
+        if accepted and found.T_a_b is not None and found.covariance is not None:
+            edges.append(
+                LoopEdge(
+                    self._next_edge_id, candidate.id, trial.to_id, found.T_a_b, found.covariance, found.has_scale,
+                    found.inliers, candidate.score,
+                )
+            )  # fmt: skip
+            self._next_edge_id += 1
+        return LoopCandidate(
+            candidate.id, trial.to_id, candidate.source, candidate.score, found.inliers, judgement.decision,
+            judgement.reason, found.sigma_m, candidate.consistency,
+        )  # fmt: skip
+
+    def _forget(self, newest_id: int) -> None:
+        """Let go of witnesses and parked edges that no coming keyframe is close enough to confirm."""
+        oldest = newest_id - self._config.neighbour_keyframes
+        self._witnesses = [witness for witness in self._witnesses if witness.to_id > oldest]
+        self._parked = [trial for trial in self._parked if trial.to_id > oldest]

@@ -1,0 +1,76 @@
+"""Matching where a pose is known: the point of one view is looked for near its place in the other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.geometry import invert
+from vislam.loop.hamming import distance, packed
+from vislam.loop.view import View
+from vislam.messages import Array
+
+Pairs = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def _search(
+    points: Array, descriptors: NDArray[np.uint64], T_other_this: Array, order: NDArray[np.int64], x_sorted: Array,
+    xy_other: NDArray[np.float32], descriptors_other: NDArray[np.uint64], radius: float, max_distance: int,
+) -> Pairs:  # fmt: skip
+    """Return mutual best pairs [K, 2] (this, other) of points [N, 3] and the other's features within `radius`."""
+    nearest = np.full(len(points), -1, np.int64)
+    owner = np.full(len(xy_other), -1, np.int64)
+    owner_distance = np.full(len(xy_other), 257, np.int64)
+    R, t = np.ascontiguousarray(T_other_this[:3, :3]), T_other_this[:3, 3]
+    for i in range(len(points)):
+        if not np.isfinite(points[i, 2]):
+            continue
+        p = R @ points[i] + t
+        if p[2] <= 0.0:
+            continue
+        x, y = p[0] / p[2], p[1] / p[2]
+        best = max_distance + 1
+        for s in range(np.searchsorted(x_sorted, x - radius), len(order)):
+            if x_sorted[s] > x + radius:
+                break
+            j = order[s]
+            dx, dy = xy_other[j, 0] - x, xy_other[j, 1] - y
+            if dx * dx + dy * dy <= radius * radius:
+                d = distance(descriptors, i, descriptors_other, j)
+                if d < best:
+                    best, nearest[i] = d, j
+        j = nearest[i]
+        if j >= 0 and best < owner_distance[j]:
+            owner[j], owner_distance[j] = i, best
+    pairs = np.empty((len(points), 2), np.int64)
+    count = 0
+    for i in range(len(points)):
+        if nearest[i] >= 0 and owner[nearest[i]] == i:
+            pairs[count, 0], pairs[count, 1] = i, nearest[i]
+            count += 1
+    return pairs[:count]
+
+
+def _one_way(this: View, other: View, T_other_this: Array, radius: float, max_distance: int) -> Pairs:
+    order = np.argsort(other.xy[:, 0], kind="stable")
+    x_sorted = other.xy[order, 0].astype(np.float64)
+    return np.asarray(
+        _search(
+            this.points_or_nan(), packed(this.descriptors), T_other_this, order, x_sorted, other.xy,
+            packed(other.descriptors), radius, max_distance,
+        ),
+        dtype=np.int64,
+    )  # fmt: skip
+
+
+def match_guided(a: View, b: View, T_a_b: Array, radius: float, max_distance: int) -> Pairs:
+    """Return feature pairs [K, 2] (a, b) that a relative pose of the cameras [4, 4] brings within `radius` on z = 1.
+
+    Points of a are looked for in b; what remains of b's points is looked for in a. No feature occurs twice.
+    """
+    forward = _one_way(a, b, invert(T_a_b), radius, max_distance)
+    reverse = _one_way(b, a, T_a_b, radius, max_distance)[:, ::-1]
+    free = ~np.isin(reverse[:, 0], forward[:, 0]) & ~np.isin(reverse[:, 1], forward[:, 1])
+    return np.concatenate([forward, reverse[free]])

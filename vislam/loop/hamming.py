@@ -1,0 +1,48 @@
+"""Hamming distances between 256-bit descriptors, for the compiled kernels of this room."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+
+DESCRIPTOR_BYTES = 32
+
+
+@intrinsic
+def popcount(typing_context: Any, value: Any) -> Any:
+    """Count the set bits of a uint64 with the processor's own instruction."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.uint64(types.uint64), generate
+
+
+@njit(cache=True, nogil=True)
+def distance(a: NDArray[np.uint64], i: int, b: NDArray[np.uint64], j: int) -> int:
+    """Return the Hamming distance between rows `a[i]` and `b[j]` of packed descriptors [N, 4]."""
+    return np.int64(
+        popcount(a[i, 0] ^ b[j, 0])
+        + popcount(a[i, 1] ^ b[j, 1])
+        + popcount(a[i, 2] ^ b[j, 2])
+        + popcount(a[i, 3] ^ b[j, 3])
+    )
+
+
+def packed(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Return descriptors [N, 32] uint8 as [N, 4] uint64 (no copy when they are contiguous).
+
+    Raises DataError when they are not 256-bit descriptors.
+    """
+    if descriptors.dtype != np.uint8 or descriptors.ndim != 2 or descriptors.shape[1] != DESCRIPTOR_BYTES:
+        raise DataError(
+            f"loop closing needs 256-bit descriptors [N, {DESCRIPTOR_BYTES}] uint8 such as ORB's, "
+            f"got {list(descriptors.shape)} {descriptors.dtype}"
+        )
+    return np.ascontiguousarray(descriptors).view(np.uint64)

@@ -1,0 +1,67 @@
+"""What loop closing keeps of a keyframe: its features in normalised coordinates, never its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Rig
+from vislam.errors import DataError
+from vislam.geometry import invert, transform_points
+from vislam.loop.hamming import packed
+from vislam.messages import Array, Keyframe
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The described features of a keyframe as cam0 saw them; about 60 bytes each."""
+
+    id: int
+    t_ns: int
+    descriptors: NDArray[np.uint8]  # [N, 32]
+    xy: NDArray[np.float32]  # [N, 2] undistorted, on the plane z = 1; float32 is 1e-4 px
+    points_cam_m: NDArray[np.float32] | None  # [N, 3] in cam0, NaN where unknown; None: no depth at all
+
+    @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """Which features [N] have a point."""
+        if self.points_cam_m is None:
+            return np.zeros(len(self.xy), dtype=np.bool_)
+        return np.isfinite(self.points_cam_m[:, 2])
+
+    @property
+    def has_points(self) -> bool:
+        """Whether any feature has a point."""
+        return bool(np.any(self.known))
+
+    def points_or_nan(self) -> Array:
+        """Return the points [N, 3] in cam0 as float64, NaN where unknown."""
+        if self.points_cam_m is None:
+            return np.full((len(self.xy), 3), np.nan)
+        return self.points_cam_m.astype(np.float64)
+
+
+def make_view(keyframe: Keyframe, rig: Rig) -> View:
+    """Copy what loop closing needs of a keyframe; features that no ray explains are left out.
+
+    Points behind the camera or not finite become unknown. Raises DataError when arrays disagree in length.
+    """
+    packed(keyframe.descriptors)  # refuses other descriptors
+    count = len(keyframe.descriptors)
+    points = keyframe.points_body_m
+    if keyframe.keypoints_px.shape != (count, 2) or (points is not None and points.shape != (count, 3)):
+        raise DataError(
+            f"keyframe {keyframe.id}: {count} descriptors, but keypoints {list(keyframe.keypoints_px.shape)} and points "
+            f"{None if points is None else list(points.shape)}; expected [{count}, 2] and [{count}, 3]"
+        )
+    xy = rig.cameras[0].normalise(keyframe.keypoints_px)
+    seen = np.isfinite(xy).all(axis=1)
+    points_cam = None
+    if points is not None:
+        inside = transform_points(invert(rig.T_body_cams[0]), points[seen])
+        usable = np.isfinite(inside).all(axis=1) & (inside[:, 2] > 0.0)
+        points_cam = np.where(usable[:, None], inside, np.nan).astype(np.float32)
+    return View(keyframe.id, keyframe.t_ns, keyframe.descriptors[seen], xy[seen].astype(np.float32), points_cam)

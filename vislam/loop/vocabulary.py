@@ -1,0 +1,173 @@
+"""The vocabulary: which of some thousand words a descriptor is, and how much each word tells about a place.
+
+tf-idf weights and the L1 score are those of DBoW2 (Galvez-Lopez and Tardos, "Bags of binary words for fast place recognition in
+image sequences", T-RO 2012). A vocabulary trained on the run's own keyframes beats a generic one of 700,000 words, so none is
+shipped: see `database.py`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.errors import DataError, StorageError
+from vislam.loop.hamming import packed
+from vislam.loop.tree import descend, grow, similarity, weigh
+
+_FORMAT = 1
+_MAX_FILE_BYTES = 512 * 1024 * 1024  # ten million nodes; a file that claims more is damaged or hostile
+_DTYPES = {"format": "<i8", "nodes": "<u8", "first_child": "<i4", "child_count": "<i4", "idf": "<f8"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BagOfWords:
+    """An image as weighted words: ascending, unique; the weights are positive and sum to 1 (or there are none)."""
+
+    words: NDArray[np.int32]  # [M]
+    weights: NDArray[np.float64]  # [M]
+
+    def score(self, other: BagOfWords) -> float:
+        """Return the similarity 0..1: 1 - |a - b|_1 / 2, as DBoW2's L1 score."""
+        return float(similarity(self.words, self.weights, other.words, other.weights))
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """A tree of descriptors; leaves are words, numbered in node order, each with its inverse document frequency."""
+
+    nodes: NDArray[np.uint64]  # [nodes, 4] packed centres, breadth first; the root's is unused
+    first_child: NDArray[np.int32]  # [nodes]
+    child_count: NDArray[np.int32]  # [nodes]; 0: a leaf
+    idf: NDArray[np.float64]  # [words]
+
+    @property
+    def word_count(self) -> int:
+        """The number of words."""
+        return len(self.idf)
+
+    @cached_property
+    def _word_of(self) -> NDArray[np.int32]:
+        leaf = self.child_count == 0
+        return np.where(leaf, np.cumsum(leaf) - 1, -1).astype(np.int32)
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 of the content: word numbers mean something only together with it."""
+        digest = hashlib.sha256()
+        for array in (self.nodes, self.first_child, self.child_count, self.idf):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Return the word [N] of each descriptor [N, 32]."""
+        return np.asarray(
+            descend(packed(descriptors), self.nodes, self.first_child, self.child_count, self._word_of), dtype=np.int32
+        )
+
+    def transform(self, descriptors: NDArray[np.uint8]) -> BagOfWords:
+        """Return the bag of words of an image's descriptors [N, 32]."""
+        return BagOfWords(*weigh(self.words(descriptors), self.idf))
+
+    def save(self, path: Path) -> None:
+        """Write the vocabulary as a compressed npz; the file appears whole or not at all.
+
+        Raises StorageError when it cannot be written.
+        """
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            format=np.int64(_FORMAT),
+            nodes=self.nodes,
+            first_child=self.first_child,
+            child_count=self.child_count,
+            idf=self.idf,
+        )
+        unfinished = path.with_name(path.name + ".part")
+        try:
+            unfinished.write_bytes(buffer.getvalue())
+            os.replace(unfinished, path)
+        except OSError as error:
+            unfinished.unlink(missing_ok=True)
+            raise StorageError(f"vocabulary {path} cannot be written: {error.strerror}; free space or choose another place") from error  # fmt: skip
+
+    @staticmethod
+    def load(path: Path) -> Vocabulary:
+        """Read a vocabulary that `save` wrote; raises DataError when the file is not a sound one."""
+        arrays = _read_arrays(path)
+        if int(arrays["format"]) != _FORMAT:
+            raise DataError(f"vocabulary {path} has format {int(arrays['format'])}, this version reads {_FORMAT}; train it again")  # fmt: skip
+        vocabulary = Vocabulary(arrays["nodes"], arrays["first_child"], arrays["child_count"], arrays["idf"])
+        fault = _fault(vocabulary)
+        if fault:
+            raise DataError(f"vocabulary {path} is damaged: {fault}; train it again")
+        return vocabulary
+
+
+def train(
+    images: Sequence[NDArray[np.uint8]], branching: int, depth: int, seed: int, max_descriptors: int
+) -> Vocabulary:
+    """Train a vocabulary on the descriptors of images ([N_i, 32] each), deterministic for a seed.
+
+    The tree grows on at most `max_descriptors`, taken evenly; idf = log(images / images that have the word), from all.
+    Raises DataError when there is nothing to train on.
+    """
+    filled = [image for image in images if len(image)]
+    if not filled or branching < 2 or depth < 1 or max_descriptors < 1:
+        raise DataError(
+            f"training a vocabulary needs descriptors, branching >= 2, depth >= 1; got {len(filled)} images with any, "
+            f"branching {branching}, depth {depth}, at most {max_descriptors} descriptors"
+        )
+    total = sum(len(image) for image in filled)
+    stride = -(-total // max_descriptors)
+    sample = packed(np.concatenate(filled)[::stride])
+    nodes, first_child, child_count = grow(sample, branching, depth, seed)
+    bare = Vocabulary(nodes, first_child, child_count, np.zeros(int(np.sum(child_count == 0))))
+    images_with = np.zeros(bare.word_count)
+    for image in filled:
+        images_with[np.unique(bare.words(image))] += 1.0
+    idf = np.where(images_with > 0.0, np.log(len(filled) / np.maximum(images_with, 1.0)), 0.0)
+    return Vocabulary(nodes, first_child, child_count, idf)
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
+    """Read the npz with bounds on what it may claim; nothing in it is ever executed."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            claimed = sum(member.file_size for member in archive.infolist())
+        if claimed > _MAX_FILE_BYTES:
+            raise DataError(f"vocabulary {path} would unpack to {claimed} bytes, the limit is {_MAX_FILE_BYTES}")
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in _DTYPES}
+    except DataError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
+        raise DataError(f"vocabulary {path} cannot be read: {error}; train it again") from error
+    for name, array in arrays.items():
+        expected = np.dtype(_DTYPES[name])
+        if array.dtype != expected or array.ndim != (0 if name == "format" else 2 if name == "nodes" else 1):
+            raise DataError(f"vocabulary {path}: '{name}' is {array.dtype} {list(array.shape)}, expected {expected}")
+    return arrays
+
+
+def _fault(vocabulary: Vocabulary) -> str:
+    """Return what is wrong with the tree, or an empty string: a walk down a sound tree ends at a word."""
+    nodes, first, count = vocabulary.nodes, vocabulary.first_child.astype(np.int64), vocabulary.child_count.astype(np.int64)
+    if not (len(nodes) == len(first) == len(count) >= 1) or nodes.shape[1] != 4:
+        return f"its arrays disagree in length ({len(nodes)}, {len(first)}, {len(count)} nodes)"
+    inner = np.flatnonzero(count)
+    if np.any(count < 0) or np.any(first[inner] <= inner) or np.any(first[inner] + count[inner] > len(nodes)):
+        return "a node points at children that cannot be its own"
+    if len(vocabulary.idf) != len(nodes) - len(inner):
+        return f"{len(vocabulary.idf)} word weights for {len(nodes) - len(inner)} leaves"
+    if not np.all(np.isfinite(vocabulary.idf)) or np.any(vocabulary.idf < 0.0):
+        return "a word weight is negative or not finite"
+    return ""
