@@ -117,6 +117,11 @@ class EkfConfig:
     gate_probability: float = 0.999  # chi-square gate on every innovation
     reset_rejects: int = 5  # this many rejections in a row ...
     reset_s: float = 1.0  # ... over this long mean that the filter is wrong, not vision: P is inflated, counted
+    reset_rotation_deg: float = 3.0  # what such a soft reset adds to the sigmas of the state; the state itself stays
+    reset_position_m: float = 0.3
+    reset_velocity_m_s: float = 1.0
+    reset_gyro_bias_rad_s: float = 0.02
+    reset_accel_bias_m_s2: float = 0.2
     zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
     graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
@@ -156,6 +161,7 @@ class GraphConfig:
     vo_floor_m: float = 0.0005
     direction_floor_deg: float = 0.2  # mono: direction of motion
     direction_soft_m: float = 0.005  # mono: baselines shorter than this lose their say on direction
+    direction_scale_sigma: float = 5.0  # mono: relative, on the expected step; wide, for only the IMU knows the scale
     huber_k: float = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
     imu_inflation: float = 2.0  # on white noise sigma: data sheets know no vibration, scale error or time jitter
     imu_integration_sigma: float = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
@@ -205,6 +211,29 @@ class LoopConfig:
     sigma_floor_m: float = 0.005
     sigma_floor_deg: float = 0.25
     direction_floor_deg: float = 2.0  # of a direction without scale: the lever arm of the camera is not in it
+    max_sigma_m: float = 0.03  # a pose this good needs no witness; for a scene at 2 m, grows with depth
+    agreement_m: float = 0.15  # a witness differs by less; for a scene at 2 m, grows with depth
+    agreement_deg: float = 8.0  # a witness differs by less
+    min_agreement_share: float = 0.5  # of matches that also agree the other way round, and in depth
+    max_tilt_deg: float = 5.0  # against gravity; true edges stay within 3 deg
+    max_direction_sigma_deg: float = 10.0  # of a direction without scale
+    min_agreeing_direction: int = 2  # witnesses of an edge without scale, which is never taken alone
+    neighbour_keyframes: int = 10  # witnesses are at most so far away, so that odometry to them is good
+    max_verifications: int = 6  # per keyframe, about 4 ms each: bounds the time of a keyframe
+    max_odometry: int = 4  # candidates per keyframe that the map's poses suggest
+    odometry_skip_keyframes: int = 5  # the newest ones are tied by visual odometry already
+    min_overlap: float = 0.35  # share of what is seen that a candidate should see too, by the map
+    min_apart_keyframes: int = 3  # between odometry candidates, so that they constrain different places
+    nominal_depth_m: float = 3.0  # of features without depth, to guess what two keyframes share
+    max_appearance: int = 3  # candidates per keyframe that look alike
+    retrieved: int = 10  # keyframes asked of the index before they are grouped into islands
+    island_gap: int = 3  # ids in one island differ by at most this
+    appearance_skip_keyframes: int = 20  # the newest ones always look most alike
+    appearance_skip_s: float = 5.0  # and so do those of the last seconds
+    first_training: int = 10  # keyframes; before, none is old enough to be a candidate by appearance anyway
+    training_descriptors: int = 200_000  # at most, 0.5 s of training; more retrieves little better
+    vocabulary_branching: int = 10  # children of a node
+    vocabulary_depth: int = 5  # levels; one less while there are few descriptors
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,303 @@
+"""The command line: one verb per job. The only place that prints and sets exit codes.
+
+Exit codes: 0 done, 2 usage, 3 input or data, 4 tracking lost or a quality gate failed, 5 hardware, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
+
+if TYPE_CHECKING:
+    from vislam.config import Config
+
+_INTERRUPTED = 130
+
+Options = TypeVar("Options")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a verb and leave the process with its exit code."""
+    sys.exit(run_verb(list(sys.argv[1:] if arguments is None else arguments)))
+
+
+def run_verb(arguments: list[str]) -> int:
+    """Run a verb; return the exit code. Expected failures become one line on stderr, bugs keep their traceback."""
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help())
+        return 0 if arguments else 2
+    verb = _VERBS.get(arguments[0])
+    if verb is None:
+        _complain(f"no verb '{arguments[0]}'; there are: {', '.join(_VERBS)}")
+        return UsageError.exit_code
+    try:
+        return verb.function(arguments[1:])
+    except VislamError as error:
+        _complain(str(error))
+        return error.exit_code
+    except BrokenPipeError:
+        return 0
+    except KeyboardInterrupt:
+        _complain("interrupted; what was computed is in the run folder")
+        return _INTERRUPTED
+
+
+@dataclass(frozen=True, slots=True)
+class _Verb:
+    function: Callable[[list[str]], int]
+    summary: str
+    example: str
+
+
+def _help() -> str:
+    lines = ["usage: vislam VERB ...", "", "SLAM from a camera and a cheap IMU.", ""]
+    lines += [f"  {name:<10}{verb.summary}" for name, verb in _VERBS.items()]
+    lines += ["", "examples:"] + [f"  {verb.example}" for verb in _VERBS.values()]
+    lines += [
+        "",
+        "vislam VERB --help tells the rest. Exit codes: 0 done, 2 usage, 3 data, 4 tracking lost, 5 hardware.",
+    ]
+    return "\n".join(lines)
+
+
+def _complain(message: str) -> None:
+    print(f"vislam: {message}", file=sys.stderr)
+
+
+def _parse(options: type[Options], arguments: list[str], verb: str, default: Options | None = None) -> Options:
+    """Parse the arguments of a verb into its options; wrong ones leave with exit code 2, --help with 0."""
+    import tyro
+
+    start = {} if default is None else {"default": default}
+    summary = _VERBS[verb].summary
+    return tyro.cli(options, prog=f"vislam {verb}", description=summary, args=arguments, **start)  # type: ignore[arg-type]
+
+
+def _take_option(arguments: list[str], name: str) -> str | None:
+    """Remove `--name VALUE` or `--name=VALUE` from the arguments and return the value."""
+    for i, argument in enumerate(arguments):
+        if argument == name:
+            if i + 1 == len(arguments):
+                raise UsageError(f"{name} needs a value")
+            value = arguments[i + 1]
+            del arguments[i : i + 2]
+            return value
+        if argument.startswith(f"{name}="):
+            del arguments[i]
+            return argument.partition("=")[2]
+    return None
+
+
+def _run(arguments: list[str]) -> int:
+    from vislam.config import dump, load
+    from vislam.options import RunOptions, run_options
+
+    command = ["vislam", "run", *arguments]
+    config_path = _take_option(arguments, "--config")
+    base = load(Path(config_path) if config_path else None)
+    options = _parse(RunOptions, arguments, "run", run_options(base))
+    if options.dry_run:
+        print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
+        return 0
+    metrics = _run_source(options.source, options.settings, options.out, options.overwrite, command)
+    if options.json:
+        print(json.dumps(metrics))
+    else:
+        _print_summary(metrics, options.out)
+    return 0
+
+
+def _run_source(source: str, settings: Config, out: Path, overwrite: bool, command: list[str]) -> dict[str, Any]:
+    """Run a source into a folder and write its report, whatever happened on the way."""
+    from vislam.report import write_report
+    from vislam.run import execute
+    from vislam.runfolder import prepare
+    from vislam.sources import open_source
+
+    recording = open_source(source, settings.seed)
+    prepare(out, overwrite)
+    try:
+        with _progress(recording.name) as progress:
+            return execute(recording, settings, out, source=source, command=command, progress=progress)
+    finally:
+        if (out / "metrics.json").is_file():
+            write_report(out)
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[[int, int, str], None] | None]:
+    """Show a progress bar on stderr when that is a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total} frames"), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name, note="")
+        yield lambda done, total, note: bar.update(task, completed=done, total=total, note=note)
+
+
+def _print_summary(metrics: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    titles = {"ekf": "EKF alone, causal" if metrics["has_imu"] else "odometry, causal", "live": "graph, causal"}
+    titles["graph"] = "graph, final"
+    if metrics["accuracy"]:
+        table = Table(title=f"{metrics['name']} ({metrics['mode']}{', inertial' if metrics['has_imu'] else ''})")
+        for column in ("trajectory", "ATE rmse [m]", "ATE max [m]", "RPE 1 s [m]", "RPE 1 s [deg]", "covered"):
+            table.add_column(column, justify="left" if column == "trajectory" else "right")
+        for name, entry in metrics["accuracy"].items():
+            values = [_number(entry[key], 3) for key in ("ate_rmse_m", "ate_max_m", "rpe_1s_m", "rpe_1s_deg")]
+            table.add_row(titles.get(name, name), *values, f"{entry['coverage']:.0%}")
+        console.print(table)
+    loops = metrics["loops"]
+    console.print(
+        f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {loops['accepted']} loops of "
+        f"{loops['candidates']} candidates, {_number(metrics['realtime_factor'], 1)} x real time"
+    )
+    for warning in metrics["warnings"]:
+        console.print(f"warning: {warning}", style="yellow")
+    for name, title in (("report.html", "report"), ("run.rrd", "Rerun recording"), ("map", "map")):
+        if (out / name).exists():
+            console.print(f"{title}: {out / name}", soft_wrap=True)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _demo(arguments: list[str]) -> int:
+    from vislam.config import Config
+    from vislam.options import DemoOptions
+
+    options = _parse(DemoOptions, arguments, "demo")
+    _complain(f"simulating '{options.world}' and running the pipeline on it; about two minutes ...")
+    source = f"sim:{options.world}"
+    metrics = _run_source(source, Config(seed=options.seed), options.out, True, ["vislam", "demo", *arguments])
+    _print_summary(metrics, options.out)
+    return 0
+
+
+def _simulate(arguments: list[str]) -> int:
+    from vislam.datasets.recorder import Recorder
+    from vislam.messages import Frame
+    from vislam.options import SimulateOptions
+    from vislam.sim import open_world
+
+    options = _parse(SimulateOptions, arguments, "simulate")
+    choices = {"rig": options.rig, "duration_s": options.duration_s}
+    choices = {name: value for name, value in choices.items() if value not in (None, "default")}
+    world = open_world(options.world, seed=options.seed, **choices)
+    frames = 0
+    with Recorder(options.out, world.rig, world.imu_noise) as recorder, _progress(options.world) as progress:
+        truth = world.truth()
+        if truth is not None:
+            for t_ns, T_world_body in zip(truth.t_ns.tolist(), truth.T_world_body, strict=True):
+                recorder.write_truth(t_ns, T_world_body)
+        for value in world.events():
+            recorder.write(value)
+            if isinstance(value, Frame):
+                frames += 1
+                if progress is not None:
+                    progress(frames, world.frame_count, "")
+    print(f"{frames} frames in {options.out}; next: vislam run {options.out} --out RUN")
+    return 0
+
+
+def _eval(arguments: list[str]) -> int:
+    from vislam.options import EvalOptions
+
+    options = _parse(EvalOptions, arguments, "eval")
+    results = _evaluate(options.estimate, options.reference, options.align, options.association)
+    if options.json:
+        print(json.dumps(results))
+    else:
+        _print_evaluation(results)
+    covered = min(entry["coverage"] for entry in results.values())
+    if covered < options.min_coverage:
+        raise TrackingLostError(
+            f"the estimate covers {covered:.0%} of the reference, {options.min_coverage:.0%} asked; "
+            "check that both use the same clock, or lower --min-coverage"
+        )
+    return 0
+
+
+def _evaluate(estimate: Path, reference: Path | None, align: str, association: Any) -> dict[str, dict[str, Any]]:
+    from vislam.trajectory import evaluate, read_trajectory
+
+    names = {estimate.name: estimate}
+    if estimate.is_dir():
+        names = {p.stem.removeprefix("trajectory_"): p for p in sorted(estimate.glob("trajectory_*.tum"))}
+        truth = names.pop("truth", None)
+        reference = reference or truth
+    if reference is None:
+        raise UsageError("no reference to evaluate against; give --reference FILE")
+    if not names:
+        raise DataError(f"{estimate} holds no trajectory_*.tum; give a run folder or a trajectory file")
+    truth_trajectory = read_trajectory(reference)
+    return {
+        name: evaluate(read_trajectory(path), truth_trajectory, align, association=association)
+        for name, path in names.items()
+    }
+
+
+def _print_evaluation(results: dict[str, dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    columns = {
+        "ATE rmse [m]": "ate_rmse_m", "median": "ate_median_m", "max": "ate_max_m", "RPE 1 s [m]": "rpe_1s_m",
+        "RPE 1 s [deg]": "rpe_1s_deg", "scale": "scale",
+    }  # fmt: skip
+    table = Table()
+    for title in ("trajectory", *columns, "matched", "covered"):
+        table.add_column(title, justify="left" if title == "trajectory" else "right")
+    for name, entry in results.items():
+        numbers = [_number(entry[key], 4) for key in columns.values()]
+        table.add_row(name, *numbers, f"{entry['matched']}/{entry['total']}", f"{entry['coverage']:.0%}")
+    Console().print(table)
+
+
+def _doctor(arguments: list[str]) -> int:
+    from vislam.options import DoctorOptions
+
+    options = _parse(DoctorOptions, arguments, "doctor")
+    from vislam.datasets.inspect import inspect
+
+    findings = inspect(options.source)
+    if options.json:
+        print(json.dumps([asdict(finding) for finding in findings]))
+    else:
+        for finding in findings:
+            print(finding)
+    return DataError.exit_code if any(finding.severity == "error" for finding in findings) else 0
+
+
+def _report(arguments: list[str]) -> int:
+    from vislam.options import ReportOptions
+    from vislam.report import write_report
+
+    options = _parse(ReportOptions, arguments, "report")
+    print(write_report(options.run))
+    return 0
+
+
+_VERBS = {
+    "demo": _Verb(_demo, "simulate a cart in a workshop and run everything on it", "vislam demo"),
+    "run": _Verb(_run, "run the pipeline on a recording", "vislam run tum:PATH --out runs/desk"),
+    "simulate": _Verb(_simulate, "record a simulated world", "vislam simulate corridor-loop --out recordings/corridor"),
+    "eval": _Verb(_eval, "compare a trajectory with the truth", "vislam eval runs/desk"),
+    "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
+    "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
+}

@@ -1,0 +1,293 @@
+"""The front half of the pipeline: everything that runs at the rate of the sensors and gives the continuous pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vislam.camera import Rig
+from vislam.clock import StageClock
+from vislam.config import Config
+from vislam.ekf import Ekf
+from vislam.errors import TrackingLostError, UsageError
+from vislam.frontend import TrackResult, make_frontend
+from vislam.frontend.initialisation import Initialisation, Initialiser
+from vislam.geometry import invert
+from vislam.imu import ImuBuffer, ImuNoise, RestDetector, subtract_bias
+from vislam.messages import (
+    Array,
+    Frame,
+    GraphUpdate,
+    ImuSample,
+    ImuSpan,
+    KeyframePacket,
+    MagSample,
+    NavState,
+    Observations,
+    Tracking,
+)
+
+_MIN_SHARED_TRACKS = 10  # fewer say nothing about the motion of the camera
+_UNKNOWN_VELOCITY_M_S = 3.0  # sigma for a keyframe whose velocity the initialisation did not estimate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryKeyframe:
+    """A keyframe on its way to the back end, with the pose that odometry gave it."""
+
+    packet: KeyframePacket
+    T_odom_body: Array  # [4, 4]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrontStep:
+    """What the front half made of one frame."""
+
+    frame: Frame
+    track: TrackResult
+    T_odom_body: Array | None  # None before initialisation
+    state: NavState | None  # of the filter; None before initialisation or without an IMU
+    keyframe_id: int  # the newest keyframe
+    T_keyframe_body: Array | None  # relative to it; None: only known by interpolation between keyframes
+    keyframes: list[OdometryKeyframe]  # usually none or one; those that waited for gravity come together
+
+
+class Front:
+    """Owns the IMU buffer, the filter, visual odometry and the search for the first state.
+
+    Without an IMU, `odom` is the chain of visual odometry. With one, it is the filter's frame, gravity-aligned, and
+    keyframes wait for it; visual odometry before that lives in its own frame `vo`.
+    """
+
+    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock) -> None:
+        """Build the stages for a rig; without `noise` there is no IMU and odometry is visual only."""
+        self.frontend = make_frontend(config.frontend, rig, config.seed)
+        if noise is None and self.frontend.mode == "mono":
+            raise UsageError(
+                "one camera without an IMU cannot see scale; use --frontend.mode stereo or rgbd where the recording "
+                "allows it, or record an IMU"
+            )
+        self.initialisation: Initialisation | None = None
+        self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
+        self.last_refusal = "no frame yet"  # why there is no first state
+        self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0}
+        self._config = config
+        self._clock = clock
+        self._has_imu = noise is not None
+        self._ekf: Ekf | None = None
+        if noise is not None:
+            self._buffer = ImuBuffer(config.imu)
+            self._rest = RestDetector(config.init, noise)
+            self._initialiser = Initialiser(config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
+            self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2)
+        self._last_frame_t_ns: int | None = None
+        self._last_seen: Observations | None = None
+        self._keyframe_t_ns = 0
+        self._keyframe_id = -1
+        self._rested_since_keyframe = True
+        self._mag: MagSample | None = None
+        self._T_vo_keyframe = np.eye(4)
+        self._T_odom_keyframe: Array | None = None
+        self._T_vo_body = np.eye(4)
+        self._waiting: list[OdometryKeyframe] = []  # in frame `vo`, until gravity is known
+
+    def add(self, value: ImuSample | MagSample) -> None:
+        """Take a sample of an inertial sensor; the filter predicts at once."""
+        if isinstance(value, MagSample):
+            self._mag = value
+        elif self._has_imu and self._buffer.add(value) and self._ekf is not None and self._ekf.initialised:
+            self._ekf.predict(value)
+
+    def is_ready(self, frame_t_ns: int, newest_frame_t_ns: int) -> bool:
+        """Whether a frame can be processed: an inertial sample newer than it is there, or none will come in time."""
+        if not self._has_imu:
+            return True
+        newest = self._buffer.newest_t_ns
+        waited_s = (newest_frame_t_ns - frame_t_ns) * 1e-9
+        return (newest is not None and newest > frame_t_ns) or waited_s > self._config.imu.max_wait_s
+
+    def process(self, frame: Frame) -> FrontStep:
+        """Track one frame, update the filter with it, and hand over keyframes that are ready."""
+        span = self._span(self._last_frame_t_ns, frame.t_ns)
+        with self._clock.measure("track"):
+            track = self.frontend.track(frame, self._without_bias(span))
+        at_rest = self._is_at_rest(span, track.observations)
+        self._count(track, at_rest)
+        T_vo_keyframe_body = track.vo.T_keyframe_body if track.vo.has_scale else None
+        if T_vo_keyframe_body is not None:
+            self._T_vo_body = self._T_vo_keyframe @ T_vo_keyframe_body
+        with self._clock.measure("ekf"):
+            ready = self._initialise(span, track, at_rest)
+            T_odom_body, state = self._filter(frame, track, at_rest)
+        T_keyframe_body = self._since_keyframe(T_vo_keyframe_body, T_odom_body)
+        if track.keyframe is not None:
+            ready += self._take_keyframe(track, T_odom_body)
+            T_keyframe_body = np.eye(4)
+        self._last_frame_t_ns = frame.t_ns
+        self._last_seen = track.observations
+        return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready)
+
+    def feed_back(self, update: GraphUpdate) -> None:
+        """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
+        newest = update.newest
+        if newest is None or self._ekf is None or not self._ekf.initialised or not self._config.ekf.graph_feedback:
+            return
+        sigmas = np.sqrt(np.diag(newest.covariance))
+        self._ekf.feed_back(newest.gyro_bias_rad_s, newest.accel_bias_m_s2, sigmas[9:12], sigmas[12:15])
+
+    def give_up_waiting(self) -> list[OdometryKeyframe]:
+        """Return the keyframes that still wait for gravity when the recording ends: vision alone has to do.
+
+        Without scale nothing can be done with them, and the list is empty.
+        """
+        if self._has_imu and self.initialisation is None and self.frontend.mode != "mono":
+            return self._release(np.eye(4))
+        return []
+
+    @property
+    def all_counters(self) -> dict[str, dict[str, int]]:
+        """Counters of this room and of those inside."""
+        counters = {"front": dict(self.counters)}
+        if self._has_imu:
+            counters["imu"] = dict(self._buffer.counters)
+        if self._ekf is not None:
+            counters["ekf"] = dict(self._ekf.counters)
+        return counters
+
+    def _span(self, from_t_ns: int | None, to_t_ns: int) -> ImuSpan | None:
+        if not self._has_imu or from_t_ns is None:
+            return None
+        if self._buffer.gap_s(from_t_ns, to_t_ns) > self._config.imu.max_gap_s:
+            self.counters["imu_outages"] += 1
+        return self._buffer.span(from_t_ns, to_t_ns)
+
+    def _without_bias(self, span: ImuSpan | None) -> ImuSpan | None:
+        if span is None or self._ekf is None or not self._ekf.initialised:
+            return span
+        state = self._ekf.state()
+        return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+
+    def _is_at_rest(self, span: ImuSpan | None, seen: Observations) -> bool:
+        if not self._has_imu:
+            return False
+        still_imu = self._rest.add(span)
+        flow_px = median_flow_px(self._last_seen, seen)
+        return still_imu and flow_px is not None and flow_px < self._config.init.still_px
+
+    def _count(self, track: TrackResult, at_rest: bool) -> None:
+        self.counters["frames_lost"] += track.vo.tracking == Tracking.LOST
+        self.counters["frames_degraded"] += track.vo.tracking == Tracking.DEGRADED
+        self.counters["frames_at_rest"] += at_rest
+        self._rested_since_keyframe = self._rested_since_keyframe and at_rest
+
+    def _initialise(self, span: ImuSpan | None, track: TrackResult, at_rest: bool) -> list[OdometryKeyframe]:
+        """Look for the first gravity-aligned state; once found, start the filter and release what waited."""
+        if self._ekf is None or self.initialisation is not None:
+            return []
+        found = self._initialiser.add(span, track.vo, at_rest)
+        self.last_refusal = found.reason
+        if found.last is None or found.first is None or found.T_odom_vo is None:
+            return []
+        self.initialisation = found
+        self._ekf.initialise(found.last)
+        newest = self._buffer.newest_t_ns
+        ahead = self._buffer.span(found.last.t_ns, newest) if newest is not None else None
+        for sample in samples_after_first(ahead):
+            self._ekf.predict(sample)
+        return self._release(found.T_odom_vo)
+
+    def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
+        """Return the waiting keyframes in `odom`, and settle the state of the first."""
+        released = [OdometryKeyframe(w.packet, T_odom_vo @ w.T_odom_body) for w in self._waiting]
+        self._waiting = []
+        self._T_odom_keyframe = T_odom_vo @ self._T_vo_keyframe
+        found = self.initialisation
+        if released and found is not None and found.first is not None:
+            self.first_state = first_keyframe_state(found.first, released[0])
+        return released
+
+    def _filter(self, frame: Frame, track: TrackResult, at_rest: bool) -> tuple[Array | None, NavState | None]:
+        """Return the pose in `odom` and the filter's state after this frame."""
+        if self._ekf is None:
+            return self._T_vo_body.copy(), None
+        if not self._ekf.initialised:
+            return None, None
+        if track.vo.tracking != Tracking.LOST:
+            self._ekf.update_vo(track.vo)
+        if at_rest:
+            self._ekf.update_zero_velocity(frame.t_ns)
+        if track.keyframe is not None:
+            self._ekf.add_keyframe(track.keyframe.id, frame.t_ns)
+        return self._ekf.pose_at(frame.t_ns), self._ekf.state()
+
+    def _since_keyframe(self, T_vo_keyframe_body: Array | None, T_odom_body: Array | None) -> Array | None:
+        if T_vo_keyframe_body is not None:
+            return T_vo_keyframe_body
+        if T_odom_body is not None and self._T_odom_keyframe is not None:
+            return invert(self._T_odom_keyframe) @ T_odom_body
+        return None
+
+    def _take_keyframe(self, track: TrackResult, T_odom_body: Array | None) -> list[OdometryKeyframe]:
+        """Pack a new keyframe with all that the back end needs of it; return it unless it has to wait for gravity."""
+        keyframe = track.keyframe
+        assert keyframe is not None
+        imu = None
+        if self._has_imu and self._keyframe_id >= 0:
+            imu = self._buffer.span(self._keyframe_t_ns, keyframe.t_ns)
+        at_rest = self._rested_since_keyframe and self._keyframe_id >= 0
+        packet = KeyframePacket(keyframe, track.vo, track.observations, imu, self._mag, at_rest)
+        self._keyframe_id, self._keyframe_t_ns = keyframe.id, keyframe.t_ns
+        self._rested_since_keyframe, self._mag = True, None
+        self._T_vo_keyframe = self._T_vo_body.copy()
+        self._T_odom_keyframe = T_odom_body
+        if T_odom_body is not None:
+            return [OdometryKeyframe(packet, T_odom_body)]
+        self._waiting.append(OdometryKeyframe(packet, self._T_vo_body.copy()))
+        return self._give_up_if_late(keyframe.t_ns)
+
+    def _give_up_if_late(self, now_t_ns: int) -> list[OdometryKeyframe]:
+        """Go on without the IMU when gravity could not be found for too long; keyframes must not wait for ever."""
+        waited_s = (now_t_ns - self._waiting[0].packet.keyframe.t_ns) * 1e-9
+        if waited_s < self._config.init.give_up_s:
+            return []
+        if self.frontend.mode == "mono":
+            raise TrackingLostError(
+                f"no scale after {waited_s:.0f} s: {self.last_refusal}; move the camera with more acceleration at the "
+                "start, begin at rest, or use a second camera or depth"
+            )
+        self.counters["imu_given_up"] = 1
+        self._ekf, self._has_imu = None, False
+        return self._release(np.eye(4))
+
+
+def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:
+    """Return the state of the first keyframe, given the state of the first frame that the initialisation used.
+
+    If that frame came later, the keyframe's velocity is unknown, and its covariance says so.
+    """
+    t_ns = keyframe.packet.keyframe.t_ns
+    if first.t_ns == t_ns:
+        return replace(first, T_world_body=keyframe.T_odom_body)
+    covariance = first.covariance.copy()
+    covariance[6:9, :] = covariance[:, 6:9] = 0.0
+    covariance[6:9, 6:9] = np.eye(3) * _UNKNOWN_VELOCITY_M_S**2
+    return NavState(t_ns, keyframe.T_odom_body, np.zeros(3), first.gyro_bias_rad_s, first.accel_bias_m_s2, covariance)
+
+
+def median_flow_px(before: Observations | None, after: Observations) -> float | None:
+    """Return the median image motion in pixels of the tracks that both frames saw; None with fewer than ten."""
+    if before is None:
+        return None
+    _, i, j = np.intersect1d(before.track_ids, after.track_ids, assume_unique=True, return_indices=True)
+    if len(i) < _MIN_SHARED_TRACKS:
+        return None
+    return float(np.median(np.linalg.norm(after.pixels_px[j] - before.pixels_px[i], axis=1)))
+
+
+def samples_after_first(span: ImuSpan | None) -> list[ImuSample]:
+    """Return the samples of a span without its first, which the filter has already reached."""
+    if span is None:
+        return []
+    rows = zip(span.t_ns[1:].tolist(), span.gyro_rad_s[1:], span.accel_m_s2[1:], strict=True)
+    return [ImuSample(t_ns, gyro, accel) for t_ns, gyro, accel in rows]

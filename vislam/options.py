@@ -1,0 +1,98 @@
+"""The options of every verb of the command line; their comments and docstrings are its --help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from vislam.config import Config
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of `vislam run`."""
+
+    source: Positional[str]
+    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD, or a path that is recognised by what is in it"""
+    out: Path
+    """Folder to make for everything that the run leaves"""
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    overwrite: bool = False
+    """Replace the run that the folder holds"""
+    dry_run: bool = False
+    """Only print the resolved configuration as JSON"""
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Options of `vislam demo`."""
+
+    out: Path = Path("demo")
+    """Folder for the run; a run that it holds is replaced"""
+    world: str = "workshop-cart"
+    """Simulated world"""
+    seed: int = 0
+    """Of the world and of the pipeline"""
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """Options of `vislam simulate`."""
+
+    world: Positional[str]
+    """Name of a simulated world; a wrong one lists them"""
+    out: Path
+    """Folder to make for the recording (ASL layout, with truth)"""
+    rig: Literal["default", "rgbd", "stereo", "mono"] = "default"
+    """Cameras: what the world has by default, or one of these"""
+    duration_s: float | None = None
+    """Only the first so many seconds"""
+    seed: int = 0
+    """Same seed, same bytes"""
+
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """Options of `vislam eval`."""
+
+    estimate: Positional[Path]
+    """A trajectory file (TUM, EuRoC csv) or a run folder"""
+    reference: Path | None = None
+    """True trajectory; a run folder brings its own"""
+    align: Literal["se3", "sim3", "yaw", "first", "none"] = "se3"
+    """How the estimate is moved onto the reference before errors are taken"""
+    association: Literal["interpolate", "nearest"] = "interpolate"
+    """Interpolate the reference at the estimate's times, or take the nearest pose within 10 ms"""
+    min_coverage: float = 0.8
+    """Below this share of the reference's time the evaluation fails with exit code 4"""
+    json: bool = False
+    """Print JSON instead of the table"""
+
+
+@dataclass(frozen=True)
+class DoctorOptions:
+    """Options of `vislam doctor`."""
+
+    source: Positional[str]
+    """Recording to examine, as for `run`"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of `vislam report`."""
+
+    run: Positional[Path]
+    """Run folder"""
+
+
+def run_options(base: Config) -> RunOptions:
+    """Return the options of `vislam run` to parse into, with `base` for every setting that is not given."""
+    return RunOptions(source=tyro.MISSING, out=tyro.MISSING, settings=base)

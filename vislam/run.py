@@ -1,0 +1,194 @@
+"""One recording through the pipeline into a run folder: the library's side of `vislam run`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from vislam.config import Config, ImuConfig
+from vislam.errors import DataError, TrackingLostError, VislamError
+from vislam.imu import ImuNoise
+from vislam.recording import Recording
+from vislam.runfolder import RunLog, write_json, write_setup
+from vislam.session import SessionWriter
+from vislam.slam import KeyframeStep, Slam, Step
+from vislam.trajectory import Trajectory, evaluate
+from vislam.viewer import open_viewer
+
+Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
+
+_MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
+
+
+def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
+    """Return the recording's noise model with what the configuration overrides; None without an IMU."""
+    if recorded is None:
+        return None
+    overrides = {name: value for name in asdict(recorded) if (value := getattr(config, name, None)) is not None}
+    return ImuNoise(**{**asdict(recorded), **overrides})
+
+
+class Run:
+    """Drives the pipeline over one recording and keeps the run folder."""
+
+    def __init__(self, recording: Recording, config: Config, out: Path, source: str, command: list[str]) -> None:
+        """Open the outputs in an existing, empty folder."""
+        cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
+        self.recording = recording
+        self.config = config
+        self.out = out
+        write_setup(out, config, source, command)
+        self.slam = Slam(config, recording.rig, imu_noise(config.imu, recording.imu_noise))
+        self.log = RunLog()
+        self.session = SessionWriter(out / "session.db", {"source": source, "config": asdict(config)})
+        self.viewer = open_viewer(out / "run.rrd", config.view.enabled)
+        self.warnings: list[str] = []
+
+    def execute(self, progress: Progress | None = None) -> dict[str, Any]:
+        """Process the whole recording and write every file; return the metrics.
+
+        What was computed is written whatever happens; the error is raised afterwards. Raises TrackingLostError when
+        fewer than half of the frames got a pose.
+        """
+        start = time.perf_counter()
+        failure: BaseException | None = None
+        try:
+            self._feed(progress)
+        except (VislamError, KeyboardInterrupt) as error:
+            failure = error
+            self.warnings.append(f"stopped early: {error or 'interrupted'}")
+        try:
+            metrics = self._finish(start)
+        except VislamError as error:
+            raise failure or error from error
+        if failure is not None:
+            raise failure
+        self._judge(metrics)
+        return metrics
+
+    def _feed(self, progress: Progress | None) -> None:
+        clock = self.slam.clock
+        values = iter(self.recording.events())
+        while True:
+            with clock.measure("read"):
+                value = next(values, None)
+            if value is None:
+                return
+            for step in self.slam.feed(value):
+                self._take(step)
+                if progress is not None:
+                    progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
+
+    def _take(self, step: Step) -> None:
+        self.log.add(step)
+        with self.slam.clock.measure("view"):
+            self.viewer.log_step(step)
+        for keyframe in step.keyframes:
+            self._store(keyframe)
+
+    def _store(self, step: KeyframeStep) -> None:
+        with self.slam.clock.measure("store"):
+            self.session.add(step.odometry.packet.keyframe, step.odometry.T_odom_body, step.update, step.edges)
+
+    def _finish(self, start: float) -> dict[str, Any]:
+        finish = self.slam.finish()
+        for step in finish.steps:
+            self._take(step)
+        for keyframe in finish.keyframes:
+            self.log.add_keyframe(keyframe)
+            self._store(keyframe)
+        self.session.move(finish.update)
+        self.session.close()
+        graph = self.slam.back.graph
+        ids, poses = [int(i) for i in graph.ids], graph.poses()
+        final = self.log.final_trajectory(ids, poses)
+        wall_s = time.perf_counter() - start
+        truth = self._truth()
+        self.log.write_trajectories(self.out, final, truth)
+        self.log.write_states(self.out, ids, graph.states())
+        loops = self.log.write_tables(self.out, {report.loop_id: report for report in graph.edge_reports()})
+        if self.slam.back.mapper is not None:
+            with self.slam.clock.measure("map export"):
+                self.slam.back.mapper.export(self.out / "map", ids, poses)
+        self.viewer.finish(finish.update, final, truth)
+        metrics = self._metrics(final, truth, wall_s, loops)
+        write_json(self.out / "metrics.json", metrics)
+        return metrics
+
+    def _truth(self) -> Trajectory | None:
+        try:
+            return self.recording.truth()
+        except DataError as error:
+            self.warnings.append(f"no truth: {error}")
+            return None
+
+    def _metrics(
+        self, final: Trajectory, truth: Trajectory | None, wall_s: float, loops: dict[str, int]
+    ) -> dict[str, Any]:
+        front, back = self.slam.front, self.slam.back
+        stamps = self.log.stamps_ns
+        duration_s = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
+        counters: dict[str, Any] = {**front.all_counters}
+        for name, room in (("loop", back.loops), ("map", back.mapper)):
+            if room is not None:
+                counters[name] = dict(room.counters)
+        found = front.initialisation
+        return {
+            "name": self.recording.name,
+            "mode": front.frontend.mode,
+            "has_imu": self.recording.imu_noise is not None,
+            "frames": len(self.log),
+            "frames_expected": self.recording.frame_count,
+            "keyframes": self.log.keyframes,
+            "duration_s": duration_s,
+            "wall_s": wall_s,
+            "realtime_factor": duration_s / wall_s if wall_s > 0.0 else None,
+            "initialisation": {
+                "status": "none" if found is None else str(found.status),
+                "reason": front.last_refusal if found is None else found.reason,
+                "t_s": None if found is None or found.last is None else (found.last.t_ns - int(stamps[0])) * 1e-9,
+            },
+            "accuracy": self._accuracy(final, truth),
+            "timing_ms": self.slam.clock.summary_ms(),
+            "counters": counters,
+            "problems": dict(self.recording.problems),
+            "loops": loops,
+            "graph_revisions": self.log.revisions,
+            "coverage_frames": len(final) / max(len(self.log), 1),
+            "warnings": self.warnings,
+        }
+
+    def _accuracy(self, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
+        if truth is None:
+            return {}
+        stamps = self.log.stamps_ns
+        accuracy = {}
+        estimates = {"ekf": self.log.odometry_trajectory(), "live": self.log.live_trajectory(), "graph": final}
+        for name, estimate in estimates.items():
+            try:
+                span = (int(stamps[0]), int(stamps[-1]))
+                accuracy[name] = evaluate(estimate, truth, "se3", span_ns=span)
+            except VislamError as error:
+                self.warnings.append(f"{name}: {error}")
+        return accuracy
+
+    def _judge(self, metrics: dict[str, Any]) -> None:
+        if metrics["frames"] == 0:
+            raise DataError(f"{self.recording.name}: not one usable frame; run `vislam doctor` on it")
+        if metrics["coverage_frames"] < _MIN_COVERAGE:
+            raise TrackingLostError(
+                f"{self.recording.name}: only {metrics['coverage_frames']:.0%} of the frames have a pose "
+                f"({metrics['initialisation']['reason']}); see tracking.csv and report.html in {self.out}"
+            )
+
+
+def execute(
+    recording: Recording, config: Config, out: Path, source: str, command: list[str], progress: Progress | None = None
+) -> dict[str, Any]:
+    """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`."""
+    return Run(recording, config, out, source, command).execute(progress)

@@ -1,0 +1,271 @@
+"""The run folder: every file that one run leaves behind, each written whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import platform
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.config import Config, dump
+from vislam.errors import StorageError, UsageError
+from vislam.messages import Array, LoopCandidate, NavState
+from vislam.slam import KeyframeStep, Step
+from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
+
+_HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
+_HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
+_PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
+_TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
+_LOOPS_HEADER = (
+    "from_id", "to_id", "from_t_ns", "to_t_ns", "source", "score", "inliers", "sigma_m", "consistency",
+    "chi2", "weight", "decision", "reason",
+)  # fmt: skip
+
+
+def prepare(out: Path, overwrite: bool) -> None:
+    """Make the folder of a new run; raises UsageError when it holds something else, StorageError when it cannot be."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if not (out / "manifest.json").is_file():
+            raise UsageError(f"--out {out} exists and is not a run; choose a new folder")
+        if not overwrite:
+            raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
+        with storage(out):
+            for name in (
+                *_run_files(),
+                *(f"{name}{suffix}" for name in ("session.db",) for suffix in ("-wal", "-shm")),
+            ):
+                (out / name).unlink(missing_ok=True)
+    with storage(out):
+        out.mkdir(parents=True, exist_ok=True)
+
+
+def _run_files() -> tuple[str, ...]:
+    return (
+        "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "session.db", "run.rrd",
+        "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
+        "trajectory_graph.tum", "trajectory_truth.tum",
+    )  # fmt: skip
+
+
+@contextmanager
+def storage(path: Path) -> Iterator[None]:
+    """Turn failures to write into StorageError with the next step."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written: {error}; free disk space or choose another --out") from error
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write plain data as JSON, atomically; numbers that are not finite become null."""
+    write_text(path, json.dumps(_finite(data), indent=1) + "\n")
+
+
+def _finite(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {str(key): _finite(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [_finite(value) for value in data]
+    if isinstance(data, (float, np.floating)):
+        return float(data) if np.isfinite(data) else None
+    return data.item() if isinstance(data, np.generic) else data
+
+
+def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
+    """Return what identifies a run: code, packages, data, seed, command, machine."""
+    return {
+        "source": source,
+        "data_sha256": fingerprint(Path(source.partition(":")[2] or source)),
+        "command": command,
+        "seed": config.seed,
+        "code_revision": _code_revision(),
+        "packages": {name: version for name in _PACKAGES if (version := _version(name))},
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def fingerprint(path: Path) -> str | None:
+    """Return the SHA-256 of a recording: names and sizes of its files, and the contents of its tables."""
+    if not path.exists():
+        return None
+    digest = hashlib.sha256()
+    for file in sorted(p for p in ([path] if path.is_file() else path.rglob("*")) if p.is_file()):
+        size = file.stat().st_size
+        digest.update(f"{file.relative_to(path.parent)} {size}\n".encode())
+        if file.suffix in _HASHED_SUFFIXES and size <= _HASHED_FILE_BYTES:
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _code_revision() -> str | None:
+    """Return the git revision of the code, with a hash of local changes; None outside a checkout."""
+    root = Path(__file__).resolve().parent.parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True).stdout
+
+    try:
+        if not (root / ".git").exists():
+            return None
+        changes = git("diff", "HEAD")
+        dirty = f"+{hashlib.sha256(changes.encode()).hexdigest()[:12]}" if changes else ""
+        return git("rev-parse", "HEAD").strip() + dirty
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+class RunLog:
+    """Remembers of every frame what the trajectories and tables need, and writes them."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._t_ns: list[int] = []
+        self._keyframe_ids: list[int] = []
+        self._since_keyframe: list[Array | None] = []
+        self._odom: list[Array | None] = []
+        self._live: list[Array | None] = []
+        self._tracking: list[tuple[Any, ...]] = []
+        self._ekf_states: dict[int, NavState] = {}
+        self._keyframe_t_ns: dict[int, int] = {}
+        self._candidates: list[LoopCandidate] = []
+        self._edge_ids: dict[tuple[int, int], int] = {}
+        self.revisions = 0
+
+    def __len__(self) -> int:
+        return len(self._t_ns)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Times [N] of the frames so far."""
+        return np.array(self._t_ns, dtype=np.int64)
+
+    @property
+    def keyframes(self) -> int:
+        """How many keyframes reached the back end."""
+        return len(self._keyframe_t_ns)
+
+    def add(self, step: Step) -> None:
+        """Remember one step."""
+        front = step.front
+        self._t_ns.append(front.frame.t_ns)
+        self._keyframe_ids.append(front.keyframe_id)
+        self._since_keyframe.append(front.T_keyframe_body)
+        self._odom.append(front.T_odom_body)
+        self._live.append(step.T_map_body)
+        vo = front.track.vo
+        self._tracking.append((front.frame.t_ns, str(vo.tracking), vo.inliers, vo.keyframe_id, front.track.reason))
+        if front.state is not None and front.track.keyframe is not None:
+            self._ekf_states[front.track.keyframe.id] = front.state
+        for keyframe in step.keyframes:
+            self.add_keyframe(keyframe)
+
+    def add_keyframe(self, step: KeyframeStep) -> None:
+        """Remember what the back end did with a keyframe."""
+        keyframe = step.odometry.packet.keyframe
+        self._keyframe_t_ns[keyframe.id] = keyframe.t_ns
+        self._candidates.extend(step.candidates)
+        for edge in step.edges:
+            self._edge_ids[edge.from_id, edge.to_id] = edge.id
+        self.revisions = step.update.revision
+
+    def final_trajectory(self, ids: list[int], T_map_body: Array) -> Trajectory:
+        """Return the pose of every frame from the final poses of the keyframes that they were tracked against.
+
+        Frames whose motion since their keyframe is unknown are interpolated between keyframes.
+        """
+        poses = dict(zip(ids, T_map_body, strict=True))
+        keyframes = Trajectory(np.array([self._keyframe_t_ns[i] for i in ids], dtype=np.int64), np.array(T_map_body))
+        t_ns, frames = [], []
+        for stamp, keyframe_id, T in zip(self._t_ns, self._keyframe_ids, self._since_keyframe, strict=True):
+            if T is not None and keyframe_id in poses:
+                frames.append(poses[keyframe_id] @ T)
+            elif len(keyframes) > 1 and keyframes.t_ns[0] <= stamp <= keyframes.t_ns[-1]:
+                frames.append(keyframes.at(stamp))
+            else:
+                continue
+            t_ns.append(stamp)
+        return Trajectory(np.array(t_ns, dtype=np.int64), np.array(frames).reshape(-1, 4, 4))
+
+    def odometry_trajectory(self) -> Trajectory:
+        """Return the causal poses in odom: those of the filter, or of visual odometry without an IMU."""
+        return self._causal(self._odom)
+
+    def live_trajectory(self) -> Trajectory:
+        """Return the causal best estimates in map."""
+        return self._causal(self._live)
+
+    def _causal(self, poses: list[Array | None]) -> Trajectory:
+        known = [(t, T) for t, T in zip(self._t_ns, poses, strict=True) if T is not None]
+        t_ns = np.array([t for t, _ in known], dtype=np.int64)
+        return Trajectory(t_ns, np.array([T for _, T in known]).reshape(-1, 4, 4))
+
+    def write_trajectories(self, out: Path, final: Trajectory, truth: Trajectory | None) -> None:
+        """Write the TUM files of a run."""
+        write_tum(self.odometry_trajectory(), out / "trajectory_ekf.tum")
+        write_tum(self.live_trajectory(), out / "trajectory_live.tum")
+        write_tum(final, out / "trajectory_graph.tum")
+        if truth is not None:
+            write_tum(truth, out / "trajectory_truth.tum")
+
+    def write_states(self, out: Path, ids: list[int], states: list[NavState]) -> None:
+        """Write keyframe states with covariances, of the filter and of the graph."""
+        if states:
+            write_states_csv(out / "states_graph.csv", ids, states)
+        if self._ekf_states:
+            write_states_csv(out / "states_ekf.csv", list(self._ekf_states), list(self._ekf_states.values()))
+
+    def write_tables(self, out: Path, loop_reports: dict[int, Any]) -> dict[str, int]:
+        """Write tracking.csv and loops.csv; return how many candidates were accepted, parked and rejected.
+
+        `loop_reports` maps edge ids to what the graph decided (chi2, weight, decision, reason).
+        """
+        write_text(out / "tracking.csv", _csv(_TRACKING_HEADER, self._tracking))
+        rows, decisions = [], {"candidates": len(self._candidates), "accepted": 0, "parked": 0, "rejected": 0}
+        for candidate in self._candidates:
+            report = loop_reports.get(self._edge_ids.get((candidate.from_id, candidate.to_id), -1))
+            decision, reason = candidate.decision, candidate.reason
+            if report is not None:
+                decision, reason = report.decision, f"{candidate.reason}; {report.reason}"
+            decisions[str(decision)] += 1
+            times = (self._keyframe_t_ns.get(candidate.from_id), self._keyframe_t_ns.get(candidate.to_id))
+            rows.append((
+                candidate.from_id, candidate.to_id, *times, candidate.source, f"{candidate.score:.6g}",
+                candidate.inliers, f"{candidate.sigma_m:.6g}", candidate.consistency,
+                "" if report is None else f"{report.chi2:.6g}", "" if report is None else f"{report.weight:.6g}",
+                str(decision), reason,
+            ))  # fmt: skip
+        write_text(out / "loops.csv", _csv(_LOOPS_HEADER, rows))
+        return decisions
+
+
+def _csv(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def write_setup(out: Path, config: Config, source: str, command: list[str]) -> None:
+    """Write manifest.json and config.json, before anything is computed."""
+    write_json(out / "manifest.json", manifest(source, command, config))
+    write_json(out / "config.json", dump(config))

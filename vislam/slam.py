@@ -1,0 +1,141 @@
+"""The reference pipeline, on one thread: measurements go in by `Slam.feed`, one `Step` per frame comes out.
+
+inertial sample -> EKF                                  -> pose in odom, at IMU rate
+frame           -> front end -> EKF                     -> keyframe?
+keyframe        -> loop detector -> graph -> mapper     -> poses in map, T_map_odom, map
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.camera import Rig
+from vislam.clock import StageClock
+from vislam.config import Config
+from vislam.front import Front, FrontStep, OdometryKeyframe
+from vislam.graph import PoseGraph
+from vislam.imu import ImuNoise
+from vislam.loop import LoopDetector
+from vislam.mapping import Mapper
+from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopCandidate, LoopEdge, MagSample
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeStep:
+    """What the back end did with one keyframe."""
+
+    odometry: OdometryKeyframe
+    update: GraphUpdate
+    edges: list[LoopEdge]
+    candidates: list[LoopCandidate]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """The answer to one frame: what the front half saw, the causal pose, and the keyframes that went to the back."""
+
+    front: FrontStep
+    T_map_body: Array | None  # None: no pose yet
+    keyframes: list[KeyframeStep]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finish:
+    """What came when the recording ended."""
+
+    steps: list[Step]
+    keyframes: list[KeyframeStep]  # those that had waited for gravity until the end
+    update: GraphUpdate
+
+
+class Back:
+    """What runs at the rate of keyframes: loop detector, graph, mapper."""
+
+    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock) -> None:
+        """Build the stages; loop closing and mapping can be switched off in the configuration."""
+        self.graph = PoseGraph(config.graph, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
+        self.loops = LoopDetector(config.loop, rig, config.seed) if config.loop.enabled else None
+        self.mapper = Mapper(config.map, rig) if config.map.enabled else None
+        self.clock = clock
+        self.T_map_odom = np.eye(4)
+
+    def add(self, odometry: OdometryKeyframe) -> KeyframeStep:
+        """Take one keyframe in: find its loops, optimise, follow with the map."""
+        keyframe = odometry.packet.keyframe
+        edges: list[LoopEdge] = []
+        candidates: list[LoopCandidate] = []
+        if self.loops is not None:
+            with self.clock.measure("loop"):
+                edges, candidates = self.loops.detect(keyframe, self.T_map_odom @ odometry.T_odom_body)
+        with self.clock.measure("graph"):
+            update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
+        self._follow(update)
+        if self.mapper is not None:
+            with self.clock.measure("map"):
+                self.mapper.add(keyframe, self.T_map_odom @ odometry.T_odom_body)
+        return KeyframeStep(odometry, update, edges, candidates)
+
+    def finish(self) -> GraphUpdate:
+        """Optimise to convergence and bring the map to the final poses."""
+        with self.clock.measure("graph finish"):
+            update = self.graph.finish()
+        self._follow(update)
+        if self.mapper is not None:
+            with self.clock.measure("map finish"):
+                self.mapper.finish()
+        return update
+
+    def _follow(self, update: GraphUpdate) -> None:
+        self.T_map_odom = update.T_map_odom
+        if self.loops is not None:
+            self.loops.move(update)
+        if self.mapper is not None:
+            with self.clock.measure("map move"):
+                self.mapper.move(update)
+
+
+class Slam:
+    """Camera and IMU in, poses and map out; deterministic, one thread, two doors: an inertial sample and a frame."""
+
+    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None = None) -> None:
+        """Build the pipeline for a rig; without `noise` there is no IMU."""
+        self.clock = StageClock()
+        self.front = Front(config, rig, noise, self.clock)
+        self.back = Back(config, rig, noise, self.clock)
+        self._frames: deque[Frame] = deque()
+
+    def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
+        """Take one measurement; return a step for every frame that could be processed with it.
+
+        A frame waits until one inertial sample newer than it has come, so that its span ends exactly at its time.
+        """
+        if isinstance(value, Frame):
+            self._frames.append(value)
+        else:
+            self.front.add(value)
+        steps = []
+        while self._frames and self.front.is_ready(self._frames[0].t_ns, self._frames[-1].t_ns):
+            steps.append(self._step(self._frames.popleft()))
+        return steps
+
+    def finish(self) -> Finish:
+        """Process the frames that still wait and optimise a last time."""
+        steps = [self._step(self._frames.popleft()) for _ in range(len(self._frames))]
+        keyframes = [self._add(odometry) for odometry in self.front.give_up_waiting()]
+        return Finish(steps, keyframes, self.back.finish())
+
+    def _add(self, odometry: OdometryKeyframe) -> KeyframeStep:
+        if odometry.packet.keyframe.id == 0:
+            self.back.graph.initialise(self.front.first_state)
+        step = self.back.add(odometry)
+        self.front.feed_back(step.update)
+        return step
+
+    def _step(self, frame: Frame) -> Step:
+        front = self.front.process(frame)
+        keyframes = [self._add(odometry) for odometry in front.keyframes]
+        T_map_body = None if front.T_odom_body is None else self.back.T_map_odom @ front.T_odom_body
+        return Step(front, T_map_body, keyframes)
