@@ -75,9 +75,8 @@ def _parse(options: type[Options], arguments: list[str], verb: str, default: Opt
     """Parse the arguments of a verb into its options; wrong ones leave with exit code 2, --help with 0."""
     import tyro
 
-    start = {} if default is None else {"default": default}
-    summary = _VERBS[verb].summary
-    return tyro.cli(options, prog=f"vislam {verb}", description=summary, args=arguments, **start)  # type: ignore[arg-type]
+    start = tyro.MISSING_NONPROP if default is None else default
+    return tyro.cli(options, prog=f"vislam {verb}", description=_VERBS[verb].summary, args=arguments, default=start)
 
 
 def _take_option(arguments: list[str], name: str) -> str | None:
