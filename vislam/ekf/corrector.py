@@ -1,0 +1,106 @@
+"""Applies one measurement to the state: linearise, gate, correct; and what to do when the gate keeps saying no."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vislam.config import EkfConfig
+from vislam.ekf import kernels
+from vislam.ekf.history import Event, Kind, Ledger
+from vislam.ekf.measurements import (
+    LinearMeasurement,
+    biases,
+    chi_square_limit,
+    relative_motion,
+    with_shared_error,
+    zero_velocity,
+)
+from vislam.imu import ImuNoise
+from vislam.messages import Array
+
+
+class Corrector:
+    """Holds settings only: the same event on the same state gives the same answer, however often it is replayed."""
+
+    def __init__(self, config: EkfConfig, noise: ImuNoise, T_body_camera: Array | None) -> None:
+        self._config = config
+        self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
+        per_sample = config.imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
+        self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
+        self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 7)]
+        self._reset_sigmas = np.repeat(
+            [
+                np.deg2rad(config.reset_rotation_deg),
+                config.reset_position_m,
+                config.reset_velocity_m_s,
+                config.reset_gyro_bias_rad_s,
+                config.reset_accel_bias_m_s2,
+            ],
+            3,
+        )
+
+    def apply(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
+        """Apply an event to x [23] and P [21, 21] in place, write its outcome into it, and return the new ledger."""
+        event.was_reset, event.accepted, event.nis, event.reason = False, False, float("nan"), ""
+        if event.kind is Kind.KEYFRAME:
+            kernels.clone(x, P)
+            event.outcome, event.accepted = "keyframes", True
+            return replace(ledger, clone_id=event.keyframe_id, shared=np.zeros((6, 6)))
+        if event.kind is Kind.VO:
+            return self._apply_vo(event, x, P, ledger)
+        if event.kind is Kind.ZERO_VELOCITY:
+            at_rest = zero_velocity(x, gyro_rad_s, self._config.zero_velocity_sigma_m_s, self._zero_rate_sigma)
+            self._correct(event, at_rest, x, P, "zero_velocity")
+            return ledger
+        assert event.bias is not None
+        known = biases(x, event.bias[:3], event.bias[3:6], event.bias[6:])
+        self._correct(event, known, x, P, "bias", only=slice(9, 15))
+        return ledger
+
+    def _apply_vo(self, event: Event, x: Array, P: Array, ledger: Ledger) -> Ledger:
+        assert event.vo is not None
+        if event.keyframe_id != ledger.clone_id:
+            have = "none" if ledger.clone_id is None else f"keyframe {ledger.clone_id}"
+            event.outcome = "vo_no_keyframe"
+            event.reason = f"relative to keyframe {event.keyframe_id}, but the filter holds {have}"
+            return ledger
+        config = self._config
+        measurement = relative_motion(x, P, event.vo, self._lever, config.vo_inflation)
+        white, more, shared = with_shared_error(measurement, config.vo_shared_fraction, ledger.shared)
+        widened = P.copy()
+        widened[15:, 15:] += more
+        self._correct(event, white, x, widened, "vo")
+        if event.accepted:
+            P[:] = widened
+            return replace(ledger, shared=shared, rejects=0, last_vo_t_ns=event.t_ns)
+        since = event.t_ns if ledger.rejects == 0 else ledger.rejects_since_ns
+        rejects = ledger.rejects + 1
+        if rejects >= config.reset_rejects and event.t_ns - since >= config.reset_s * 1e9:
+            P[np.arange(15), np.arange(15)] += self._reset_sigmas**2
+            event.was_reset = True
+            event.reason += f"; {rejects} in a row, covariance inflated"
+            rejects = 0
+        return replace(ledger, rejects=rejects, rejects_since_ns=since)
+
+    def _correct(
+        self, event: Event, measurement: LinearMeasurement, x: Array, P: Array, name: str, only: slice | None = None
+    ) -> None:
+        """Gate and apply; `only` lets the gain move just these error states (Schmidt-Kalman)."""
+        residual, H, noise = measurement.residual, measurement.H, measurement.noise
+        nis, K = kernels.innovation(P, H, noise, residual)
+        event.nis = float(nis)
+        limit = self._limits[len(residual)]
+        if measurement.impossible:
+            event.outcome, event.reason = f"{name}_opposed", measurement.impossible
+            return
+        if not nis <= limit:
+            event.outcome, event.reason = f"{name}_gated", f"innovation {nis:.1f} of at most {limit:.1f}"
+            return
+        if only is not None:
+            masked = np.zeros_like(K)
+            masked[only] = K[only]
+            K = masked
+        kernels.correct(x, P, K, H, noise, residual)
+        event.outcome, event.accepted = f"{name}_accepted", True

@@ -1,0 +1,345 @@
+"""The error-state EKF: a continuous pose at IMU rate in `odom`, corrected by motion relative to a cloned keyframe.
+
+The nominal state is that of Karpov et al. 2026, 16 numbers: position, velocity, quaternion, two biases; the error state
+has the 15 degrees of freedom behind them, plus 6 of the clone. Unlike there, visual odometry enters as relative motion:
+an accumulated visual pose taken as an absolute one makes the filter certain of its own drift.
+Measurements may come late and in any order: the filter goes back to their time and runs forward again, so the answer
+depends only on the set of measurements, not on when they came.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vislam.config import EkfConfig
+from vislam.ekf import kernels
+from vislam.ekf.corrector import Corrector
+from vislam.ekf.history import OUTCOMES, Checkpoint, Event, History, Kind, Ledger
+from vislam.ekf.measurements import why_unusable
+from vislam.geometry import interpolate, invert, quaternion_wxyz, skew
+from vislam.imu import ImuNoise, ImuSeries
+from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateResult:
+    """What the filter did with a measurement; `nis` is NaN where none was computed."""
+
+    accepted: bool
+    nis: float
+    reason: str
+
+
+class Ekf:
+    """Owns the state, its covariance and the last seconds of samples and measurements. One thread only.
+
+    Until `initialise`, samples are only kept; a state in the past is then brought to the present through them.
+
+    Attributes:
+        counters: samples and measurements by what became of them, gaps, rewinds and soft resets.
+    """
+
+    def __init__(
+        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None = None
+    ) -> None:
+        """Set up an uninitialised filter.
+
+        Args:
+            config: see `EkfConfig`.
+            noise: of the IMU; `config.imu_inflation` is applied to its white part.
+            gravity_m_s2: magnitude, down in `odom`.
+            T_body_camera: [4, 4]; its lever arm turns a direction seen by one camera into motion of the body.
+                None: camera and IMU coincide. Not used for metric visual odometry.
+        """
+        self._config = config
+        self._gravity = float(gravity_m_s2)
+        white = config.imu_inflation * np.array([noise.gyro_noise_density, noise.accel_noise_density])
+        walks = [noise.gyro_bias_walk, noise.accel_bias_walk]
+        self._sigmas = np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
+        self._corrector = Corrector(config, noise, T_body_camera)
+        self._checkpoint_ns = round(config.checkpoint_s * _NS)
+        self._history_ns = round(config.history_s * _NS)
+        self._max_gap_ns = round(config.max_gap_s * _NS)
+        self._series = ImuSeries(extra=10)  # beside each sample, x[:10] as of the last run through it
+        self._history: History | None = None
+        self._x = np.zeros(kernels.NOMINAL)
+        self._P = np.zeros((kernels.ERRORS, kernels.ERRORS))
+        self._work = np.zeros((kernels.ERRORS, kernels.ERRORS))
+        self._t_ns = 0
+        self._applied = 0
+        self._ledger = Ledger()
+        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *OUTCOMES), 0)
+
+    @property
+    def initialised(self) -> bool:
+        """Whether there is a state."""
+        return self._history is not None
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What came in and what became of it."""
+        return {**self._counts, **{f"imu_{reason}": n for reason, n in self._series.refused.items()}}
+
+    @property
+    def dead_reckoning_s(self) -> float:
+        """Seconds since visual odometry last corrected the state, or since `initialise`; infinite before."""
+        return (self._t_ns - self._ledger.last_vo_t_ns) / _NS if self.initialised else float("inf")
+
+    def initialise(self, state: NavState, vo: VoMeasurement | None = None) -> None:
+        """Set the state, at any time, and run it through the samples that are already here. Forgets the past.
+
+        Args:
+            state: pose in `odom`, with its covariance.
+            vo: metric visual motion at the time of `state`. It places the keyframe it refers to, so that the motions
+                that follow can be used before there is a new keyframe. Without it the filter waits for `add_keyframe`.
+
+        Raises:
+            ValueError: the state is not finite.
+        """
+        parts = (state.T_world_body, state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+        if not all(np.isfinite(part).all() for part in (*parts, state.covariance)):
+            raise ValueError(f"the filter cannot start from a state that is not finite (at {state.t_ns} ns)")
+        x = self._x
+        x[0:3], x[3:6] = state.T_world_body[:3, 3], state.velocity_world_m_s
+        x[6:10] = quaternion_wxyz(state.T_world_body[:3, :3].copy())
+        x[10:13], x[13:16] = state.accel_bias_m_s2, state.gyro_bias_rad_s
+        self._P[:] = 0.0
+        self._P[:15, :15] = 0.5 * (state.covariance + state.covariance.T)
+        kernels.clone(x, self._P)
+        self._t_ns = state.t_ns
+        self._applied = 0
+        self._ledger = Ledger(last_vo_t_ns=state.t_ns)
+        if vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo):
+            self._place_keyframe(vo)
+        self._series.extra[:] = np.nan
+        self._history = History(self._snapshot())
+        self._run()
+
+    def predict(self, sample: ImuSample) -> None:
+        """Take a sample and bring the state to its time. Not finite, duplicate or backward samples are counted only."""
+        before = self._series.newest_t_ns
+        if not self._series.append(sample):
+            return
+        self._counts["imu_samples"] += 1
+        dt_ns = 0 if before is None else sample.t_ns - before
+        if dt_ns > self._max_gap_ns:
+            self._counts["imu_gaps"] += 1
+        history = self._history
+        if history is None:
+            if sample.t_ns - int(self._series.t_ns[0]) > 2 * self._history_ns:
+                self._series.forget_before(sample.t_ns - self._history_ns)
+            return
+        if before != self._t_ns or history.event(self._applied) is not None:
+            self._run()
+            return
+        values = self._series.values  # the way of nearly every sample: one step, no measurement on it
+        gap_s = dt_ns * 1e-9 if dt_ns > self._max_gap_ns else 0.0
+        kernels.predict(
+            self._x, self._P, values[-2], values[-1], dt_ns * 1e-9, gap_s, self._sigmas, self._gravity, self._work
+        )
+        self._series.extra[-1] = self._x[:10]
+        self._t_ns = sample.t_ns
+        if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
+            self._take_checkpoint()
+
+    def add_keyframe(self, keyframe_id: int, t_ns: int) -> UpdateResult:
+        """Clone the pose at `t_ns`: visual motions at later times may refer to this keyframe."""
+        return self._insert(Event(t_ns, Kind.KEYFRAME, keyframe_id=keyframe_id))
+
+    def update_vo(self, vo: VoMeasurement) -> UpdateResult:
+        """Correct the state at the time of a visual motion relative to the cloned keyframe.
+
+        Metric motion corrects six degrees; without scale, rotation and direction; without parallax, rotation. A motion
+        that is lost, that refers to another keyframe or that fails the gate is counted and changes nothing.
+        """
+        if vo.tracking is Tracking.LOST:
+            return self._refuse("vo_lost", "tracking lost")
+        reason = why_unusable(vo)
+        if reason:
+            return self._refuse("vo_invalid", reason)
+        return self._insert(Event(vo.t_ns, Kind.VO, keyframe_id=vo.keyframe_id, vo=vo))
+
+    def update_zero_velocity(self, t_ns: int) -> UpdateResult:
+        """Tell the filter that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""
+        return self._insert(Event(t_ns, Kind.ZERO_VELOCITY))
+
+    def feed_back(
+        self,
+        gyro_bias: Array,
+        accel_bias: Array,
+        gyro_sigma: float | Array,
+        accel_sigma: float | Array,
+    ) -> UpdateResult:
+        """Take biases [3] (rad/s, m/s^2) that the graph found, as soft measurements at the present time.
+
+        Only the biases move: pose and velocity stay, now and when late measurements are replayed. The graph has used
+        the same images, so give sigmas well above its own.
+        """
+        bias = np.concatenate(
+            [gyro_bias, accel_bias, np.broadcast_to(gyro_sigma, 3), np.broadcast_to(accel_sigma, 3)]
+        ).astype(np.float64)
+        if not np.isfinite(bias).all() or (bias[6:] <= 0.0).any():
+            return self._refuse("bias_invalid", "biases must be finite and their sigmas positive")
+        return self._insert(Event(self._t_ns, Kind.BIAS, bias=bias))
+
+    def state(self) -> NavState:
+        """Return the state at the newest sample. Raises ValueError before `initialise`."""
+        if self._history is None:
+            raise ValueError("the filter has no state yet; call initialise first")
+        return _nav_state(self._t_ns, self._x, self._P)
+
+    def state_at(self, t_ns: int) -> NavState | None:
+        """Return the filtered state at a time within the history, None outside of it."""
+        checkpoint = self._history.checkpoint_at(t_ns) if self._history is not None and t_ns <= self._t_ns else None
+        if checkpoint is None:
+            return None
+        x, P = checkpoint.x.copy(), checkpoint.P.copy()
+        self._integrate(x, P, checkpoint.t_ns, t_ns)
+        return _nav_state(t_ns, x, P)
+
+    def pose_at(self, t_ns: int) -> Array | None:
+        """Return T_odom_body [4, 4] at a time within the history, interpolated; None outside of it."""
+        if self._history is None or t_ns > self._t_ns:
+            return None
+        checkpoint = self._history.checkpoint_at(t_ns)
+        if checkpoint is None:
+            return None
+        if checkpoint.t_ns == t_ns:
+            return kernels.pose(checkpoint.x, 0, 6)
+        times, track = self._series.t_ns, self._series.extra
+        after = int(np.searchsorted(times, t_ns))
+        if after == len(times):  # the start, when it is newer than every sample
+            return kernels.pose(self._x, 0, 6)
+        before_ns, before = checkpoint.t_ns, checkpoint.x[:10]
+        if after > 0 and int(times[after - 1]) > before_ns:
+            before_ns, before = int(times[after - 1]), track[after - 1]
+        alpha = (t_ns - before_ns) / (int(times[after]) - before_ns)
+        return interpolate(kernels.pose(before.copy(), 0, 6), kernels.pose(track[after].copy(), 0, 6), alpha)
+
+    def _refuse(self, counter: str, reason: str) -> UpdateResult:
+        self._counts[counter] += 1
+        return UpdateResult(False, float("nan"), reason)
+
+    def _insert(self, event: Event) -> UpdateResult:
+        history = self._history
+        if history is None:
+            return self._refuse("before_start", "the filter has no state yet")
+        oldest = history.checkpoints[0].t_ns
+        if event.t_ns < oldest:
+            return self._refuse("too_late", f"{(oldest - event.t_ns) / _NS:.3f} s older than the history")
+        number = history.insert(event)
+        if event.t_ns > self._t_ns:  # a sample as new has to come first
+            return UpdateResult(False, event.nis, event.reason)
+        if event.t_ns < self._t_ns or number < self._applied:
+            self._counts["rewinds"] += 1
+            self._restore(history.rewind(number, event.t_ns))
+        self._run()
+        return UpdateResult(event.accepted, event.nis, event.reason)
+
+    def _run(self) -> None:
+        """Go on from the present state through every sample and event that is here."""
+        history = self._history
+        newest = self._series.newest_t_ns
+        if history is None:
+            return
+        while (event := history.event(self._applied)) is not None and event.t_ns <= max(newest or 0, self._t_ns):
+            self._advance(event.t_ns)
+            self._apply(event)
+            self._applied += 1
+            self._take_checkpoint()
+        if newest is not None:
+            self._advance(newest)
+
+    def _advance(self, t_ns: int) -> None:
+        while self._t_ns < t_ns:
+            step_ns = min(t_ns, self._t_ns + self._checkpoint_ns)
+            if step_ns < t_ns:  # stop on a sample: stopping between two would change the arithmetic
+                step_ns = int(self._series.t_ns[np.searchsorted(self._series.t_ns, step_ns)])
+                step_ns = min(step_ns, t_ns)
+            self._integrate(self._x, self._P, self._t_ns, step_ns, keep_track=True)
+            self._t_ns = step_ns
+            if self._history is not None and step_ns - self._history.checkpoints[-1].t_ns >= self._checkpoint_ns:
+                self._take_checkpoint()
+
+    def _integrate(self, x: Array, P: Array, t0_ns: int, t1_ns: int, keep_track: bool = False) -> None:
+        series = self._series
+        if t1_ns <= t0_ns:
+            return
+        times = series.t_ns
+        inner = slice(int(np.searchsorted(times, t0_ns, side="right")), int(np.searchsorted(times, t1_ns)))
+        stamps = np.concatenate(([t0_ns], times[inner], [t1_ns])).astype(np.int64)
+        samples = np.concatenate((series.at(t0_ns)[None], series.values[inner], series.at(t1_ns)[None]))
+        # A step inside a hole must know how long the whole hole is, not only its own part of it.
+        neighbours = times[max(inner.start - 1, 0) : inner.stop + 1]
+        covered = len(neighbours) == len(stamps)  # else the state is older than every sample, or newer
+        holes = np.diff(neighbours if covered else stamps)
+        gaps_s = np.concatenate(([0.0], np.where(holes > self._max_gap_ns, holes * 1e-9, 0.0)))
+        track = np.empty((len(stamps), 10))
+        kernels.predict_run(x, P, stamps, samples, gaps_s, track, self._sigmas, self._gravity, self._work)
+        if keep_track:
+            series.extra[inner] = track[1:-1]
+            if inner.stop < len(times) and times[inner.stop] == t1_ns:
+                series.extra[inner.stop] = track[-1]
+
+    def _apply(self, event: Event) -> None:
+        rate = self._series.at(event.t_ns)[:3] if len(self._series) else np.zeros(3)
+        if event.outcome:  # a rerun: what it was counted as before no longer holds
+            self._counts[event.outcome] -= 1
+            self._counts["soft_resets"] -= event.was_reset
+        self._ledger = self._corrector.apply(event, self._x, self._P, self._ledger, rate)
+        self._counts[event.outcome] += 1
+        self._counts["soft_resets"] += event.was_reset
+
+    def _place_keyframe(self, vo: VoMeasurement) -> None:
+        """Put the clone where `vo` says its keyframe is, with the uncertainty of the body and of `vo`."""
+        assert vo.T_keyframe_body is not None
+        T_body = kernels.pose(self._x, 0, 6)
+        T_body_keyframe = invert(vo.T_keyframe_body)
+        T_keyframe = T_body @ T_body_keyframe
+        R_body = T_body[:3, :3]
+        J = np.eye(6)
+        J[:3, :3] = vo.T_keyframe_body[:3, :3]
+        J[3:, :3] = -R_body @ skew(T_body_keyframe[:3, 3].copy())
+        to_world = np.eye(6)
+        to_world[3:, 3:] = R_body
+        JM = J @ to_world
+        noise = self._config.vo_inflation**2 * (JM @ vo.covariance @ JM.T)
+        self._x[16:19] = T_keyframe[:3, 3]
+        self._x[19:23] = quaternion_wxyz(T_keyframe[:3, :3].copy())
+        P = self._P
+        P[15:, :15] = J @ P[0:6, :15]
+        P[:15, 15:] = P[15:, :15].T
+        P[15:, 15:] = J @ P[0:6, 0:6] @ J.T + noise
+        kernels.symmetrise(P)
+        self._ledger = replace(self._ledger, clone_id=vo.keyframe_id)
+
+    def _snapshot(self) -> Checkpoint:
+        return Checkpoint(self._t_ns, self._applied, self._x.copy(), self._P.copy(), self._ledger)
+
+    def _take_checkpoint(self) -> None:
+        history = self._history
+        assert history is not None
+        history.checkpoints.append(self._snapshot())
+        if self._t_ns - history.checkpoints[0].t_ns > self._history_ns + 8 * self._checkpoint_ns:
+            history.forget_before(self._t_ns - self._history_ns)
+            self._series.forget_before(history.checkpoints[0].t_ns)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        self._x[:] = checkpoint.x
+        self._P[:] = checkpoint.P
+        self._t_ns, self._applied, self._ledger = checkpoint.t_ns, checkpoint.applied, checkpoint.ledger
+
+
+def _nav_state(t_ns: int, x: Array, P: Array) -> NavState:
+    return NavState(
+        t_ns=t_ns,
+        T_world_body=kernels.pose(x, 0, 6),
+        velocity_world_m_s=x[3:6].copy(),
+        gyro_bias_rad_s=x[13:16].copy(),
+        accel_bias_m_s2=x[10:13].copy(),
+        covariance=P[:15, :15].copy(),
+    )

@@ -1,0 +1,268 @@
+"""Compiled arithmetic of the filter.
+
+Nominal state x [23]: position 0:3, velocity 3:6, quaternion wxyz 6:10, accel bias 10:13, gyro bias 13:16 (the 16 of
+Karpov et al. 2026), then the cloned keyframe: position 16:19, quaternion 19:23.
+Error state [21]: rotation 0:3 (body side), position 3:6, velocity 6:9, gyro bias 9:12, accel bias 12:15 (the order of
+`NavState`), then the clone: rotation 15:18, position 18:21. Sola, "Quaternion kinematics for the error-state Kalman
+filter", 2017; the clone after Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.messages import Array
+
+NOMINAL = 23
+ERRORS = 21
+STATE = 15  # errors of the inertial state proper
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _rotation(w: float, x: float, y: float, z: float, R: Array) -> None:
+    R[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    R[0, 1] = 2.0 * (x * y - w * z)
+    R[0, 2] = 2.0 * (x * z + w * y)
+    R[1, 0] = 2.0 * (x * y + w * z)
+    R[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    R[1, 2] = 2.0 * (y * z - w * x)
+    R[2, 0] = 2.0 * (x * z - w * y)
+    R[2, 1] = 2.0 * (y * z + w * x)
+    R[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _right_jacobian(x: float, y: float, z: float, scale: float, J: Array) -> None:
+    """J = scale * J_r([x, y, z]), to second order in the angle."""
+    J[0, 0] = scale * (1.0 - (y * y + z * z) / 6.0)
+    J[1, 1] = scale * (1.0 - (x * x + z * z) / 6.0)
+    J[2, 2] = scale * (1.0 - (x * x + y * y) / 6.0)
+    J[0, 1] = scale * (0.5 * z + x * y / 6.0)
+    J[1, 0] = scale * (-0.5 * z + x * y / 6.0)
+    J[0, 2] = scale * (-0.5 * y + x * z / 6.0)
+    J[2, 0] = scale * (0.5 * y + x * z / 6.0)
+    J[1, 2] = scale * (0.5 * x + y * z / 6.0)
+    J[2, 1] = scale * (-0.5 * x + y * z / 6.0)
+
+
+@njit(cache=True, nogil=True)
+def turn(x: Array, at: int, rx: float, ry: float, rz: float) -> None:
+    """Multiply the quaternion in `x[at:at+4]` by a rotation vector on its body side, in place."""
+    angle = math.sqrt(rx * rx + ry * ry + rz * rz)
+    c = math.cos(0.5 * angle)
+    s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
+    ex, ey, ez = s * rx, s * ry, s * rz
+    w, a, b, d = x[at], x[at + 1], x[at + 2], x[at + 3]
+    w1 = w * c - a * ex - b * ey - d * ez
+    a1 = w * ex + a * c + b * ez - d * ey
+    b1 = w * ey - a * ez + b * c + d * ex
+    d1 = w * ez + a * ey - b * ex + d * c
+    norm = 1.0 / math.sqrt(w1 * w1 + a1 * a1 + b1 * b1 + d1 * d1)
+    x[at] = w1 * norm
+    x[at + 1] = a1 * norm
+    x[at + 2] = b1 * norm
+    x[at + 3] = d1 * norm
+
+
+@njit(cache=True, nogil=True)
+def pose(x: Array, at_p: int, at_q: int) -> Array:
+    """Return the pose [4, 4] whose position and quaternion start at these places of x."""
+    T = np.eye(4)
+    _rotation(x[at_q], x[at_q + 1], x[at_q + 2], x[at_q + 3], T)
+    T[0, 3], T[1, 3], T[2, 3] = x[at_p], x[at_p + 1], x[at_p + 2]
+    return T
+
+
+@njit(cache=True, nogil=True)
+def predict(
+    x: Array,
+    P: Array,
+    rate0: Array,
+    rate1: Array,
+    dt: float,
+    gap_s: float,
+    sigmas: Array,
+    gravity: float,
+    work: Array,
+) -> None:
+    """Move x [23] and P [21, 21] by one step, in place.
+
+    Mid-point: both samples [6] (gyro, accel) are averaged, and the force acts along the attitude half way. The same
+    arithmetic as `vislam.imu.preintegrate`.
+
+    Args:
+        x: nominal state.
+        P: covariance.
+        rate0: sample [6] at the start of the step, gyro then accel.
+        rate1: sample [6] at its end.
+        dt: length of the step in s.
+        gap_s: length of the hole in the data that the step lies in, else 0.
+        sigmas: [6] gyro and accel noise densities, gyro and accel bias walks, then what mean rate and force may have
+            done unseen inside a hole (rad/s and m/s^2).
+        gravity: m/s^2.
+        work: scratch [21, 21].
+    """
+    wx = (0.5 * (rate0[0] + rate1[0]) - x[13]) * dt
+    wy = (0.5 * (rate0[1] + rate1[1]) - x[14]) * dt
+    wz = (0.5 * (rate0[2] + rate1[2]) - x[15]) * dt
+    ax = 0.5 * (rate0[3] + rate1[3]) - x[10]
+    ay = 0.5 * (rate0[4] + rate1[4]) - x[11]
+    az = 0.5 * (rate0[5] + rate1[5]) - x[12]
+    E = np.empty((3, 3))  # Exp(-w dt)
+    A = np.empty((3, 3))  # velocity by rotation
+    B = np.empty((3, 3))  # velocity by gyro bias
+    M = np.empty((3, 3))  # R at mid-step
+    R = np.empty((3, 3))
+    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
+    c = math.cos(0.5 * angle)
+    s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
+    _rotation(c, -s * wx, -s * wy, -s * wz, E)
+    _rotation(x[6], x[7], x[8], x[9], R)
+    turn(x, 6, 0.5 * wx, 0.5 * wy, 0.5 * wz)
+    _rotation(x[6], x[7], x[8], x[9], M)
+    turn(x, 6, 0.5 * wx, 0.5 * wy, 0.5 * wz)
+    # Velocity by rotation at the start: -R [b]x dt with b = R^T M a, the force seen from there.
+    fx = M[0, 0] * ax + M[0, 1] * ay + M[0, 2] * az
+    fy = M[1, 0] * ax + M[1, 1] * ay + M[1, 2] * az
+    fz = M[2, 0] * ax + M[2, 1] * ay + M[2, 2] * az
+    bx = R[0, 0] * fx + R[1, 0] * fy + R[2, 0] * fz
+    by = R[0, 1] * fx + R[1, 1] * fy + R[2, 1] * fz
+    bz = R[0, 2] * fx + R[1, 2] * fy + R[2, 2] * fz
+    for i in range(3):
+        A[i, 0] = -dt * (R[i, 1] * bz - R[i, 2] * by)
+        A[i, 1] = -dt * (R[i, 2] * bx - R[i, 0] * bz)
+        A[i, 2] = -dt * (R[i, 0] * by - R[i, 1] * bx)
+        B[i, 0] = 0.5 * dt * dt * (M[i, 1] * az - M[i, 2] * ay)
+        B[i, 1] = 0.5 * dt * dt * (M[i, 2] * ax - M[i, 0] * az)
+        B[i, 2] = 0.5 * dt * dt * (M[i, 0] * ay - M[i, 1] * ax)
+    J = np.empty((3, 3))
+    _right_jacobian(wx, wy, wz, dt, J)
+    _propagate(P, work, E, J, A, B, M, dt)
+    _add_noise(P, dt, gap_s, sigmas)
+    fz -= gravity
+    x[0] += dt * x[3] + 0.5 * dt * dt * fx
+    x[1] += dt * x[4] + 0.5 * dt * dt * fy
+    x[2] += dt * x[5] + 0.5 * dt * dt * fz
+    x[3] += dt * fx
+    x[4] += dt * fy
+    x[5] += dt * fz
+
+
+@njit(cache=True, nogil=True)
+def _propagate(P: Array, T: Array, E: Array, J: Array, A: Array, B: Array, M: Array, dt: float) -> None:
+    """P = F P F^T, using that F has only a few blocks off the identity; the result is exactly symmetric."""
+    for j in range(ERRORS):
+        for i in range(3):
+            rotation = 0.0
+            velocity = 0.0
+            for k in range(3):
+                rotation += E[i, k] * P[k, j] - J[i, k] * P[9 + k, j]
+                velocity += A[i, k] * P[k, j] + B[i, k] * P[9 + k, j] - dt * M[i, k] * P[12 + k, j]
+            T[i, j] = rotation
+            T[3 + i, j] = P[3 + i, j] + dt * P[6 + i, j] + 0.5 * dt * velocity
+            T[6 + i, j] = P[6 + i, j] + velocity
+        for i in range(9, ERRORS):
+            T[i, j] = P[i, j]
+    for i in range(ERRORS):
+        for j in range(3):
+            rotation = 0.0
+            velocity = 0.0
+            for k in range(3):
+                rotation += E[j, k] * T[i, k] - J[j, k] * T[i, 9 + k]
+                velocity += A[j, k] * T[i, k] + B[j, k] * T[i, 9 + k] - dt * M[j, k] * T[i, 12 + k]
+            P[i, j] = rotation
+            P[i, 3 + j] = T[i, 3 + j] + dt * T[i, 6 + j] + 0.5 * dt * velocity
+            P[i, 6 + j] = T[i, 6 + j] + velocity
+        for j in range(9, ERRORS):
+            P[i, j] = T[i, j]
+    symmetrise(P)
+
+
+@njit(cache=True, nogil=True)
+def symmetrise(P: Array) -> None:
+    """Replace P by the mean of itself and its transpose, in place: rounding alone would make it indefinite."""
+    for i in range(len(P)):
+        for j in range(i):
+            mean = 0.5 * (P[i, j] + P[j, i])
+            P[i, j] = mean
+            P[j, i] = mean
+
+
+@njit(cache=True, nogil=True)
+def _add_noise(P: Array, dt: float, gap_s: float, sigmas: Array) -> None:
+    # Inside a hole the unseen error is constant, so it grows with the square of time; spread over steps as white noise.
+    gyro = (sigmas[0] * sigmas[0] + sigmas[4] * sigmas[4] * gap_s) * dt
+    accel = (sigmas[1] * sigmas[1] + sigmas[5] * sigmas[5] * gap_s) * dt
+    gyro_walk, accel_walk = sigmas[2] * sigmas[2] * dt, sigmas[3] * sigmas[3] * dt
+    for i in range(3):
+        P[i, i] += gyro
+        P[3 + i, 3 + i] += accel * dt * dt / 3.0
+        P[6 + i, 6 + i] += accel
+        P[3 + i, 6 + i] += 0.5 * dt * accel
+        P[6 + i, 3 + i] += 0.5 * dt * accel
+        P[9 + i, 9 + i] += gyro_walk
+        P[12 + i, 12 + i] += accel_walk
+
+
+@njit(cache=True, nogil=True)
+def predict_run(
+    x: Array,
+    P: Array,
+    t_ns: NDArray[np.int64],
+    samples: Array,
+    gaps_s: Array,
+    track: Array,
+    sigmas: Array,
+    gravity: float,
+    work: Array,
+) -> None:
+    """Predict through samples [N, 6] at `t_ns` [N], the state being at the first; store x[:10] of each in `track`.
+
+    `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
+    """
+    track[0] = x[:10]
+    for k in range(1, len(t_ns)):
+        dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
+        predict(x, P, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, work)
+        track[k] = x[:10]
+
+
+@njit(cache=True, nogil=True)
+def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Array) -> None:
+    """Apply a gain K [21, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain."""
+    A = np.eye(ERRORS) - K @ H
+    P[:, :] = A @ P @ A.T + K @ noise @ K.T
+    symmetrise(P)
+    d = K @ residual
+    for i in range(3):
+        x[i] += d[3 + i]
+        x[3 + i] += d[6 + i]
+        x[10 + i] += d[12 + i]
+        x[13 + i] += d[9 + i]
+        x[16 + i] += d[18 + i]
+    turn(x, 6, d[0], d[1], d[2])
+    turn(x, 19, d[15], d[16], d[17])
+
+
+@njit(cache=True, nogil=True)
+def innovation(P: Array, H: Array, noise: Array, residual: Array) -> tuple[float, Array]:
+    """Return the normalised innovation squared and the optimal gain [21, m]."""
+    PHt = P @ H.T
+    S = H @ PHt + noise
+    S_inverse = np.linalg.inv(0.5 * (S + S.T))
+    nis = float(residual @ S_inverse @ residual)
+    return nis, PHt @ S_inverse
+
+
+@njit(cache=True, nogil=True)
+def clone(x: Array, P: Array) -> None:
+    """Make the clone a copy of the present pose, fully correlated with it, in place."""
+    x[16:19] = x[0:3]
+    x[19:23] = x[6:10]
+    P[15:, :15] = P[0:6, :15]
+    P[:15, 15:] = P[:15, 0:6]
+    P[15:, 15:] = P[0:6, 0:6]

@@ -1,0 +1,19 @@
+"""Inertial data: noise model, calibration, the buffer that cuts spans, preintegration, rest detection."""
+
+from vislam.imu.buffer import ImuBuffer
+from vislam.imu.noise import ImuCalibration, ImuNoise
+from vislam.imu.preintegration import Preintegrated, preintegrate
+from vislam.imu.rest import RestDetector
+from vislam.imu.series import ImuSeries, join, subtract_bias
+
+__all__ = [
+    "ImuBuffer",
+    "ImuCalibration",
+    "ImuNoise",
+    "ImuSeries",
+    "Preintegrated",
+    "RestDetector",
+    "join",
+    "preintegrate",
+    "subtract_bias",
+]

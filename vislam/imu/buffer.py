@@ -1,0 +1,76 @@
+"""The last seconds of inertial data, from which spans between frames are cut."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.config import ImuConfig
+from vislam.imu.series import ImuSeries
+from vislam.messages import ImuSample, ImuSpan
+
+_NS = 1_000_000_000
+
+
+class ImuBuffer:
+    """Takes samples in time order and cuts spans with interpolated ends; bounded by `config.buffer_s`.
+
+    Attributes:
+        counters: "samples" taken; "nan", "backward", "duplicate" refused; "gaps" longer than `config.max_gap_s`.
+    """
+
+    def __init__(self, config: ImuConfig) -> None:
+        """Start empty."""
+        self._series = ImuSeries()
+        self._buffer_ns = round(config.buffer_s * _NS)
+        self._max_gap_ns = round(config.max_gap_s * _NS)
+        self._samples = 0
+        self._gaps = 0
+        self._forget_at_ns = 0
+
+    @property
+    def newest_t_ns(self) -> int | None:
+        """Time of the newest sample; None before the first."""
+        return self._series.newest_t_ns
+
+    @property
+    def oldest_t_ns(self) -> int | None:
+        """Time of the oldest sample still held; None before the first."""
+        return int(self._series.t_ns[0]) if len(self._series) else None
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was taken, refused and missing so far."""
+        return {"samples": self._samples, **self._series.refused, "gaps": self._gaps}
+
+    def add(self, sample: ImuSample) -> bool:
+        """Take a sample; False, and a counter, if it is not finite or not newer than the last."""
+        newest = self._series.newest_t_ns
+        if not self._series.append(sample):
+            return False
+        self._samples += 1
+        if newest is not None and sample.t_ns - newest > self._max_gap_ns:
+            self._gaps += 1
+        if sample.t_ns >= self._forget_at_ns:  # now and then: forgetting costs more than taking in
+            self._series.forget_before(sample.t_ns - self._buffer_ns)
+            self._forget_at_ns = sample.t_ns + self._buffer_ns // 16
+        return True
+
+    def span(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
+        """Return the samples of `[t0_ns, t1_ns]`, first and last interpolated to these times.
+
+        None if the samples held do not cover it, or if t1 is not after t0. A hole in the samples is interpolated
+        across; ask `gap_s` whether there is one before trusting the span.
+        """
+        return self._series.cut(t0_ns, t1_ns)
+
+    def gap_s(self, t0_ns: int, t1_ns: int) -> float:
+        """Return the longest time between neighbouring samples among those that `[t0_ns, t1_ns]` touches.
+
+        Holes count whole even where the interval ends inside one. Infinite if the samples held do not cover it.
+        """
+        times = self._series.t_ns
+        if len(times) < 2 or t0_ns < times[0] or t1_ns > times[-1]:
+            return float("inf")
+        begin = max(int(np.searchsorted(times, t0_ns, side="right")) - 1, 0)
+        end = min(int(np.searchsorted(times, t1_ns)) + 1, len(times))
+        return float(np.diff(times[begin:end]).max(initial=0)) / _NS

@@ -1,0 +1,138 @@
+"""Preintegration of inertial samples between two times, second-order accurate.
+
+Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", TRO 2017, with one change: each
+step uses the mean of its two samples, and the specific force acts along the attitude in the middle of the step.
+First-order integration is off by millimetres after a second of brisk motion at 200 Hz; this one is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.geometry import skew, so3_exp, so3_right_jacobian
+from vislam.imu.noise import ImuNoise
+from vislam.messages import Array, ImuSpan
+
+_NS = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Preintegrated:
+    """Motion from inertial data alone, in the body frame at the start, gravity not yet added.
+
+    With R, v, p of the body in a world whose gravity vector is g:
+    `R1 = R0 @ dR`, `v1 = v0 + g * dt + R0 @ dv`, `p1 = p0 + v0 * dt + g * dt**2 / 2 + R0 @ dp`.
+    The covariance [9, 9] is ordered rotation (right perturbation of dR), velocity, position; white noise only.
+    """
+
+    dt_s: float
+    dR: Array  # [3, 3]
+    dv_m_s: Array  # [3]
+    dp_m: Array  # [3]
+    dR_dgyro: Array  # [3, 3], right-side tangent of dR by gyro bias
+    dv_dgyro: Array  # [3, 3]
+    dv_daccel: Array  # [3, 3]
+    dp_dgyro: Array  # [3, 3]
+    dp_daccel: Array  # [3, 3]
+    covariance: Array  # [9, 9]; zero without a noise model
+    gyro_bias_rad_s: Array  # [3], the biases that were taken off
+    accel_bias_m_s2: Array  # [3]
+
+    def corrected(self, gyro_bias_rad_s: Array, accel_bias_m_s2: Array) -> tuple[Array, Array, Array]:
+        """Return dR, dv, dp for other biases [3], to first order in their change."""
+        dg = gyro_bias_rad_s - self.gyro_bias_rad_s
+        da = accel_bias_m_s2 - self.accel_bias_m_s2
+        return (
+            self.dR @ so3_exp(self.dR_dgyro @ dg),
+            self.dv_m_s + self.dv_dgyro @ dg + self.dv_daccel @ da,
+            self.dp_m + self.dp_dgyro @ dg + self.dp_daccel @ da,
+        )
+
+
+def preintegrate(
+    span: ImuSpan,
+    gyro_bias_rad_s: Array | None = None,
+    accel_bias_m_s2: Array | None = None,
+    noise: ImuNoise | None = None,
+) -> Preintegrated:
+    """Integrate a span, with biases [3] taken off (None: zero).
+
+    Args:
+        span: at least two samples; what lies between samples is taken as linear, also across a hole.
+        gyro_bias_rad_s: in rad/s, body frame.
+        accel_bias_m_s2: in m/s^2, body frame.
+        noise: gives the covariance; None leaves it zero.
+
+    Raises:
+        ValueError: fewer than two samples.
+    """
+    if len(span.t_ns) < 2:
+        raise ValueError(f"preintegration needs at least 2 samples, got {len(span.t_ns)}")
+    gyro_bias = np.zeros(3) if gyro_bias_rad_s is None else np.asarray(gyro_bias_rad_s, dtype=np.float64)
+    accel_bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
+    densities = (0.0, 0.0) if noise is None else (noise.gyro_noise_density, noise.accel_noise_density)
+    dR, dv, dp, J_gyro, J_accel, covariance = _integrate(
+        span.t_ns, span.gyro_rad_s, span.accel_m_s2, gyro_bias, accel_bias, *densities
+    )
+    return Preintegrated(
+        dt_s=float(span.t_ns[-1] - span.t_ns[0]) * _NS,
+        dR=dR,
+        dv_m_s=dv,
+        dp_m=dp,
+        dR_dgyro=J_gyro[:3],
+        dv_dgyro=J_gyro[3:6],
+        dv_daccel=J_accel[3:6],
+        dp_dgyro=J_gyro[6:],
+        dp_daccel=J_accel[6:],
+        covariance=covariance,
+        gyro_bias_rad_s=gyro_bias.copy(),
+        accel_bias_m_s2=accel_bias.copy(),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _integrate(
+    t_ns: NDArray[np.int64],
+    gyro: Array,
+    accel: Array,
+    gyro_bias: Array,
+    accel_bias: Array,
+    gyro_density: float,
+    accel_density: float,
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
+    J_gyro, J_accel = np.zeros((9, 3)), np.zeros((9, 3))  # of (rotation, velocity, position) by bias
+    covariance = np.zeros((9, 9))
+    F = np.eye(9)
+    G_gyro, G_accel = np.zeros((9, 3)), np.zeros((9, 3))
+    for k in range(len(t_ns) - 1):
+        dt = (t_ns[k + 1] - t_ns[k]) * 1e-9
+        rate = 0.5 * (gyro[k] + gyro[k + 1]) - gyro_bias
+        force = 0.5 * (accel[k] + accel[k + 1]) - accel_bias
+        half = so3_exp(0.5 * dt * rate)
+        R_middle = dR @ half
+        acceleration = R_middle @ force
+        # One step in error form: e' = F e - G_gyro n_gyro - G_accel n_accel, the same for noise and for bias.
+        F[:3, :3] = so3_exp(-dt * rate)
+        F[3:6, :3] = -dt * (dR @ skew(half @ force))
+        F[6:, :3] = 0.5 * dt * F[3:6, :3]
+        for i in range(3):
+            F[6 + i, 3 + i] = dt
+        G_gyro[:3] = dt * so3_right_jacobian(dt * rate)
+        G_gyro[3:6] = (-0.5 * dt * dt) * (R_middle @ skew(force) @ so3_right_jacobian(0.5 * dt * rate))
+        G_gyro[6:] = 0.5 * dt * G_gyro[3:6]
+        G_accel[3:6] = dt * R_middle
+        G_accel[6:] = 0.5 * dt * G_accel[3:6]
+        J_gyro = F @ J_gyro - G_gyro
+        J_accel = F @ J_accel - G_accel
+        covariance = F @ covariance @ F.T
+        covariance += (gyro_density * gyro_density / dt) * (G_gyro @ G_gyro.T)
+        covariance += (accel_density * accel_density / dt) * (G_accel @ G_accel.T)
+        dp = dp + dt * dv + (0.5 * dt * dt) * acceleration
+        dv = dv + dt * acceleration
+        dR = dR @ (half @ half)
+    return dR, dv, dp, J_gyro, J_accel, 0.5 * (covariance + covariance.T)

@@ -1,0 +1,139 @@
+"""Inertial samples in contiguous memory: appended at the end, forgotten at the front, cut anywhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.messages import Array, ImuSample, ImuSpan
+
+_FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
+
+
+class ImuSeries:
+    """A growing, sliding window of samples; rows stay contiguous so that compiled code can run over them.
+
+    Attributes:
+        refused: samples not taken, by reason: "nan", "backward", "duplicate".
+    """
+
+    def __init__(self, extra: int = 0) -> None:
+        """Start empty; `extra` is the number of further columns that a user keeps beside each sample, NaN at first."""
+        self._t_ns: NDArray[np.int64] = np.empty(_FIRST_CAPACITY, dtype=np.int64)
+        self._values: Array = np.empty((_FIRST_CAPACITY, 6))
+        self._extra: Array = np.empty((_FIRST_CAPACITY, extra))
+        self._begin = 0
+        self._end = 0
+        self._newest_t_ns = -(1 << 62)
+        self.refused = {"nan": 0, "backward": 0, "duplicate": 0}
+
+    def __len__(self) -> int:
+        """Return the number of samples held."""
+        return self._end - self._begin
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        """Times [N] of the samples held: a view, valid until the next `append`."""
+        return self._t_ns[self._begin : self._end]
+
+    @property
+    def values(self) -> Array:
+        """Samples [N, 6], gyro (rad/s) then accel (m/s^2): a view, valid until the next `append`."""
+        return self._values[self._begin : self._end]
+
+    @property
+    def extra(self) -> Array:
+        """What the user keeps beside each sample [N, extra]: a writable view, valid until the next `append`."""
+        return self._extra[self._begin : self._end]
+
+    @property
+    def newest_t_ns(self) -> int | None:
+        """Time of the newest sample, None when there is none yet."""
+        return self._newest_t_ns if self._end > self._begin else None
+
+    def append(self, sample: ImuSample) -> bool:
+        """Take a sample that is finite and newer than the last; otherwise count why not and return False."""
+        t_ns = sample.t_ns
+        gyro, accel = sample.gyro_rad_s, sample.accel_m_s2
+        if not math.isfinite(sum(gyro.tolist()) + sum(accel.tolist())):
+            self.refused["nan"] += 1
+            return False
+        if t_ns <= self._newest_t_ns:
+            self.refused["duplicate" if t_ns == self._newest_t_ns else "backward"] += 1
+            return False
+        if self._end == len(self._t_ns):
+            self._make_room()
+        row = self._values[self._end]
+        row[:3] = gyro
+        row[3:] = accel
+        self._extra[self._end] = np.nan
+        self._t_ns[self._end] = t_ns
+        self._newest_t_ns = t_ns
+        self._end += 1
+        return True
+
+    def forget_before(self, t_ns: int) -> int:
+        """Drop samples not needed to interpolate at or after `t_ns`; return how many went."""
+        dropped = max(int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1, 0)
+        self._begin += dropped
+        return dropped
+
+    def at(self, t_ns: int) -> Array:
+        """Return the sample [6] at `t_ns`, linearly interpolated; the nearest one outside of what is held."""
+        times = self.t_ns
+        k = int(np.searchsorted(times, t_ns))
+        if k < len(times) and (times[k] == t_ns or k == 0):
+            return self.values[k].copy()
+        if k == len(times):
+            return self.values[-1].copy()
+        alpha = (t_ns - int(times[k - 1])) / (int(times[k]) - int(times[k - 1]))
+        return (1.0 - alpha) * self.values[k - 1] + alpha * self.values[k]
+
+    def cut(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
+        """Return the samples of `[t0_ns, t1_ns]` with interpolated ends; None if they do not cover it."""
+        times = self.t_ns
+        if len(times) == 0 or t1_ns <= t0_ns or t0_ns < times[0] or t1_ns > times[-1]:
+            return None
+        inner = slice(int(np.searchsorted(times, t0_ns, side="right")), int(np.searchsorted(times, t1_ns)))
+        stamps = np.concatenate(([t0_ns], times[inner], [t1_ns])).astype(np.int64)
+        values = np.concatenate((self.at(t0_ns)[None], self.values[inner], self.at(t1_ns)[None]))
+        return ImuSpan(stamps, np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:]))
+
+    def _make_room(self) -> None:
+        live = self._end - self._begin
+        capacity = len(self._t_ns)
+        if 2 * live > capacity:
+            capacity *= 2
+        t_ns: NDArray[np.int64] = np.empty(capacity, dtype=np.int64)
+        values: Array = np.empty((capacity, 6))
+        extra: Array = np.empty((capacity, self._extra.shape[1]))
+        t_ns[:live] = self.t_ns
+        values[:live] = self.values
+        extra[:live] = self.extra
+        self._t_ns, self._values, self._extra, self._begin, self._end = t_ns, values, extra, 0, live
+
+
+def join(spans: Sequence[ImuSpan]) -> ImuSpan:
+    """Return one span from consecutive spans, each beginning where the one before ended.
+
+    Raises ValueError if they do not follow each other.
+    """
+    for a, b in pairwise(spans):
+        if a.t_ns[-1] != b.t_ns[0]:
+            raise ValueError(
+                f"spans do not follow each other: one ends at {a.t_ns[-1]}, the next begins at {b.t_ns[0]}"
+            )
+    return ImuSpan(
+        np.concatenate([spans[0].t_ns, *(span.t_ns[1:] for span in spans[1:])]),
+        np.concatenate([spans[0].gyro_rad_s, *(span.gyro_rad_s[1:] for span in spans[1:])]),
+        np.concatenate([spans[0].accel_m_s2, *(span.accel_m_s2[1:] for span in spans[1:])]),
+    )
+
+
+def subtract_bias(span: ImuSpan, gyro_bias_rad_s: Array, accel_bias_m_s2: Array) -> ImuSpan:
+    """Return the span with its biases [3] taken off."""
+    return ImuSpan(span.t_ns, span.gyro_rad_s - gyro_bias_rad_s, span.accel_m_s2 - accel_bias_m_s2)

@@ -1,0 +1,109 @@
+"""How a visual motion between two body poses constrains them: residuals and Jacobians, compiled.
+
+A residual is `measured - predicted`, so `residual(x + d) = residual(x) - J @ d`. Poses are perturbed by rotation on the
+body side and position in world axes, in this order, as in `NavState`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from vislam.geometry import (
+    skew,
+    so3_left_jacobian_inverse,
+    so3_log,
+    so3_right_jacobian_inverse,
+)
+from vislam.messages import Array
+
+
+@njit(cache=True, nogil=True)
+def metric_residual(T_world_a: Array, T_world_b: Array, T_a_b: Array) -> tuple[Array, Array, Array]:
+    """Return the residual [6] of a measured `T_a_b` and its Jacobians [6, 6] by pose a and by pose b.
+
+    The residual is rotation then translation, in axes of b, so that a body-side covariance of `T_a_b` is its noise.
+    """
+    R_a, R_b = T_world_a[:3, :3].copy(), T_world_b[:3, :3].copy()
+    R_a_b, t_a_b = T_a_b[:3, :3].copy(), T_a_b[:3, 3].copy()
+    R_b_a = R_b.T @ R_a
+    r = np.empty(6)
+    rotation = so3_log(R_b_a @ R_a_b)
+    translation = R_b.T @ (T_world_a[:3, 3] + R_a @ t_a_b - T_world_b[:3, 3])
+    r[:3] = rotation
+    r[3:] = translation
+    J_a, J_b = np.zeros((6, 6)), np.zeros((6, 6))
+    J_b[:3, :3] = so3_left_jacobian_inverse(rotation)
+    J_b[3:, :3] = -skew(translation)
+    J_b[3:, 3:] = R_b.T
+    J_a[:3, :3] = -so3_right_jacobian_inverse(rotation) @ R_a_b.T
+    J_a[3:, :3] = R_b_a @ skew(t_a_b)
+    J_a[3:, 3:] = -R_b.T
+    return r, J_a, J_b
+
+
+@njit(cache=True, nogil=True)
+def across(direction: Array) -> Array:
+    """Return two orthonormal columns [3, 2] perpendicular to a unit direction [3]."""
+    axis = np.zeros(3)
+    axis[np.argmin(np.abs(direction))] = 1.0
+    first = np.cross(direction, axis)
+    first /= np.sqrt(np.sum(first * first))
+    out = np.empty((3, 2))
+    out[:, 0] = first
+    out[:, 1] = np.cross(direction, first)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def camera_displacement(T_world_a: Array, T_world_b: Array, lever_m: Array) -> Array:
+    """Return how far the camera, `lever_m` [3] from the body's origin, moved from a to b: [3] in body axes of a."""
+    R_a_world = np.ascontiguousarray(T_world_a[:3, :3].T)
+    R_b = T_world_b[:3, :3].copy()
+    return R_a_world @ (T_world_b[:3, 3] - T_world_a[:3, 3] + R_b @ lever_m) - lever_m
+
+
+@njit(cache=True, nogil=True)
+def direction_residual(T_world_a: Array, T_world_b: Array, T_a_b: Array, lever_m: Array) -> tuple[Array, Array, Array]:
+    """Return the residual [6] of a motion without scale and its Jacobians [6, 6] by pose a and by pose b.
+
+    `T_a_b` holds the rotation and, as translation, the unit direction of the camera's displacement in body axes of a.
+    Entries 0:3 are rotation. Entries 3:5, in metres, are what the predicted displacement has across the measured
+    direction: linear in position, also for the shortest displacements; their noise grows with the displacement (see
+    `direction_noise`). Entry 5 is minus the displacement along it: no measurement, but its sign tells front from back.
+    """
+    R_a, R_b = T_world_a[:3, :3].copy(), T_world_b[:3, :3].copy()
+    R_a_b, direction = T_a_b[:3, :3].copy(), T_a_b[:3, 3].copy()
+    rotation = so3_log(R_b.T @ R_a @ R_a_b)
+    basis = np.empty((3, 3))
+    basis[:2] = across(direction).T
+    basis[2] = direction
+    displacement = camera_displacement(T_world_a, T_world_b, lever_m)
+    r = np.empty(6)
+    r[:3] = rotation
+    r[3:] = -(basis @ displacement)
+    J_a, J_b = np.zeros((6, 6)), np.zeros((6, 6))
+    J_b[:3, :3] = so3_left_jacobian_inverse(rotation)
+    J_b[3:, :3] = -(basis @ (R_a.T @ R_b) @ skew(lever_m))
+    J_b[3:, 3:] = basis @ R_a.T
+    J_a[:3, :3] = -so3_right_jacobian_inverse(rotation) @ R_a_b.T
+    J_a[3:, :3] = basis @ skew(displacement + lever_m)
+    J_a[3:, 3:] = -(basis @ R_a.T)
+    return r, J_a, J_b
+
+
+@njit(cache=True, nogil=True)
+def direction_noise(T_a_b: Array, covariance: Array, distance_m: float) -> Array:
+    """Return the noise [5, 5] of the first five entries of `direction_residual`, for a displacement of `distance_m`.
+
+    Args:
+        T_a_b: the measurement, unit direction as translation.
+        covariance: [6, 6], body-side; its translation block is that of the unit direction.
+        distance_m: how far the camera moved, as well as it is known.
+    """
+    M = np.zeros((5, 6))
+    for i in range(3):
+        M[i, i] = 1.0
+    basis = np.ascontiguousarray(across(T_a_b[:3, 3].copy()).T)
+    M[3:, 3:] = distance_m * (basis @ T_a_b[:3, :3].copy())
+    return M @ covariance @ M.T
