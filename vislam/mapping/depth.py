@@ -1,10 +1,8 @@
 """From a depth image to the points worth mapping: range limits, object borders, speckles, subsampling.
 
-What survives is kept as a small 16-bit depth image on a fixed grid of rays, so that it can be stored in little space and
-put anywhere later.
+What survives is kept as a small 16-bit depth image on a fixed grid of rays, so that it can be stored in little space
+and put anywhere later.
 """
-
-# ruff: noqa: PLR0917 - compiled kernels take plain arrays, by position
 
 from __future__ import annotations
 
@@ -53,8 +51,8 @@ def rgbd_view(rig: Rig, config: MapConfig) -> DepthView:
     maps = None
     if camera.distortion != "none":
         pixels = np.nan_to_num(camera.project(_pinhole_rays(K, (u.shape[1], u.shape[0]))) / step, nan=-1.0)
-        pixels = pixels.astype(np.float32).reshape(*u.shape, 2)
-        maps = (np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1]))
+        grid = pixels.astype(np.float32).reshape(*u.shape, 2)
+        maps = (np.ascontiguousarray(grid[..., 0]), np.ascontiguousarray(grid[..., 1]))
     T = np.array(rig.T_body_cams[0], dtype=np.float64)
     return DepthView(_turned(rays, T, u.shape), T, K, maps, _unit_m(config.max_range_m), config.max_range_m)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vislam.errors import DataError
 from vislam.mapping.blocks import KEY_ORIGIN, BlockPool
 from vislam.mapping.octree import Octree, log_odds, octree_from_blocks
-from vislam.mapping.scan import cast_rays, end_voxels, marked_blocks, merge_blocks
+from vislam.mapping.scan import cast_rays, end_voxels, finite_points, marked_blocks, merge_blocks
 
 Array = NDArray[np.float64]
 Insertion = Literal["discretised", "full"]
@@ -72,16 +72,16 @@ class OccupancyMap:
         left out. "discretised" casts one ray per end voxel, "full" one per point. Raises DataError when a point lies
         beyond the key range (32768 voxels from the origin) or the scan's bounding box is too large.
         """
-        points = np.ascontiguousarray(points_map_m, dtype=np.float32).reshape(-1, 3)
-        finite = np.isfinite(points).all(axis=1)
-        if not finite.all():
-            points = np.ascontiguousarray(points[finite])
+        points, low, high = finite_points(np.ascontiguousarray(points_map_m, dtype=np.float32).reshape(-1, 3))
         origin = np.asarray(origin_map_m, dtype=np.float32).reshape(3)
         if not np.isfinite(origin).all():
             raise DataError(f"a scan's origin must be finite, got {origin.tolist()}")
         if len(points) == 0:
             return 0
-        base, blocks = self._scan_box(points, origin, max_range_m if insertion == "full" else -1.0)
+        # discretised insertion looks at the end voxels of all points, however far, before it shortens the rays
+        reach_m = max_range_m if insertion == "full" and max_range_m >= 0.0 else np.inf
+        low, high = np.maximum(low, origin - reach_m), np.minimum(high, origin + reach_m)
+        base, blocks = self._scan_box(np.minimum(low, origin), np.maximum(high, origin))
         nx, nxy = int(blocks[0]) * 8, int(blocks[0] * blocks[1]) * 64
         size = int(blocks.prod()) * 64
         if size > len(self._words):
@@ -101,14 +101,8 @@ class OccupancyMap:
         )  # fmt: skip
         return len(points)
 
-    def _scan_box(
-        self, points: NDArray[np.float32], origin: NDArray[np.float32], max_range_m: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _scan_box(self, low: Array, high: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the lowest voxel key [3], a multiple of 8, and the size in blocks [3] of the box around a scan."""
-        low = np.minimum(points.min(axis=0), origin).astype(np.float64)
-        high = np.maximum(points.max(axis=0), origin).astype(np.float64)
-        if max_range_m >= 0.0:
-            low, high = np.maximum(low, origin - max_range_m), np.minimum(high, origin + max_range_m)
         reach = (KEY_ORIGIN - 8) * self.resolution_m
         if low.min() < -reach or high.max() > reach:
             worst = max(-low.min(), high.max())
@@ -127,7 +121,7 @@ class OccupancyMap:
             )
         return base, blocks
 
-    def log_odds_at(self, points_map_m: Array) -> NDArray[np.float32]:
+    def log_odds_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite."""
         points = np.asarray(points_map_m, dtype=np.float64).reshape(-1, 3)
         scaled = np.floor(points * (1.0 / self.resolution_m))
@@ -136,7 +130,7 @@ class OccupancyMap:
         keys[inside] = scaled[inside].astype(np.int64) + KEY_ORIGIN
         return self._pool.read(keys)
 
-    def state_at(self, points_map_m: Array) -> NDArray[np.int8]:
+    def state_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.int8]:
         """Return the `Occupancy` [N] at points [N, 3]."""
         return states(self.log_odds_at(points_map_m))
 

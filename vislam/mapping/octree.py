@@ -13,10 +13,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vislam.errors import DataError
 from vislam.mapping.blocks import BLOCK_VOXELS, KEY_ORIGIN
 
 Array = NDArray[np.float64]
 TREE_LEVELS = 16  # OctoMap's depth: a leaf of level 0 is one voxel, the root has level 16
+_MAX_VOXELS = 1 << 27  # taken apart: 3 GiB
 
 
 def log_odds(probability: float) -> np.float32:
@@ -36,7 +38,7 @@ class Octree:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def log_odds_at(self, points_map_m: Array) -> NDArray[np.float32]:
+    def log_odds_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite."""
         points = np.asarray(points_map_m, dtype=np.float64).reshape(-1, 3)
         out = np.full(len(points), np.nan, np.float32)
@@ -64,15 +66,23 @@ class Octree:
         return (low + 0.5 * size[:, None]) * self.resolution_m, np.asarray(size * self.resolution_m, dtype=np.float64)
 
     def occupied_voxels(self) -> NDArray[np.int64]:
-        """Return the occupied voxels [M, 3] (0 at the map's origin), large leaves taken apart."""
+        """Return the occupied voxels [M, 3] (0 at the map's origin), large leaves taken apart.
+
+        Raises DataError when there are more than fit in memory.
+        """
         return self._voxels(self.log_odds >= 0.0)
 
     def free_voxels(self) -> NDArray[np.int64]:
-        """Return the free voxels [M, 3] (0 at the map's origin), large leaves taken apart."""
+        """Return the free voxels [M, 3] (0 at the map's origin), large leaves taken apart.
+
+        Raises DataError when there are more than fit in memory.
+        """
         return self._voxels(self.log_odds < 0.0)
 
     def _voxels(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
         counts = np.int64(1) << (3 * self.levels[chosen].astype(np.int64))
+        if float(counts.astype(np.float64).sum()) > _MAX_VOXELS:
+            raise DataError(f"the octree's leaves are more than {_MAX_VOXELS} voxels; use its boxes instead")
         first = np.repeat(self.starts[chosen], counts)
         within = np.arange(int(counts.sum()), dtype=np.int64) - np.repeat(np.cumsum(counts) - counts, counts)
         return np.asarray(morton_decode(first + within) - KEY_ORIGIN)

@@ -7,8 +7,6 @@ covers its bounding box first, so that each voxel gets one update per scan and e
 into the blocks of the map.
 """
 
-# ruff: noqa: PLR0917 - compiled kernels take plain arrays, by position
-
 from __future__ import annotations
 
 from typing import Any
@@ -77,6 +75,24 @@ def _cast(ox: Any, oy: Any, oz: Any, ex: Any, ey: Any, ez: Any, resolution: floa
         if index == end or min(t0, t1, t2) > length:
             return end
         grid[index] = FREE_MARK
+
+
+@njit(cache=True, nogil=True)
+def finite_points(points: _F32) -> tuple[_F32, NDArray[np.float64], NDArray[np.float64]]:
+    """Return the finite ones of points [N, 3] and the lowest and highest corner [3] of their bounding box."""
+    kept = np.empty((len(points), 3), np.float32)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    count = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            continue
+        kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
+        count += 1
+        for axis in range(3):
+            value = np.float64(points[i, axis])
+            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+    return kept[:count], low, high
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,74 @@
+"""What a keyframe can tell the map: depth from its sensor, from its second camera, or a few triangulated points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Rig
+from vislam.config import MapConfig
+from vislam.mapping.depth import DepthView, filter_depth, rgbd_view
+from vislam.mapping.stereo import DenseStereo
+from vislam.mapping.store import Scan
+from vislam.messages import Keyframe
+
+ImageU8 = NDArray[np.uint8]
+
+
+class ScanExtractor:
+    """Makes scans of keyframes, the richest that each offers; what it could not use is counted."""
+
+    def __init__(self, config: MapConfig, rig: Rig) -> None:
+        self._config = config
+        self._camera = rig.cameras[0]
+        self._stereo = DenseStereo(rig, config) if rig.is_stereo and not rig.has_depth else None
+        self.view: DepthView = self._stereo.view if self._stereo else rgbd_view(rig, config)
+        self.counters = {"keyframes_dense": 0, "keyframes_sparse": 0, "keyframes_without_depth": 0}
+
+    def extract(self, keyframe: Keyframe) -> Scan | None:
+        """Return the keyframe's scan, or None when nothing of its geometry is known.
+
+        Raises DataError when an image or depth image does not have the size of its camera.
+        """
+        scan = self._dense(keyframe) or self._sparse(keyframe)
+        if scan is None:
+            self.counters["keyframes_without_depth"] += 1
+        else:
+            self.counters["keyframes_dense" if scan.depth is not None else "keyframes_sparse"] += 1
+        return scan
+
+    def _dense(self, keyframe: Keyframe) -> Scan | None:
+        frame = keyframe.frame
+        if self._stereo is not None:
+            if len(frame.images) < 2:
+                return None
+            depth_m, grey = self._stereo.match(frame.images[0], frame.images[1])
+            return Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(grey))
+        if frame.depth_m is None:
+            return None
+        image = frame.images[0] if frame.color is None else frame.color
+        self._camera.check_image(image)
+        depth = filter_depth(frame.depth_m, self._config.pixel_step, self.view, self._config)
+        return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
+
+    def _sparse(self, keyframe: Keyframe) -> Scan | None:
+        if keyframe.points_body_m is None:
+            return None
+        known = np.isfinite(keyframe.points_body_m).all(axis=1)
+        if not known.any():
+            return None
+        frame = keyframe.frame
+        image = frame.images[0] if frame.color is None else frame.color
+        pixels = np.nan_to_num(np.round(keyframe.keypoints_px[known])).astype(np.int64)
+        rows = np.clip(pixels[:, 1], 0, image.shape[0] - 1)
+        colors = _rgb(image)[rows, np.clip(pixels[:, 0], 0, image.shape[1] - 1)]
+        return Scan(None, keyframe.points_body_m[known].astype(np.float32), colors)
+
+
+def _rgb(image: NDArray[np.generic]) -> ImageU8:
+    """Return a grey or BGR image as RGB [H, W, 3]."""
+    array = np.asarray(image, dtype=np.uint8)
+    if array.ndim == 2:
+        return np.repeat(array[..., None], 3, axis=2)
+    return np.ascontiguousarray(array[..., ::-1])

@@ -1,0 +1,150 @@
+"""The mapper: keyframes in, corrections followed, maps out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Rig
+from vislam.config import MapConfig
+from vislam.errors import DataError, StorageError
+from vislam.mapping.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
+from vislam.mapping.correct import CorrectedOccupancy
+from vislam.mapping.depth import surface_points
+from vislam.mapping.extract import ScanExtractor
+from vislam.mapping.files import replacing
+from vislam.mapping.grid import Grid, floor_height_m, navigation_grid, write_grid
+from vislam.mapping.mesh import fuse_mesh
+from vislam.mapping.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octomap_io import encode_bt
+from vislam.mapping.ply import write_ply
+from vislam.mapping.store import KeyframeStore, Scan
+from vislam.messages import GraphUpdate, Keyframe
+
+Array = NDArray[np.float64]
+
+_RIGID_TOLERANCE = 1e-4
+
+
+class Mapper:
+    """Keeps every keyframe's geometry in its own frame, and the maps made of it at the poses the graph gives."""
+
+    def __init__(self, config: MapConfig, rig: Rig) -> None:
+        """Raises DataError when the settings or the rig cannot make a map."""
+        self._config = config
+        self._extractor = ScanExtractor(config, rig)
+        self._store = KeyframeStore()
+        self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
+        self.notes: dict[str, str] = {}  # what was left out of an export, and why
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What went in, what had no depth, and how often the map was rebuilt."""
+        return {**self._extractor.counters, **self._occupancy.counters, "store_bytes": self._store.nbytes}
+
+    @property
+    def occupancy(self) -> OccupancyMap:
+        """The occupancy map as it is now."""
+        return self._occupancy.occupancy
+
+    def add(self, keyframe: Keyframe, T_map_body: Array) -> None:
+        """Integrate a keyframe at its pose [4, 4].
+
+        Raises DataError on a pose that is not rigid, an id seen before, or images that are not the camera's size.
+        """
+        T = _rigid(T_map_body, keyframe.id)
+        scan = self._extractor.extract(keyframe)
+        if scan is None:
+            return
+        self._store.add(keyframe.id, keyframe.t_ns, scan)
+        self._occupancy.add(keyframe.id, scan, T)
+
+    def move(self, update: GraphUpdate) -> None:
+        """Take over corrected poses, and re-integrate a bounded number of keyframes if some moved by a voxel."""
+        for keyframe_id, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
+            _rigid(T, keyframe_id)
+        self._occupancy.move(update.ids, update.T_map_body)
+        self._occupancy.advance(self._config.rebuild_keyframes_per_call)
+
+    def finish(self) -> None:
+        """Bring the map to exactly the newest poses, whatever it takes."""
+        self._occupancy.finish()
+
+    def keyframe_cloud(self, keyframe_id: int, voxel_m: float = 0.04) -> Cloud:
+        """Return one keyframe's points in its body frame, one per voxel; empty if it has none."""
+        if keyframe_id not in self._store:
+            return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+        return voxel_filter(self._points(self._store.scan(keyframe_id), np.eye(4)), voxel_m)
+
+    def cloud(self) -> Cloud:
+        """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
+        config = self._config
+        average = VoxelAverage(config.cloud_voxel_m)
+        sparse_only = True
+        for scan, T in self._scans():
+            sparse_only = sparse_only and scan.depth is None
+            average.add(self._points(scan, T))
+        fused = average.cloud(1 if sparse_only else config.cloud_min_points)
+        # what later rays passed through was a moving thing or a false match
+        fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
+        return without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma)
+
+    def grid(self) -> Grid:
+        """Return the navigation grid of the occupancy map."""
+        octree = self.occupancy.max_likelihood_octree()
+        floor_m = self._config.grid_floor_m
+        floor_m = floor_height_m(octree) if floor_m is None else floor_m
+        return navigation_grid(octree, floor_m, self._config.grid_low_m, self._config.grid_high_m)
+
+    def export(self, folder: Path) -> dict[str, Path]:
+        """Write cloud.ply, octomap.bt, grid.pgm with grid.yaml and, if asked for, mesh.ply; return what was written.
+
+        Each file is replaced whole. Raises StorageError when one cannot be written.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"{folder} cannot be made: {error.strerror}; choose another folder") from error
+        cloud = self.cloud()
+        written = {"cloud": folder / "cloud.ply", "octomap": folder / "octomap.bt"}
+        write_ply(written["cloud"], cloud.points_m, cloud.colors)
+        with replacing(written["octomap"]) as file:
+            file.write(encode_bt(self.occupancy.max_likelihood_octree()))
+        written["grid"], written["grid_yaml"] = write_grid(folder, self.grid())
+        if self._config.mesh:
+            mesh, reason = fuse_mesh(self._scans(), self._extractor.view, self._config.mesh_voxel_m)
+            if mesh is None:
+                self.notes["mesh"] = reason
+            else:
+                written["mesh"] = folder / "mesh.ply"
+                write_ply(written["mesh"], mesh.points_m, mesh.colors, mesh.triangles)
+        return written
+
+    def _scans(self) -> Iterator[tuple[Scan, Array]]:
+        for keyframe_id in self._store.ids:
+            yield self._store.scan(keyframe_id), self._occupancy.poses[keyframe_id]
+
+    def _points(self, scan: Scan, T_frame_body: Array) -> Cloud:
+        if scan.depth is not None:
+            points, pixels = surface_points(scan.depth, self._extractor.view, T_frame_body)
+            return Cloud(points, scan.colors.reshape(-1, 3)[pixels])
+        if scan.points_body_m is None:
+            return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+        points_body = scan.points_body_m.astype(np.float64)
+        return Cloud((points_body @ T_frame_body[:3, :3].T + T_frame_body[:3, 3]).astype(np.float32), scan.colors)
+
+
+def _rigid(T: Array, keyframe_id: int) -> Array:
+    """Return a copy of a pose; raises DataError when it is not a rigid transform."""
+    pose = np.array(T, dtype=np.float64)
+    rigid = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
+    if rigid:
+        R = pose[:3, :3]
+        rigid = bool(np.allclose(R @ R.T, np.eye(3), atol=_RIGID_TOLERANCE) and np.linalg.det(R) > 0.0)
+        rigid = rigid and bool(np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]))
+    if not rigid:
+        raise DataError(f"the map pose of keyframe {keyframe_id} is not a rigid transform: {pose.tolist()}")
+    return pose

@@ -1,0 +1,108 @@
+"""Binary little-endian PLY: clouds and meshes written in pieces, clouds read with memory bounded by the file's size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+from vislam.mapping.files import replacing
+
+Points = NDArray[np.float32]
+Colors = NDArray[np.uint8]
+
+_CHUNK = 1 << 16
+_MAX_HEADER_LINES = 100
+_MAX_LINE_BYTES = 1024
+_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+_FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+def write_ply(path: Path, points_m: Points, colors: Colors, triangles: NDArray[np.int32] | None = None) -> None:
+    """Write points [N, 3] with RGB colours [N, 3], and triangles [M, 3] of vertex indices if it is a mesh.
+
+    Raises StorageError when the file cannot be written.
+    """
+    faces = "" if triangles is None else f"element face {len(triangles)}\nproperty list uchar int vertex_indices\n"
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment vislam, metres in the map frame\n"
+        f"element vertex {len(points_m)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"property uchar red\nproperty uchar green\nproperty uchar blue\n{faces}end_header\n"
+    )
+    with replacing(path) as file:
+        file.write(header.encode())
+        for chunk in _chunks(len(points_m)):
+            rows = np.empty(chunk.stop - chunk.start, _VERTEX)
+            rows["xyz"], rows["rgb"] = points_m[chunk], colors[chunk]
+            file.write(rows.tobytes())
+        if triangles is not None:
+            for chunk in _chunks(len(triangles)):
+                faces_out = np.empty(chunk.stop - chunk.start, _FACE)
+                faces_out["corners"], faces_out["vertices"] = 3, triangles[chunk]
+                file.write(faces_out.tobytes())
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    for start in range(0, count, _CHUNK):
+        yield slice(start, min(start + _CHUNK, count))
+
+
+def read_ply(path: Path) -> tuple[Points, Colors]:
+    """Return vertices [N, 3] and RGB colours [N, 3] (grey 128 if it has none) of a binary little-endian PLY.
+
+    Raises DataError when it is something else or cut short; what a header promises is checked against the file's size
+    before memory is taken.
+    """
+    try:
+        with path.open("rb") as file:
+            count, vertex = _read_header(file, path)
+            available = path.stat().st_size - file.tell()
+            if count * vertex.itemsize > available:
+                raise DataError(
+                    f"{path} is cut: it promises {count} points of {vertex.itemsize} bytes, {available} bytes follow"
+                )
+            rows = np.fromfile(file, vertex, count)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float32)
+    if not {"red", "green", "blue"} <= set(vertex.names or ()):
+        return points, np.full((count, 3), 128, np.uint8)
+    return points, np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
+    """Return the number of vertices and their layout; the vertices must come first."""
+    lines = []
+    for _ in range(_MAX_HEADER_LINES):
+        line = file.readline(_MAX_LINE_BYTES).decode("ascii", errors="replace").strip()
+        lines.append(line)
+        if line == "end_header" or not line:
+            break
+    if lines[0] != "ply" or lines[-1] != "end_header":
+        raise DataError(f"{path} has no PLY header that ends within {_MAX_HEADER_LINES} lines")
+    if "format binary_little_endian 1.0" not in lines:
+        raise DataError(f"{path} is not a binary little-endian PLY; convert it first")
+    start = next((i for i, line in enumerate(lines) if line.startswith("element")), len(lines) - 1)
+    words = lines[start].split()
+    if words[:2] != ["element", "vertex"] or len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 12:
+        raise DataError(f"{path}: the first element must be 'element vertex COUNT', got '{lines[start]}'")
+    fields: list[tuple[str, str]] = []
+    for line in lines[start + 1 :]:
+        kind, *rest = line.split()
+        if kind != "property":
+            break
+        if len(rest) != 2 or rest[0] not in _TYPES or rest[1] in [name for name, _ in fields]:
+            raise DataError(f"{path}: a vertex property cannot be read: '{line}'")
+        fields.append((rest[1], _TYPES[rest[0]]))
+    if not {"x", "y", "z"} <= {name for name, _ in fields}:
+        raise DataError(f"{path}: vertices lack x, y, z; they have {[name for name, _ in fields]}")
+    return int(words[2]), np.dtype(fields)
