@@ -46,6 +46,14 @@ def open_dataset(uri: str) -> Recording:
 def survey(uri: str) -> Survey:
     """Return what `FORMAT:PATH` or a bare path holds, for `open_dataset` and `vislam doctor`; raises as it does."""
     name, path = _split(uri)
+    try:
+        return _reader(name, path).survey(path)
+    except OSError as error:  # a folder that may not be entered, a disk that fails
+        raise DataError(f"{error.filename or path} cannot be read: {error.strerror or error}") from error
+
+
+def _reader(name: str, path: Path) -> Reader:
+    """Return the reader of format `name`, or the one that recognises the path when it is empty."""
     if not path.exists():
         raise DataError(f"{path} does not exist; give the folder or file of a recording")
     if path.is_dir() and not any(path.iterdir()):
@@ -56,7 +64,7 @@ def survey(uri: str) -> Survey:
         raise DataError(f"{path} is no {name} recording: looked for {_wanted(name)}{hint}")
     if not fitting:
         raise DataError(f"{path} is no recording that vislam knows: looked for {_wanted(name)}")
-    return READERS[name or fitting[0]].survey(path)
+    return READERS[name or fitting[0]]
 
 
 def _split(uri: str) -> tuple[str, Path]:

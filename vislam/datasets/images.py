@@ -24,6 +24,7 @@ Result = TypeVar("Result")
 MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
 _HEAD_BYTES = 2**18  # enough to reach the size in a JPEG with an embedded preview and profile
 _TAIL_BYTES = 1024  # some cameras pad after the end mark
+_PNG_END, _JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"
 _GREY_OR_COLOR = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _RAW_DEPTH = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -117,7 +118,7 @@ def probe(path: Path) -> tuple[int, int]:
 
 def _checked_size(head: bytes, tail: bytes, path: Path) -> tuple[int, int]:
     size = image_size(head)
-    if size is None or (b"IEND" if head[0] == 0x89 else b"\xff\xd9") not in tail:
+    if size is None or (_PNG_END if head[0] == 0x89 else _JPEG_END) not in tail:
         raise UnreadableImageError("unreadable image", path)
     return size
 

@@ -82,6 +82,13 @@ def _unpaired(partners: NDArray[np.int64], others: int) -> int:
     return (len(partners) - paired) + (others - paired)
 
 
+def open_loader(survey: Survey, rig: Rig, frames: FrameTable) -> Loader:
+    """Return what loads the frames of a survey; close it after use. Raises DataError when a video cannot be opened."""
+    if survey.video is not None:
+        return VideoLoader(survey.video, survey.cameras[0].files, rig.cameras[0])
+    return FolderLoader(frames, survey.cameras, survey.depth, rig, survey.depth_units_per_m)
+
+
 class FileRecording:
     """A recording on disk that implements `vislam.recording.Recording`.
 
@@ -128,7 +135,7 @@ class FileRecording:
     def _check_first_images(self) -> None:
         """Compare the first readable image of each camera with its calibration, before a run starts."""
         if self._survey.video is not None:
-            self._open_loader().close()
+            open_loader(self._survey, self.rig, self._frames).close()
             return
         for column, (camera, stream) in enumerate(zip(self.rig.cameras, self._survey.cameras, strict=True)):
             for row in self._frames.camera_rows[:100, column]:
@@ -138,15 +145,9 @@ class FileRecording:
                 except UnreadableImageError:
                     continue
 
-    def _open_loader(self) -> Loader:
-        survey = self._survey
-        if survey.video is not None:
-            return VideoLoader(survey.video, survey.cameras[0].files, self.rig.cameras[0])
-        return FolderLoader(self._frames, survey.cameras, survey.depth, self.rig, survey.depth_units_per_m)
-
     def _read_frames(self) -> Generator[Frame, None, None]:
         gaps = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter)
-        with closing(self._open_loader()) as loader:
+        with closing(open_loader(self._survey, self.rig, self._frames)) as loader:
             index = 0
             with closing(decode_ahead(range(self.frame_count), loader.load, loader.workers)) as decoded:
                 for t_ns, loaded in zip(self._frames.t_ns.tolist(), decoded, strict=False):

@@ -1,0 +1,146 @@
+"""Images: sizes from headers, damage that decoders hide, matching by time, decoding ahead in order."""
+
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mini_recording import HEIGHT, WIDTH, picture
+
+from vislam.camera import Camera
+from vislam.datasets.images import (
+    UnreadableImageError,
+    decode_ahead,
+    image_size,
+    match_by_time,
+    probe,
+    read_depth,
+    read_grey_or_color,
+)
+from vislam.errors import DataError
+
+CAMERA = Camera(WIDTH, HEIGHT, 50.0, 50.0, 31.5, 23.5)
+
+
+@given(st.integers(1, 300), st.integers(1, 300), st.sampled_from([".png", ".jpg"]), st.booleans())
+def test_header_size_is_what_opencv_decodes(width: int, height: int, suffix: str, color: bool) -> None:
+    _, data = cv2.imencode(suffix, picture(0, (width, height), color))
+    assert image_size(data.tobytes()) == (width, height)
+
+
+@given(st.binary(max_size=64), st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"]))
+def test_any_bytes_give_a_size_or_none(data: bytes, magic: bytes) -> None:
+    size = image_size(magic + data)
+    assert size is None or len(size) == 2
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_cut_image_is_unreadable_not_grey(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    cv2.imwrite(str(path), picture(1))
+    grey, color = read_grey_or_color(path, CAMERA)
+    assert grey.shape == (HEIGHT, WIDTH) and color is None
+    data = path.read_bytes()
+    for kept in (0, 1, 30, len(data) // 2, len(data) - 3):
+        path.write_bytes(data[:kept])
+        with pytest.raises(UnreadableImageError, match="unreadable image"):
+            read_grey_or_color(path, CAMERA)
+        with pytest.raises(UnreadableImageError):
+            probe(path)
+
+
+def test_damage_in_the_middle_of_a_png_is_unreadable(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), picture(1))
+    data = bytearray(path.read_bytes())
+    data[200:260] = bytes(60)
+    path.write_bytes(data)
+    with pytest.raises(UnreadableImageError):
+        read_grey_or_color(path, CAMERA)
+
+
+def test_forged_size_is_refused_before_decoding(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), picture(1))
+    data = bytearray(path.read_bytes())
+    data[16:24] = (100_000).to_bytes(4, "big") * 2
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"a.png is 100000x100000 but its calibration is for 64x48"):
+        read_grey_or_color(path, CAMERA)
+
+
+def test_color_is_kept_and_made_grey(tmp_path: Path) -> None:
+    image = picture(2, color=True)
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    grey, color = read_grey_or_color(tmp_path / "a.png", CAMERA)
+    assert color is not None and np.array_equal(color, image)
+    assert np.array_equal(grey, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+
+
+def test_sixteen_bit_grey_as_in_tum_vi(tmp_path: Path) -> None:
+    image = picture(3).astype(np.uint16) * 256
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    grey, color = read_grey_or_color(tmp_path / "a.png", CAMERA)
+    assert color is None and np.array_equal(grey, picture(3))
+
+
+def test_depth_is_metres_and_must_be_sixteen_bit(tmp_path: Path) -> None:
+    raw = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH)
+    cv2.imwrite(str(tmp_path / "d.png"), raw)
+    depth_m = read_depth(tmp_path / "d.png", CAMERA, 5000.0)
+    assert depth_m.dtype == np.float32
+    np.testing.assert_allclose(depth_m, raw / 5000.0, rtol=1e-6)
+    cv2.imwrite(str(tmp_path / "e.png"), picture(1))
+    with pytest.raises(UnreadableImageError, match="not 16-bit"):
+        read_depth(tmp_path / "e.png", CAMERA, 5000.0)
+
+
+def greedy(a: list[int], b: list[int], tolerance: int) -> dict[int, int]:
+    """The benchmark's `associate.py`: all pairs by distance, closest first."""
+    pairs = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b) if abs(x - y) <= tolerance)
+    out: dict[int, int] = {}
+    for _, i, j in pairs:
+        if i not in out and j not in out.values():
+            out[i] = j
+    return out
+
+
+@given(st.sets(st.integers(0, 10**6), max_size=12), st.sets(st.integers(0, 10**6), max_size=12))
+def test_matching_equals_closest_first(a: set[int], b: set[int]) -> None:
+    first, second = sorted(a), sorted(b)
+    distances = [abs(x - y) for x in first for y in second]
+    if len(set(distances)) != len(distances):
+        return  # ties may be broken either way
+    partner = match_by_time(np.array(first, np.int64), np.array(second, np.int64), 200_000)
+    assert {i: int(j) for i, j in enumerate(partner) if j >= 0} == greedy(first, second, 200_000)
+
+
+def test_decoding_ahead_keeps_order_bounds_and_ends() -> None:
+    asked: list[int] = []
+    running = threading.active_count()
+
+    def jobs():
+        for i in range(1000):
+            asked.append(i)
+            yield i
+
+    stream = decode_ahead(jobs(), lambda i: i * i, workers=3, ahead=4)
+    assert [next(stream) for _ in range(20)] == [i * i for i in range(20)]
+    assert len(asked) <= 20 + 4 + 1
+    stream.close()
+    assert threading.active_count() == running
+
+
+def test_decoding_ahead_raises_in_its_place() -> None:
+    def load(i: int) -> int:
+        if i == 3:
+            raise DataError("third")
+        return i
+
+    stream = decode_ahead(range(10), load)
+    assert [next(stream), next(stream), next(stream)] == [0, 1, 2]
+    with pytest.raises(DataError, match="third"):
+        next(stream)

@@ -1,0 +1,354 @@
+"""What a recording holds and everything wrong with it, for `vislam doctor`; damaged recordings are its daily bread."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Camera, Rig
+from vislam.datasets import survey as survey_recording
+from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, probe, read_depth, read_grey_or_color
+from vislam.datasets.loaders import FrameTable
+from vislam.datasets.plausibility import (
+    EpipolarFacts,
+    ImuFacts,
+    camera_tilt_rad,
+    epipolar_facts,
+    gyro_turns,
+    imu_facts,
+    turn_disagreement,
+    turning_pairs,
+)
+from vislam.datasets.stream import Survey, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
+from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
+from vislam.errors import DataError
+from vislam.imu import ImuNoise
+
+Severity = Literal["ok", "warning", "error"]
+Stamps = NDArray[np.int64]
+
+_GRAVITY_M_S2 = 9.81
+_REST_TOLERANCE_M_S2 = 0.3  # bias and scale of a cheap accelerometer
+_MOVING_TOLERANCE_M_S2 = 1.0  # what an honest journey may average to
+_MAX_TILT_RAD = np.deg2rad(60.0)
+_MIN_IMU_RATE_HZ = 50.0  # below it, preintegration between frames of 20 Hz has next to nothing to integrate
+_DECODED_PER_CAMERA = 200  # each image's head and end are read, and so many, spread evenly, are decoded
+_CHECKED_PAIRS = 6
+_CHECKED_TURNS = 12
+_MIN_TURNS = 3
+_POOR_TURNS, _WRONG_TURNS = 0.35, 0.7  # of the turn; right calibrations stay below 0.2, inverted ones reach 1 and more
+_MIN_MATCHES = 60
+_MIN_ON_LINE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was checked: what came out, where, and what to do about it (empty when nothing)."""
+
+    severity: Severity
+    what: str
+    where: str
+    next_step: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSummary:
+    """One stream of a recording; rates are those of the usual period."""
+
+    name: str
+    count: int
+    rate_hz: float  # NaN when there are fewer than two
+    first_t_ns: int
+    last_t_ns: int
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """What a recording holds and what was found."""
+
+    source: str
+    format: str
+    duration_s: float
+    size_bytes: int
+    streams: tuple[StreamSummary, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def worst(self) -> Severity:
+        """The worst severity among the findings."""
+        return max((f.severity for f in self.findings), key=("ok", "warning", "error").index, default="ok")
+
+
+def _camera_of(rig: Rig | None, index: int) -> Camera | None:
+    return rig.cameras[index] if rig is not None and index < len(rig.cameras) else None
+
+
+def inspect(uri: str) -> Inspection:
+    """Examine `FORMAT:PATH` or a bare path.
+
+    Raises UsageError or DataError only when there is no recording to look at: a wrong name, an empty folder.
+    """
+    found = survey_recording(uri)
+    problems = Problems()
+    problems.update(found.problems)
+    inspector = _Inspector(found, problems)
+    return inspector.run(uri)
+
+
+class _Inspector:
+    """Goes through one survey and collects findings; each check stands alone, so that one failure hides no other."""
+
+    def __init__(self, found: Survey, problems: Problems) -> None:
+        self._found = found
+        self._problems = problems
+        self._findings: list[Finding] = [Finding("error", str(error), str(found.root)) for error in found.errors]
+        self._streams: list[StreamSummary] = []
+        self._size_bytes = 0
+
+    def run(self, uri: str) -> Inspection:
+        found = self._found
+        frames = frame_table(found, self._problems) if found.cameras else None
+        self._check_cameras(frames)
+        facts = self._check_imu()
+        if frames is not None and facts is not None:
+            self._check_overlap(frames.t_ns, facts.t_ns, "IMU")
+        self._check_geometry(frames, facts)
+        self._check_truth(frames)
+        for kind, count in self._problems.items():
+            self._add_problem(kind, count, frames)
+        ends = [(s.first_t_ns, s.last_t_ns) for s in self._streams if s.count]
+        duration_ns = max(end for _, end in ends) - min(begin for begin, _ in ends) if ends else 0
+        return Inspection(
+            source=uri,
+            format=found.format,
+            duration_s=duration_ns * 1e-9,
+            size_bytes=self._size_bytes,
+            streams=tuple(self._streams),
+            findings=tuple(sorted(self._findings, key=lambda f: ("error", "warning", "ok").index(f.severity))),
+        )
+
+    def _add(self, severity: Severity, what: str, where: str, next_step: str = "") -> None:
+        self._findings.append(Finding(severity, what, where, next_step if severity != "ok" else ""))
+
+    def _add_problem(self, kind: str, count: int, frames: FrameTable | None) -> None:
+        total = len(frames.t_ns) if frames is not None else 0
+        minor = kind == "frame without depth" and count < 0.2 * total
+        self._add("ok" if minor else "warning", f"{kind}: {count}", self._found.root.name, "skipped when it is run")
+
+    def _check_stream(self, name: str, t_ns: Stamps, limit_s: float, declared_hz: float | None) -> None:
+        """Summarise a stream and judge its rate and gaps."""
+        steps_s = np.diff(t_ns) * 1e-9
+        if not len(t_ns):
+            self._add("error", f"{name} is empty", name, "record again, or remove the sensor's folder")
+            return
+        rate_hz = 1.0 / float(np.median(steps_s)) if len(steps_s) else float("nan")
+        longest = float(steps_s.max()) if len(steps_s) else 0.0
+        self._streams.append(StreamSummary(name, len(t_ns), rate_hz, int(t_ns[0]), int(t_ns[-1]), longest))
+        for i in np.argsort(-steps_s, kind="stable")[:3]:
+            if steps_s[i] > limit_s:
+                gap = f"gap of {steps_s[i]:.2f} s at t={t_ns[i] * 1e-9:.3f} s"
+                self._add("warning", f"{name}: {gap}", name, "the run bridges it if another sensor covers it")
+        late = float(np.mean(steps_s > 1.5 / rate_hz)) if len(steps_s) else 0.0
+        if late > 0.02:
+            what = f"{name}: {100 * late:.0f} % of the intervals are over 1.5 periods"
+            self._add("warning", what, name, "samples were dropped or stamped late; record at a lower load")
+        if declared_hz and abs(rate_hz / declared_hz - 1.0) > 0.1:
+            what = f"{name}: {rate_hz:.1f} Hz, but its sensor file says {declared_hz:.1f} Hz"
+            self._add("warning", what, name, "correct rate_hz")
+        elif len(steps_s):
+            self._add("ok", f"{name}: {len(t_ns)} at {rate_hz:.1f} Hz, longest gap {longest:.3f} s", name)
+
+    def _check_cameras(self, frames: FrameTable | None) -> None:
+        found = self._found
+        if not found.cameras:
+            self._add("error", "no camera images", str(found.root), "this can be evaluated but not run")
+        streams = [*found.cameras, *([found.depth] if found.depth is not None else [])]
+        for index, images in enumerate(streams):
+            self._check_stream(images.name, images.t_ns, gap_limit_s(images.t_ns), images.rate_hz)
+            if found.video is None:
+                is_depth = images is found.depth
+                self._check_images(images, _camera_of(found.rig, 0 if is_depth else index), is_depth)
+        if found.video is not None:
+            self._size_bytes += found.video.stat().st_size
+        if frames is not None and not len(frames.t_ns):
+            self._add("error", "no frame: the cameras share no stamps", str(found.root), "synchronise the cameras")
+
+    def _check_images(self, images: ImageList, camera: Camera | None, is_depth: bool) -> None:
+        """Probe every image, decode some, and tell which cannot be used."""
+        bad: dict[str, list[Path]] = {}
+        stride = max(1, len(images.files) // _DECODED_PER_CAMERA)
+        decoded = 0
+        for i in range(len(images.files)):
+            path = images.path(i)
+            try:
+                size = probe(path)
+                self._size_bytes += path.stat().st_size
+                if camera is None:
+                    continue
+                check_size_px(size, camera, path)
+                if i % stride == 0:
+                    decoded += 1
+                    _ = read_depth(path, camera, 1.0) if is_depth else read_grey_or_color(path, camera)
+            except UnreadableImageError as error:
+                bad.setdefault(error.kind, []).append(path)
+            except DataError as error:
+                bad.setdefault(f"image of wrong size ({error})", []).append(path)
+        for kind, paths in bad.items():
+            hopeless = kind.startswith("image of wrong") or len(paths) > len(images.files) // 2
+            severity: Severity = "error" if hopeless else "warning"
+            what = f"{images.name}: {len(paths)} of {len(images.files)}: {kind}"
+            self._add(severity, what, str(paths[0]), "copy the files again; the run skips what it cannot read")
+        if not bad and images.files:
+            self._add("ok", f"{images.name}: all images are there, {decoded} of them decoded", images.name)
+
+    def _rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        assert self._found.imu_file is not None
+        return in_time_order(read_numbers(self._found.imu_file, 6, problems), problems, "imu")
+
+    def _check_imu(self) -> ImuFacts | None:
+        if self._found.imu_file is None:
+            self._add("ok", "no IMU: vision alone gives the motion", str(self._found.root))
+            return None
+        self._size_bytes += self._found.imu_file.stat().st_size
+        try:
+            facts = imu_facts(self._rows(self._problems))
+        except DataError as error:
+            self._add("error", str(error), str(self._found.imu_file))
+            return None
+        noise = self._found.imu_noise
+        declared_hz = noise.rate_hz if noise is not None else 0.0
+        self._check_stream("imu0", facts.t_ns, imu_gap_limit_s(declared_hz), declared_hz)
+        if len(facts.window_t_ns) == 0:
+            return None
+        self._check_gravity(facts)
+        self._check_gyro(facts, noise)
+        return facts
+
+    def _check_gravity(self, facts: ImuFacts) -> None:
+        rest = bool(facts.at_rest.any())
+        force = facts.accel_mean[facts.at_rest] if rest else facts.accel_mean
+        norm = float(np.linalg.norm(force.mean(axis=0))) if not rest else float(np.linalg.norm(force, axis=1).mean())
+        state = f"over {int(facts.at_rest.sum()) * 0.5:.1f} s at rest" if rest else "on average (never at rest)"
+        what = f"specific force {norm:.2f} m/s^2 {state}"
+        off = abs(norm - _GRAVITY_M_S2)
+        if abs(norm - 1.0) < 0.1:
+            self._add("error", f"{what}: the unit seems to be g", "imu0", f"multiply by {_GRAVITY_M_S2}")
+        elif norm < 0.5 * _GRAVITY_M_S2:
+            self._add("error", f"{what}: gravity is missing", "imu0", "record raw data, with gravity, in m/s^2")
+        elif off > (_REST_TOLERANCE_M_S2 if rest else _MOVING_TOLERANCE_M_S2):
+            self._add("warning", f"{what}, expected {_GRAVITY_M_S2}", "imu0", "calibrate the accelerometer")
+        else:
+            self._add("ok", what, "imu0")
+
+    def _check_gyro(self, facts: ImuFacts, noise: ImuNoise | None) -> None:
+        rate = np.linalg.norm(facts.gyro_mean, axis=1)
+        if float(np.median(rate)) > 10.0 or float(rate.max()) > 40.0:
+            self._add(
+                "error", f"gyro of up to {rate.max():.0f} rad/s: the unit seems to be deg/s", "imu0", "convert it"
+            )
+        period_ns = float(np.median(np.diff(facts.t_ns))) if len(facts.t_ns) > 1 else 0.0
+        if period_ns > 1e9 / _MIN_IMU_RATE_HZ:
+            self._add("warning", f"only {1e9 / period_ns:.0f} Hz of IMU", "imu0", "100 Hz or more serve better")
+        if noise is None and not self._found.errors:
+            self._add("error", "the IMU has no noise model", "imu0", "write its sensor.yaml, see docs/formats.md")
+
+    def _check_overlap(self, frame_t_ns: Stamps, t_ns: Stamps, what: str) -> None:
+        """Judge how many frames lie within the time of another stream."""
+        if not len(frame_t_ns) or not len(t_ns):
+            return
+        outside = int(np.count_nonzero((frame_t_ns < t_ns[0]) | (frame_t_ns > t_ns[-1])))
+        where = f"{what} {t_ns[0] * 1e-9:.3f} to {t_ns[-1] * 1e-9:.3f} s"
+        if outside == len(frame_t_ns):
+            self._add("error", f"no frame lies within the time of the {what}", where, "stamp both with one clock")
+        elif outside:
+            text = f"{outside} of {len(frame_t_ns)} frames lie outside the time of the {what}"
+            minor = what != "IMU" and outside < 0.05 * len(frame_t_ns)
+            self._add("ok" if minor else "warning", text, where, "start it earlier and stop it later")
+        else:
+            self._add("ok", f"every frame lies within the time of the {what}", where)
+
+    def _check_geometry(self, frames: FrameTable | None, facts: ImuFacts | None) -> None:
+        """Compare calibration with images and gravity, as far as all of them are there."""
+        rig = self._found.rig
+        if rig is None or frames is None or not len(frames.t_ns):
+            return
+        try:
+            if rig.is_stereo:
+                self._judge_stereo(self._stereo_facts(rig, frames))
+            if facts is not None:
+                self._judge_extrinsics(rig, facts, self._disagreements(rig, frames, facts))
+        except DataError as error:
+            self._add("error", str(error), str(self._found.root))
+
+    def _stereo_facts(self, rig: Rig, frames: FrameTable) -> EpipolarFacts:
+        chosen = np.unique(np.linspace(0, len(frames.t_ns) - 1, _CHECKED_PAIRS).astype(int))
+        with closing(open_loader(self._found, rig, frames)) as loader:
+            loaded = [loader.load(int(i)).images for i in chosen]
+        return epipolar_facts(rig, [(images[0], images[1]) for images in loaded if images])
+
+    def _judge_stereo(self, facts: EpipolarFacts) -> None:
+        what = f"stereo: {100 * facts.on_line:.0f} % of {facts.matches} matches lie on their epipolar line"
+        if facts.matches < _MIN_MATCHES:
+            self._add("warning", f"stereo: only {facts.matches} matches, too few to judge", "cam1", "more texture")
+        elif facts.on_line < _MIN_ON_LINE:
+            step = "check T_BS of both cameras, and that their images are not swapped"
+            self._add("error", f"{what}: the extrinsics do not fit", "cam1", step)
+        elif facts.in_front < _MIN_ON_LINE:
+            self._add("error", f"{what}, but behind the cameras", "cam1", "cam0 and cam1 seem to be swapped")
+        else:
+            self._add("ok", what, "cam1")
+
+    def _disagreements(self, rig: Rig, frames: FrameTable, facts: ImuFacts) -> list[float]:
+        """Return for the strongest turns how far image and gyro disagree, as fractions of the turn."""
+        pairs = turning_pairs(facts, frames.t_ns, _CHECKED_TURNS)
+        spans = [(int(frames.t_ns[first]), int(frames.t_ns[last])) for first, last in pairs]
+        turns = gyro_turns(self._rows(Problems()), spans, facts.gyro_bias_rad_s)
+        ratios: list[float | None] = []
+        with closing(open_loader(self._found, rig, frames)) as loader:
+            for (first, last), turn in zip(pairs, turns, strict=True):
+                loaded = [loader.load(i) for i in range(first, last + 1)]
+                if turn is not None and all(part.images for part in loaded):
+                    images = [part.images[0] for part in loaded]
+                    ratios.append(turn_disagreement(rig.cameras[0], rig.T_body_cams[0][:3, :3], images, turn))
+        return [ratio for ratio in ratios if ratio is not None]
+
+    def _judge_extrinsics(self, rig: Rig, facts: ImuFacts, ratios: list[float]) -> None:
+        tilt_rad = camera_tilt_rad(facts, rig)
+        tilt = f"gravity is {np.rad2deg(tilt_rad):.0f} deg from the vertical of cam0's image"
+        ratio = float(np.median(ratios)) if len(ratios) >= _MIN_TURNS else float("nan")
+        what = f"turns seen by cam0 and by the gyro differ by {100 * ratio:.0f} % in {len(ratios)} places"
+        step = "check the rotation in T_BS (is it the camera in the body, not the body in the camera?) and the clocks"
+        if ratio > _WRONG_TURNS:
+            self._add("error", f"{what}: extrinsics or time stamps are wrong", "cam0", step)
+        elif ratio > _POOR_TURNS:
+            self._add("warning", what, "cam0", step)
+        elif not np.isnan(ratio):
+            self._add("ok", what, "cam0")
+        if tilt_rad < _MAX_TILT_RAD or ratio <= _POOR_TURNS:
+            self._add("ok", tilt, "cam0")
+        else:
+            step = "fine if the camera is mounted so; else check T_BS and that the accelerometer at rest reads +g up"
+            self._add("warning", tilt, "cam0", step)
+
+    def _check_truth(self, frames: FrameTable | None) -> None:
+        if self._found.truth is None:
+            self._add("ok", "no truth: it can be run but not scored", str(self._found.root))
+            return
+        try:
+            truth = self._found.truth(self._problems)
+        except DataError as error:
+            self._add("warning", f"truth cannot be used: {error}", str(self._found.root), "repair or remove it")
+            return
+        if truth is None or not len(truth.t_ns):
+            self._add("warning", "the truth holds no pose", str(self._found.root), "repair or remove it")
+            return
+        self._check_stream("truth", truth.t_ns, float("inf"), None)
+        if frames is not None:
+            self._check_overlap(frames.t_ns, truth.t_ns, "truth")

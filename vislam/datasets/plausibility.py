@@ -1,0 +1,217 @@
+"""Does a recording fit its calibration? Checks of physics without SLAM: gravity, gyro against image, epipolar lines.
+
+They return numbers; `inspect.py` judges them.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Camera, Rig
+from vislam.datasets.tables import Row
+from vislam.geometry import invert, skew, so3_exp, so3_log
+from vislam.messages import ImageU8
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+_WINDOW_NS = 500_000_000
+_REST_GYRO_STD, _REST_ACCEL_STD = 0.05, 0.3  # rad/s, m/s^2: a hand or an idling motor shakes more
+_REST_GYRO_MEAN = 0.2  # rad/s: above any sane gyro bias
+_CORNERS = 300
+_MIN_TRACKS = 40
+_MATCH_RATIO = 0.8
+_EPIPOLAR_LIMIT_PX = 2.0
+_TURN_SPAN_NS = 200_000_000
+_MIN_TURN_RAD = np.deg2rad(3.0)  # a smaller turn tells little beside bias and noise of a few tracks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuFacts:
+    """Inertial data at a glance: stamps [N] and statistics of windows of half a second [W]."""
+
+    t_ns: Stamps
+    window_t_ns: Stamps  # [W] begin
+    accel_mean: Array  # [W, 3]
+    gyro_mean: Array  # [W, 3]
+    at_rest: NDArray[np.bool_]  # [W]
+
+    @property
+    def gyro_bias_rad_s(self) -> Array:
+        """Mean rate [3] over the windows at rest; zero when there are none."""
+        return np.asarray(self.gyro_mean[self.at_rest].mean(axis=0)) if self.at_rest.any() else np.zeros(3)
+
+
+def imu_facts(rows: Iterable[Row[list[float]]]) -> ImuFacts:
+    """Return the facts of inertial rows (gyro, then accelerometer) in time order; only stamps are kept of them."""
+    stamps = array("q")
+    windows: list[tuple[int, Array, Array]] = []
+    current: list[list[float]] = []
+
+    def finish() -> None:
+        if len(current) > 1:
+            values = np.array(current)
+            windows.append((begin_ns, values.mean(axis=0), values.std(axis=0)))
+
+    begin_ns = 0
+    for t_ns, values in rows:
+        if not current or t_ns - begin_ns >= _WINDOW_NS:
+            finish()
+            current, begin_ns = [], t_ns
+        current.append(values)
+        stamps.append(t_ns)
+    finish()
+    means = np.array([window[1] for window in windows]).reshape(-1, 6)
+    stds = np.array([window[2] for window in windows]).reshape(-1, 6)
+    still = (np.linalg.norm(stds[:, :3], axis=1) < _REST_GYRO_STD) & (
+        np.linalg.norm(stds[:, 3:], axis=1) < _REST_ACCEL_STD
+    )
+    return ImuFacts(
+        t_ns=np.array(stamps, dtype=np.int64),
+        window_t_ns=np.array([window[0] for window in windows], dtype=np.int64),
+        accel_mean=means[:, 3:],
+        gyro_mean=means[:, :3],
+        at_rest=still & (np.linalg.norm(means[:, :3], axis=1) < _REST_GYRO_MEAN),
+    )
+
+
+def camera_tilt_rad(facts: ImuFacts, rig: Rig) -> float:
+    """Return the angle between up, as the accelerometer feels it, and the top of cam0's image, through `T_BS`."""
+    chosen = facts.accel_mean[facts.at_rest] if facts.at_rest.any() else facts.accel_mean
+    up_cam = rig.T_body_cams[0][:3, :3].T @ chosen.mean(axis=0)
+    return float(np.arccos(np.clip(-up_cam[1] / max(float(np.linalg.norm(up_cam)), 1e-9), -1.0, 1.0)))
+
+
+def turning_pairs(facts: ImuFacts, frame_t_ns: Stamps, count: int) -> list[tuple[int, int]]:
+    """Return up to `count` pairs of frames some 0.2 s apart, from the windows in which the body turns most."""
+    rate = np.linalg.norm(facts.gyro_mean - facts.gyro_bias_rad_s, axis=1)
+    pairs = []
+    for window in np.argsort(-rate, kind="stable"):
+        begin_ns = int(facts.window_t_ns[window])
+        first = int(np.searchsorted(frame_t_ns, begin_ns))
+        last = int(np.searchsorted(frame_t_ns, begin_ns + _TURN_SPAN_NS, side="right")) - 1
+        if last > first:
+            pairs.append((first, last))
+        if len(pairs) == count:
+            break
+    return sorted(pairs)
+
+
+def gyro_turns(
+    rows: Iterable[Row[list[float]]], spans_ns: Sequence[tuple[int, int]], bias_rad_s: Array
+) -> list[Array | None]:
+    """Return R_begin_end [3, 3] of the body over each span, integrated from inertial rows; None where they are thin."""
+    turns = [np.eye(3) for _ in spans_ns]
+    covered = [0 for _ in spans_ns]
+    previous: tuple[int, Array] | None = None
+    for t_ns, values in rows:
+        rate = np.array(values[:3]) - bias_rad_s
+        if previous is not None:
+            mean = 0.5 * (rate + previous[1])
+            for i, (begin_ns, end_ns) in enumerate(spans_ns):
+                part_ns = min(t_ns, end_ns) - max(previous[0], begin_ns)
+                if part_ns > 0 and t_ns - previous[0] < _WINDOW_NS:
+                    turns[i] = turns[i] @ so3_exp(mean * (part_ns * 1e-9))
+                    covered[i] += part_ns
+        previous = (t_ns, rate)
+    return [
+        turn if covered[i] > 0.99 * (end - begin) else None
+        for i, (turn, (begin, end)) in enumerate(zip(turns, spans_ns, strict=True))
+    ]
+
+
+def turn_disagreement(camera: Camera, R_body_cam: Array, images: Sequence[ImageU8], R_begin_end: Array) -> float | None:
+    """Return how far the turn seen in images of one span is from the gyro's, as a fraction of the turn.
+
+    About 0 when `R_body_cam` and the time stamps are right, about 1 or more when not; None when the body turns too
+    little or the images track too badly. The turn of the images is that of their essential matrix (Nister, 2004).
+    """
+    R_gyro = R_body_cam.T @ R_begin_end @ R_body_cam
+    angle = float(np.linalg.norm(so3_log(R_gyro)))
+    tracks = _track(images)
+    if angle < _MIN_TURN_RAD or tracks is None:
+        return None
+    first, last = camera.normalise(tracks[0]), camera.normalise(tracks[1])
+    usable = np.all(np.isfinite(np.hstack([first, last])), axis=1)
+    if int(usable.sum()) < _MIN_TRACKS:
+        return None
+    first, last = np.ascontiguousarray(first[usable]), np.ascontiguousarray(last[usable])
+    cv2.setRNGSeed(0)
+    E, inliers = cv2.findEssentialMat(first, last, np.eye(3), cv2.RANSAC, 0.999, 1.5 / camera.fx)
+    if E is None or E.shape != (3, 3):
+        return None
+    _, R_last_first, _, _ = cv2.recoverPose(E, first, last, np.eye(3), mask=inliers)
+    return float(np.linalg.norm(so3_log(np.ascontiguousarray(R_gyro.T @ R_last_first.T)))) / angle
+
+
+def _track(images: Sequence[ImageU8]) -> tuple[Array, Array] | None:
+    """Return pixels [N, 2] in the first and the last of consecutive images, followed by Lucas-Kanade."""
+    start = cv2.goodFeaturesToTrack(images[0], _CORNERS, 0.01, 12.0)
+    if start is None or len(start) < _MIN_TRACKS:
+        return None
+    points, kept = start, np.ones(len(start), dtype=bool)
+    for before, after in pairwise(images):
+        points, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(21, 21), maxLevel=4)
+        kept &= status.ravel() == 1
+    if int(kept.sum()) < _MIN_TRACKS:
+        return None
+    return start[kept].reshape(-1, 2).astype(np.float64), points[kept].reshape(-1, 2).astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class EpipolarFacts:
+    """How matched features of stereo pairs fit the extrinsics."""
+
+    matches: int
+    on_line: float  # fraction of matches within 2 px of their epipolar line
+    in_front: float  # fraction of those that lie in front of both cameras
+
+
+def epipolar_facts(rig: Rig, pairs: Iterable[tuple[ImageU8, ImageU8]]) -> EpipolarFacts:
+    """Match ORB features between the cameras and compare with the epipolar geometry of the rig."""
+    T_cam1_cam0 = invert(rig.T_cam0_cam1)
+    R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
+    E = skew(t) @ R
+    matches, on_line, in_front = 0, 0, 0
+    for left, right in pairs:
+        pixels = _match(left, right)
+        first, second = rig.cameras[0].unproject(pixels[:, :2]), rig.cameras[1].unproject(pixels[:, 2:])
+        usable = np.all(np.isfinite(np.hstack([first, second])), axis=1)
+        first, second = first[usable], second[usable]
+        lines1, lines0 = first @ E.T, second @ E
+        slope = np.sum(lines1[:, :2] ** 2, axis=1) + np.sum(lines0[:, :2] ** 2, axis=1)
+        sampson_px = np.abs(np.sum(second * lines1, axis=1)) / np.sqrt(np.maximum(slope, 1e-18)) * rig.cameras[0].fx
+        close = sampson_px < _EPIPOLAR_LIMIT_PX
+        matches += len(first)
+        on_line += int(close.sum())
+        in_front += _count_in_front(first[close] @ R.T, second[close], t)
+    return EpipolarFacts(matches, on_line / max(matches, 1), in_front / max(on_line, 1))
+
+
+def _match(left: ImageU8, right: ImageU8) -> Array:
+    """Return matched pixels [N, 4] (left x, y, right x, y) that pass the ratio test."""
+    orb = cv2.ORB.create(nfeatures=800)
+    points0, descriptors0 = orb.detectAndCompute(left, None)
+    points1, descriptors1 = orb.detectAndCompute(right, None)
+    if descriptors0 is None or descriptors1 is None or len(points1) < 2:
+        return np.empty((0, 4))
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(descriptors0, descriptors1, k=2)
+    good = [m[0] for m in pairs if len(m) == 2 and m[0].distance < _MATCH_RATIO * m[1].distance]
+    return np.array([[*points0[m.queryIdx].pt, *points1[m.trainIdx].pt] for m in good]).reshape(-1, 4)
+
+
+def _count_in_front(rays0: Array, rays1: Array, t: Array) -> int:
+    """Count points with positive depth on both rays: least squares of depth0 * ray0 + t = depth1 * ray1, cam1 axes."""
+    a, b, c = np.sum(rays0**2, axis=1), np.sum(rays0 * rays1, axis=1), np.sum(rays1**2, axis=1)
+    d, e = rays0 @ t, rays1 @ t
+    # times the determinant a c - b b, which is never negative and near zero for points far away: those count as seen
+    depth0, depth1 = b * e - c * d, a * e - b * d
+    far = (a * c - b * b) < 1e-6 * a * c
+    return int(np.count_nonzero(far | ((depth0 > 0.0) & (depth1 > 0.0))))
