@@ -144,7 +144,7 @@ class RunViewer:
         known = len(self._groups)
         for name, value in values.items():
             self._groups.setdefault(name.partition("/")[0])
-            self._stream.log(f"plots/{name}", rr.Scalars(float(value)))
+            self._stream.log(["plots", *name.split("/")], rr.Scalars(float(value)))
         if len(self._groups) > known:
             self._stream.send_blueprint(self._blueprint())
 
@@ -181,7 +181,8 @@ class RunViewer:
         self._stream.log(
             "status/tracking",
             rr.StateConfiguration(
-                values=[state.value for state in _TRACKING_COLORS], colors=list(_TRACKING_COLORS.values())
+                values=[state.value for state in _TRACKING_COLORS],
+                colors=np.array(list(_TRACKING_COLORS.values()), np.uint32),
             ),
             static=True,
         )
@@ -193,7 +194,6 @@ class RunViewer:
                 resolution=[small.width, small.height],
                 camera_xyz=rr.ViewCoordinates.RDF,
                 image_plane_distance=0.3,
-                line_width=1.0,
             )
             self._stream.log(_CAMERA, _transform(self._rig.T_body_cams[0]), pinhole, static=True)
         self._stream.send_blueprint(self._blueprint())
@@ -263,7 +263,7 @@ class RunViewer:
         world = rrb.Spatial3DView(
             origin="world",
             name="world",
-            contents=["$origin/**", "- world/loops/rejected", "- world/ekf/**"],
+            contents=["$origin/**", "- world/loops/rejected", f"- {_CAMERA}/image/**"],
             background=[20, 22, 26],
             eye_controls=self._eye(),
         )
@@ -283,7 +283,7 @@ class RunViewer:
         centre = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
         extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2.0)
         return rrb.EyeControls3D(
-            position=centre + extent * np.array([-0.6, -0.9, 0.9]), look_target=centre, eye_up=[0.0, 0.0, 1.0]
+            position=centre + extent * np.array([-0.8, -1.1, 1.2]), look_target=centre, eye_up=[0.0, 0.0, 1.0]
         )
 
 
