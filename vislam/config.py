@@ -47,7 +47,8 @@ class FrontEndConfig:
     flow_levels: int = 3  # pyramid levels above the image: reach of about 80 px around the predicted place
     max_back_px: float = 0.7  # forward-backward disagreement of a good match
     max_misses: int = 2  # frames in a row that a track may fail before it is dropped
-    track_sigma_px: float = 0.3  # Lucas-Kanade noise in one image
+    readout_s: float = 0.0  # rolling shutter: time between the first and the last row; 0 is global
+    track_sigma_px: float = 0.6  # Lucas-Kanade noise in one image
 
     min_depth_m: float = 0.3  # nearer is out of focus or out of range
     max_depth_m: float = 8.0  # of depth images: beyond, structured light guesses
@@ -188,6 +189,7 @@ class GraphConfig:
     consistency_inflation: float = 3.0  # on odometry sigma; loops are parked because odometry is overconfident
     consistency_max_sigma_m: float = 0.5  # odometry looser than this between two loops proves nothing
     consistency_max_sigma_deg: float = 5.0
+    vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +261,8 @@ class MapConfig:
     move_voxels: float = 1.0  # a keyframe corrected by more than this many voxels is integrated again
     move_deg: float = 1.0  # or turned by more than this: 7 cm at 4 m
     rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 5 ms each
-    cloud_voxel_m: float = 0.02  # one averaged point per voxel in cloud.ply
+    cloud_voxel_m: float = 0.01  # one averaged point per voxel in cloud.ply
+    cloud_max_points: int = 1_500_000  # a larger cloud gets larger voxels: 22 MB
     cloud_min_points: int = 2  # depth pixels that must agree on a voxel of the cloud
     cloud_neighbours: int = 12  # statistical outlier removal: mean distance to so many neighbours
     cloud_outlier_sigma: float = 2.5  # may exceed the average by so many standard deviations

@@ -9,7 +9,6 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vislam.errors import DataError
 from vislam.mapping.blocks import find_slot
 
 Points = NDArray[np.float32]
@@ -17,7 +16,7 @@ Colors = NDArray[np.uint8]
 
 _KEY_BITS = 21
 _KEY_HALF = 1 << (_KEY_BITS - 1)
-_MAX_POINTS = 1 << 26  # 67 million: 5 GB while fusing
+_COARSER = 1.5  # a cloud that gets too large gets voxels larger by this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,18 +42,20 @@ def _rehash(table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(points: Points, colors: Colors, voxel_m: float, hashed: tuple[NDArray[np.int64], NDArray[np.int32]],
+def _voxel(x: float, y: float, z: float, voxel_m: float) -> int:
+    """Return the packed key of a point's voxel, or -1 when it is not finite or absurdly far."""
+    a, b, c = np.floor(x / voxel_m), np.floor(y / voxel_m), np.floor(z / voxel_m)
+    if not (abs(a) < _KEY_HALF and abs(b) < _KEY_HALF and abs(c) < _KEY_HALF):
+        return -1
+    return ((int(a) + _KEY_HALF) << _KEY_BITS | (int(b) + _KEY_HALF)) << _KEY_BITS | (int(c) + _KEY_HALF)
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(points: Points, colors: Colors, voxel_m: float, table: NDArray[np.int64], rows: NDArray[np.int32],
                 keys: NDArray[np.int64], sums: NDArray[np.float64], count: int) -> int:  # fmt: skip
-    table, rows = hashed
     for i in range(len(points)):
-        key = np.int64(0)
-        inside = True
-        for axis in range(3):
-            scaled = np.floor(np.float64(points[i, axis]) / voxel_m)
-            inside = inside and abs(scaled) < _KEY_HALF  # false for NaN
-            if inside:
-                key = (key << _KEY_BITS) | (np.int64(scaled) + _KEY_HALF)
-        if not inside:
+        key = _voxel(np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]), voxel_m)
+        if key < 0:
             continue
         slot = find_slot(table, key)
         if table[slot] < 0:
@@ -69,11 +70,31 @@ def _accumulate(points: Points, colors: Colors, voxel_m: float, hashed: tuple[ND
     return count
 
 
-class VoxelAverage:
-    """Averages position and colour of the points in each voxel, over any number of clouds, in bounded memory."""
+@njit(cache=True, nogil=True)
+def _coarsen(old: NDArray[np.float64], voxel_m: float, table: NDArray[np.int64], rows: NDArray[np.int32],
+             keys: NDArray[np.int64], sums: NDArray[np.float64]) -> int:  # fmt: skip
+    count = 0
+    for i in range(len(old)):
+        weight = old[i, 6]
+        key = _voxel(old[i, 0] / weight, old[i, 1] / weight, old[i, 2] / weight, voxel_m)
+        slot = find_slot(table, key)
+        if table[slot] < 0:
+            table[slot], rows[slot], keys[count] = key, count, key
+            sums[count, :] = 0.0
+            count += 1
+        sums[rows[slot]] += old[i]
+    return count
 
-    def __init__(self, voxel_m: float) -> None:
-        self._voxel_m = voxel_m
+
+class VoxelAverage:
+    """Averages position and colour of the points in each voxel, over any number of clouds, in bounded memory.
+
+    When more than `max_points` voxels are in use, they are merged into larger ones.
+    """
+
+    def __init__(self, voxel_m: float, max_points: int = 1 << 22) -> None:
+        self.voxel_m = voxel_m
+        self._max_points = max_points
         self._count = 0
         self._keys = np.empty(1 << 12, np.int64)
         self._sums = np.empty((1 << 12, 7), np.float64)  # position, colour, number of points
@@ -81,12 +102,19 @@ class VoxelAverage:
         self._rows = np.zeros(1 << 14, np.int32)
 
     def add(self, cloud: Cloud) -> None:
-        """Add a cloud; points that are not finite are left out. Raises DataError when the result gets too large."""
-        need = self._count + len(cloud)
-        if need > _MAX_POINTS:
-            raise DataError(
-                f"a cloud of more than {_MAX_POINTS} points at {self._voxel_m} m; use a larger map.cloud_voxel_m"
-            )
+        """Add a cloud; points that are not finite are left out."""
+        self._reserve(len(cloud))
+        self._count = _accumulate(
+            cloud.points_m, cloud.colors, self.voxel_m, self._table, self._rows, self._keys, self._sums, self._count
+        )
+        while self._count > self._max_points:
+            old = self._sums[: self._count].copy()
+            self.voxel_m *= _COARSER
+            self._table[:] = -1
+            self._count = _coarsen(old, self.voxel_m, self._table, self._rows, self._keys, self._sums)
+
+    def _reserve(self, extra: int) -> None:
+        need = self._count + extra
         if need > len(self._keys):
             grown = max(need, 2 * len(self._keys))
             self._keys = np.resize(self._keys, grown)
@@ -95,9 +123,6 @@ class VoxelAverage:
             size = 1 << int(np.ceil(np.log2(4 * need)))
             self._table, self._rows = np.full(size, -1, np.int64), np.zeros(size, np.int32)
             _rehash(self._table, self._rows, self._keys, self._count)
-        self._count = _accumulate(
-            cloud.points_m, cloud.colors, self._voxel_m, (self._table, self._rows), self._keys, self._sums, self._count
-        )
 
     def cloud(self, min_points: int = 1) -> Cloud:
         """Return one point per voxel that holds at least `min_points`, in order of first use."""
@@ -114,13 +139,17 @@ def voxel_filter(cloud: Cloud, voxel_m: float) -> Cloud:
     return average.cloud()
 
 
-def without_outliers(cloud: Cloud, neighbours: int, sigma: float) -> Cloud:
-    """Return the points whose mean distance to their `neighbours` is not `sigma` deviations above the average.
+def without_outliers(cloud: Cloud, neighbours: int, sigma: float, cell_m: float) -> Cloud:
+    """Return the points of cells whose mean distance to their `neighbours` is not `sigma` deviations above the average.
 
-    Statistical outlier removal, Rusu et al., "Towards 3D point cloud based object maps", 2008.
+    Statistical outlier removal (Rusu et al., "Towards 3D point cloud based object maps", 2008) on one point per cell of
+    `cell_m`: as good at finding stray points, and its cost does not depend on how fine the cloud is.
     """
-    if len(cloud) <= neighbours:
+    cells = np.floor(cloud.points_m.astype(np.float64) / cell_m).astype(np.int64)
+    _, first, cell_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    if len(first) <= neighbours:
         return cloud
-    distances, _ = cKDTree(cloud.points_m).query(cloud.points_m, k=neighbours + 1)
+    centres = (cells[first] + 0.5) * cell_m
+    distances, _ = cKDTree(centres).query(centres, k=neighbours + 1)
     mean = np.asarray(distances, dtype=np.float64)[:, 1:].mean(axis=1)
-    return cloud.select(mean <= mean.mean() + sigma * mean.std())
+    return cloud.select((mean <= mean.mean() + sigma * mean.std())[cell_of.ravel()])

@@ -82,7 +82,7 @@ class Mapper:
     def cloud(self) -> Cloud:
         """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
         config = self._config
-        average = VoxelAverage(config.cloud_voxel_m)
+        average = VoxelAverage(config.cloud_voxel_m, config.cloud_max_points)
         sparse_only = True
         for scan, T in self._scans():
             sparse_only = sparse_only and scan.depth is None
@@ -90,7 +90,7 @@ class Mapper:
         fused = average.cloud(1 if sparse_only else config.cloud_min_points)
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
-        return without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma)
+        return without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
 
     def grid(self) -> Grid:
         """Return the navigation grid of the occupancy map."""

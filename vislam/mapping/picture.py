@@ -1,0 +1,343 @@
+"""Pictures of maps for reports: a coloured cloud, a mesh or an octree from above, with trajectories drawn in.
+
+Numpy, numba and OpenCV only, so that a report needs no viewer and no graphics driver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vislam.geometry import level_rotation
+from vislam.mapping.cloud import Cloud
+from vislam.mapping.mesh import Mesh
+from vislam.mapping.octree import Octree
+from vislam.mapping.raster import fill_triangles, light_onto, splat_colors, splat_depth
+
+Array = NDArray[np.float64]
+ImageU8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+
+_SUPERSAMPLING = 2
+_FIELD_OF_VIEW = np.deg2rad(38.0)
+_MARGIN = 0.05  # of the picture's size, left free on each side
+_NEAR_M = 0.02
+_HIDDEN_ALPHA = 0.3  # of a line behind a surface
+_EDL_STRENGTH = 60.0
+_BLENDED_M = 0.03  # depth noise of one surface seen from several keyframes
+_CEILING_ABOVE_PATH_M = 0.5
+_PALENESS = 0.15  # of the colours of height, so that shading and lines stand out
+_PAPER = {"white": (255, 255, 255), "dark": (18, 20, 26)}
+_GRID_LINE = {"white": (226, 229, 233), "dark": (44, 48, 58)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """A path drawn into a picture, in the map frame."""
+
+    points_m: Array  # [N, 3]
+    color: tuple[int, int, int]  # RGB
+    width_px: float = 3.0
+    marks_ends: bool = True  # a ring at the start, a dot at the end
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """How a picture is made; heights and directions are in the map frame."""
+
+    size: tuple[int, int] = (1600, 900)  # width, height
+    background: Literal["white", "dark"] = "white"
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # opposite to gravity, where the map is not levelled
+    ceiling_m: float | None = None  # cut away what is higher along up; None: half a metre above the lines
+    azimuth_deg: float | None = None  # where the eye stands, seen from the middle; None: where it sees the lines best
+    elevation_deg: float = 42.0
+    floor_grid: bool = True  # lines every metre at the height of the lowest points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Eye:
+    """A pinhole camera: p_eye = R @ p + t; z forward."""
+
+    R: Array
+    t: Array
+    focal_px: float
+    centre_px: Array  # [2]
+
+    def see(self, points: NDArray[np.floating]) -> tuple[F32, F32]:
+        """Return pixels [N, 2] and depth [N] of points [N, 3]; meaningless where depth is not positive."""
+        local = points @ self.R.T + self.t
+        z = np.maximum(local[:, 2], _NEAR_M)
+        pixels = self.focal_px * local[:, :2] / z[:, None] + self.centre_px
+        return pixels.astype(np.float32), local[:, 2].astype(np.float32)
+
+    def scaled(self, factor: float) -> _Eye:
+        """Return the eye for the picture resized by a factor."""
+        return _Eye(self.R, self.t, self.focal_px * factor, (self.centre_px + 0.5) * factor - 0.5)
+
+
+@dataclass(eq=False)
+class _Canvas:
+    """What is drawn so far, at the supersampled size."""
+
+    eye: _Eye
+    depth: F32  # [H, W] infinite where nothing is
+    surface: F32  # [H, W, 4] colour, and 1 where anything is
+
+
+def render_cloud(cloud: Cloud, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of a coloured cloud, seen from above at an angle."""
+    style = style or Style()
+    R_up = level_rotation(np.array(style.up, dtype=np.float64))
+    points, lines = cloud.points_m @ R_up.T, _turned(lines, R_up)
+    below = points[:, 2] <= _ceiling_m(style, lines)
+    points, colors = points[below], cloud.colors[below].astype(np.float32)
+    spacing_m = _spacing_m(points)
+    canvas = _canvas(points, lines, style)
+    pixels, z = canvas.eye.see(points)
+    ahead = z > _NEAR_M
+    pixels, z, colors = pixels[ahead], z[ahead], colors[ahead]
+    # discs close a surface sampled every `spacing_m`; wider ones blend into each other and smooth the depth's noise
+    radius = np.clip(canvas.eye.focal_px * spacing_m / z, 1.0, 40.0).astype(np.float32)
+    splat_depth(pixels, z, np.float32(0.8) * radius, canvas.depth)
+    canvas.surface = splat_colors(
+        pixels, z, np.float32(1.3) * radius, colors, canvas.depth, max(_BLENDED_M, 1.5 * spacing_m)
+    )
+    return _finish(canvas, points, lines, style)
+
+
+def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of a coloured mesh, seen from above at an angle."""
+    style = style or Style()
+    R_up = level_rotation(np.array(style.up, dtype=np.float64))
+    points, lines = mesh.points_m @ R_up.T, _turned(lines, R_up)
+    below = points[:, 2] <= _ceiling_m(style, lines)
+    triangles = mesh.triangles[below[mesh.triangles].all(axis=1)]
+    used = points[np.unique(triangles)]
+    canvas = _canvas(used, lines, style)
+    _draw_triangles(canvas, points, mesh.colors.astype(np.float32), triangles)
+    return _finish(canvas, used, lines, style)
+
+
+def render_octree(octree: Octree, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of an octree's occupied voxels as cubes coloured by height."""
+    style = style or Style()
+    R_up = level_rotation(np.array(style.up, dtype=np.float64))
+    lines = _turned(lines, R_up)
+    voxels = octree.occupied_voxels()
+    centres = (voxels + 0.5) * octree.resolution_m @ R_up.T
+    below = centres[:, 2] <= _ceiling_m(style, lines)
+    voxels, centres = voxels[below], centres[below]
+    canvas = _canvas(centres, lines, style)
+    eye_voxels = (R_up.T @ (-canvas.eye.R.T @ canvas.eye.t)) / octree.resolution_m
+    corners, faces, owner, normals = _visible_faces(voxels, eye_voxels)
+    colors = _height_colors(centres[:, 2])[owner] * (0.80 + 0.20 * (normals @ R_up.T)[:, 2:])
+    colors *= 1.0 - 0.10 * np.abs((normals @ R_up.T)[:, :1])  # the two kinds of walls differ
+    vertices = (corners * octree.resolution_m @ R_up.T).reshape(-1, 3)
+    _draw_triangles(canvas, vertices, np.repeat(colors, 4, axis=0).astype(np.float32), faces)
+    return _finish(canvas, centres, lines, style)
+
+
+def _visible_faces(voxels: NDArray[np.int64], eye: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int64], Array]:
+    """Return the free faces that look at the eye: corners [F, 4, 3], triangles [2F, 3], voxel [F], normal [F, 3]."""
+    base = voxels.min(axis=0, initial=0) - 1
+    extent = voxels.max(axis=0, initial=0) - base + 2
+    strides = np.array([1, extent[0], extent[0] * extent[1]])
+    codes = (voxels - base) @ strides
+    known = np.sort(codes)
+    corners, owners, normals = [], [], []
+    for axis in range(3):
+        for side in (0, 1):
+            neighbour = codes + strides[axis] * (2 * side - 1)
+            place = np.minimum(np.searchsorted(known, neighbour), max(len(known) - 1, 0))
+            free = known[place] != neighbour if len(known) else np.zeros(0, np.bool_)
+            faces_eye = (eye[axis] - (voxels[:, axis] + side)) * (2 * side - 1) > 0.0
+            chosen = np.flatnonzero(free & faces_eye)
+            square = np.zeros((4, 3))
+            square[:, axis] = side
+            square[:, (axis + 1) % 3] = [0, 1, 1, 0]
+            square[:, (axis + 2) % 3] = [0, 0, 1, 1]
+            normal = np.zeros(3)
+            normal[axis] = 2 * side - 1
+            corners.append(voxels[chosen][:, None, :] + square)
+            owners.append(chosen)
+            normals.append(np.tile(normal, (len(chosen), 1)))
+    quads = np.concatenate(corners)
+    first = 4 * np.arange(len(quads))[:, None]
+    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])]).astype(np.int32)
+    return quads, triangles, np.concatenate(owners), np.concatenate(normals)
+
+
+def _height_colors(heights: Array) -> Array:
+    """Return RGB [N, 3] of heights [N]: Google's turbo map over the inner 98 % of them."""
+    if len(heights) == 0:
+        return np.zeros((0, 3))
+    low, high = np.percentile(heights, [1.0, 99.0])
+    level = np.clip((heights - low) / max(high - low, 1e-6), 0.0, 1.0)
+    shades = np.round(25 + 205 * level).astype(np.uint8)  # the map's ends are too dark to shade
+    turbo = np.asarray(cv2.applyColorMap(shades[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1], dtype=np.float64)
+    return turbo + _PALENESS * (255.0 - turbo)
+
+
+def _turned(lines: Sequence[Line], R: Array) -> list[Line]:
+    return [replace(line, points_m=line.points_m[np.isfinite(line.points_m).all(axis=1)] @ R.T) for line in lines]
+
+
+def _ceiling_m(style: Style, lines: Sequence[Line]) -> float:
+    if style.ceiling_m is not None:
+        return style.ceiling_m
+    heights = [float(line.points_m[:, 2].max()) for line in lines if len(line.points_m)]
+    return max(heights) + _CEILING_ABOVE_PATH_M if heights else np.inf
+
+
+def _spacing_m(points: NDArray[np.floating]) -> float:
+    """Return the usual distance between neighbouring points."""
+    if len(points) < 2:
+        return 0.02
+    some = points[:: max(1, len(points) // 2000)]
+    distances, _ = cKDTree(points).query(some, k=min(5, len(points)))
+    return max(float(np.median(np.asarray(distances)[:, -1])), 1e-3)
+
+
+def _canvas(points: NDArray[np.floating], lines: Sequence[Line], style: Style) -> _Canvas:
+    size = (style.size[0] * _SUPERSAMPLING, style.size[1] * _SUPERSAMPLING)
+    subject = _subject(points, lines)
+    if style.azimuth_deg is not None:
+        eye = _framed(subject, np.deg2rad(style.azimuth_deg), np.deg2rad(style.elevation_deg), size)
+    else:
+        eye = _best_eye(points, subject, lines, style, size)
+    return _Canvas(eye, np.full(size[::-1], np.inf, np.float32), np.zeros((*size[::-1], 4), np.float32))
+
+
+def _subject(points: NDArray[np.floating], lines: Sequence[Line]) -> Array:
+    """Return the points [M, 3] that the picture must hold: a sample without stray ones, and the lines."""
+    parts = [np.asarray(line.points_m, dtype=np.float64) for line in lines]
+    if len(points):
+        some = np.asarray(points[:: max(1, len(points) // 20000)], dtype=np.float64)
+        low, high = np.percentile(some, [0.1, 99.9], axis=0)
+        parts.append(some[((some >= low) & (some <= high)).all(axis=1)])
+    subject = np.concatenate(parts) if parts else np.zeros((0, 3))
+    return subject if len(subject) else np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+
+
+def _framed(subject: Array, azimuth_rad: float, elevation_rad: float, size: tuple[int, int]) -> _Eye:
+    """Return the eye in a direction from the subject, as near as the picture's borders allow."""
+    ca, sa, ce, se = np.cos(azimuth_rad), np.sin(azimuth_rad), np.cos(elevation_rad), np.sin(elevation_rad)
+    forward = -np.array([ca * ce, sa * ce, se])
+    right = np.array([-sa, ca, 0.0])
+    R = np.stack([right, np.cross(forward, right), forward])
+    focal = 0.5 * size[1] / np.tan(0.5 * _FIELD_OF_VIEW)
+    half = (0.5 - _MARGIN) * np.array(size) / focal
+    local = subject @ R.T
+    t = -np.append(0.5 * (local[:, :2].min(axis=0) + local[:, :2].max(axis=0)), 0.0)
+    for _ in range(4):  # perspective: centring and distance depend on each other
+        shifted = local + np.append(t[:2], 0.0)
+        t[2] = float((np.abs(shifted[:, :2]) / half - shifted[:, 2:]).max()) + _NEAR_M
+        seen = shifted[:, :2] / (shifted[:, 2:] + t[2])
+        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
+        t[:2] -= middle * float(np.median(shifted[:, 2] + t[2]))
+    shifted = local + np.append(t[:2], 0.0)
+    t[2] = float((np.abs(shifted[:, :2]) / half - shifted[:, 2:]).max()) + _NEAR_M
+    return _Eye(R, t, focal, 0.5 * np.array(size) - 0.5)
+
+
+def _best_eye(
+    points: NDArray[np.floating], subject: Array, lines: Sequence[Line], style: Style, size: tuple[int, int]
+) -> _Eye:
+    """Return the eye, of sixteen around the subject, that is near to it and sees most of the lines."""
+    small = (size[0] // 16, size[1] // 16)
+    path = np.concatenate([line.points_m for line in lines]) if lines else subject
+    some = np.asarray(points[:: max(1, len(points) // 60000)], dtype=np.float64)
+    best, best_score = None, -np.inf
+    for azimuth in np.arange(16) * np.pi / 8.0 + np.deg2rad(5.0):
+        eye = _framed(subject, azimuth, np.deg2rad(style.elevation_deg), small)
+        depth = np.full(small[::-1], np.inf, np.float32)
+        pixels, z = eye.see(some)
+        splat_depth(pixels, z, np.full(len(z), 1.0, np.float32), depth)
+        nearness = float(np.linalg.norm(subject.max(axis=0) - subject.min(axis=0))) / eye.t[2]
+        score = float(_is_visible(path, eye, depth).mean()) + nearness
+        if score > best_score + 1e-9:
+            best, best_score = azimuth, score
+    return _framed(subject, float(best or 0.0), np.deg2rad(style.elevation_deg), size)
+
+
+def _is_visible(points: Array, eye: _Eye, depth: F32) -> NDArray[np.bool_]:
+    pixels, z = eye.see(points)
+    rounded = np.round(pixels).astype(np.int64)
+    x, y = np.clip(rounded[:, 0], 0, depth.shape[1] - 1), np.clip(rounded[:, 1], 0, depth.shape[0] - 1)
+    return np.asarray(z <= depth[y, x] + 0.02 * z)
+
+
+def _draw_triangles(canvas: _Canvas, points: NDArray[np.floating], colors: F32, triangles: NDArray[np.int32]) -> None:
+    pixels, z = canvas.eye.see(points)
+    ahead = (z[triangles] > _NEAR_M).all(axis=1)
+    fill_triangles(pixels, z, colors, np.ascontiguousarray(triangles[ahead]), canvas.depth, canvas.surface)
+
+
+def _finish(canvas: _Canvas, points: NDArray[np.floating], lines: Sequence[Line], style: Style) -> ImageU8:
+    """Light the surface, put it on paper, draw the lines and reduce to the asked size."""
+    paper = np.full((*canvas.depth.shape, 3), _PAPER[style.background], np.uint8)
+    if style.floor_grid and len(points):
+        _draw_floor_grid(paper, canvas.eye, points, _GRID_LINE[style.background])
+    light_onto(paper, canvas.surface, canvas.depth, _SUPERSAMPLING, _EDL_STRENGTH)
+    image = np.asarray(cv2.resize(paper, style.size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    eye = canvas.eye.scaled(1.0 / _SUPERSAMPLING)
+    for line in lines:
+        visible = _is_visible(line.points_m, canvas.eye, canvas.depth)
+        image = _with_line(image, eye, line, visible)
+    return image
+
+
+def _draw_floor_grid(image: ImageU8, eye: _Eye, points: NDArray[np.floating], color: tuple[int, int, int]) -> None:
+    """Draw a line every metre (every 5 or 25 in large maps) a little below the points."""
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    step = next(s for s in (1.0, 5.0, 25.0, 1e9) if (high - low)[:2].max() / s <= 40.0)
+    first, last = np.floor(low[:2] / step) * step - step, np.ceil(high[:2] / step) * step + step
+    height = float(np.percentile(points[:, 2], 0.5))
+    for axis in (0, 1):
+        for value in np.arange(first[axis], last[axis] + 0.5 * step, step):
+            along = np.linspace(first[1 - axis], last[1 - axis], 64)
+            path = np.full((64, 3), height)
+            path[:, axis], path[:, 1 - axis] = value, along
+            _polyline(image, eye, path, color, 1.0 * _SUPERSAMPLING)
+
+
+def _with_line(image: ImageU8, eye: _Eye, line: Line, visible: NDArray[np.bool_]) -> ImageU8:
+    """Return the image with a line that has a light border; what is behind a surface shines through."""
+    if len(line.points_m) == 0:
+        return image
+    behind = image.copy()
+    _polyline(behind, eye, line.points_m, line.color, line.width_px)
+    image = np.asarray(cv2.addWeighted(behind, _HIDDEN_ALPHA, image, 1.0 - _HIDDEN_ALPHA, 0.0), dtype=np.uint8)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]]).astype(np.int8)))
+    for color, extra in (((255, 255, 255), 2.0), (line.color, 0.0)):
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            _polyline(image, eye, line.points_m[start:stop], color, line.width_px + extra)
+    if line.marks_ends:
+        pixels, z = eye.see(line.points_m[[0, -1]])
+        for pixel, fill in zip(pixels[z > _NEAR_M], ((255, 255, 255), line.color), strict=False):
+            _disc(image, pixel, 2.4 * line.width_px, (255, 255, 255))
+            _disc(image, pixel, 1.9 * line.width_px, line.color)
+            _disc(image, pixel, 1.0 * line.width_px, fill)
+    return image
+
+
+def _polyline(image: ImageU8, eye: _Eye, path: Array, color: tuple[int, int, int], width: float) -> None:
+    pixels, z = eye.see(path)
+    limit = 4.0 * max(image.shape)  # OpenCV's fixed-point coordinates
+    good = (z > _NEAR_M) & (np.abs(pixels) < limit).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        fixed = np.round(pixels[start:stop] * 16.0).astype(np.int32)
+        cv2.polylines(image, [fixed], False, color, max(1, round(width)), cv2.LINE_AA, 4)
+
+
+def _disc(image: ImageU8, pixel: F32, radius: float, color: tuple[int, int, int]) -> None:
+    centre = (round(float(pixel[0]) * 16), round(float(pixel[1]) * 16))
+    if max(map(abs, centre)) < 64 * max(image.shape):
+        cv2.circle(image, centre, round(radius * 16), color, -1, cv2.LINE_AA, 4)
