@@ -184,7 +184,7 @@ class GraphConfig:
     loop_batch_m: float = 1.0  # a larger correction starts from a batch solution instead of incremental steps
     loop_batch_deg: float = 10.0
     parked_max: int = 200  # parked loops kept; the oldest leave first
-    parked_retest: int = 5  # newest parked loops gated again after each acceptance; each costs a joint marginal
+    parked_retest: int = 5  # best fitting parked loops gated again after each acceptance; each costs a joint marginal
     consistency_min_others: int = 2  # parked loops that must agree with one another besides the first
     consistency_inflation: float = 3.0  # on odometry sigma; loops are parked because odometry is overconfident
     consistency_max_sigma_m: float = 0.5  # odometry looser than this between two loops proves nothing
@@ -218,7 +218,8 @@ class LoopConfig:
     agreement_deg: float = 8.0  # a witness differs by less
     min_agreement_share: float = 0.5  # of matches that also agree the other way round, and in depth
     max_tilt_deg: float = 5.0  # against gravity; true edges stay within 3 deg
-    max_direction_sigma_deg: float = 10.0  # of a direction without scale
+    max_rotation_sigma_deg: float = 2.0  # of an edge without scale
+    max_direction_sigma_deg: float = 5.0  # of its direction
     min_agreeing_direction: int = 2  # witnesses of an edge without scale, which is never taken alone
     neighbour_keyframes: int = 10  # witnesses are at most so far away, so that odometry to them is good
     max_verifications: int = 6  # per keyframe, about 4 ms each: bounds the time of a keyframe

@@ -160,8 +160,8 @@ class PoseGraph:
             if model is not None:
                 (passed if self._gate(model) else parked).append(model)
         if passed:
-            self._accept(passed, notes, "inside the gate")
-        touched += self._retest(notes) if passed else []
+            parked += self._accept(passed, notes, "inside the gate")
+            touched += self._retest(notes)
         for model in parked:
             evicted = self._park.park(model, self._estimator.poses, self._travel)
             if evicted is not None:
@@ -172,6 +172,7 @@ class PoseGraph:
             if group:
                 touched += [g.record.id for g in group]
                 self._promote(group, notes)
+                touched += self._retest(notes)
         decided = sorted(set(touched))
         accepted = [n for n in decided if self._reports[n].decision is LoopDecision.ACCEPTED]
         return accepted, [n for n in decided if n not in accepted]
@@ -207,8 +208,8 @@ class PoseGraph:
         old = self._reports[model.record.id]
         self._reports[model.record.id] = replace(old, decision=decision, reason=f"{old.reason}; {reason}")
 
-    def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> None:
-        """Put loops into the graph, and take out again those that the optimised graph contradicts."""
+    def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> list[LoopModel]:
+        """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
         notes.append(self._estimator.close(fresh, batch=promoted or any(self._is_far(m) for m in fresh)))
         contradicted = []
         for model in fresh:
@@ -218,11 +219,13 @@ class PoseGraph:
             weight = model.weight(*self._ends(model))
             if weight < self._config.loop_min_weight:
                 contradicted.append(model)
-                self._report(model, LoopDecision.REJECTED, f"contradicted by the graph, weight {weight:.3f}")
+                decision = LoopDecision.REJECTED if promoted else LoopDecision.PARKED
+                self._report(model, decision, f"contradicted by the graph, weight {weight:.3f}")
             else:
                 self._report(model, LoopDecision.ACCEPTED, reason)
         if contradicted:
             notes.append(self._estimator.drop(contradicted))
+        return contradicted
 
     def _is_far(self, model: LoopModel) -> bool:
         """Return whether a loop asks for a correction beyond what incremental steps should try."""
@@ -231,24 +234,35 @@ class PoseGraph:
         return turn or (model.record.has_scale and float(np.linalg.norm(residual[3:])) > self._config.loop_batch_m)
 
     def _retest(self, notes: list[str]) -> list[int]:
-        """Gate the newest parked loops again, after an accepted one changed the estimate; return the accepted ids."""
-        passed = [m for m in self._park.edges[::-1][: self._config.parked_retest] if self._gate(m)]
+        """Gate the best fitting parked loops again, after the estimate changed; return the accepted ids."""
+        ranked = sorted(self._park.edges, key=lambda m: m.chi2(*self._ends(m)))
+        passed = [m for m in ranked[: self._config.parked_retest] if self._gate(m)]
         if not passed:
             return []
         self._park.remove(passed)
-        self._accept(passed, notes, "inside the gate after another loop")
+        for model in self._accept(passed, notes, "inside the gate after another loop"):
+            self._report(model, LoopDecision.REJECTED, "twice")
         return [m.record.id for m in passed]
 
     def _promote(self, group: list[LoopModel], notes: list[str]) -> None:
-        """Accept a consistent group of parked loops, unless that tears more loops than it brings."""
+        """Accept a consistent group of parked loops, unless that tears more loops than it brings.
+
+        Several witnesses against the odometry say how much too small its covariance is: it is inflated to fit them.
+        """
         self._park.remove(group)
         older = list(self._estimator.loops.values())
         sound = [m for m in older if m.weight(*self._ends(m)) >= 0.5]
         snapshot = self._estimator.snapshot()
+        misfit = float(np.median([self._reports[m.record.id].chi2 for m in group])) / 6.0
+        room = self._config.vo_scale_max / self._estimator.vo_scale
+        factor = float(np.clip(np.sqrt(misfit), 1.0, max(room, 1.0)))
+        self._estimator.distrust_odometry(factor)
+        self._travel.scale(factor)
         self._accept(group, notes, f"one of {len(group)} parked loops that agree", promoted=True)
         torn = [m for m in sound if m.weight(*self._ends(m)) < _COLLAPSED]
         if len(torn) >= len(group):
             notes.append(self._estimator.revert(snapshot, group))
+            self._travel.scale(1.0 / factor)
             for model in group:
                 self._report(model, LoopDecision.REJECTED, f"its group tore {len(torn)} older loops")
 
@@ -281,7 +295,11 @@ class PoseGraph:
         self._published[moved] = poses[moved]
         self._revision += 1
         newest = self._state(len(poses) - 1) if self._estimator.has_imu else None
-        details = {"solver": self._estimator.solver_name, "parked": len(self._park.edges)}
+        details = {
+            "solver": self._estimator.solver_name,
+            "parked": len(self._park.edges),
+            "vo_scale": self._estimator.vo_scale,
+        }
         return GraphUpdate(
             self._revision,
             np.flatnonzero(moved).astype(np.int64),

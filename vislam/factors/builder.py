@@ -14,8 +14,8 @@ from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import B, V, X, bias_of
 from vislam.factors.noise import gaussian, huber, inflated
 from vislam.factors.priors import start_factors
-from vislam.factors.visual import direction_factor, direction_measurement, direction_model, pose_factor
-from vislam.geometry import transform
+from vislam.factors.visual import direction_as_pose, pose_factor
+from vislam.geometry import invert, transform
 from vislam.imu import ImuNoise
 from vislam.messages import Array
 
@@ -55,12 +55,20 @@ class Builder:
         return start_factors(record, self._config), Guess(record.T_map_body, record.velocity_map_m_s, bias)
 
     def keyframe(
-        self, record: KeyframeRecord, previous: KeyframeRecord, before: Guess, last_motion: Array, has_imu: bool
+        self,
+        record: KeyframeRecord,
+        previous: KeyframeRecord,
+        before: Guess,
+        *,
+        last_motion: Array,
+        has_imu: bool,
+        vo_scale: float,
     ) -> Step:
         """Return the factors that tie a keyframe to the previous one, whose state is `before`.
 
         `last_motion` [4, 4] is the motion of the step before, the guess where neither vision nor IMU saw this one.
-        Every variable gets at least one factor that bounds it, whatever is missing.
+        `vo_scale` multiplies the sigma of visual odometry: what loops taught about it. Every variable gets at least
+        one factor that bounds it, whatever is missing.
         """
         config = self._config
         duration_s = (record.t_ns - previous.t_ns) * 1e-9
@@ -71,7 +79,7 @@ class Builder:
         factors: list[gtsam.NonlinearFactor] = []
         notes: list[str] = []
         if record.T_previous_body is not None:
-            factors.append(self._visual(record))
+            factors.append(self._visual(record, before, guess, vo_scale))
         if integrated is not None and self._preintegrator is not None:
             factors.append(self._preintegrator.factor(record.id, integrated))
             if integrated.outage_s > 0.0:
@@ -83,7 +91,7 @@ class Builder:
         loose_rad = np.deg2rad(config.lost_rate_sigma_deg_s) * duration_s
         loose_m = config.lost_speed_sigma_m_s * duration_s
         if (record.T_previous_body is None and integrated is None) or unscaled:
-            T = np.linalg.inv(before.T_map_body) @ guess.T_map_body
+            T = invert(before.T_map_body) @ guess.T_map_body
             factors.append(motion.loose_motion(record.id, T, loose_rad, loose_m))
         if record.T_previous_body is None:
             notes.append("vision lost, bridged by " + ("IMU" if integrated is not None else "constant motion"))
@@ -92,28 +100,36 @@ class Builder:
         if record.covariance is None or not record.has_scale:
             variances = (loose_rad**2, loose_m**2)
         else:
-            covariance = self._visual_covariance(record)
+            covariance = self._visual_covariance(record, vo_scale)
             variances = (float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0)
         return Step(factors, guess, *variances, note="; ".join(notes))
 
-    def _visual_covariance(self, record: KeyframeRecord) -> Array:
+    def _visual_covariance(self, record: KeyframeRecord, vo_scale: float) -> Array:
         assert record.covariance is not None
         config = self._config
-        factor = config.vo_inflation * (config.vo_degraded_inflation if record.degraded else 1.0)
+        factor = vo_scale * config.vo_inflation * (config.vo_degraded_inflation if record.degraded else 1.0)
         floor_m = config.vo_floor_m if record.has_scale else 0.0
         return inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)
 
-    def _visual(self, record: KeyframeRecord) -> gtsam.NonlinearFactor:
+    def _visual(self, record: KeyframeRecord, before: Guess, guess: Guess, vo_scale: float) -> gtsam.NonlinearFactor:
         assert record.T_previous_body is not None
-        config, covariance = self._config, self._visual_covariance(record)
+        config, covariance = self._config, self._visual_covariance(record, vo_scale)
         a, b = X(record.id - 1), X(record.id)
-        if record.has_scale:
-            model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
-            return pose_factor(a, b, record.T_previous_body, model)
-        floor = np.deg2rad(config.direction_floor_deg)
-        measured = direction_measurement(record.T_previous_body, covariance, floor)
-        model = huber(direction_model(measured, config.covariance_ratio_max), config.huber_k)
-        return direction_factor(a, b, measured, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model)
+        T = record.T_previous_body
+        if not record.has_scale:
+            lever = self._lever_m
+            moved = invert(before.T_map_body) @ guess.T_map_body
+            step_m = float(np.linalg.norm(moved[:3, 3] + moved[:3, :3] @ lever - lever))
+            T, covariance = direction_as_pose(
+                T,
+                covariance,
+                lever,
+                max(step_m, config.direction_soft_m),
+                floor_rad=np.deg2rad(config.direction_floor_deg),
+                scale_sigma=config.direction_scale_sigma,
+            )
+        model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
+        return pose_factor(a, b, T, model)
 
     def _without_imu(self, record: KeyframeRecord, guess: Guess, duration_s: float) -> list[gtsam.NonlinearFactor]:
         """Keep velocity and biases bounded where the IMU factor had to be dropped."""

@@ -39,6 +39,7 @@ class Estimator:
         self._values = gtsam.Values()
         self.loops: dict[int, LoopModel] = {}  # in the graph, by loop id
         self.poses: Array = np.zeros((0, 4, 4))
+        self.vo_scale = 1.0  # on the sigma of visual odometry, learnt from loops that it contradicted
 
     @property
     def has_imu(self) -> bool:
@@ -75,6 +76,10 @@ class Estimator:
         step = self._step(record, previous, self._values)
         self._records.append(record)
         return step, self._extend(step.factors, record.id, step.guess)
+
+    def distrust_odometry(self, factor: float) -> None:
+        """Multiply the sigma of visual odometry; past factors follow with the next `close` in batch."""
+        self.vo_scale *= factor
 
     def close(self, fresh: list[LoopModel], batch: bool) -> str:
         """Take loops: first without a kernel, so that the estimate reaches them, then under the Cauchy kernel.
@@ -114,12 +119,13 @@ class Estimator:
             return self._recover(self._values, [], error)
         return ""
 
-    def snapshot(self) -> gtsam.Values:
+    def snapshot(self) -> tuple[gtsam.Values, float]:
         """Return the current estimate, for `revert`."""
-        return self._values
+        return self._values, self.vo_scale
 
-    def revert(self, values: gtsam.Values, edges: list[LoopModel]) -> str:
+    def revert(self, snapshot: tuple[gtsam.Values, float], edges: list[LoopModel]) -> str:
         """Go back to an earlier estimate of the same keyframes, without some loops."""
+        values, self.vo_scale = snapshot
         for edge in edges:
             self.loops.pop(edge.record.id, None)
         try:
@@ -164,7 +170,9 @@ class Estimator:
         motion = np.eye(4)
         if previous.id > 0:
             motion = invert(values.atPose3(X(previous.id - 1)).matrix()) @ before.T_map_body
-        return self._builder.keyframe(record, previous, before, motion, self.has_imu)
+        return self._builder.keyframe(
+            record, previous, before, last_motion=motion, has_imu=self.has_imu, vo_scale=self.vo_scale
+        )
 
     def _extend(self, factors: list[gtsam.NonlinearFactor], k: int, guess: Guess) -> str:
         new = gtsam.Values()

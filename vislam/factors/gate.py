@@ -52,6 +52,11 @@ class Travel:
         rad2, distance = abs(self._rad2[j] - self._rad2[i]), abs(self._distance_m[j] - self._distance_m[i])
         return rad2, abs(self._m2[j] - self._m2[i]) + rad2 * distance**2 / 3.0, distance
 
+    def scale(self, sigma_factor: float) -> None:
+        """Multiply all sigmas."""
+        self._rad2 = [v * sigma_factor**2 for v in self._rad2]
+        self._m2 = [v * sigma_factor**2 for v in self._m2]
+
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return a diagonal stand-in [6, 6] for the covariance of the relative pose, from odometry alone."""
         rad2, m2, _ = self.between(i, j)
