@@ -1,5 +1,6 @@
 """Tables: exact stamps, bounded reading, damage that is counted and where it is told."""
 
+import itertools
 from decimal import Decimal
 from pathlib import Path
 
@@ -121,7 +122,7 @@ def test_missing_file_is_an_error(tmp_path: Path) -> None:
 def test_time_order_is_strict_and_every_row_is_accounted_for(stamps: list[int]) -> None:
     problems = Problems()
     kept = [t for t, _ in in_time_order(((t, None) for t in stamps), problems, "imu")]
-    assert all(a < b for a, b in zip(kept, kept[1:], strict=False))
+    assert all(a < b for a, b in itertools.pairwise(kept))
     assert len(kept) + sum(problems.values()) == len(stamps)
 
 

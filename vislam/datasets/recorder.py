@@ -195,10 +195,10 @@ class Recorder:
             raise DataError(f"image of {name} at {t_ns} ns cannot be encoded as {image_format}")
         try:
             path.write_bytes(encoded.tobytes())
-        except OSError:
+        except OSError as error:
             with suppress(OSError):
                 path.unlink()
-            raise
+            raise OSError(error.errno, error.strerror, str(path)) from error
         log.append_text(f"{t_ns},{path.name}")
 
     def _storage_error(self, error: OSError, where: Path) -> StorageError:

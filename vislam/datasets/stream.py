@@ -130,7 +130,13 @@ class FileRecording:
 
     def truth(self) -> Trajectory | None:
         """Return the true body trajectory, or None; raises DataError when its file is unusable."""
-        return None if self._survey.truth is None else self._survey.truth(Problems())
+        if self._survey.truth is None:
+            return None
+        met = Problems()
+        trajectory = self._survey.truth(met)
+        self._known.update(met)
+        self._counter.update(met)
+        return trajectory
 
     def _check_first_images(self) -> None:
         """Compare the first readable image of each camera with its calibration, before a run starts."""

@@ -1,0 +1,185 @@
+"""The doctor: every fault is found and told, and no damage gives a traceback."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
+from test_other_formats import write_kitti, write_tum, write_video
+
+from vislam.camera import Camera, Rig
+from vislam.datasets.inspect import Inspection, inspect
+from vislam.datasets.plausibility import epipolar_facts, gyro_turns, turn_disagreement
+from vislam.errors import DataError, UsageError
+from vislam.geometry import so3_exp, so3_log
+
+
+def told(inspection: Inspection, severity: str, what: str) -> bool:
+    return any(f.severity == severity and what in f.what for f in inspection.findings)
+
+
+def test_a_sound_recording_has_streams_and_no_error(tmp_path: Path) -> None:
+    write_asl(tmp_path, frames=20, stereo=False)
+    result = inspect(str(tmp_path))
+    assert result.format == "euroc" and result.worst == "ok"
+    streams = {s.name: s for s in result.streams}
+    assert streams["cam0"].count == 20 and streams["cam0"].rate_hz == pytest.approx(20.0)
+    assert streams["imu0"].count == 191 and streams["imu0"].rate_hz == pytest.approx(200.0)
+    assert result.duration_s == pytest.approx(0.95) and result.size_bytes > 20 * 64 * 48 // 2
+    assert told(result, "ok", "specific force 9.81 m/s^2 over")
+    assert told(result, "ok", "every frame lies within the time of the IMU")
+    assert told(result, "ok", "gravity is 0 deg from the vertical")
+
+
+def test_every_fault_is_told_at_once(tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=40)
+    images = [root / "cam0" / "data" / f"{BEGIN_NS + i * FRAME_NS}.png" for i in range(40)]
+    images[3].unlink()
+    images[5].write_bytes(images[5].read_bytes()[:80])
+    cv2.imwrite(str(images[7]), picture(0, (32, 24)))
+    edit_lines(root / "cam1" / "data.csv", {9: None})
+    edit_lines(root / "cam0" / "data.csv", dict.fromkeys(range(20, 33)))
+    rows = imu_rows(200)
+    rows[10], rows[11] = rows[9], rows[4]
+    rows[20] = rows[20].replace("9.81", "nan")
+    rows[30:130] = []
+    (root / "imu0" / "data.csv").write_text("#t\n" + "\n".join(rows) + "\n12,3")
+    result = inspect(str(tmp_path))
+    assert result.worst == "error"
+    assert told(result, "error", "cam0: 1 of 27: image of wrong size")
+    assert told(result, "error", "is 32x24 but its calibration is for 64x48")
+    for what in (
+        "cam0: 1 of 27: missing image", "cam0: 1 of 27: unreadable image", "stereo image without partner",
+        "imu: duplicate stamp", "imu: backward stamp", "rows with NaN or infinity (first: line 22)",
+        "imu0: gap of 0.5", "cam0: gap of 0.70 s", "last line cut short", "frames lie outside the time of the IMU",
+    ):  # fmt: skip
+        assert told(result, "warning", what), what
+    assert all(f.next_step for f in result.findings if f.severity == "warning")
+
+
+@pytest.mark.parametrize(
+    ("accel", "severity", "what"),
+    [
+        ("0.0,0.0,1.0", "error", "the unit seems to be g"),
+        ("0.0,0.0,0.0", "error", "gravity is missing"),
+        ("0.0,0.0,10.4", "warning", "expected 9.81"),
+        ("0.0,0.0,-9.81", "warning", "gravity is 180 deg from the vertical"),
+        ("9.81,0.0,0.0", "warning", "gravity is 90 deg from the vertical"),
+    ],
+)
+def test_gravity_that_contradicts(tmp_path: Path, accel: str, severity: str, what: str) -> None:
+    root = write_asl(tmp_path, frames=10, stereo=False)
+    rows = [row.replace("0.0,0.0,9.81", accel) for row in imu_rows(100)]
+    (root / "imu0" / "data.csv").write_text("#t\n" + "\n".join(rows) + "\n")
+    assert told(inspect(str(tmp_path)), severity, what)
+
+
+def test_rates_units_and_clocks_that_do_not_fit(tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=10, stereo=False)
+    rows = [f"{BEGIN_NS + 10**12 + i * 50_000_000},0,0,60.0,0,0,9.81" for i in range(30)]
+    (root / "imu0" / "data.csv").write_text("#t\n" + "\n".join(rows) + "\n")
+    result = inspect(str(tmp_path))
+    assert told(result, "warning", "imu0: 20.0 Hz, but its sensor file says 200.0 Hz")
+    assert told(result, "warning", "only 20 Hz of IMU")
+    assert told(result, "error", "the unit seems to be deg/s")
+    assert told(result, "error", "no frame lies within the time of the IMU")
+
+
+def test_unusable_parts_do_not_hide_the_others(tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=5)
+    (root / "cam0" / "sensor.yaml").write_text("nonsense")
+    (root / "imu0" / "data.csv").write_text("#t\n" + "x\n" * 50)
+    (root / "mocap0").mkdir()
+    (root / "mocap0" / "data.csv").write_text("1,nan,0,0,1,0,0,0\n" * 50)
+    result = inspect(str(tmp_path))
+    assert told(result, "error", "sensor.yaml must hold")
+    assert told(result, "error", "imu0/data.csv:2")
+    assert told(result, "warning", "truth cannot be used")
+    assert {s.name for s in result.streams} == {"cam0", "cam1"}
+
+
+def test_inertial_recording_is_looked_at(tmp_path: Path) -> None:
+    write_imu(tmp_path / "mav0", imu_rows(300))
+    result = inspect(str(tmp_path))
+    assert told(result, "error", "no camera images") and told(result, "ok", "specific force 9.81")
+
+
+def test_other_formats(tmp_path: Path) -> None:
+    tum = inspect(str(write_tum(tmp_path / "fr1_mini")))
+    assert tum.worst != "error" and {s.name for s in tum.streams} == {"cam0", "depth0", "truth"}
+    assert told(tum, "ok", "no IMU")
+    kitti = inspect(str(write_kitti(tmp_path / "kitti")))
+    assert {s.name for s in kitti.streams} == {"cam0", "cam1", "truth"}
+    (tmp_path / "video").mkdir()
+    path = write_video(tmp_path / "video")
+    assert inspect(str(path)).worst == "ok"
+    (tmp_path / "video" / "ride.yaml").write_text(camera_yaml(size=(32, 24)))
+    assert told(inspect(str(path)), "error", "is 64x48")
+    path.write_bytes(b"")
+    assert told(inspect(str(path)), "error", "cannot be opened as a video")
+
+
+def test_what_is_no_recording_raises(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is empty"):
+        inspect(str(tmp_path))
+    with pytest.raises(UsageError, match="no format"):
+        inspect("bag:x")
+
+
+@pytest.mark.parametrize(
+    "name", ["cam0/data.csv", "cam1/data.csv", "imu0/data.csv", "cam0/sensor.yaml", "imu0/sensor.yaml"]
+)
+@pytest.mark.parametrize("content", [b"", b"\0" * 5000, b"\xff\xfe" * 900, b"1,2,3\n" * 2000, b"a: {b: [1"])
+def test_any_damage_is_a_finding_or_a_clean_error(tmp_path: Path, name: str, content: bytes) -> None:
+    root = write_asl(tmp_path, frames=4)
+    (root / name).write_bytes(content)
+    assert inspect(str(tmp_path)).worst in ("warning", "error")
+    (root / name).unlink()
+    inspect(str(tmp_path))
+
+
+SIZE = (320, 240)
+CAMERA = Camera(*SIZE, 250.0, 250.0, 159.5, 119.5)
+
+
+def turned_view(R_world_cam: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """The view of a far textured world: a pure rotation is a homography of one large picture."""
+    world = picture(0, (900, 800))
+    world = cv2.GaussianBlur(cv2.resize(cv2.resize(world, (300, 266)), (900, 800)), (5, 5), 0)
+    K_world = np.array([[250.0, 0, 449.5], [0, 250.0, 399.5], [0, 0, 1]])
+    H = CAMERA.K @ R_world_cam.T @ np.linalg.inv(K_world)
+    return cv2.warpPerspective(world, H, SIZE)
+
+
+def test_turn_seen_by_camera_and_gyro() -> None:
+    R_body_cam = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    rate = np.array([0.2, -0.5, 0.6])
+    images = [turned_view(R_body_cam.T @ so3_exp(rate * t) @ R_body_cam) for t in (0.0, 0.05, 0.1, 0.15)]
+    rows = [(i * 10_000_000, [*rate, 0.0, 0.0, 9.81]) for i in range(30)]
+    (turn,) = gyro_turns(rows, [(5_000_000, 155_000_000)], np.zeros(3))
+    assert turn is not None
+    np.testing.assert_allclose(turn, so3_exp(rate * 0.15), atol=1e-9)
+    right = turn_disagreement(CAMERA, R_body_cam, images, turn)
+    wrong = turn_disagreement(CAMERA, R_body_cam.T, images, turn)
+    assert right is not None and right < 0.1
+    expected = np.linalg.norm(so3_log(R_body_cam @ turn.T @ R_body_cam.T @ R_body_cam.T @ turn @ R_body_cam))
+    assert wrong == pytest.approx(expected / np.linalg.norm(rate * 0.15), abs=0.1) and wrong > 0.5
+    assert turn_disagreement(CAMERA, R_body_cam, [images[0]] * 4, np.eye(3)) is None
+    assert gyro_turns(rows[:5], [(5_000_000, 155_000_000)], np.zeros(3)) == [None]
+
+
+def test_epipolar_check_tells_right_wrong_and_swapped() -> None:
+    left = turned_view(np.eye(3))
+    right = np.roll(left, -10, axis=1)  # everything at disparity 10 px: cam1 to the right of cam0
+
+    def facts(T_cam0_cam1: np.ndarray, pair: tuple[np.ndarray, np.ndarray]):
+        return epipolar_facts(Rig((CAMERA, CAMERA), (np.eye(4), T_cam0_cam1)), [pair])
+
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    good = facts(T, (left, right))
+    assert good.matches > 60 and good.on_line > 0.9 and good.in_front > 0.9
+    assert facts(T, (right, left)).in_front < 0.2
+    T[:3, :3] = so3_exp(np.array([0.1, 0.0, 0.0]))
+    assert facts(T, (left, right)).on_line < 0.3

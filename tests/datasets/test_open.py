@@ -1,0 +1,58 @@
+"""Naming a recording: formats, bare paths, and clear errors for what is none."""
+
+from pathlib import Path
+
+import pytest
+from mini_recording import write_asl
+
+from vislam.datasets import READERS, open_dataset
+from vislam.errors import DataError, UsageError
+
+
+def test_unknown_format_lists_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no format 'rosbag' in .*; known formats: euroc, tum, kitti, video"):
+        open_dataset(f"rosbag:{tmp_path}")
+
+
+@pytest.mark.parametrize("name", ["", *READERS])
+def test_missing_and_empty_folders_say_what_was_looked_for(tmp_path: Path, name: str) -> None:
+    prefix = f"{name}:" if name else ""
+    with pytest.raises(DataError, match="does not exist"):
+        open_dataset(f"{prefix}{tmp_path / 'none'}")
+    with pytest.raises(DataError, match="is empty; looked for") as caught:
+        open_dataset(f"{prefix}{tmp_path}")
+    wanted = [READERS[name]] if name else READERS.values()
+    assert all(reader.LOOKS_FOR in str(caught.value) for reader in wanted)
+
+
+def test_folder_of_something_else(tmp_path: Path) -> None:
+    (tmp_path / "holiday.txt").write_text("sun")
+    with pytest.raises(DataError, match=r"is no recording that vislam knows: looked for mav0/cam0/data.csv \(euroc\)"):
+        open_dataset(str(tmp_path))
+
+
+def test_wrong_format_for_a_recording_names_the_right_one(tmp_path: Path) -> None:
+    write_asl(tmp_path, frames=2)
+    with pytest.raises(DataError, match=f"is no tum recording: looked for rgb.txt; it looks like euroc:{tmp_path}"):
+        open_dataset(f"tum:{tmp_path}")
+
+
+def test_a_path_may_contain_a_colon(tmp_path: Path) -> None:
+    folder = tmp_path / "run:7"
+    write_asl(folder, frames=2)
+    assert open_dataset(str(folder)).name == "run:7"
+    assert open_dataset(f"euroc:{folder}").name == "run:7"
+
+
+def test_a_file_without_permission_is_an_error_not_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write_asl(tmp_path, frames=2)
+    blocked = Path.open
+
+    def refuse(self: Path, *args: object, **kwargs: object) -> object:
+        if self.name == "data.csv":
+            raise PermissionError(13, "Permission denied", str(self))
+        return blocked(self, *args, **kwargs)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(DataError, match=r"data.csv cannot be read: Permission denied"):
+        open_dataset(str(root))

@@ -1,0 +1,73 @@
+"""The readers on the real recordings: what each is known to hold."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from vislam.datasets import open_dataset
+from vislam.datasets.inspect import inspect
+from vislam.messages import Frame, ImuSample
+
+pytestmark = pytest.mark.data
+
+
+def test_euroc_mh01(data_root: Path) -> None:
+    recording = open_dataset(str(data_root / "euroc_mh01_17s"))
+    assert recording.frame_count == 329
+    frames = imu = 0
+    last_ns = 0
+    for event in recording.events():
+        assert event.t_ns >= last_ns
+        last_ns = event.t_ns
+        frames += isinstance(event, Frame)
+        imu += isinstance(event, ImuSample)
+        if isinstance(event, Frame):
+            assert event.index == frames - 1 and [i.shape for i in event.images] == [(480, 752)] * 2
+    assert (frames, imu) == (329, 3720)
+    assert recording.problems == {"stereo image without partner": 2}
+    truth = recording.truth()
+    assert truth is not None and len(truth.t_ns) == 3720
+    assert recording.rig.T_cam0_cam1[0, 3] == pytest.approx(0.110, abs=1e-3)
+
+
+def test_tum_fr1_desk(data_root: Path) -> None:
+    recording = open_dataset(f"tum:{data_root / 'tum_fr1_desk'}")
+    assert recording.frame_count == 613 and recording.rig.cameras[0].fx == 517.306408
+    events = recording.events()
+    frames = [next(events) for _ in range(30)]
+    events.close()
+    assert all(f.color is not None and f.color.shape == (480, 640, 3) for f in frames)
+    depth_m = next(f.depth_m for f in frames if f.depth_m is not None)
+    assert 0.4 < float(np.median(depth_m[depth_m > 0])) < 3.0
+    assert recording.problems == {"frame without depth": 40}  # 573 matches, as the benchmark's own script
+    truth = recording.truth()
+    assert truth is not None and len(truth.t_ns) == 2335
+
+
+@pytest.mark.slow
+def test_doctor_approves_of_euroc_and_refuses_inverted_extrinsics(data_root: Path, tmp_path: Path) -> None:
+    result = inspect(str(data_root / "euroc_mh01_17s"))
+    assert result.worst == "warning"  # the two images without partner
+    assert [f.what for f in result.findings if f.severity == "warning"] == ["stereo image without partner: 2"]
+    assert any("turns seen by cam0 and by the gyro differ by" in f.what for f in result.findings)
+    source, root = data_root / "euroc_mh01_17s" / "mav0", tmp_path / "mav0"
+    for name in ("cam0", "imu0"):
+        (root / name).mkdir(parents=True)
+        for file in ("data.csv", "sensor.yaml"):
+            shutil.copyfile(source / name / file, root / name / file)
+    (root / "cam0" / "data").symlink_to(source / "cam0" / "data")
+    sensor = yaml.safe_load((root / "cam0" / "sensor.yaml").read_text())
+    T = np.linalg.inv(np.array(sensor["T_BS"]["data"]).reshape(4, 4))
+    sensor["T_BS"]["data"] = T.ravel().tolist()
+    (root / "cam0" / "sensor.yaml").write_text(yaml.safe_dump(sensor))
+    inverted = inspect(str(tmp_path))
+    assert any(f.severity == "error" and "extrinsics or time stamps are wrong" in f.what for f in inverted.findings)
+
+
+def test_inertial_recordings_are_inspected(data_root: Path) -> None:
+    result = inspect(str(data_root / "euroc_v101_imu"))
+    assert {s.name: s.count for s in result.streams} == {"imu0": 29120, "truth": 2895}
+    assert any("specific force 9.79" in f.what and f.severity == "ok" for f in result.findings)
