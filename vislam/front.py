@@ -190,7 +190,7 @@ class Front:
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
         self.initialisation = found
-        self._ekf.initialise(found.last)
+        self._ekf.initialise(found.last, track.vo)
         newest = self._buffer.newest_t_ns
         ahead = self._buffer.span(found.last.t_ns, newest) if newest is not None else None
         for sample in samples_after_first(ahead):
@@ -219,7 +219,7 @@ class Front:
             self._ekf.update_zero_velocity(frame.t_ns)
         if track.keyframe is not None:
             self._ekf.add_keyframe(track.keyframe.id, frame.t_ns)
-        return self._ekf.pose_at(frame.t_ns), self._ekf.state()
+        return self._ekf.pose_at(frame.t_ns), self._ekf.state_at(frame.t_ns)
 
     def _since_keyframe(self, T_vo_keyframe_body: Array | None, T_odom_body: Array | None) -> Array | None:
         if T_vo_keyframe_body is not None:

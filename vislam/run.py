@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, TrackingLostError, VislamError
 from vislam.imu import ImuNoise
+from vislam.messages import Tracking
 from vislam.recording import Recording
 from vislam.runfolder import RunLog, write_json, write_setup
 from vislam.session import SessionWriter
 from vislam.slam import KeyframeStep, Slam, Step
-from vislam.trajectory import Trajectory, evaluate
+from vislam.trajectory import Trajectory, align, associate, evaluate
 from vislam.viewer import open_viewer
 
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
@@ -46,7 +49,7 @@ class Run:
         self.slam = Slam(config, recording.rig, imu_noise(config.imu, recording.imu_noise))
         self.log = RunLog()
         self.session = SessionWriter(out / "session.db", {"source": source, "config": asdict(config)})
-        self.viewer = open_viewer(out / "run.rrd", config.view.enabled)
+        self.viewer = open_viewer(out / "run.rrd", config.view.enabled, recording.rig, config.view)
         self.warnings: list[str] = []
 
     def execute(self, progress: Progress | None = None) -> dict[str, Any]:
@@ -86,14 +89,29 @@ class Run:
 
     def _take(self, step: Step) -> None:
         self.log.add(step)
-        with self.slam.clock.measure("view"):
-            self.viewer.log_step(step)
         for keyframe in step.keyframes:
             self._store(keyframe)
+        with self.slam.clock.measure("view"):
+            self._show(step)
 
     def _store(self, step: KeyframeStep) -> None:
         with self.slam.clock.measure("store"):
             self.session.add(step.odometry.packet.keyframe, step.odometry.T_odom_body, step.update, step.edges)
+
+    def _show(self, step: Step) -> None:
+        """Log a step for the viewer: the image with its tracks, the poses, what the back end did."""
+        frame, track = step.front.frame, step.front.track
+        self.viewer.log_frame(frame, track.observations, track.vo.tracking)
+        if step.T_map_body is not None:
+            self.viewer.log_pose("live", frame.t_ns, step.T_map_body)
+        if track.vo.tracking != Tracking.OK:
+            self.viewer.log_note(frame.t_ns, f"{track.vo.tracking}: {track.reason}")
+        for keyframe in step.keyframes:
+            T_map_body = keyframe.update.T_map_odom @ keyframe.odometry.T_odom_body
+            self.viewer.log_keyframe(keyframe.odometry.packet.keyframe, T_map_body)
+            self.viewer.move(keyframe.update)
+            for candidate in keyframe.candidates:
+                self.viewer.log_loop(candidate)
 
     def _finish(self, start: float) -> dict[str, Any]:
         finish = self.slam.finish()
@@ -102,23 +120,39 @@ class Run:
         for keyframe in finish.keyframes:
             self.log.add_keyframe(keyframe)
             self._store(keyframe)
-        self.session.move(finish.update)
+        if finish.update is not None:
+            self.session.move(finish.update)
+            self.viewer.move(finish.update)
         self.session.close()
-        graph = self.slam.back.graph
-        ids, poses = [int(i) for i in graph.ids], graph.poses()
-        final = self.log.final_trajectory(ids, poses)
-        wall_s = time.perf_counter() - start
+        final, loops = self._write_estimates()
         truth = self._truth()
         self.log.write_trajectories(self.out, final, truth)
-        self.log.write_states(self.out, ids, graph.states())
-        loops = self.log.write_tables(self.out, {report.loop_id: report for report in graph.edge_reports()})
-        if self.slam.back.mapper is not None:
+        if self.slam.back is not None and self.slam.back.mapper is not None:
             with self.slam.clock.measure("map export"):
-                self.slam.back.mapper.export(self.out / "map", ids, poses)
-        self.viewer.finish(finish.update, final, truth)
+                self.slam.back.mapper.export(self.out / "map")
+        self._show_result(final, truth)
+        wall_s = time.perf_counter() - start
         metrics = self._metrics(final, truth, wall_s, loops)
         write_json(self.out / "metrics.json", metrics)
         return metrics
+
+    def _write_estimates(self) -> tuple[Trajectory, dict[str, int]]:
+        """Write states and tables; return the final trajectory and the counts of loop decisions."""
+        graph = None if self.slam.back is None else self.slam.back.graph
+        if graph is None:
+            return self.log.final_trajectory([], np.zeros((0, 4, 4))), self.log.write_tables(self.out, {})
+        ids = [int(i) for i in graph.ids]
+        self.log.write_states(self.out, ids, graph.states())
+        loops = self.log.write_tables(self.out, {report.loop_id: report for report in graph.edge_reports()})
+        return self.log.final_trajectory(ids, graph.poses()), loops
+
+    def _show_result(self, final: Trajectory, truth: Trajectory | None) -> None:
+        self.viewer.log_path("graph", final.positions_m)
+        if truth is not None and len(final):
+            with suppress(VislamError):  # too little in common: metrics say so
+                pairs = associate(truth, final)
+                self.viewer.log_path("truth", pairs.aligned(align(pairs, "se3")).estimate[:, :3, 3])
+        self.viewer.close()
 
     def _truth(self) -> Trajectory | None:
         try:
@@ -134,9 +168,9 @@ class Run:
         stamps = self.log.stamps_ns
         duration_s = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
         counters: dict[str, Any] = {**front.all_counters}
-        for name, room in (("loop", back.loops), ("map", back.mapper)):
-            if room is not None:
-                counters[name] = dict(room.counters)
+        if back is not None:
+            rooms = {"loop": back.loops, "map": back.mapper}
+            counters |= {name: dict(room.counters) for name, room in rooms.items() if room is not None}
         found = front.initialisation
         return {
             "name": self.recording.name,

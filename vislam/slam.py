@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,9 +19,9 @@ from vislam.config import Config
 from vislam.front import Front, FrontStep, OdometryKeyframe
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
-from vislam.loop import LoopDetector
-from vislam.mapping import Mapper
-from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopCandidate, LoopEdge, MagSample
+from vislam.loop.detector import LoopDetector
+from vislam.mapping.mapper import Mapper
+from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopCandidate, LoopEdge, MagSample, NavState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,16 +49,22 @@ class Finish:
 
     steps: list[Step]
     keyframes: list[KeyframeStep]  # those that had waited for gravity until the end
-    update: GraphUpdate
+    update: GraphUpdate | None  # None: not one keyframe reached the back end
 
 
 class Back:
     """What runs at the rate of keyframes: loop detector, graph, mapper."""
 
-    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock) -> None:
-        """Build the stages; loop closing and mapping can be switched off in the configuration."""
-        self.graph = PoseGraph(config.graph, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
-        self.loops = LoopDetector(config.loop, rig, config.seed) if config.loop.enabled else None
+    def __init__(
+        self, config: Config, rig: Rig, noise: ImuNoise | None, first_state: NavState | None, clock: StageClock
+    ) -> None:
+        """Build the stages; `first_state` is that of keyframe 0, None where no IMU tells gravity."""
+        has_gravity = first_state is not None
+        self.graph = PoseGraph(
+            config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig.T_body_cams[0]
+        )
+        self.graph.initialise(first_state)
+        self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self.mapper = Mapper(config.map, rig) if config.map.enabled else None
         self.clock = clock
         self.T_map_odom = np.eye(4)
@@ -104,7 +111,8 @@ class Slam:
         """Build the pipeline for a rig; without `noise` there is no IMU."""
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock)
-        self.back = Back(config, rig, noise, self.clock)
+        self.back: Back | None = None  # begins with the first keyframe, when gravity is known
+        self._make_back = partial(Back, config, rig, noise)
         self._frames: deque[Frame] = deque()
 
     def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
@@ -125,11 +133,11 @@ class Slam:
         """Process the frames that still wait and optimise a last time."""
         steps = [self._step(self._frames.popleft()) for _ in range(len(self._frames))]
         keyframes = [self._add(odometry) for odometry in self.front.give_up_waiting()]
-        return Finish(steps, keyframes, self.back.finish())
+        return Finish(steps, keyframes, None if self.back is None else self.back.finish())
 
     def _add(self, odometry: OdometryKeyframe) -> KeyframeStep:
-        if odometry.packet.keyframe.id == 0:
-            self.back.graph.initialise(self.front.first_state)
+        if self.back is None:
+            self.back = self._make_back(self.front.first_state, self.clock)
         step = self.back.add(odometry)
         self.front.feed_back(step.update)
         return step
@@ -137,5 +145,6 @@ class Slam:
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)
         keyframes = [self._add(odometry) for odometry in front.keyframes]
-        T_map_body = None if front.T_odom_body is None else self.back.T_map_odom @ front.T_odom_body
-        return Step(front, T_map_body, keyframes)
+        if self.back is None or front.T_odom_body is None:
+            return Step(front, None, keyframes)
+        return Step(front, self.back.T_map_odom @ front.T_odom_body, keyframes)
