@@ -100,7 +100,9 @@ class InitConfig:
     max_scale_sigma: float = 0.15  # relative, monocular only
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
-    min_parallax_deg: float = 1.0  # camera displacement over scene depth is unknown; rotation-free flow stands for it
+    attempt_s: float = 0.2  # between attempts: a window changes little from frame to frame
+    max_nodes: int = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
+    min_directions: int = 8  # monocular: motions with parallax in the window; four unknown states need some redundancy
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +207,9 @@ class LoopConfig:
     feature_sigma_px: float = 1.0  # of a keypoint; only its ratio to the depth sigma matters, residuals set the scale
     inverse_depth_sigma_1_m: float = 0.01  # of the difference of two inverse depths
     epipolar_px: float = 1.5  # Sampson error of an inlier where no depth is known
-    min_inliers_direction: int = 20  # of the essential matrix; wrong matches reached 15 in 5,735 pairs
-    min_parallax_px: float = 3.0  # less, and the direction is noise
+    min_inliers_direction: int = 25  # of the essential matrix; wrong matches reached 15 in 5,735 pairs
+    min_parallax_px: float = 6.0  # median that rotation does not explain; less, and the direction is noise
+    max_plane_share: float = 0.8  # of the matches; a plane seen twice fits two directions (one was wrong by 109 deg)
     # the fit's own covariance is several times too small (coarse octaves, depth bias, rolling shutter): with these three the
     # mean squared error per degree of freedom is 1.0 on TUM fr1_desk, 0.4 on EuRoC MH_01, against motion capture
     covariance_inflation: float = 16.0  # of the fit's variance
@@ -254,6 +257,7 @@ class MapConfig:
     max_range_m: float = 4.0  # depth noise grows with the square; farther points only clear the way to here
     pixel_step: int = 2  # keep every n-th row and column of a depth image; at 4 m still 3 pixels per voxel
     edge_ratio: float = 0.03  # a step to a neighbour pixel of more than this share of depth is an object's border
+    edge_px: int = 2  # pixels left out on both sides of such a border, where sensors mix near and far
     speckle_pixels: int = 40  # smaller connected surfaces, in kept pixels, are noise
     stereo_scale: float = 0.5  # image scale for dense stereo; 30 ms per 752x480 keyframe
     stereo_disparity_sigma_px: float = 0.3  # of semi-global matching at that scale
@@ -264,7 +268,7 @@ class MapConfig:
     rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 5 ms each
     cloud_voxel_m: float = 0.01  # one averaged point per voxel in cloud.ply
     cloud_max_points: int = 1_500_000  # a larger cloud gets larger voxels: 22 MB
-    cloud_min_points: int = 2  # depth pixels that must agree on a voxel of the cloud
+    cloud_min_points: int = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
     cloud_neighbours: int = 12  # statistical outlier removal: mean distance to so many neighbours
     cloud_outlier_sigma: float = 2.5  # may exceed the average by so many standard deviations
     grid_floor_m: float | None = None  # height of the floor in map; None: the lowest large horizontal surface

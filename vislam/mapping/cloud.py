@@ -16,6 +16,8 @@ Colors = NDArray[np.uint8]
 
 _KEY_BITS = 21
 _KEY_HALF = 1 << (_KEY_BITS - 1)
+_COLUMNS = 8  # weighted sums of position and colour, sum of weights, number of points
+_FAINT_SHARE = 0.15  # of the usual weight of a voxel in its cell; what has less is the blur around a surface
 _COARSER = 1.5  # a cloud that gets too large gets voxels larger by this
 
 
@@ -51,8 +53,9 @@ def _voxel(x: float, y: float, z: float, voxel_m: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(points: Points, colors: Colors, voxel_m: float, table: NDArray[np.int64], rows: NDArray[np.int32],
-                keys: NDArray[np.int64], sums: NDArray[np.float64], count: int) -> int:  # fmt: skip
+def _accumulate(points: Points, colors: Colors, weights: NDArray[np.float32], voxel_m: float,
+                table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.int64],
+                sums: NDArray[np.float64], count: int) -> int:  # fmt: skip
     for i in range(len(points)):
         key = _voxel(np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]), voxel_m)
         if key < 0:
@@ -63,10 +66,11 @@ def _accumulate(points: Points, colors: Colors, voxel_m: float, table: NDArray[n
             sums[count, :] = 0.0
             count += 1
         row = sums[rows[slot]]
-        row[6] += 1.0
+        row[6] += weights[i]
+        row[7] += 1.0
         for axis in range(3):
-            row[axis] += points[i, axis]
-            row[3 + axis] += colors[i, axis]
+            row[axis] += weights[i] * points[i, axis]
+            row[3 + axis] += weights[i] * colors[i, axis]
     return count
 
 
@@ -97,15 +101,24 @@ class VoxelAverage:
         self._max_points = max_points
         self._count = 0
         self._keys = np.empty(1 << 12, np.int64)
-        self._sums = np.empty((1 << 12, 7), np.float64)  # position, colour, number of points
+        self._sums = np.empty((1 << 12, _COLUMNS), np.float64)
         self._table = np.full(1 << 14, -1, np.int64)
         self._rows = np.zeros(1 << 14, np.int32)
 
-    def add(self, cloud: Cloud) -> None:
-        """Add a cloud; points that are not finite are left out."""
+    def add(self, cloud: Cloud, weights: NDArray[np.float32] | None = None) -> None:
+        """Add a cloud with positive weights [N] (all 1 unless given); points that are not finite are left out."""
         self._reserve(len(cloud))
+        weights = np.ones(len(cloud), np.float32) if weights is None else weights
         self._count = _accumulate(
-            cloud.points_m, cloud.colors, self.voxel_m, self._table, self._rows, self._keys, self._sums, self._count
+            cloud.points_m,
+            cloud.colors,
+            weights,
+            self.voxel_m,
+            self._table,
+            self._rows,
+            self._keys,
+            self._sums,
+            self._count,
         )
         while self._count > self._max_points:
             old = self._sums[: self._count].copy()
@@ -118,18 +131,36 @@ class VoxelAverage:
         if need > len(self._keys):
             grown = max(need, 2 * len(self._keys))
             self._keys = np.resize(self._keys, grown)
-            self._sums = np.concatenate([self._sums, np.empty((grown - len(self._sums), 7))])
+            self._sums = np.concatenate([self._sums, np.empty((grown - len(self._sums), _COLUMNS))])
         if 2 * need > len(self._table):
             size = 1 << int(np.ceil(np.log2(4 * need)))
             self._table, self._rows = np.full(size, -1, np.int64), np.zeros(size, np.int32)
             _rehash(self._table, self._rows, self._keys, self._count)
 
-    def cloud(self, min_points: int = 1) -> Cloud:
-        """Return one point per voxel that holds at least `min_points`, in order of first use."""
+    def cloud(self, min_points: int = 1, cell_m: float = 0.0) -> Cloud:
+        """Return one point per voxel, in order of first use.
+
+        With `cell_m`, only where a cell of that size holds at least `min_points`, and without its faintest voxels.
+        """
         sums = self._sums[: self._count]
-        sums = sums[sums[:, 6] >= min_points]
-        means = sums[:, :6] / sums[:, 6:]
+        if cell_m > 0.0 and len(sums):
+            cell_of = cells_of(sums[:, :3] / sums[:, 6:7], cell_m)
+            usual = np.bincount(cell_of, weights=sums[:, 6]) / np.bincount(cell_of)
+            enough = np.bincount(cell_of, weights=sums[:, 7]) >= min_points
+            sums = sums[enough[cell_of] & (sums[:, 6] >= _FAINT_SHARE * usual[cell_of])]
+        means = sums[:, :6] / sums[:, 6:7]
         return Cloud(means[:, :3].astype(np.float32), np.clip(np.round(means[:, 3:]), 0, 255).astype(np.uint8))
+
+
+def cells_of(points_m: NDArray[np.floating], cell_m: float) -> NDArray[np.int64]:
+    """Return the number [N], from 0 on and dense, of the cubic cell that each of the points [N, 3] lies in."""
+    if len(points_m) == 0:
+        return np.zeros(0, np.int64)
+    cells = np.floor(points_m.astype(np.float64) / cell_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    _, numbers = np.unique((cells[:, 2] * extent[1] + cells[:, 1]) * extent[0] + cells[:, 0], return_inverse=True)
+    return np.asarray(numbers, dtype=np.int64)
 
 
 def voxel_filter(cloud: Cloud, voxel_m: float) -> Cloud:
@@ -145,11 +176,11 @@ def without_outliers(cloud: Cloud, neighbours: int, sigma: float, cell_m: float)
     Statistical outlier removal (Rusu et al., "Towards 3D point cloud based object maps", 2008) on one point per cell of
     `cell_m`: as good at finding stray points, and its cost does not depend on how fine the cloud is.
     """
-    cells = np.floor(cloud.points_m.astype(np.float64) / cell_m).astype(np.int64)
-    _, first, cell_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    if len(first) <= neighbours:
+    cell_of = cells_of(cloud.points_m, cell_m)
+    counts = np.bincount(cell_of)
+    if len(counts) <= neighbours:
         return cloud
-    centres = (cells[first] + 0.5) * cell_m
+    centres = np.stack([np.bincount(cell_of, weights=cloud.points_m[:, axis]) / counts for axis in range(3)], axis=1)
     distances, _ = cKDTree(centres).query(centres, k=neighbours + 1)
     mean = np.asarray(distances, dtype=np.float64)[:, 1:].mean(axis=1)
-    return cloud.select((mean <= mean.mean() + sigma * mean.std())[cell_of.ravel()])
+    return cloud.select((mean <= mean.mean() + sigma * mean.std())[cell_of])

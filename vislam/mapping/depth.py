@@ -86,8 +86,8 @@ def _unit_m(max_range_m: float) -> float:
 def filter_depth(depth_m: ImageF32, step: int, view: DepthView, config: MapConfig) -> ImageU16:
     """Return the trusted depth on the view's grid in the view's units [h, w], 0 where there is none.
 
-    Left out: depth that is not finite, nearer than `min_range_m`, beside a jump of more than `edge_ratio` between
-    neighbouring pixels (sensors smear objects' borders), or in a connected surface of fewer than `speckle_pixels`.
+    Left out: depth that is not finite, nearer than `min_range_m`, within `edge_px` of a jump that is steeper than
+    `edge_ratio` per pixel (sensors smear objects' borders), or in a connected surface of fewer than `speckle_pixels`.
     Raises DataError when the image is not `step` times the view's size.
     """
     expected = tuple(-(-n // step) for n in depth_m.shape)
@@ -96,16 +96,15 @@ def filter_depth(depth_m: ImageF32, step: int, view: DepthView, config: MapConfi
             f"depth image is {'x'.join(map(str, depth_m.shape[::-1]))} but the camera's is about "
             f"{view.size[0] * step}x{view.size[1] * step}; register depth to cam0 and give its calibration"
         )
-    kept = _away_from_edges(
-        np.ascontiguousarray(depth_m, dtype=np.float32), step, config.min_range_m, config.edge_ratio, view.unit_m
-    )
+    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    kept = _away_from_edges(depth, step, config.min_range_m, config.edge_ratio, config.edge_px, view.unit_m)
     # neighbours on the coarser grid lie `step` pixels apart, so a surface may step by as many times the ratio
     _remove_speckles(kept, config.edge_ratio * step, config.speckle_pixels)
     return np.asarray(kept)
 
 
 @njit(cache=True, nogil=True)
-def _away_from_edges(depth: ImageF32, step: int, min_depth: float, ratio: float, unit: float) -> ImageU16:
+def _away_from_edges(depth: ImageF32, step: int, min_depth: float, ratio: float, reach: int, unit: float) -> ImageU16:
     rows, columns = depth.shape
     out = np.zeros(((rows + step - 1) // step, (columns + step - 1) // step), np.uint16)
     for i in range(out.shape[0]):
@@ -114,13 +113,11 @@ def _away_from_edges(depth: ImageF32, step: int, min_depth: float, ratio: float,
             z = depth[v, u]
             if not (z >= min_depth and z < np.inf):
                 continue
-            limit = ratio * z
             smooth = True
-            for dv in range(-1, 2):
-                for du in range(-1, 2):
-                    vv, uu = min(max(v + dv, 0), rows - 1), min(max(u + du, 0), columns - 1)
+            for vv in range(max(v - reach, 0), min(v + reach, rows - 1) + 1):
+                for uu in range(max(u - reach, 0), min(u + reach, columns - 1) + 1):
                     other = depth[vv, uu]
-                    if other > 0.0 and abs(other - z) > limit:
+                    if other > 0.0 and abs(other - z) > ratio * z * max(abs(vv - v), abs(uu - u)):
                         smooth = False
             if smooth:
                 out[i, j] = np.uint16(min(np.floor(z / unit + 0.5), 65535.0))

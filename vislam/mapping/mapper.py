@@ -86,8 +86,12 @@ class Mapper:
         sparse_only = True
         for scan, T in self._scans():
             sparse_only = sparse_only and scan.depth is None
-            average.add(self._points(scan, T))
-        fused = average.cloud(1 if sparse_only else config.cloud_min_points)
+            points = self._points(scan, T)
+            seen_from = (T @ self._extractor.view.T_body_view)[:3, 3].astype(np.float32)
+            squared_m2 = np.maximum(np.sum((points.points_m - seen_from) ** 2, axis=1), config.min_range_m**2)
+            # depth from disparity, structured light included, errs with the square of range: weight 1 / sigma^2
+            average.add(points, (1.0 / squared_m2**2).astype(np.float32))
+        fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
         return without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)

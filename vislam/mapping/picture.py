@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vislam.geometry import level_rotation
-from vislam.mapping.cloud import Cloud
+from vislam.mapping.cloud import Cloud, cells_of
 from vislam.mapping.mesh import Mesh
 from vislam.mapping.octree import Octree
 from vislam.mapping.raster import fill_triangles, light_onto, splat_colors, splat_depth
@@ -30,7 +30,7 @@ _MARGIN = 0.05  # of the picture's size, left free on each side
 _NEAR_M = 0.02
 _HIDDEN_ALPHA = 0.3  # of a line behind a surface
 _EDL_STRENGTH = 60.0
-_BLENDED_M = 0.03  # depth noise of one surface seen from several keyframes
+_BLENDED_M = 0.025  # depth noise of one surface seen from several keyframes
 _CEILING_ABOVE_PATH_M = 0.5
 _PALENESS = 0.15  # of the colours of height, so that shading and lines stand out
 _PAPER = {"white": (255, 255, 255), "dark": (18, 20, 26)}
@@ -87,6 +87,7 @@ class _Canvas:
 
     eye: _Eye
     depth: F32  # [H, W] infinite where nothing is
+    noise_m: float  # of the surface's depth
     surface: F32  # [H, W, 4] colour, and 1 where anything is
 
 
@@ -102,12 +103,11 @@ def render_cloud(cloud: Cloud, lines: Sequence[Line] = (), style: Style | None =
     pixels, z = canvas.eye.see(points)
     ahead = z > _NEAR_M
     pixels, z, colors = pixels[ahead], z[ahead], colors[ahead]
-    # discs close a surface sampled every `spacing_m`; wider ones blend into each other and smooth the depth's noise
-    radius = np.clip(canvas.eye.focal_px * spacing_m / z, 1.0, 40.0).astype(np.float32)
+    # discs close the surface; wider ones blend into each other and smooth the noise of depth
+    radius = np.clip(canvas.eye.focal_px * spacing_m[ahead] / z, 1.0, 40.0).astype(np.float32)
     splat_depth(pixels, z, np.float32(0.8) * radius, canvas.depth)
-    canvas.surface = splat_colors(
-        pixels, z, np.float32(1.3) * radius, colors, canvas.depth, max(_BLENDED_M, 1.5 * spacing_m)
-    )
+    canvas.noise_m = _BLENDED_M
+    canvas.surface = splat_colors(pixels, z, np.float32(1.25) * radius, colors, canvas.depth, _BLENDED_M)
     return _finish(canvas, points, lines, style)
 
 
@@ -195,13 +195,17 @@ def _ceiling_m(style: Style, lines: Sequence[Line]) -> float:
     return max(heights) + _CEILING_ABOVE_PATH_M if heights else np.inf
 
 
-def _spacing_m(points: NDArray[np.floating]) -> float:
-    """Return the usual distance between neighbouring points."""
+def _spacing_m(points: NDArray[np.floating]) -> Array:
+    """Return the usual distance [N] from each point to its neighbours, from how many share a cell with it."""
     if len(points) < 2:
-        return 0.02
+        return np.full(len(points), 0.02)
     some = points[:: max(1, len(points) // 2000)]
     distances, _ = cKDTree(points).query(some, k=min(5, len(points)))
-    return max(float(np.median(np.asarray(distances)[:, -1])), 1e-3)
+    usual = max(float(np.median(np.asarray(distances)[:, -1])), 1e-3)
+    cell_m = 6.0 * usual
+    cell_of = cells_of(points, cell_m)
+    in_cell = np.bincount(cell_of)[cell_of]
+    return np.clip(cell_m / np.sqrt(in_cell), usual, 1.7 * usual)
 
 
 def _canvas(points: NDArray[np.floating], lines: Sequence[Line], style: Style) -> _Canvas:
@@ -211,14 +215,14 @@ def _canvas(points: NDArray[np.floating], lines: Sequence[Line], style: Style) -
         eye = _framed(subject, np.deg2rad(style.azimuth_deg), np.deg2rad(style.elevation_deg), size)
     else:
         eye = _best_eye(points, subject, lines, style, size)
-    return _Canvas(eye, np.full(size[::-1], np.inf, np.float32), np.zeros((*size[::-1], 4), np.float32))
+    return _Canvas(eye, np.full(size[::-1], np.inf, np.float32), 0.0, np.zeros((*size[::-1], 4), np.float32))
 
 
 def _subject(points: NDArray[np.floating], lines: Sequence[Line]) -> Array:
     """Return the points [M, 3] that the picture must hold: a sample without stray ones, and the lines."""
     parts = [np.asarray(line.points_m, dtype=np.float64) for line in lines]
     if len(points):
-        some = np.asarray(points[:: max(1, len(points) // 20000)], dtype=np.float64)
+        some = np.asarray(points[:: max(1, len(points) // 5000)], dtype=np.float64)
         low, high = np.percentile(some, [0.1, 99.9], axis=0)
         parts.append(some[((some >= low) & (some <= high)).all(axis=1)])
     subject = np.concatenate(parts) if parts else np.zeros((0, 3))
@@ -252,7 +256,7 @@ def _best_eye(
     """Return the eye, of sixteen around the subject, that is near to it and sees most of the lines."""
     small = (size[0] // 16, size[1] // 16)
     path = np.concatenate([line.points_m for line in lines]) if lines else subject
-    some = np.asarray(points[:: max(1, len(points) // 60000)], dtype=np.float64)
+    some = np.asarray(points[:: max(1, len(points) // 20000)], dtype=np.float64)
     best, best_score = None, -np.inf
     for azimuth in np.arange(16) * np.pi / 8.0 + np.deg2rad(5.0):
         eye = _framed(subject, azimuth, np.deg2rad(style.elevation_deg), small)
@@ -284,7 +288,7 @@ def _finish(canvas: _Canvas, points: NDArray[np.floating], lines: Sequence[Line]
     paper = np.full((*canvas.depth.shape, 3), _PAPER[style.background], np.uint8)
     if style.floor_grid and len(points):
         _draw_floor_grid(paper, canvas.eye, points, _GRID_LINE[style.background])
-    light_onto(paper, canvas.surface, canvas.depth, _SUPERSAMPLING, _EDL_STRENGTH)
+    light_onto(paper, canvas.surface, canvas.depth, _SUPERSAMPLING, _EDL_STRENGTH, canvas.noise_m)
     image = np.asarray(cv2.resize(paper, style.size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     eye = canvas.eye.scaled(1.0 / _SUPERSAMPLING)
     for line in lines:

@@ -85,10 +85,10 @@ def fill_triangles(pixels: F32, z: F32, colors: F32, triangles: NDArray[np.int32
 
 
 @njit(cache=True, nogil=True)
-def light_onto(paper: NDArray[np.uint8], image: F32, depth: F32, radius: int, strength: float) -> None:
+def light_onto(paper: NDArray[np.uint8], image: F32, depth: F32, radius: int, strength: float, noise_m: float) -> None:
     """Put the covered pixels of an image [H, W, 4] onto paper [H, W, 3], darker where neighbours are nearer to the eye.
 
-    Neighbours at one and at three radii are asked, in eight directions.
+    Neighbours at one and at three radii are asked, in eight directions; steps up to `noise_m` cast no shadow.
     """
     rows, columns = depth.shape
     log_depth = np.log(depth)
@@ -96,7 +96,7 @@ def light_onto(paper: NDArray[np.uint8], image: F32, depth: F32, radius: int, st
         for x in range(columns):
             if image[y, x, 3] == 0.0:
                 continue
-            here = log_depth[y, x]
+            here = log_depth[y, x] - noise_m / depth[y, x]
             hidden = 0.0
             for ring in range(2):
                 reach = radius * (1 + 2 * ring)
