@@ -96,7 +96,8 @@ class Preintegrator:
         if len(t_ns) == 0:
             return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
         first, last = int(t_ns[0] > t0_ns), int(t_ns[-1] < t1_ns)
-        t_ns = np.concatenate([[t0_ns] * first, t_ns, [t1_ns] * last])
+        ends = [np.full(first, t0_ns, dtype=np.int64), t_ns, np.full(last, t1_ns, dtype=np.int64)]
+        t_ns = np.concatenate(ends)  # integers throughout: a float loses 256 ns of the time of day
         gyro = np.concatenate([gyro[:first], gyro, gyro[len(gyro) - last :]])
         accel = np.concatenate([accel[:first], accel, accel[len(accel) - last :]])
         return (t_ns - t0_ns).astype(np.float64) * 1e-9, gyro, accel
