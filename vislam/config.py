@@ -219,6 +219,8 @@ class LoopConfig:
     max_sigma_m: float = 0.03  # a pose this good needs no witness; for a scene at 2 m, grows with depth
     agreement_m: float = 0.15  # a witness differs by less; for a scene at 2 m, grows with depth
     agreement_deg: float = 8.0  # a witness differs by less
+    agreement_sigmas: float = 3.0  # and by less than both standard deviations, taken together, explain
+    agreement_slack_m: float = 0.03  # beside what odometry adds between neighbours
     min_agreement_share: float = 0.5  # of matches that also agree the other way round, and in depth
     max_tilt_deg: float = 5.0  # against gravity; true edges stay within 3 deg
     max_rotation_sigma_deg: float = 2.0  # of an edge without scale

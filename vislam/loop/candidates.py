@@ -39,7 +39,7 @@ class Island:
 
 
 def islands(ids: Sequence[int], scores: Sequence[float], max_gap: int) -> list[Island]:
-    """Group retrieved keyframes whose ids differ by at most `max_gap`, best island first (Galvez-Lopez and Tardos 2012)."""
+    """Group retrieved keyframes whose ids differ by at most `max_gap`, best first (Galvez-Lopez 2012)."""
     found: list[Island] = []
     for identifier, score in sorted(zip(ids, scores, strict=True)):
         last = found[-1] if found else None
@@ -87,7 +87,7 @@ def view_bounds(camera: Camera) -> Array:
 
 @njit(cache=True, nogil=True)
 def _overlaps(points_map: Array, centre: Array, T_cam_maps: Array, bounds: Array) -> Array:
-    """Return for each old camera which share of the points [P, 3] it sees, weighted by how alike they look from there."""
+    """Return for each old camera which share of the points [P, 3] it sees, weighted by how alike they look there."""
     out = np.zeros(len(T_cam_maps))
     cos_limit = np.cos(_MAX_VIEW_ANGLE_RAD)
     for k in range(len(T_cam_maps)):
@@ -127,7 +127,7 @@ def odometry_candidates(
         bounds: of an image on z = 1, from `view_bounds`.
         count: at most this many.
         min_overlap: least weighted share of the points that must be visible, 0..1.
-        min_apart: ids of two candidates differ by at least this, so that they constrain different parts of the trajectory.
+        min_apart: ids of two candidates differ by at least this, so that they tie different stretches.
     """
     overlap = _overlaps(np.ascontiguousarray(points_map_m), centre_map_m, np.ascontiguousarray(T_cam_maps), bounds)
     chosen: list[Candidate] = []

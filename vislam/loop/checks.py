@@ -1,7 +1,8 @@
-"""Whether a verified pose may become an edge: the rule that let no gross error through in the measurements, with its reason.
+"""Whether a verified pose may become an edge, and why: the rule that let no gross error through when measured.
 
-Enough inliers alone do not do: what remains wrong after PnP is the right place with a bad pose, or an object that exists twice. A
-small standard deviation, or the agreement of an independent neighbour through odometry, sorts those out.
+Enough inliers alone do not do: what remains wrong after PnP is the right place with a bad pose, or an object that
+exists twice. A small standard deviation, or the agreement of an independent neighbour through odometry, sorts those
+out.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ class Measured:
     T_from_to: Array  # [4, 4]
     has_scale: bool
     median_depth_m: float
+    sigma_m: float  # of the translation
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,8 @@ def agree(one: Measured, other: Measured, poses: PoseTable, config: LoopConfig) 
         return False
     if one.has_scale and other.has_scale:
         depth = np.nanmax([_REFERENCE_DEPTH_M, one.median_depth_m, other.median_depth_m])
-        limit = config.agreement_m * depth / _REFERENCE_DEPTH_M
+        both = config.agreement_sigmas * np.hypot(one.sigma_m, other.sigma_m) + config.agreement_slack_m
+        limit = min(config.agreement_m * depth / _REFERENCE_DEPTH_M, both)
         return bool(np.linalg.norm(one.T_from_to[:3, 3] - predicted[:3, 3]) <= limit)
     if one.has_scale or other.has_scale:
         return False
@@ -82,7 +85,7 @@ def _rays_meet(direction: Array, origin: Array, other_direction: Array, limit_de
 def agrees_with_map(one: Measured, poses: PoseTable, config: LoopConfig) -> bool:
     """Return whether a measurement says what the map says already; without scale, the rotation only."""
     T = invert(poses[one.from_id]) @ poses[one.to_id]
-    measured = Measured(one.from_id, one.to_id, T, one.has_scale, one.median_depth_m)
+    measured = Measured(one.from_id, one.to_id, T, one.has_scale, one.median_depth_m, one.sigma_m)
     if one.has_scale:
         return agree(one, measured, poses, config)
     return _angle_rad(one.T_from_to, T) <= np.deg2rad(config.agreement_deg)
@@ -95,13 +98,18 @@ def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -
     for name, share in (("the other way round", found.reverse_agreement), ("in depth", found.depth_agreement)):
         if share < config.min_agreement_share:
             return f"only {share:.0%} agree {name}, needs {config.min_agreement_share:.0%}"
-    if not found.has_scale and not np.rad2deg(found.sigma_m) <= config.max_direction_sigma_deg:
-        return f"direction good to {np.rad2deg(found.sigma_m):.1f} deg only, limit {config.max_direction_sigma_deg:g}"
+    if not found.has_scale and found.covariance is not None:
+        worst = np.rad2deg(np.sqrt([np.linalg.eigvalsh(found.covariance[:3, :3])[-1], found.sigma_m**2]))
+        if not (worst[0] <= config.max_rotation_sigma_deg and worst[1] <= config.max_direction_sigma_deg):
+            return (
+                f"rotation and direction good to {worst[0]:.1f} and {worst[1]:.1f} deg only, "
+                f"limits {config.max_rotation_sigma_deg:g} and {config.max_direction_sigma_deg:g}"
+            )
     return ""
 
 
 def judge(found: Verification, tilt_rad: float | None, agreeing: int, config: LoopConfig) -> Judgement:
-    """Decide about a candidate from its verification, its tilt against gravity (None: unknown) and agreeing neighbours."""
+    """Decide about a candidate from its verification, its tilt (None: unknown) and how many neighbours agree."""
     if found.T_a_b is None:
         return Judgement(LoopDecision.REJECTED, found.reason)
     seen = f"{found.inliers} inliers, {found.supporters} with guided matching"

@@ -1,8 +1,9 @@
 """Finding keyframes that look alike: a vocabulary trained on the run's own keyframes, over an inverted index.
 
-There is no vocabulary file. The first training comes after a few keyframes, before any of them is old enough to be a candidate, and
-the tree is grown again each time their number has doubled: always on what this run has seen, which retrieves better than a generic
-tree of 700,000 words. Training is part of `add`, so that a replay gives the same words.
+There is no vocabulary file. The first training comes after a few keyframes, before any of them is old enough to be a
+candidate, and the tree is grown again each time their number has doubled: always on what this run has seen, which
+retrieves better than a generic tree of 700,000 words. Training is part of `add`, so that a replay gives the same
+words.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class LoopDetector:
             T_map_body: its current estimate [4, 4].
 
         Returns:
-            Verified edges, which may end at an earlier keyframe whose parked edge was confirmed now, and every candidate
+            Verified edges, some perhaps to an earlier keyframe whose parked edge was confirmed now, and every candidate
             with its decision and reason. Raises DataError for features that cannot be used.
         """
         if not self._config.enabled:
@@ -167,7 +167,9 @@ class LoopDetector:
             if self._gravity_aligned:
                 tilt_rad = tilt_error_rad(found.T_a_b, self._poses[candidate.id], self._poses[view.id])
             if not objection(found, tilt_rad, self._config):
-                measured = Measured(candidate.id, view.id, found.T_a_b, found.has_scale, found.median_depth_m)
+                measured = Measured(
+                    candidate.id, view.id, found.T_a_b, found.has_scale, found.median_depth_m, found.sigma_m
+                )
         return _Trial(candidate, view.id, found, tilt_rad, measured)
 
     def _is_settled(self, trial: _Trial, trials: list[_Trial]) -> bool:

@@ -1,12 +1,13 @@
-"""Relative rotation and direction of two views without points: essential matrix by RANSAC, refined on the Sampson error.
+"""Relative rotation and direction of two views without points: essential matrix, refined on the Sampson error.
 
-Hartley and Zisserman, "Multiple View Geometry", sections 9.6 and 11.4. The translation has no length; its tangent is the plane
-across the direction, so its covariance is singular along it.
+Hartley and Zisserman, "Multiple View Geometry", sections 9.6 and 11.4. The translation has no length; its tangent is
+the plane across the direction, so its covariance is singular along it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,21 +32,14 @@ class Direction:
     covariance: Array  # [6, 6] of the fit, singular along the direction
     inliers: NDArray[np.bool_]  # [N]
     parallax: float  # median displacement of the inliers that rotation does not explain, on z = 1
+    plane_share: float  # of the inliers that one plane explains; near 1, two directions fit equally well
 
 
 def relative_direction(xy_a: Array, xy_b: Array, limit: float, seed: int) -> Direction | None:
     """Return rotation and direction from matches [N, 2] on z = 1 with inlier `limit` there; None when there is none."""
     if len(xy_a) < _MIN_MATCHES:
         return None
-    settings = cv2.UsacParams()
-    settings.randomGeneratorState = seed % 2**31
-    settings.threshold = limit
-    settings.confidence = _CONFIDENCE
-    settings.maxIterations = _RANSAC_ROUNDS
-    settings.sampler = cv2.SAMPLING_UNIFORM
-    settings.score = cv2.SCORE_METHOD_MSAC
-    settings.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    settings.isParallel = False
+    settings = _ransac(limit, seed)
     eye, none = np.eye(3), np.zeros(4)
     try:
         E, mask = cv2.findEssentialMat(xy_b, xy_a, eye, eye, none, none, settings)
@@ -57,7 +51,29 @@ def relative_direction(xy_a: Array, xy_b: Array, limit: float, seed: int) -> Dir
     inliers = mask.ravel() > 0
     if np.count_nonzero(inliers) < _MIN_MATCHES:
         return None
-    return _refined(R, t.ravel(), xy_a, xy_b, inliers, limit)
+    return _refined(R, t.ravel(), xy_a, xy_b, inliers, limit, seed)
+
+
+def _ransac(limit: float, seed: int) -> Any:
+    settings = cv2.UsacParams()
+    settings.randomGeneratorState = seed % 2**31
+    settings.threshold = limit
+    settings.confidence = _CONFIDENCE
+    settings.maxIterations = _RANSAC_ROUNDS
+    settings.sampler = cv2.SAMPLING_UNIFORM
+    settings.score = cv2.SCORE_METHOD_MSAC
+    settings.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    settings.isParallel = False
+    return settings
+
+
+def _plane_share(xy_a: Array, xy_b: Array, limit: float, seed: int) -> float:
+    """Return the largest share of matches [N, 2] that one homography explains."""
+    try:
+        _, mask = cv2.findHomography(xy_a, xy_b, _ransac(limit, seed))
+    except cv2.error:  # degenerate samples only
+        return 1.0
+    return 1.0 if mask is None else float(np.mean(mask.ravel() > 0))
 
 
 def _sampson(R: Array, t: Array, rays_a: Array, rays_b: Array) -> tuple[Array, Array]:
@@ -74,7 +90,9 @@ def _tangent(R: Array, t: Array) -> Array:
     return basis
 
 
-def _refined(R: Array, t: Array, xy_a: Array, xy_b: Array, inliers: NDArray[np.bool_], limit: float) -> Direction | None:
+def _refined(
+    R: Array, t: Array, xy_a: Array, xy_b: Array, inliers: NDArray[np.bool_], limit: float, seed: int
+) -> Direction | None:
     ones = np.ones((len(xy_a), 1))
     rays_a, rays_b = np.hstack([xy_a, ones]), np.hstack([xy_b, ones])
     sigma = limit / 3.0
@@ -107,4 +125,5 @@ def _refined(R: Array, t: Array, xy_a: Array, xy_b: Array, inliers: NDArray[np.b
     turned = rays_b[inliers] @ R.T
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_a[inliers], axis=1)
-    return Direction(T, spread * lift @ np.linalg.inv(H) @ lift.T, inliers, float(np.nanmedian(shift)))
+    plane = _plane_share(xy_a[inliers], xy_b[inliers], 2.0 * limit, seed)
+    return Direction(T, spread * lift @ np.linalg.inv(H) @ lift.T, inliers, float(np.nanmedian(shift)), plane)

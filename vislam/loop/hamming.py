@@ -27,12 +27,9 @@ def popcount(typing_context: Any, value: Any) -> Any:
 @njit(cache=True, nogil=True)
 def distance(a: NDArray[np.uint64], i: int, b: NDArray[np.uint64], j: int) -> int:
     """Return the Hamming distance between rows `a[i]` and `b[j]` of packed descriptors [N, 4]."""
-    return np.int64(
-        popcount(a[i, 0] ^ b[j, 0])
-        + popcount(a[i, 1] ^ b[j, 1])
-        + popcount(a[i, 2] ^ b[j, 2])
-        + popcount(a[i, 3] ^ b[j, 3])
-    )
+    low = popcount(a[i, 0] ^ b[j, 0]) + popcount(a[i, 1] ^ b[j, 1])
+    high = popcount(a[i, 2] ^ b[j, 2]) + popcount(a[i, 3] ^ b[j, 3])
+    return int(low + high)
 
 
 def packed(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:

@@ -1,8 +1,8 @@
 """The inverted index: which keyframes have a word, so that a query touches only what it shares.
 
-Each word's postings lie together in one pool, keyframes ascending, and move to the end of the pool with twice the room when they
-have no more: adding stays incremental and a query reads memory in order (postings chained in blocks are ten times slower at 50,000
-keyframes, from cache misses).
+Each word's postings lie together in one pool, keyframes ascending, and move to the end of the pool with twice the
+room when they have no more: adding stays incremental and a query reads memory in order (postings chained in blocks
+are ten times slower at 50,000 keyframes, from cache misses).
 """
 
 from __future__ import annotations
@@ -107,7 +107,15 @@ class InvertedIndex:
             self._slots = np.resize(self._slots, 2 * needed)
             self._values = np.resize(self._values, 2 * needed)
         self._used = _append(
-            self._count, bag.words, bag.weights, self._start, self._fill, self._room, self._slots, self._values, self._used
+            self._count,
+            bag.words,
+            bag.weights,
+            self._start,
+            self._fill,
+            self._room,
+            self._slots,
+            self._values,
+            self._used,
         )
         self._ids[self._count] = keyframe_id
         self._count += 1

@@ -35,7 +35,7 @@ class PoseTable:
         return self._poses[: len(self)]
 
     def add(self, keyframe_id: int, T_map_body: Array) -> None:
-        """Add a keyframe. Raises ValueError unless ids ascend and the pose is finite: the caller is broken otherwise."""
+        """Add a keyframe. Raises ValueError unless ids ascend and the pose is finite: the caller is at fault."""
         count = len(self)
         if count and keyframe_id <= self._ids[count - 1]:
             raise ValueError(f"keyframe {keyframe_id} came after keyframe {self._ids[count - 1]}")

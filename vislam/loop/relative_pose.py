@@ -1,8 +1,8 @@
 """The relative pose of two views from matched features with points: robust refinement, and its covariance.
 
-A match can hold up to five numbers that the pose explains: the point of a in the pixels of b, the point of b in the pixels of a, and
-the inverse depths of both against each other. All are fitted together by Gauss-Newton with a Cauchy kernel. Everything is in
-camera frames and normalised coordinates; the tangent perturbs `T_a_b @ se3_exp(xi)`.
+A match can hold up to five numbers that the pose explains: the point of a in the pixels of b, the point of b in the
+pixels of a, and the inverse depths of both against each other. All are fitted together by Gauss-Newton with a Cauchy
+kernel. Everything is in camera frames and normalised coordinates; the tangent perturbs `T_a_b @ se3_exp(xi)`.
 """
 
 from __future__ import annotations
@@ -50,9 +50,7 @@ class Refined:
 
 
 @njit(cache=True, nogil=True)
-def _add(
-    H: Array, g: Array, point: Array, J_point: Array, fx: float, fy: float, sigma: float, share: float
-) -> None:
+def _add(H: Array, g: Array, point: Array, J_point: Array, fx: float, fy: float, sigma: float, share: float) -> None:
     """Add the residual of a projected point [3] at observed (fx, fy); J_point [3, 6] is d(point)/d(xi)."""
     z = point[2]
     rx, ry = (point[0] / z - fx) / sigma, (point[1] / z - fy) / sigma
@@ -126,7 +124,7 @@ def _gauss_newton(
 
 @njit(cache=True, nogil=True)
 def _errors(T_a_b: Array, points_a: Array, points_b: Array, xy_a: Array, xy_b: Array) -> tuple[Array, Array, Array]:
-    """Return reprojection errors a in b and b in a [N] on z = 1, and inverse depth differences [N]; NaN where unknown."""
+    """Return reprojection errors a in b, b in a [N] on z = 1, and inverse depth differences [N]; NaN: unknown."""
     count = len(xy_a)
     forward, reverse, depth = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
     T_b_a = invert(T_a_b)

@@ -1,8 +1,8 @@
 """Hierarchical k-medians over 256-bit descriptors: growing the tree and walking down it.
 
-Nister and Stewenius, "Scalable recognition with a vocabulary tree", CVPR 2006, with the majority bit as the median of a
-cluster (Galvez-Lopez and Tardos, T-RO 2012) and k-means++ seeds. Nodes are stored breadth first: the children of a node are
-consecutive and come after it, so the tree is four flat arrays.
+Nister and Stewenius, "Scalable recognition with a vocabulary tree", CVPR 2006, with the majority bit as the median of
+a cluster (Galvez-Lopez and Tardos, T-RO 2012) and k-means++ seeds. Nodes are stored breadth first: the children of a
+node are consecutive and come after it, so the tree is four flat arrays.
 """
 
 from __future__ import annotations
@@ -50,9 +50,7 @@ def _majority(data: Packed, members: Ints, low: int, high: int, out: Packed, row
 
 
 @njit(cache=True, nogil=True)
-def _seed_centres(
-    data: Packed, members: Ints, low: int, high: int, centres: Packed, state: NDArray[np.uint64]
-) -> int:
+def _seed_centres(data: Packed, members: Ints, low: int, high: int, centres: Packed, state: NDArray[np.uint64]) -> int:
     """Choose centres by k-means++ among `members[low:high]`; return how many different ones were found."""
     stride = (high - low + _SEED_SAMPLE - 1) // _SEED_SAMPLE
     sample = members[low:high:stride]
@@ -135,12 +133,10 @@ def _split(
 
 
 @njit(cache=True, nogil=True)
-def grow(
-    data: Packed, branching: int, depth: int, seed: int
-) -> tuple[Packed, NDArray[np.int32], NDArray[np.int32]]:
+def grow(data: Packed, branching: int, depth: int, seed: int) -> tuple[Packed, NDArray[np.int32], NDArray[np.int32]]:
     """Grow a tree over packed descriptors [N, 4], N >= 1; breadth first, deterministic for a seed.
 
-    Returns centres [nodes, 4] (the root's is unused), the first child of each node and its number of children (0: a leaf).
+    Returns centres [nodes, 4] (the root's is unused), each node's first child and its number of children (0: a leaf).
     """
     total = len(data)
     capacity = 1 + total * depth  # every node below the root holds at least one descriptor of its level

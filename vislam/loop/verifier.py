@@ -1,8 +1,9 @@
 """Geometric verification: whether two views show the same place, and the relative pose if they do.
 
-Matches by descriptor, PnP with RANSAC (the points of one view in the pixels of the other), guided re-matching with the pose found,
-refinement on all inliers in both directions. Without points on either side the essential matrix gives rotation and direction.
-The covariance is that of the fit, inflated and floored by what TUM's motion capture showed (`LoopConfig`).
+Matches by descriptor, PnP with RANSAC (the points of one view in the pixels of the other), guided re-matching with
+the pose found, refinement on all inliers in both directions. Without points on either side the essential matrix gives
+rotation and direction. The covariance is that of the fit, inflated and floored by what TUM's motion capture showed
+(`LoopConfig`).
 """
 
 from __future__ import annotations
@@ -157,16 +158,21 @@ class Verifier:
         return np.asarray(fit + np.diag([floor_rad**2] * 3 + [config.sigma_floor_m**2] * 3), dtype=np.float64)
 
     def _verify_direction(self, a: View, b: View, pairs: NDArray[np.int64]) -> Verification:
-        """Verify without points: rotation and direction only, and more inliers, since wrong matches agree more easily."""
+        """Verify without points: rotation and direction only; more inliers, since wrong matches agree easily."""
         config = self._config
         xy_a, xy_b = a.xy[pairs[:, 0]].astype(np.float64), b.xy[pairs[:, 1]].astype(np.float64)
         found = relative_direction(xy_a, xy_b, config.epipolar_px * self._px, self._pair_seed(a, b))
         count = 0 if found is None else int(np.count_nonzero(found.inliers))
         if found is None or count < config.min_inliers_direction:
-            reason = f"{count} epipolar inliers of {len(pairs)} matches, needs {config.min_inliers_direction} without depth"
+            reason = (
+                f"{count} epipolar inliers of {len(pairs)} matches, needs {config.min_inliers_direction} without depth"
+            )
             return Verification(reason, len(pairs), count, has_scale=False)
         if found.parallax < config.min_parallax_px * self._px:
             reason = f"parallax {found.parallax / self._px:.1f} px, the direction needs {config.min_parallax_px:g}"
+            return Verification(reason, len(pairs), count, has_scale=False)
+        if found.plane_share > config.max_plane_share:
+            reason = f"one plane explains {found.plane_share:.0%} of the matches, so that two directions fit"
             return Verification(reason, len(pairs), count, has_scale=False)
         R = self._T_body_cam[:3, :3]
         T_a_b = np.eye(4)
@@ -174,7 +180,9 @@ class Verifier:
         T_a_b[:3, 3] = R @ found.T_a_b[:3, 3]  # the lever arm is of unknown size against a unit direction
         turn = np.kron(np.eye(2), R)
         covariance = turn @ found.covariance @ turn.T * config.covariance_inflation
-        across = np.eye(3) - np.outer(found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3], found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3])
+        across = np.eye(3) - np.outer(
+            found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3], found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3]
+        )
         covariance[:3, :3] += np.eye(3) * np.deg2rad(config.sigma_floor_deg) ** 2
         covariance[3:, 3:] += R @ across @ R.T * np.deg2rad(config.direction_floor_deg) ** 2
         return Verification(

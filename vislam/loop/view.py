@@ -54,8 +54,8 @@ def make_view(keyframe: Keyframe, rig: Rig) -> View:
     points = keyframe.points_body_m
     if keyframe.keypoints_px.shape != (count, 2) or (points is not None and points.shape != (count, 3)):
         raise DataError(
-            f"keyframe {keyframe.id}: {count} descriptors, but keypoints {list(keyframe.keypoints_px.shape)} and points "
-            f"{None if points is None else list(points.shape)}; expected [{count}, 2] and [{count}, 3]"
+            f"keyframe {keyframe.id}: {count} descriptors, but keypoints {list(keyframe.keypoints_px.shape)} "
+            f"and points {None if points is None else list(points.shape)}; expected [{count}, 2] and [{count}, 3]"
         )
     xy = rig.cameras[0].normalise(keyframe.keypoints_px)
     seen = np.isfinite(xy).all(axis=1)

@@ -1,8 +1,8 @@
 """The vocabulary: which of some thousand words a descriptor is, and how much each word tells about a place.
 
-tf-idf weights and the L1 score are those of DBoW2 (Galvez-Lopez and Tardos, "Bags of binary words for fast place recognition in
-image sequences", T-RO 2012). A vocabulary trained on the run's own keyframes beats a generic one of 700,000 words, so none is
-shipped: see `database.py`.
+tf-idf weights and the L1 score are those of DBoW2 (Galvez-Lopez and Tardos, "Bags of binary words for fast place
+recognition in image sequences", T-RO 2012). A vocabulary trained on the run's own keyframes beats a generic one of
+700,000 words, so none is shipped: see `database.py`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,14 +98,18 @@ class Vocabulary:
             os.replace(unfinished, path)
         except OSError as error:
             unfinished.unlink(missing_ok=True)
-            raise StorageError(f"vocabulary {path} cannot be written: {error.strerror}; free space or choose another place") from error  # fmt: skip
+            raise StorageError(
+                f"vocabulary {path} cannot be written: {error.strerror}; free space or choose another place"
+            ) from error
 
     @staticmethod
     def load(path: Path) -> Vocabulary:
         """Read a vocabulary that `save` wrote; raises DataError when the file is not a sound one."""
         arrays = _read_arrays(path)
         if int(arrays["format"]) != _FORMAT:
-            raise DataError(f"vocabulary {path} has format {int(arrays['format'])}, this version reads {_FORMAT}; train it again")  # fmt: skip
+            raise DataError(
+                f"vocabulary {path} has format {int(arrays['format'])}, this version reads {_FORMAT}; train it again"
+            )
         vocabulary = Vocabulary(arrays["nodes"], arrays["first_child"], arrays["child_count"], arrays["idf"])
         fault = _fault(vocabulary)
         if fault:
@@ -138,7 +143,7 @@ def train(
     return Vocabulary(nodes, first_child, child_count, idf)
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Read the npz with bounds on what it may claim; nothing in it is ever executed."""
     try:
         with zipfile.ZipFile(path) as archive:
@@ -160,14 +165,15 @@ def _read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
 
 def _fault(vocabulary: Vocabulary) -> str:
     """Return what is wrong with the tree, or an empty string: a walk down a sound tree ends at a word."""
-    nodes, first, count = vocabulary.nodes, vocabulary.first_child.astype(np.int64), vocabulary.child_count.astype(np.int64)
+    nodes, idf = vocabulary.nodes, vocabulary.idf
+    first, count = vocabulary.first_child.astype(np.int64), vocabulary.child_count.astype(np.int64)
     if not (len(nodes) == len(first) == len(count) >= 1) or nodes.shape[1] != 4:
         return f"its arrays disagree in length ({len(nodes)}, {len(first)}, {len(count)} nodes)"
     inner = np.flatnonzero(count)
     if np.any(count < 0) or np.any(first[inner] <= inner) or np.any(first[inner] + count[inner] > len(nodes)):
         return "a node points at children that cannot be its own"
-    if len(vocabulary.idf) != len(nodes) - len(inner):
-        return f"{len(vocabulary.idf)} word weights for {len(nodes) - len(inner)} leaves"
-    if not np.all(np.isfinite(vocabulary.idf)) or np.any(vocabulary.idf < 0.0):
+    if len(idf) != len(nodes) - len(inner):
+        return f"{len(idf)} word weights for {len(nodes) - len(inner)} leaves"
+    if not np.all(np.isfinite(idf)) or np.any(idf < 0.0):
         return "a word weight is negative or not finite"
     return ""
