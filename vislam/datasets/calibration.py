@@ -171,7 +171,7 @@ def _numbers(data: Mapping[str, Any], key: str, path: Path, count: int | None = 
     flat: list[Any] = [x for row in rows for x in (row if isinstance(row, list) else [row])]
     try:
         numbers = [float(x) for x in flat]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != (len(flat) if count is None else count) or not np.all(np.isfinite(numbers)):
         raise DataError(f"{path}: {key} must be {count or 'a list of'} finite numbers, got {str(value)[:80]}")

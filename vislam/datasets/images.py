@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,6 +23,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
+_SHORT_HEAD_BYTES = 2**12  # holds the size of most images
 _HEAD_BYTES = 2**18  # enough to reach the size in a JPEG with an embedded preview and profile
 _TAIL_BYTES = 1024  # some cameras pad after the end mark
 _PNG_END, _JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"
@@ -105,9 +107,10 @@ def probe(path: Path) -> tuple[int, int]:
     """
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-            file.seek(0, 2)
-            file.seek(max(0, file.tell() - _TAIL_BYTES))
+            head = file.read(_SHORT_HEAD_BYTES)
+            if image_size(head) is None:
+                head += file.read(_HEAD_BYTES - _SHORT_HEAD_BYTES)
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
             tail = file.read(_TAIL_BYTES)
     except FileNotFoundError as error:
         raise UnreadableImageError("missing image", path) from error

@@ -170,13 +170,15 @@ class Recorder:
             raise DataError("a frame with depth came, but the recording was begun with a rig without depth")
         for camera, image in zip(self._rig.cameras, frame.images, strict=True):
             camera.check_image(image)
+        for extra in (frame.color, frame.depth_m):
+            if extra is not None:
+                self._rig.cameras[0].check_image(extra)
         images: list[ImageU8] = list(frame.images)
         if frame.color is not None:
             images[0] = frame.color  # the grey image is made from it on reading
         for i, image in enumerate(images):
             self._write_image(f"cam{i}", frame.t_ns, image, self._image_format)
         if frame.depth_m is not None:
-            self._rig.cameras[0].check_image(frame.depth_m)
             self._write_image("depth0", frame.t_ns, self._raw_depth(frame.depth_m), "png")
         self._last_frame_ns = frame.t_ns
         self.counts["frames"] += 1
