@@ -1,7 +1,8 @@
 """Turns the description of a world into arrays: paints every surface, lights it, and makes its mip maps.
 
-Surfaces are matte and lamps do not move, so light belongs to a point of the world and not to the view: it is computed once
-(lamps with soft shadows, plus ambient light dimmed in corners), on a coarse grid per surface, and multiplied into the texture.
+Surfaces are matte and lamps do not move, so light belongs to a point of the world and not to the view: it is computed
+once (lamps with soft shadows, plus ambient light dimmed in corners), on a coarse grid per surface, and multiplied into
+the texture.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class _Light:
 def _blocked(
     origin: Array, direction: Array, reach: float, centres: Array, halves: Array, chosen: NDArray[np.int64]
 ) -> bool:
-    """Tell whether a chosen solid lies within `reach` along a unit direction; those that contain the origin do not count."""
+    """Tell whether a chosen solid lies within `reach` along a unit direction; one around the origin does not count."""
     for s in chosen:
         enter, leave = 0.0, reach
         for k in range(3):
@@ -62,7 +63,7 @@ def _blocked(
             enter, leave = max(enter, near), min(leave, far)
             if enter > leave:
                 break
-        if leave > enter and enter > 0.0:
+        if leave > enter > 0.0:
             return True
     return False
 
@@ -96,7 +97,14 @@ def _near_segment(
 
 @njit(cache=True, nogil=True)
 def _shine(
-    points: Array, normals: Array, lamps: Array, centres: Array, halves: Array, ambient: float, sphere: Array, out: Array
+    points: Array,
+    normals: Array,
+    lamps: Array,
+    centres: Array,
+    halves: Array,
+    ambient: float,
+    sphere: Array,
+    out: Array,
 ) -> None:
     """Fill the linear BGR light `out` [N, 3] that falls on points with normals [N, 3]; `sphere` are unit directions."""
     toward = np.empty(3)
@@ -175,7 +183,9 @@ def bake(builder: SceneBuilder, seed: np.random.SeedSequence, threads: int = 2) 
     """Paint, light and pack a world; the same builder and seed give the same bytes for any number of threads."""
     solids = builder.solids or [(np.full(3, 1e6), np.eye(3))]
     light = _Light(
-        lamps=np.array([[*lamp.position_m, lamp.power, *lamp.bgr, lamp.size_m] for lamp in builder.lamps]).reshape(-1, 8),
+        lamps=np.array([[*lamp.position_m, lamp.power, *lamp.bgr, lamp.size_m] for lamp in builder.lamps]).reshape(
+            -1, 8
+        ),
         centres=np.stack([centre for centre, _ in solids]),
         halves=np.stack([half for _, half in solids]),
         ambient=builder.ambient,
@@ -210,7 +220,9 @@ def _pack(surfaces: Sequence[Surface], images: list[list[ImageU8]]) -> Scene:
             texels[offset : offset + height * width] = picture.reshape(-1, 4).view("<u4")[:, 0]
         pictures.clear()  # memory: the images are as large as the world
     boxes = [surface.bounding_box() for surface in surfaces]
-    geometry = np.array([np.concatenate([s.origin, s.axis_u, s.axis_v, s.normal, s.size_m, s.size_m]) for s in surfaces])
+    geometry = np.array(
+        [np.concatenate([s.origin, s.axis_u, s.axis_v, s.normal, s.size_m, s.size_m]) for s in surfaces]
+    )
     geometry[:, 14:16] = levels[:, 0, 1:3] / geometry[:, 12:14]
     return Scene(
         kind=np.array([surface.kind for surface in surfaces], dtype=np.int64),

@@ -1,4 +1,4 @@
-"""The world `corridor-loop`: a walk of 70 m around a block of corridors, closed once by walking over its start again."""
+"""The world `corridor-loop`: a walk of 70 m around a block of corridors, closed once by passing its start again."""
 
 from __future__ import annotations
 
@@ -58,9 +58,7 @@ def build(rng: np.random.Generator) -> SceneBuilder:
                 base = paint.brick((95, 115, 165))
             hung = shell.hangings(rng, length, _Z, crowd=1.2)
             shell.wall(world, left, right, _Z, signs.carrying(base, hung), 190.0)
-    half = [(b[0] - a[0]) / 2 for a, b in zip(inner, inner[1:], strict=False)]
     world.solids.append((np.array([0.0, 0.0, _Z / 2]), np.diag([inner[2][0] - 0.02, inner[0][1] - 0.02, _Z / 2])))
-    del half
     _floors(world)
     _furniture(world, rng)
     _lamps(world, rng)
@@ -84,8 +82,8 @@ def _furniture(world: SceneBuilder, rng: np.random.Generator) -> None:
     near, far = _HALF_WIDTH_M - 0.21, -_HALF_WIDTH_M + 0.21
     places = [(-7.5, near), (-5.0, far), (-1.0, near), (2.5, far), (5.5, near), (8.0, far)]
     for side, (turn, half) in enumerate(((0.0, _X), (np.pi / 2, _Y), (np.pi, _X), (3 * np.pi / 2, _Y))):
-        for along, across in places:
-            along = along + float(rng.uniform(-0.8, 0.8))
+        for place, across in places:
+            along = place + float(rng.uniform(-0.8, 0.8))
             if abs(along) > half - 2.2:
                 continue
             offset = np.array([along, -(_Y if side % 2 == 0 else _X) + across])
@@ -110,7 +108,9 @@ def _piece(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, f
         world.box(centre, 0.0, (0.4, 0.5, 0.45), facing, signs.carton())
         world.box(centre, 0.45, (0.33, 0.4, 0.3), facing + 0.15, signs.crate(color), signs.carton())
     else:
-        world.cylinder(centre, 0.0, 0.16, 0.6, signs.carrying(paint.plain(color), [(0.3, 0.5, 0.4, 0.3, signs.poster())]))
+        world.cylinder(
+            centre, 0.0, 0.16, 0.6, signs.carrying(paint.plain(color), [(0.3, 0.5, 0.4, 0.3, signs.poster())])
+        )
 
 
 def _lamps(world: SceneBuilder, rng: np.random.Generator) -> None:

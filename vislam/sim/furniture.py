@@ -36,7 +36,9 @@ def shelf(
     gap = (height - 0.15) / boards
     for level in range(boards):
         bottom = 0.1 + level * gap
-        world.box(centre, bottom, (depth - 0.02, width - 0.02, 0.035), yaw, paint.wood((110, 135, 160)), show_bottom=True)
+        world.box(
+            centre, bottom, (depth - 0.02, width - 0.02, 0.035), yaw, paint.wood((110, 135, 160)), show_bottom=True
+        )
         if load == "books":
             _fill_with_books(world, rng, centre, yaw, (depth, width, gap), bottom + 0.035)
         else:
@@ -100,7 +102,13 @@ def table(
     depth, width, height = size_m
     for forward in (-0.45, 0.45):
         for left in (-0.46, 0.46):
-            world.box(_at(centre, yaw, forward * depth, left * width), 0.0, (0.06, 0.06, height - 0.04), yaw, paint.plain(_METAL))
+            world.box(
+                _at(centre, yaw, forward * depth, left * width),
+                0.0,
+                (0.06, 0.06, height - 0.04),
+                yaw,
+                paint.plain(_METAL),
+            )
     world.box(centre, height - 0.04, (depth, width, 0.04), yaw, paint.wood((95, 145, 190)), show_bottom=True)
     places = (np.arange(things) + 0.5) / things - 0.5
     for index, place in enumerate(rng.permutation(places)):
@@ -108,14 +116,20 @@ def table(
         position = _at(centre, yaw, float(rng.uniform(-0.15, 0.2)) * depth, left)
         turn = yaw + float(rng.uniform(-0.3, 0.3))
         if index == 0:
-            world.box(position, height + 0.08, (0.04, 0.55, 0.34), turn, paint.plain((45, 45, 48)), front=signs.screen())
+            world.box(
+                position, height + 0.08, (0.04, 0.55, 0.34), turn, paint.plain((45, 45, 48)), front=signs.screen()
+            )
             world.box(position, height, (0.16, 0.2, 0.08), turn, paint.plain((50, 50, 52)))
         elif rng.random() < 0.35:
-            tin = signs.carrying(paint.plain(paint.shade(rng, (170, 120, 60), 0.5)), [(0.02, 0.17, 0.3, 0.13, signs.poster())])
+            tin = signs.carrying(
+                paint.plain(paint.shade(rng, (170, 120, 60), 0.5)), [(0.02, 0.17, 0.3, 0.13, signs.poster())]
+            )
             world.cylinder(position, height, 0.07, 0.2, tin, paint.plain((150, 150, 150)), 300.0)
         else:
             size = tuple(float(s) for s in rng.uniform((0.14, 0.18, 0.08), (0.28, 0.35, 0.3)))
-            world.box(position, height, (size[0], size[1], size[2]), turn, _goods(rng), top=signs.carton(), texels_per_m=280.0)
+            world.box(
+                position, height, (size[0], size[1], size[2]), turn, _goods(rng), top=signs.carton(), texels_per_m=280.0
+            )
 
 
 def pallet(
@@ -148,7 +162,9 @@ def barrel(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, f
     world.cylinder(centre, 0.0, 0.29, 0.86, signs.carrying(paint.plain(color), hung), paint.plain(color))
 
 
-def pillar(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, float], side_m: float, height_m: float) -> None:
+def pillar(
+    world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, float], side_m: float, height_m: float
+) -> None:
     """Add a square concrete pillar with a striped foot and a number on every side."""
 
     def face() -> Painter:
@@ -180,10 +196,14 @@ def plant(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, fl
         turn, lean = float(rng.uniform(0.0, 2.0 * np.pi)), float(rng.uniform(0.02, 0.13))
         position = _at(centre, turn, lean, 0.0)
         height = float(rng.uniform(0.3, 0.85))
-        world.box(position, 0.36, (0.012, float(rng.uniform(0.05, 0.1)), height), turn, paint.wood((50, 130, 60), 0.02, True))
+        world.box(
+            position, 0.36, (0.012, float(rng.uniform(0.05, 0.1)), height), turn, paint.wood((50, 130, 60), 0.02, True)
+        )
 
 
-def ceiling_lamp(world: SceneBuilder, centre: tuple[float, float, float], size_m: tuple[float, float], power: float) -> None:
+def ceiling_lamp(
+    world: SceneBuilder, centre: tuple[float, float, float], size_m: tuple[float, float], power: float
+) -> None:
     """Add a glowing panel at the ceiling and the light that it throws."""
     warm = (0.93, 0.98, 1.0)
     length, width = size_m

@@ -28,9 +28,11 @@ def motion(rng: np.random.Generator) -> BodySpline:
 
     def design(t_s: Array) -> tuple[Array, Array]:
         arc = travel.arc_m(t_s)
-        arc = arc + 0.35 * np.sin(2.0 * np.pi * 9.0 * arc / path.length_m) * np.clip(arc * (path.length_m - arc), 0.0, 1.0)
+        arc = arc + 0.35 * np.sin(2.0 * np.pi * 9.0 * arc / path.length_m) * np.clip(
+            arc * (path.length_m - arc), 0.0, 1.0
+        )
         xy, heading = path.at(arc)
-        # The floor shakes the cart only while it moves; the shaking belongs to the place, so it is a function of the way.
+        # The floor shakes the cart only while it moves, and the same way at the same place.
         shaking = wander(arc, np.random.default_rng(shake_seed), 1.0, (0.4, 2.5), 3)
         rolling = smoothstep(arc, 0.05, 0.5) * smoothstep(path.length_m - arc, 0.05, 0.5)
         shaking *= rolling[:, None] * np.array([0.003, 0.003, 0.0008])
@@ -79,13 +81,24 @@ def _shell(world: SceneBuilder, rng: np.random.Generator) -> None:
     shell.ceiling(world, (-_X, -_Y), (_X, _Y), _Z, paint.tiles((170, 175, 178), 0.6, 0.1))
     cream, blue, green = (165.0, 190.0, 200.0), (150.0, 125.0, 90.0), (120.0, 145.0, 105.0)
     corners = ((-_X, _Y), (_X, _Y), (_X, -_Y), (-_X, -_Y))
-    bases = (paint.plaster(cream, green), paint.brick(), paint.plaster(cream, blue), paint.plaster(cream, (120, 130, 160)))
+    bases = (
+        paint.plaster(cream, green),
+        paint.brick(),
+        paint.plaster(cream, blue),
+        paint.plaster(cream, (120, 130, 160)),
+    )
     for index, base in enumerate(bases):
         left, right = corners[index], corners[(index + 1) % 4]
         length = float(np.hypot(right[0] - left[0], right[1] - left[1]))
         hung = shell.hangings(rng, length, _Z, crowd=1.3)
         hung += [
-            (float(x), float(rng.uniform(2.75, 3.5)), float(rng.uniform(0.5, 1.3)), 0.45, signs.sign(paint.VIVID[int(k)]))
+            (
+                float(x),
+                float(rng.uniform(2.75, 3.5)),
+                float(rng.uniform(0.5, 1.3)),
+                0.45,
+                signs.sign(paint.VIVID[int(k)]),
+            )
             for x, k in zip(np.arange(0.6, length - 1.4, 2.1), rng.integers(0, 10, 40), strict=False)
         ]
         shell.wall(world, left, right, _Z, signs.carrying(base, hung))

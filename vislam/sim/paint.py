@@ -1,7 +1,7 @@
 """Painters of matte surfaces: procedural, seeded, never twice the same, with crisp corners at several scales.
 
-A painter takes a generator, the height and width in pixels and the pixels per metre, and returns a BGR image. The factories here
-return painters, so that a world can say `rectangle(..., paint.brick((60, 80, 140)))`.
+A painter takes a generator, the height and width in pixels and the pixels per metre, and returns a BGR image. The
+factories here return painters, so that a world can say `rectangle(..., paint.brick((60, 80, 140)))`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ def shade(rng: np.random.Generator, color: Color, spread: float) -> Color:
     return blue, green, red
 
 
-def text(image: ImageU8, words: str, left: int, bottom: int, cap_px: float, color: Color, font: int, bold: float) -> None:
+def text(
+    image: ImageU8, words: str, left: int, bottom: int, cap_px: float, color: Color, font: int, bold: float
+) -> None:
     """Write one line whose capitals are `cap_px` high, its lower left corner at (left, bottom)."""
     thickness = max(1, round(cap_px * bold))
     cv2.putText(image, words, (left, bottom), font, cap_px / 21.0, color, thickness, cv2.LINE_AA)
@@ -180,7 +182,9 @@ def brick(color: Color = (70, 90, 150), size_m: tuple[float, float] = (0.24, 0.0
             for column in range(columns):
                 left, top = (column + shift) * size_m[0] * ppm, row * size_m[1] * ppm
                 low = np.round(np.array([left + joint, top + joint]) * 16).astype(int)
-                high = np.round(np.array([left + size_m[0] * ppm - joint, top + size_m[1] * ppm - joint]) * 16).astype(int)
+                high = np.round(np.array([left + size_m[0] * ppm - joint, top + size_m[1] * ppm - joint]) * 16).astype(
+                    int
+                )
                 points = np.array([low, (high[0], low[1]), high, (low[0], high[1])], dtype=np.int32)
                 cv2.fillConvexPoly(image, points, shade(rng, color, spread), cv2.LINE_AA, 4)
         grey = noise(rng, height, width, (0.9 * ppm, 0.03 * ppm, 1.0), (0.07, 0.07, 0.06))
@@ -216,7 +220,9 @@ def wood(color: Color = (80, 125, 175), plank_m: float = 0.11, upright: bool = F
     return paint
 
 
-def tiles(color: Color, size_m: float, spread: float = 0.06, joint: Color = (95, 95, 95), grain: float = 0.04) -> Painter:
+def tiles(
+    color: Color, size_m: float, spread: float = 0.06, joint: Color = (95, 95, 95), grain: float = 0.04
+) -> Painter:
     """Square tiles with joints; a few in another colour."""
 
     def paint(rng: np.random.Generator, height: int, width: int, ppm: float) -> ImageU8:

@@ -1,9 +1,9 @@
 """A ray caster for baked scenes: colour and exact depth, anti-aliased, for any camera model and any row timing.
 
 Surfaces are first sorted into tiles of the image, nearest first, so that a ray meets only a handful of candidates.
-Surfaces are sampled trilinearly from mip maps with up to four probes along the long side of a pixel's footprint, and
-pixels at the outline of a surface are cast again with four rays each: features move as smoothly as they do in a photograph.
-One frame is one single-threaded call without the GIL; frames can be rendered in parallel and never depend on each other.
+Textures are sampled from mip maps with up to four probes along the long side of a pixel's footprint, and pixels at the
+outline of a surface are cast again with four rays each: features move as smoothly as they do in a photograph. One frame
+is one single-threaded call without the GIL; frames can be rendered in parallel and never depend on each other.
 """
 
 from __future__ import annotations
@@ -20,11 +20,14 @@ from vislam.sim.scene import CYLINDER, DISC, Scene
 _TILE_PX = 16
 _NEAR_M = 0.02
 _MAX_PROBES = 4
+_FILTER_REUSE = 4  # pixels along a row that share one choice of mip level
 _BLEND = 2.0  # how much narrower than the distance between mip levels their blending is
 _SAMPLES_AT_EDGES = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))  # rotated grid
 
 Ray = tuple[float, float, float]  # a direction, or a colour
+Color = tuple[np.float32, np.float32, np.float32]
 Hit = tuple[float, float, float]  # depth, and metres along u and v
+Filter = tuple[float, int, float, float]  # mip level, probes, step between them in metres along u and v
 
 
 class Renderer:
@@ -40,7 +43,9 @@ class Renderer:
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
         rays = camera.normalise(pixels).reshape(camera.height + 2, camera.width + 2, 2)
         if not np.all(np.isfinite(rays)):
-            raise UsageError("the simulated camera's distortion cannot be inverted over the whole image; make it milder")
+            raise UsageError(
+                "the simulated camera's distortion cannot be inverted over the whole image; make it milder"
+            )
         self._rays = np.ascontiguousarray(rays)
         self._tiles = _tile_bounds(self._rays, _TILE_PX)
         self._pixel_rad = 1.0 / np.sqrt(camera.fx * camera.fy)
@@ -53,7 +58,8 @@ class Renderer:
             T_world_cam: the camera's pose [4, 4], or one pose per image row [H, 4, 4] for a rolling shutter.
 
         Returns:
-            BGR image [H, W, 3] in display encoding 0..255, not rounded, and exact z-depth [H, W] in metres, 0 where nothing is.
+            BGR image [H, W, 3] in display encoding 0..255, not rounded, and exact z-depth [H, W] in metres, 0 where
+            nothing is.
         """
         rows = np.broadcast_to(T_world_cam, (self.camera.height, 4, 4))
         poses = np.ascontiguousarray(rows[:, :3, :])
@@ -82,7 +88,7 @@ def _tile_bounds(rays: Array, tile: int) -> Array:
 
 @njit(cache=True, nogil=True)
 def _outside(box: Array, bounds: Array, slack: float) -> bool:
-    """Tell whether a bounding box (centre and half axes [4, 3], camera frame) misses a frustum of x/z and y/z bounds."""
+    """Tell whether a box (centre and half axes [4, 3], camera frame) misses a frustum of x/z and y/z bounds."""
     for side in range(4):
         axis = side // 2
         sign = 1.0 if side % 2 == 0 else -1.0
@@ -112,7 +118,7 @@ def _to_camera(pose: Array, centre: Array, half: Array, box: Array) -> float:
 
 @njit(cache=True, nogil=True)
 def _sway(poses: Array, first: int, last: int) -> tuple[float, float]:
-    """Return bounds of how far the camera turns (rad) and moves (m) between its middle row and any of a range of rows."""
+    """Return bounds of how far the camera turns (rad) and moves (m) between the middle row of a range and its ends."""
     middle = (first + last) // 2
     angle, shift = 0.0, 0.0
     for row in (first, last):
@@ -207,7 +213,13 @@ def _meet_cylinder(g: Array, ray: Ray, ex: float, ey: float, ez: float, limit: f
 
 @njit(cache=True, nogil=True)
 def _trace(
-    ray: Ray, pose: Array, candidates: NDArray[np.int64], count: int, nearest: Array, kind: NDArray[np.int64], geometry: Array
+    ray: Ray,
+    pose: Array,
+    candidates: NDArray[np.int64],
+    count: int,
+    nearest: Array,
+    kind: NDArray[np.int64],
+    geometry: Array,
 ) -> tuple[int, float, float, float]:
     """Return the nearest surface along a ray (or -1), its depth and the hit in metres along the surface's u and v."""
     best, best_t, best_a, best_b = -1, np.inf, 0.0, 0.0
@@ -241,9 +253,8 @@ def _trace(
 
 
 @njit(cache=True, nogil=True)
-def _bilinear(texels: NDArray[np.uint32], level: NDArray[np.int64], x: float, y: float) -> Ray:
+def _bilinear(texels: NDArray[np.uint32], offset: int, width: int, height: int, x: float, y: float) -> Color:
     """Return the colour (b, g, r) of a mip level at texel coordinates; borders are held."""
-    offset, width, height = level[0], level[1], level[2]
     x = min(max(x, 0.0), width - 1.0)
     y = min(max(y, 0.0), height - 1.0)
     x0, y0 = int(x), int(y)
@@ -266,55 +277,48 @@ def _bilinear(texels: NDArray[np.uint32], level: NDArray[np.int64], x: float, y:
 
 
 @njit(cache=True, nogil=True)
-def _footprint(g: Array, cylinder: bool, ray: Ray, t: float, a: float, pixel_rad: float) -> tuple[float, float, float, float]:
-    """Return the short and long side in metres of a pixel on a surface, and the direction (u, v) of the long side."""
+def _filter(ray: Ray, t: float, a: float, cylinder: bool, g: Array, level_count: int, pixel_rad: float) -> Filter:
+    """Return how to sample a surface under a pixel: mip level, probes along its long side, the step between them."""
     dx, dy, dz = ray
-    scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    along_u = scale * (g[3] * dx + g[4] * dy + g[5] * dz)
-    along_v = scale * (g[6] * dx + g[7] * dy + g[8] * dz)
-    along_n = scale * (g[9] * dx + g[10] * dy + g[11] * dz)
+    along_u = g[3] * dx + g[4] * dy + g[5] * dz
+    along_v = g[6] * dx + g[7] * dy + g[8] * dz
+    along_n = g[9] * dx + g[10] * dy + g[11] * dz
     if cylinder:
         angle = 2.0 * np.pi * a / g[12]
         sine, cosine = np.sin(angle), np.cos(angle)
         along_u, along_n = cosine * along_n - sine * along_u, cosine * along_u + sine * along_n
-    short = t * pixel_rad
-    long = short / max(abs(along_n), 0.02)
-    norm = np.sqrt(along_u * along_u + along_v * along_v)
-    if norm < 1e-6:
-        return short, long, 1.0, 0.0
-    return short, long, along_u / norm, along_v / norm
+    in_plane = along_u * along_u + along_v * along_v
+    ratio = min(np.sqrt(1.0 + in_plane / (along_n * along_n + 1e-9)), 50.0)
+    probes = min(_MAX_PROBES, int(ratio + 0.5))
+    step_m = t * pixel_rad * ratio / probes
+    level = min(max(np.log2(np.float32(step_m * g[14])), 0.0), level_count - 1.0)
+    norm = step_m / np.sqrt(in_plane + 1e-12)
+    return level, probes, norm * along_u, norm * along_v
 
 
 @njit(cache=True, nogil=True)
-def _shade(
-    ray: Ray,
-    t: float,
-    a: float,
-    b: float,
-    cylinder: bool,
-    g: Array,
-    texels: NDArray[np.uint32],
-    levels: NDArray[np.int64],
-    level_count: int,
-    pixel_rad: float,
+def _sample(
+    filtered: Filter, a: float, b: float, g: Array, texels: NDArray[np.uint32], levels: NDArray[np.int64]
 ) -> Ray:
-    """Return the colour (b, g, r) of a hit at `a`, `b` metres along a surface's u and v."""
-    short, long, direction_u, direction_v = _footprint(g, cylinder, ray, t, a, pixel_rad)
-    probes = min(_MAX_PROBES, int(long / short + 0.5))
-    level = min(max(np.log2(long / probes * g[14]), 0.0), level_count - 1.0)
+    """Return the colour (b, g, r) of a surface at `a`, `b` metres along its u and v."""
+    level, probes, step_u_m, step_v_m = filtered
     low = int(level)
     # Sharp between levels, blended only around the middle: most pixels then read one level instead of two.
     fraction = min(max(_BLEND * (level - low - 0.5) + 0.5, 0.0), 1.0)
     blue, green, red = 0.0, 0.0, 0.0
-    for k in range(probes):
-        offset = long * ((k + 0.5) / probes - 0.5)
-        u, v = (a + offset * direction_u) / g[12], (b + offset * direction_v) / g[13]
-        for m in range(2):
-            weight = (fraction if m == 1 else 1.0 - fraction) / probes
-            if weight > 0.0:
-                part = levels[low + m]
-                sample = _bilinear(texels, part, u * part[1] - 0.5, v * part[2] - 0.5)
-                blue, green, red = blue + weight * sample[0], green + weight * sample[1], red + weight * sample[2]
+    for m in range(2):
+        weight = (fraction if m == 1 else 1.0 - fraction) / probes
+        if weight == 0.0:
+            continue
+        offset, width, height = levels[low + m, 0], levels[low + m, 1], levels[low + m, 2]
+        scale_u, scale_v = width / g[12], height / g[13]
+        step_u, step_v = step_u_m * scale_u, step_v_m * scale_v
+        x = a * scale_u - 0.5 - 0.5 * (probes - 1) * step_u
+        y = b * scale_v - 0.5 - 0.5 * (probes - 1) * step_v
+        for _ in range(probes):
+            part = _bilinear(texels, offset, width, height, x, y)
+            blue, green, red = blue + weight * part[0], green + weight * part[1], red + weight * part[2]
+            x, y = x + step_u, y + step_v
     return blue, green, red
 
 
@@ -348,6 +352,7 @@ def _cast(
     """Cast one ray through the centre of every pixel."""
     for v in range(hit.shape[0]):
         pose = poses[v]
+        filtered, of, age = (0.0, 1, 0.0, 0.0), -1, 0
         for u in range(hit.shape[1]):
             ray = _turn(pose, rays[v + 1, u + 1, 0], rays[v + 1, u + 1, 1])
             row, column = v // _TILE_PX, u // _TILE_PX
@@ -358,9 +363,11 @@ def _cast(
                 color[v, u, 0], color[v, u, 1], color[v, u, 2] = 0.0, 0.0, 0.0
                 continue
             depth[v, u] = t
-            color[v, u, 0], color[v, u, 1], color[v, u, 2] = _shade(
-                ray, t, a, b, kind[p] == CYLINDER, geometry[p], texels, levels[p], level_count[p], pixel_rad
-            )
+            if p != of or age == _FILTER_REUSE:  # the footprint changes slowly along a row
+                filtered = _filter(ray, t, a, kind[p] == CYLINDER, geometry[p], level_count[p], pixel_rad)
+                of, age = p, 0
+            age += 1
+            color[v, u, 0], color[v, u, 1], color[v, u, 2] = _sample(filtered, a, b, geometry[p], texels, levels[p])
 
 
 @njit(cache=True, nogil=True)
@@ -407,8 +414,7 @@ def _smooth_edges(
                 ray = _turn(pose, x, y)
                 p, t, a, b = _trace(ray, pose, lists[row, column], counts[row, column], nearest, kind, geometry)
                 if p >= 0:
-                    sample = _shade(
-                        ray, t, a, b, kind[p] == CYLINDER, geometry[p], texels, levels[p], level_count[p], pixel_rad
-                    )
+                    filtered = _filter(ray, t, a, kind[p] == CYLINDER, geometry[p], level_count[p], pixel_rad)
+                    sample = _sample(filtered, a, b, geometry[p], texels, levels[p])
                     blue, green, red = blue + sample[0], green + sample[1], red + sample[2]
             color[v, u, 0], color[v, u, 1], color[v, u, 2] = scale * blue, scale * green, scale * red

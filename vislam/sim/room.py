@@ -25,23 +25,20 @@ def motion(rng: np.random.Generator) -> BodySpline:
     def design(t_s: Array) -> tuple[Array, Array]:
         moving = smoothstep(t_s, _REST_S, _REST_S + 2.0) * (1.0 - smoothstep(t_s, _DURATION_S - 2.5, _DURATION_S - 1.0))
         swing, sway, tremble, twitch = (np.random.default_rng(seed) for seed in seeds)
-        # The integral of the smoothstep pair, close enough for a design: progress eases in and out.
-        progress = smoothstep(t_s, _REST_S - 1.5, _DURATION_S + 0.5)
-        progress = smoothstep(t_s, _REST_S, _REST_S + 1.5) * (0.35 * progress + 0.65 * _ramp(t_s))
-        angle = 2.0 * np.pi * _TURNS * progress
+        angle = 2.0 * np.pi * _TURNS * _progress(t_s)
         x, y = 0.95 * np.cos(angle - 2.4), 0.6 * np.sin(angle - 2.4)
         ease = moving[:, None]
         position = np.column_stack([x, y, np.full_like(t_s, 1.35)]) + ease * wander(t_s, sway, 0.09, (0.12, 0.5), 3)
         position += ease * wander(t_s, tremble, 0.002, (1.5, 4.0), 3)
         angles = np.column_stack([np.zeros_like(t_s), np.full_like(t_s, 0.16), angle - 2.4])
-        angles += ease * wander(t_s, swing, 1.0, (0.1, 0.4), 3) * np.array([0.07, 0.12, 0.22])
+        angles += ease * wander(t_s, swing, 1.0, (0.1, 0.4), 3) * np.array([0.07, 0.12, 0.19])
         angles += ease * wander(t_s, twitch, 0.005, (1.5, 4.0), 3)
         return position, angles
 
     return BodySpline.from_design(design, _DURATION_S, _KNOTS_S)
 
 
-def _ramp(t_s: Array) -> Array:
+def _progress(t_s: Array) -> Array:
     """Return progress 0..1 that is even in the middle of the recording and rests at both ends."""
     begin, end, ramp = _REST_S, _DURATION_S - 1.0, 2.5
     grid = np.linspace(begin, end, 2000)
@@ -64,7 +61,9 @@ def build(rng: np.random.Generator) -> SceneBuilder:
     world.box((-0.2, -1.95), 0.0, (1.9, 0.65, 0.4), 0.0, signs.rug((60, 75, 130)))
     world.box((-0.2, -2.2), 0.4, (1.9, 0.18, 0.42), 0.0, signs.rug((60, 75, 130)))
     for x, color in ((-0.8, (60, 170, 210)), (0.3, (170, 120, 60))):
-        world.box((x, -2.0), 0.4, (0.42, 0.16, 0.36), 0.15, signs.rug((float(color[0]), float(color[1]), float(color[2]))))
+        world.box(
+            (x, -2.0), 0.4, (0.42, 0.16, 0.36), 0.15, signs.rug((float(color[0]), float(color[1]), float(color[2])))
+        )
     furniture.plant(world, rng, (-2.6, -1.95))
     furniture.plant(world, rng, (0.42, 2.0))
     furniture.cupboard(world, (-2.75, -0.9), 0.0, (0.45, 1.2, 0.85), (140, 150, 160))

@@ -95,7 +95,7 @@ class SceneBuilder:
         glow: float = 0.0,
         kind: int = RECTANGLE,
     ) -> None:
-        """Add a rectangle from its top-left corner and its two edge vectors (to the right and down, seen from outside)."""
+        """Add a rectangle from its top-left corner and its edge vectors (to the right and down, seen from outside)."""
         u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
         length_u, length_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
         origin = np.asarray(corner, dtype=np.float64)
@@ -167,8 +167,8 @@ class SceneBuilder:
 class Scene:
     """A baked world: what the ray caster reads, P surfaces with at most L mip levels each.
 
-    A row of `geometry` holds origin [0:3], axis u [3:6], axis v [6:9], normal [9:12], size along u and v [12:14] in metres and
-    texels per metre along u and v [14:16]; one array instead of six, because compiled code pays for every array it is passed.
+    A row of `geometry` holds origin [0:3], axis u [3:6], axis v [6:9], normal [9:12], size along u and v [12:14] in
+    metres and texels per metre along u and v [14:16]: all that a ray asks of a surface lies in one stretch of memory.
     """
 
     kind: NDArray[np.int64]  # [P]

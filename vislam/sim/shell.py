@@ -12,10 +12,16 @@ from vislam.sim.signs import Hung
 Point = tuple[float, float]
 
 
-def wall(world: SceneBuilder, left: Point, right: Point, height_m: float, painter: Painter, texels_per_m: float = 200.0) -> None:
+def wall(
+    world: SceneBuilder, left: Point, right: Point, height_m: float, painter: Painter, texels_per_m: float = 200.0
+) -> None:
     """Add a wall from its left to its right end as seen by who looks at it."""
     world.rectangle(
-        (left[0], left[1], height_m), (right[0] - left[0], right[1] - left[1], 0.0), (0.0, 0.0, -height_m), painter, texels_per_m
+        (left[0], left[1], height_m),
+        (right[0] - left[0], right[1] - left[1], 0.0),
+        (0.0, 0.0, -height_m),
+        painter,
+        texels_per_m,
     )
 
 
@@ -33,7 +39,9 @@ def ceiling(
     world.rectangle((low[0], low[1], height_m), (length, 0.0, 0.0), (0.0, width, 0.0), painter, texels_per_m)
 
 
-def hangings(rng: np.random.Generator, length_m: float, height_m: float, crowd: float = 1.0, doors: bool = True) -> list[Hung]:
+def hangings(
+    rng: np.random.Generator, length_m: float, height_m: float, crowd: float = 1.0, doors: bool = True
+) -> list[Hung]:
     """Return doors, posters, boards and signs along a wall, without overlaps; `crowd` above 1 packs them closer."""
     hung: list[Hung] = []
     left = float(rng.uniform(0.15, 0.5))

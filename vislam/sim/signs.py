@@ -1,4 +1,4 @@
-"""Painters of things that people put into rooms: posters, labels, doors, lockers, books, screens, and walls that carry them."""
+"""Painters of things that people put into rooms: posters, labels, doors, books, screens, and walls that carry them."""
 
 from __future__ import annotations
 
@@ -108,7 +108,9 @@ def _chart(rng: np.random.Generator, height: int, width: int) -> ImageU8:
         corner = (int(left), int(top)), (int(left + 0.6 * width / bars), int(0.88 * height))
         cv2.rectangle(image, *corner, _vivid(rng), -1)
     for row in range(3, 10):
-        cv2.line(image, (int(0.05 * width), row * height // 10), (int(0.95 * width), row * height // 10), (150, 150, 150), 1)
+        cv2.line(
+            image, (int(0.05 * width), row * height // 10), (int(0.95 * width), row * height // 10), (150, 150, 150), 1
+        )
     return image
 
 
@@ -195,7 +197,9 @@ def _label(rng: np.random.Generator, image: ImageU8, ppm: float) -> None:
     position = x + 0.08 * w
     while position < x + 0.9 * w:
         bar = w * rng.uniform(0.015, 0.06)
-        cv2.rectangle(image, (int(position), int(y + 0.5 * h)), (int(position + bar), int(y + 0.9 * h)), (25, 25, 25), -1)
+        cv2.rectangle(
+            image, (int(position), int(y + 0.5 * h)), (int(position + bar), int(y + 0.9 * h)), (25, 25, 25), -1
+        )
         position += bar + w * rng.uniform(0.02, 0.05)
     p.text(image, p.word(rng, 6), int(x + 0.08 * w), int(y + 0.4 * h), 0.25 * h, (30, 30, 30), 0, 0.1)
 
@@ -228,7 +232,10 @@ def door(color: Color, words: str | None = None) -> Painter:
         cv2.rectangle(image, (0, 0), (width - 1, height + rim), p.shade(rng, (80, 85, 90), 0.3), rim)
         cv2.rectangle(image, (rim, rim), (width - rim, height), (35, 35, 38), max(1, int(0.008 * ppm)))
         if rng.random() < 0.65:
-            low, high = (int(0.25 * width), int(0.15 * height)), (int(0.75 * width), int(rng.uniform(0.3, 0.45) * height))
+            low, high = (
+                (int(0.25 * width), int(0.15 * height)),
+                (int(0.75 * width), int(rng.uniform(0.3, 0.45) * height)),
+            )
             cv2.rectangle(image, low, high, p.shade(rng, (120, 105, 85), 0.4), -1)
             cv2.line(image, (low[0], high[1]), (high[0], low[1]), (185, 180, 170), max(1, int(0.02 * ppm)), cv2.LINE_AA)
             cv2.rectangle(image, low, high, (50, 50, 55), max(1, int(0.02 * ppm)))
@@ -257,7 +264,9 @@ def lockers(color: Color, width_m: float = 0.3) -> Painter:
             for slot in range(4):
                 y = int((0.06 + 0.022 * slot) * height)
                 cv2.line(image, (int(left + 0.07 * ppm), y), (int(right - 0.07 * ppm), y), (40, 42, 45), 1)
-            p.text(image, p.word(rng, 2), int(left + 0.05 * ppm), int(0.3 * height), 0.07 * ppm, (235, 235, 235), 0, 0.12)
+            p.text(
+                image, p.word(rng, 2), int(left + 0.05 * ppm), int(0.3 * height), 0.07 * ppm, (235, 235, 235), 0, 0.12
+            )
             if rng.random() < 0.6:
                 sticker = poster()(rng, max(6, int(0.14 * ppm)), max(6, int(0.16 * ppm)), ppm)
                 top = int(rng.uniform(0.35, 0.75) * height)
@@ -321,7 +330,9 @@ def whiteboard() -> Painter:
                 p.text(image, p.word(rng, int(rng.integers(3, 8))), int(x), int(y), cap, ink, 0, 0.1)
                 continue
             points = np.array([x, y]) + np.cumsum(rng.normal(0.0, 0.09 * ppm, (7, 2)), axis=0)
-            cv2.polylines(image, [np.round(points * 16).astype(np.int32)], False, ink, max(1, int(0.008 * ppm)), cv2.LINE_AA, 4)
+            cv2.polylines(
+                image, [np.round(points * 16).astype(np.int32)], False, ink, max(1, int(0.008 * ppm)), cv2.LINE_AA, 4
+            )
         cv2.rectangle(image, (0, 0), (width - 1, height - 1), (120, 122, 125), max(2, int(0.03 * ppm)))
         return image
 

@@ -18,10 +18,11 @@ from vislam.errors import UsageError
 from vislam.messages import Array
 
 _DEGREE = 5
+_ROUNDING_S = 1e-6  # times this little outside are taken as the end
 _MAX_PITCH_RAD = 1.4  # angles are singular at 90 degrees of pitch; no world goes near it
 
 Design = Callable[[Array], tuple[Array, Array]]
-"""Maps times in seconds [N] to wanted positions [N, 3] in metres and roll, pitch, yaw [N, 3] in radians (yaw unwrapped)."""
+"""Maps times in seconds [N] to wanted positions [N, 3] in metres and roll, pitch, unwrapped yaw [N, 3] in radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +42,7 @@ class BodySpline:
         """Build the spline from control points.
 
         Args:
-            positions_m: control points of the position [M, 3]; point i acts mostly around the time `(i - 2) * spacing_s`.
+            positions_m: control points of the position [M, 3]; point i acts around the time `(i - 2) * spacing_s`.
             angles_rad: control points of roll, pitch, yaw [M, 3]; `R_world_body = Rz(yaw) @ Ry(pitch) @ Rx(roll)`.
             spacing_s: time between control points.
 
@@ -69,7 +70,8 @@ class BodySpline:
         The design is asked for times slightly outside `[0, duration_s]` as well and should hold its ends there.
         """
         count = int(np.ceil(duration_s / spacing_s - 1e-9)) + _DEGREE
-        positions, angles = design(spacing_s * (np.arange(count) - 2.0))
+        times_s: Array = spacing_s * (np.arange(count, dtype=np.float64) - 2.0)
+        positions, angles = design(times_s)
         return cls(positions, angles, spacing_s)
 
     def at(self, t_s: Array) -> Motion:
@@ -78,6 +80,8 @@ class BodySpline:
         Raises UsageError for times outside `[0, duration_s]`.
         """
         t_s = np.asarray(t_s, dtype=np.float64)
+        held = np.clip(t_s, 0.0, self.duration_s)
+        t_s = np.asarray(np.where(np.abs(held - t_s) < _ROUNDING_S, held, t_s))
         value = self._value(t_s)
         if not np.all(np.isfinite(value)):
             raise UsageError(f"asked for the body outside its trajectory of {self.duration_s:.3f} s")
