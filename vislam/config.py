@@ -182,7 +182,7 @@ class GraphConfig:
     loop_cauchy_k: float = 2.0  # whitened norm
     loop_floor_m: float = 0.005
     loop_floor_deg: float = 0.2
-    loop_min_weight: float = 0.02  # a loop that optimisation leaves with less is taken out again
+    loop_min_weight: float = 0.05  # a loop that optimisation leaves with less is taken out again
     loop_batch_m: float = 1.0  # a larger correction starts from a batch solution instead of incremental steps
     loop_batch_deg: float = 10.0
     parked_max: int = 200  # parked loops kept; the oldest leave first
@@ -226,7 +226,8 @@ class LoopConfig:
     max_rotation_sigma_deg: float = 2.0  # of an edge without scale
     max_direction_sigma_deg: float = 5.0  # of its direction
     min_agreeing_direction: int = 2  # witnesses of an edge without scale, which is never taken alone
-    neighbour_keyframes: int = 10  # witnesses are at most so far away, so that odometry to them is good
+    max_disagreeing_share: float = 0.25  # of the witnesses; the edges that were wrong by sigmas had at least a third
+    neighbour_keyframes: int = 5  # witnesses are at most so far away, so that odometry to them is good
     max_verifications: int = 6  # per keyframe, about 4 ms each: bounds the time of a keyframe
     max_odometry: int = 4  # candidates per keyframe that the map's poses suggest
     odometry_skip_keyframes: int = 5  # the newest ones are tied by visual odometry already

@@ -1,0 +1,97 @@
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from graph_world import EUROC_NOISE, GRAVITY_M_S2, World
+
+from vislam.config import GraphConfig
+from vislam.factors.imu import Preintegrator
+from vislam.imu import ImuNoise
+from vislam.messages import ImuSpan
+
+SILENT = ImuNoise(1e-12, 1e-12, 1e-12, 1e-12, 200.0)
+NO_BIAS = gtsam.imuBias.ConstantBias()
+
+
+def _preintegrator(**changes: float) -> Preintegrator:
+    return Preintegrator(GraphConfig(**changes), EUROC_NOISE, GRAVITY_M_S2)
+
+
+def _whole_span(world: World) -> ImuSpan:
+    return ImuSpan(world.imu_t_ns, world.gyro, world.accel)
+
+
+def _predict(world: World, pim: gtsam.PreintegratedCombinedMeasurementsG, i: int) -> gtsam.NavState:
+    return pim.predict(gtsam.NavState(gtsam.Pose3(world.truth[i]), world.velocity[i]), NO_BIAS)
+
+
+def test_noise_free_motion_is_integrated_to_a_tenth_of_a_millimetre() -> None:
+    world = World(2.0, noise=SILENT, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), walk=False)
+    done = _preintegrator().integrate(_whole_span(world), 0, world.t_ns(10), NO_BIAS)
+    assert done is not None
+    state = _predict(world, done.pim, 0)
+    assert done.duration_s == pytest.approx(2.0)
+    assert np.linalg.norm(state.position() - world.truth[10, :3, 3]) < 1e-4
+    assert np.linalg.norm(state.velocity() - world.velocity[10]) < 1e-4
+
+
+def test_covariance_is_honest() -> None:
+    """Mean squared error per degree of freedom of position and velocity over many seconds of noise."""
+    d2 = []
+    world = World(150.0, keyframe_hz=1.0, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), walk=False, seed=5)
+    noise = replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0)  # as in this world
+    integrator = Preintegrator(GraphConfig(imu_inflation=1.0, imu_integration_sigma=1e-6), noise, GRAVITY_M_S2)
+    for k in range(1, world.count):
+        done = integrator.integrate(world.span(k), world.t_ns(k - 1), world.t_ns(k), NO_BIAS)
+        assert done is not None
+        state = _predict(world, done.pim, k - 1)
+        factor = gtsam.GalileanCombinedImuFactor(1, 2, 3, 4, 5, 6, done.pim)
+        e = factor.evaluateError(
+            gtsam.Pose3(world.truth[k - 1]), world.velocity[k - 1], gtsam.Pose3(world.truth[k]), world.velocity[k],
+            NO_BIAS, NO_BIAS,
+        )  # fmt: skip
+        covariance = done.pim.residualCovariance()
+        d2.append(e[:9] @ np.linalg.solve(covariance[:9, :9], e[:9]) / 9.0)
+        assert np.all(np.isfinite(state.position()))
+    assert 0.8 < np.mean(d2) < 1.2
+
+
+def test_outage_is_bridged_and_pays_for_it() -> None:
+    world = World(2.0, noise=SILENT, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), walk=False)
+    span = _whole_span(world)
+    keep = np.abs(span.t_ns - 1_000_000_000) > 250_000_000
+    holed = ImuSpan(span.t_ns[keep], span.gyro_rad_s[keep], span.accel_m_s2[keep])
+    whole = _preintegrator().integrate(span, 0, world.t_ns(10), NO_BIAS)
+    done = _preintegrator().integrate(holed, 0, world.t_ns(10), NO_BIAS)
+    assert whole is not None and done is not None
+    assert whole.outage_s == 0.0
+    assert done.outage_s == pytest.approx(0.51, abs=0.011)
+    sigma = np.sqrt(np.linalg.eigvalsh(done.pim.residualCovariance()[6:9, 6:9]))
+    assert 1.2 < sigma[0] < 2.0  # m/s along gravity: 3 m/s^2 over half a second
+    assert 2.0 < sigma[2] < 10.0  # m/s across: the unmeasured rotation tilts gravity
+    assert sigma[0] > 50 * np.sqrt(whole.pim.residualCovariance()[6, 6])
+    error = np.linalg.norm(_predict(world, done.pim, 0).velocity() - world.velocity[10])
+    assert error < 3 * sigma[2]
+
+
+def test_uncovered_ends_count_as_outage_and_long_ones_drop_the_factor() -> None:
+    world = World(3.0)
+    span = _whole_span(world)
+    late = span.t_ns >= 400_000_000
+    cut = ImuSpan(span.t_ns[late], span.gyro_rad_s[late], span.accel_m_s2[late])
+    done = _preintegrator().integrate(cut, 0, world.t_ns(15), NO_BIAS)
+    assert done is not None and done.outage_s == pytest.approx(0.4)
+    assert done.duration_s == pytest.approx(3.0)
+    assert _preintegrator(imu_max_outage_s=0.3).integrate(cut, 0, world.t_ns(15), NO_BIAS) is None
+    assert _preintegrator().integrate(None, 0, 1, NO_BIAS) is None
+    outside = ImuSpan(span.t_ns[:1], span.gyro_rad_s[:1], span.accel_m_s2[:1])
+    assert _preintegrator().integrate(outside, 10**9, 2 * 10**9, NO_BIAS) is None
+
+
+def test_bias_walk_is_floored_against_gtsams_pivot_test() -> None:
+    tiny = ImuNoise(1e-4, 1e-3, 1e-9, 1e-9, 200.0)
+    config = GraphConfig()
+    integrator = Preintegrator(config, tiny, GRAVITY_M_S2)
+    assert integrator.gyro_bias_walk == config.gyro_bias_walk_floor
+    assert integrator.accel_bias_walk == config.accel_bias_walk_floor
