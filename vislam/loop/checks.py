@@ -108,32 +108,37 @@ def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -
     return ""
 
 
-def judge(found: Verification, tilt_rad: float | None, agreeing: int, config: LoopConfig) -> Judgement:
-    """Decide about a candidate from its verification, its tilt (None: unknown) and how many neighbours agree."""
+def judge(
+    found: Verification, tilt_rad: float | None, agreeing: int, disagreeing: int, config: LoopConfig
+) -> Judgement:
+    """Decide about a candidate from its verification, its tilt (None: unknown) and what its neighbours say."""
     if found.T_a_b is None:
         return Judgement(LoopDecision.REJECTED, found.reason)
     seen = f"{found.inliers} inliers, {found.supporters} with guided matching"
     against = objection(found, tilt_rad, config)
     if against:
         return Judgement(LoopDecision.REJECTED, f"{seen}, but {against}")
-    if not found.has_scale:
-        return _judge_direction(found, seen, agreeing, config)
+    if found.has_scale:
+        seen += f", sigma {100.0 * found.sigma_m:.1f} cm"
+    else:
+        seen += f", direction good to {np.rad2deg(found.sigma_m):.1f} deg"
+    doubt = _doubt(found, agreeing, disagreeing, config)
+    if doubt:
+        return Judgement(LoopDecision.PARKED, f"{seen}, but {doubt}")
+    return Judgement(LoopDecision.ACCEPTED, f"{seen}, {agreeing} of {agreeing + disagreeing} neighbours agree")
+
+
+def _doubt(found: Verification, agreeing: int, disagreeing: int, config: LoopConfig) -> str:
+    """Return why a pose that nothing speaks against has to wait for witnesses, or an empty string."""
+    if disagreeing > config.max_disagreeing_share * (agreeing + disagreeing):
+        return f"{disagreeing} of {agreeing + disagreeing} neighbours disagree"
+    if not found.has_scale:  # never taken alone: wrong matches fit an essential matrix too easily
+        needed = config.min_agreeing_direction
+        return "" if agreeing >= needed else f"{agreeing} neighbours agree so far, needs {needed} without depth"
     limit = config.max_sigma_m * np.fmax(_REFERENCE_DEPTH_M, found.median_depth_m) / _REFERENCE_DEPTH_M
-    sigma = f"sigma {100.0 * found.sigma_m:.1f} cm"
-    if agreeing >= 1:
-        return Judgement(LoopDecision.ACCEPTED, f"{seen}, {sigma}, {agreeing} neighbours agree")
-    if found.sigma_m <= limit:
-        return Judgement(LoopDecision.ACCEPTED, f"{seen}, {sigma} within {100.0 * limit:.1f} cm")
-    return Judgement(LoopDecision.PARKED, f"{seen}, {sigma} above {100.0 * limit:.1f} cm and no neighbour agrees yet")
-
-
-def _judge_direction(found: Verification, seen: str, agreeing: int, config: LoopConfig) -> Judgement:
-    """Without scale nothing is taken alone: wrong matches fit an essential matrix too easily."""
-    seen = f"{seen}, direction good to {np.rad2deg(found.sigma_m):.1f} deg"
-    if agreeing >= config.min_agreeing_direction:
-        return Judgement(LoopDecision.ACCEPTED, f"{seen}, {agreeing} neighbours agree")
-    reason = f"{seen}, {agreeing} neighbours agree so far, needs {config.min_agreeing_direction} without depth"
-    return Judgement(LoopDecision.PARKED, reason)
+    if agreeing >= 1 or found.sigma_m <= limit:
+        return ""
+    return f"that is above {100.0 * limit:.1f} cm and no neighbour agrees yet"
 
 
 def _angle_rad(T: Array, other: Array) -> float:

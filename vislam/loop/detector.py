@@ -178,18 +178,17 @@ class LoopDetector:
 
     def _judge(self, trial: _Trial, fresh: list[Measured] | None = None) -> Judgement:
         """Judge a trial with all witnesses, and those of this keyframe that are not among them yet."""
-        agreeing = 0
-        if trial.measured is not None:
-            witnesses = self._witnesses + (fresh or [])
-            agreeing = sum(self._supports(witness, trial.measured) for witness in witnesses)
-            agreeing += agrees_with_map(trial.measured, self._poses, self._config)
-        return judge(trial.found, trial.tilt_rad, agreeing, self._config)
-
-    def _supports(self, witness: Measured, measured: Measured) -> bool:
-        """Return whether another measurement close by, so that odometry between them is good, says the same."""
-        reach = self._config.neighbour_keyframes
-        apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
-        return apart != (0, 0) and max(apart) <= reach and agree(measured, witness, self._poses, self._config)
+        agreeing, disagreeing = 0, 0
+        measured, reach = trial.measured, self._config.neighbour_keyframes
+        if measured is not None:
+            agreeing += agrees_with_map(measured, self._poses, self._config)
+            for witness in self._witnesses + (fresh or []):
+                apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
+                if apart != (0, 0) and max(apart) <= reach:
+                    says_the_same = agree(measured, witness, self._poses, self._config)
+                    agreeing += says_the_same
+                    disagreeing += not says_the_same
+        return judge(trial.found, trial.tilt_rad, agreeing, disagreeing, self._config)
 
     def _reconsider(self, newest_id: int, edges: list[LoopEdge]) -> list[LoopCandidate]:
         """Promote parked edges that the new keyframe, or the map that moved meanwhile, confirms."""
