@@ -1,0 +1,120 @@
+"""Small pieces of HTML: every text from outside is escaped here."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+_MAX_PICTURE_PX = 1600
+_KEEP_BYTES = 400_000  # a smaller picture is embedded as it is
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A table cell; `mark` puts a coloured dot before the text."""
+
+    text: str
+    mark: str = ""
+    kind: str = ""  # "text" (left) or "text long" (left, may wrap)
+
+
+def escape(value: object) -> str:
+    """Return a value as text that is safe inside HTML."""
+    return html.escape(str(value), quote=True)
+
+
+def number(value: Any, digits: int = 3, unit: str = "") -> str:
+    """Return a number with fixed decimals, or a dash when there is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return "–"
+    if digits == 0 and abs(value) < 1e15:
+        return f"{round(value):,}".replace(",", "\u202f") + unit
+    return f"{value:.{digits}f}{unit}"
+
+
+def percent(value: Any, digits: int = 1) -> str:
+    """Return a share as percent, or a dash."""
+    return number(100.0 * value, digits, "\u202f%") if isinstance(value, int | float) else "–"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]], text_columns: Sequence[int] = (0,)) -> str:
+    """Return a table; columns in `text_columns` are left-aligned, the others hold numbers."""
+
+    def kind(column: int) -> str:
+        return "text" if column in text_columns else ""
+
+    lines = ["".join(f'<th class="{kind(k)}">{escape(name)}</th>' for k, name in enumerate(head))]
+    for row in rows:
+        cells = []
+        for k, value in enumerate(row):
+            cell = value if isinstance(value, Cell) else Cell(value)
+            dot = f'<i class="dot {escape(cell.mark)}"></i>' if cell.mark else ""
+            cells.append(f'<td class="{cell.kind or kind(k)}">{dot}{escape(cell.text)}</td>')
+        lines.append("".join(cells))
+    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+
+
+def tile(value: str, unit: str, label: str, kind: str = "plain") -> str:
+    """Return one headline number."""
+    small = f" <small>{escape(unit)}</small>" if unit else ""
+    return f'<div class="tile {escape(kind)}"><b>{escape(value)}{small}</b><span>{escape(label)}</span></div>'
+
+
+def card(*content: str, title: str = "", kind: str = "") -> str:
+    """Return a framed block of finished HTML."""
+    head = f"<h3>{escape(title)}</h3>" if title else ""
+    return f'<div class="card {escape(kind)}">{head}{"".join(content)}</div>'
+
+
+def grid(*cards: str) -> str:
+    """Return blocks side by side where there is room."""
+    present = [text for text in cards if text]
+    return f'<div class="grid">{"".join(present)}</div>' if present else ""
+
+
+def section(title: str, *content: str) -> str:
+    """Return a titled section, or nothing when it has no content."""
+    body = "".join(content)
+    return f"<section><h2>{escape(title)}</h2>{body}</section>" if body else ""
+
+
+def note(text: str) -> str:
+    """Return a paragraph of small print."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def bullets(lines: Sequence[str]) -> str:
+    """Return a list."""
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def preformatted(text: object) -> str:
+    """Return text in fixed width."""
+    return f"<pre>{escape(text)}</pre>"
+
+
+def folded(title: str, content: str) -> str:
+    """Return finished HTML that opens on a click."""
+    return f"<details><summary>{escape(title)}</summary><div>{content}</div></details>"
+
+
+def picture(path: Path, caption: str) -> str:
+    """Return an image embedded as data, made smaller where it is large; a reason when it cannot be read."""
+    data = path.read_bytes()
+    mime = "image/png"
+    if len(data) > _KEEP_BYTES:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:
+            return card(note(f"{path.name} is not a readable image"))
+        scale = min(1.0, _MAX_PICTURE_PX / max(image.shape[:2]))
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
+        data, mime = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes(), "image/jpeg"
+    encoded = base64.b64encode(data).decode("ascii")
+    return card(f'<img alt="{escape(caption)}" src="data:{mime};base64,{encoded}">', title=caption)

@@ -1,0 +1,359 @@
+"""The report: one HTML file made from nothing but the files of a run folder."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.report import plots
+from vislam.report.html import (
+    Cell,
+    bullets,
+    card,
+    escape,
+    folded,
+    grid,
+    note,
+    number,
+    percent,
+    picture,
+    preformatted,
+    section,
+    table,
+    tile,
+)
+from vislam.report.run_files import ESTIMATES, LoopRow, RunFiles, read_run
+from vislam.report.scene import Scene, build_scene
+from vislam.trajectory import write_text
+
+_SHOWN_LOOPS = 10  # rows that are always seen
+_MAX_LOOPS = 300  # rows that can be unfolded; the rest is in loops.csv
+_DECISIONS = ("accepted", "parked", "rejected")
+
+
+def write_report(run: Path) -> Path:
+    """Write `report.html` into a run folder and return its path.
+
+    A file that is absent leaves its section out, one that is damaged says so in the report. Raises DataError when the
+    folder holds nothing of a run, StorageError when the report cannot be written.
+    """
+    files = read_run(run)
+    scene = build_scene(files)
+    body = "".join(
+        (
+            _head(files),
+            _tiles(files),
+            _problems(files, scene),
+            _accuracy(files, scene),
+            _trajectories(files, scene),
+            _over_time(files, scene),
+            _map(files),
+            _loops(files),
+            _timing(files),
+            _biases(files, scene),
+            _lost(files),
+            _manifest(files),
+        )
+    )
+    css = Path(__file__).with_name("style.css").read_text(encoding="utf-8")
+    title = escape(f"vislam: {_name(files)}")
+    page = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{css}</style></head><body><main>{body}"
+        "<footer>Made by vislam from the files in this folder.</footer></main></body></html>\n"
+    )
+    path = run / "report.html"
+    write_text(path, page)
+    return path
+
+
+def _dict(value: Any, *keys: str) -> dict[str, Any]:
+    """Return a nested dictionary of damaged or partial data, or an empty one."""
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _name(run: RunFiles) -> str:
+    return str(run.metrics.get("name") or run.folder.resolve().name)
+
+
+def _head(run: RunFiles) -> str:
+    m = run.metrics
+    parts = []
+    if m:
+        parts.append(
+            f"{number(m.get('frames'), 0)} frames and {number(m.get('keyframes'), 0)} keyframes, "
+            f"{number(m.get('duration_s'), 1)} s of recording processed in {number(m.get('wall_s'), 1)} s."
+        )
+    start = _dict(m, "initialisation")
+    if start:
+        when = number(start.get("t_s"), 2, " s")
+        reason = f" ({start['reason']})" if start.get("reason") else ""
+        parts.append(f"Initialisation: {start.get('status', 'unknown')} at {when}{reason}.")
+    source = run.manifest.get("source")
+    if source:
+        parts.append(f"Source: {source}.")
+    return f'<h1>{escape(_name(run))}</h1><p class="lead">{escape(" ".join(parts))}</p>'
+
+
+def _tiles(run: RunFiles) -> str:
+    m = run.metrics
+    if not m:
+        return ""
+    graph, ekf, loops = _dict(m, "accuracy", "graph"), _dict(m, "accuracy", "ekf"), _dict(m, "loops")
+    tiles = []
+    if graph:
+        tiles.append(tile(number(graph.get("ate_rmse_m")), "m", "ATE of the final trajectory", "graph"))
+    if ekf:
+        tiles.append(tile(number(ekf.get("ate_rmse_m")), "m", "ATE of the EKF alone", "ekf"))
+    if graph:
+        covered = graph.get("coverage")
+        full = isinstance(covered, int | float) and covered >= 0.95
+        tiles.append(tile(percent(covered), "", "of the recording covered", "good" if full else "warn"))
+    factor = m.get("realtime_factor")
+    fast = isinstance(factor, int | float) and factor >= 1.0
+    tiles.append(tile(number(factor, 2), "×", "real time", "good" if fast else "warn"))
+    tiles.append(
+        tile(number(loops.get("accepted", 0), 0), "", f"loops of {number(loops.get('candidates', 0), 0)} candidates")
+    )
+    lost, spells = _lost_frames(run)
+    label = "frames lost" if spells == 0 else f"frames lost, in {spells} outage{'s' if spells > 1 else ''}"
+    if run.tracking is not None:
+        tiles.append(tile(number(lost, 0), "", label, "good" if lost == 0 else "bad"))
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _lost_frames(run: RunFiles) -> tuple[int, int]:
+    """Return the number of lost frames and of contiguous spells of them."""
+    states = run.tracking.tracking if run.tracking is not None else []
+    lost = [state == "lost" for state in states]
+    spells = sum(now and not before for now, before in zip(lost, [False, *lost], strict=False))
+    return sum(lost), spells
+
+
+def _problems(run: RunFiles, scene: Scene) -> str:
+    lines = [str(warning) for warning in _list(run.metrics.get("warnings"))]
+    lines += scene.notes
+    lines += [f"{name} left out: {reason}" for name, reason in run.unread.items()]
+    return card(bullets(lines), kind="warnings", title="Worth knowing") if lines else ""
+
+
+def _accuracy(run: RunFiles, scene: Scene) -> str:
+    accuracy = _dict(run.metrics, "accuracy")
+    rows: list[list[str | Cell]] = []
+    for name in ESTIMATES:
+        entry = _dict(accuracy, name)
+        if entry:
+            keys = ("ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_max_m", "rpe_1s_m")
+            rows.append(
+                [
+                    Cell(plots.LABELS[name], mark=name),
+                    *(number(entry.get(key)) for key in keys),
+                    number(entry.get("rpe_1s_deg"), 2),
+                    number(entry.get("scale"), 4),
+                    percent(entry.get("coverage")),
+                ]
+            )
+    if not rows:
+        reason = "This run has no true trajectory to compare with." if run.truth is None else ""
+        return section("Accuracy", note(reason)) if reason and run.metrics else ""
+    head = ["", "ATE RMSE [m]", "mean", "median", "max", "RPE 1 s [m]", "[°]", "scale", "coverage"]
+    graph = _dict(accuracy, "graph") or _dict(accuracy, "ekf")
+    text = (
+        f"Alignment {graph.get('alignment', 'unknown')} over a path of {number(graph.get('path_m'), 1)} m. "
+        "Scale is the factor that would fit the estimate to the truth best. EKF and live are causal; "
+        "the graph is the final answer after all loops."
+    )
+    return section("Accuracy", card(table(head, rows)), note(text), _consistency(scene))
+
+
+def _consistency(scene: Scene) -> str:
+    rows: list[list[str | Cell]] = []
+    for name, values in scene.nees.items():
+        row: list[str | Cell] = [Cell(plots.LABELS[name], mark=name), number(len(values["t_ns"]), 0)]
+        for part in ("rotation", "position"):
+            finite = values[part][np.isfinite(values[part])]
+            row += [
+                number(float(finite.mean()), 1) if len(finite) else "–",
+                number(float(np.median(finite)), 1) if len(finite) else "–",
+            ]
+        rows.append(row)
+    if not rows:
+        return ""
+    head = ["", "keyframes", "rotation mean", "median", "position mean", "median"]
+    text = (
+        "Normalised estimation error squared of the keyframes after yaw alignment. A filter that knows its own "
+        "uncertainty has a mean of 3; a larger number means that it is too sure of itself."
+    )
+    return card(table(head, rows), title="Consistency (NEES, expected 3)") + note(text)
+
+
+def _trajectories(run: RunFiles, scene: Scene) -> str:
+    if not any(len(path) > 1 for path in scene.paths.values()):
+        return ""
+    return section(
+        "Trajectories",
+        grid(card(plots.top_view(run, scene), title="From above"), card(plots.side_view(scene), title="From the side")),
+    )
+
+
+def _over_time(run: RunFiles, scene: Scene) -> str:
+    figure = plots.over_time(run, scene)
+    if not figure:
+        return ""
+    text = "Vertical green lines are accepted loops. State: green ok, yellow degraded, red lost."
+    return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), note(text))
+
+
+def _map(run: RunFiles) -> str:
+    cards = []
+    for path in run.pictures:
+        caption = path.stem.removeprefix("picture").strip("-_ ").replace("_", " ") or "The map"
+        try:
+            cards.append(picture(path, caption))
+        except OSError as error:
+            cards.append(card(note(f"{path.name} cannot be read: {error.strerror or error}")))
+    return section("Map", *cards) if len(cards) == 1 else section("Map", grid(*cards))
+
+
+def _loops(run: RunFiles) -> str:
+    counts = _dict(run.metrics, "loops")
+    if not run.loops:
+        return section("Loops", note("No candidates.")) if counts else ""
+    by_decision = Counter(loop.decision for loop in run.loops)
+    summary = ", ".join(f"{by_decision[d]} {d}" for d in _DECISIONS if by_decision[d])
+    order = sorted(run.loops, key=lambda loop: (_rank(loop.decision), loop.to_id, loop.from_id))
+    head = [
+        "from",
+        "to",
+        "at [s]",
+        "decision",
+        "reason",
+        "source",
+        "score",
+        "inliers",
+        "σ [m]",
+        "agree",
+        "χ²",
+        "weight",
+    ]
+    first_ns = min(loop.from_t_ns for loop in run.loops)
+    zero_ns = min((int(t.t_ns[0]) for t in run.estimates.values() if len(t)), default=first_ns)
+    rows = [_loop_row(loop, zero_ns) for loop in order[:_MAX_LOOPS]]
+    text = f"{len(run.loops)} candidates: {summary}."
+    shown = card(table(head, rows[:_SHOWN_LOOPS], text_columns=(3, 4, 5)))
+    rest = rows[_SHOWN_LOOPS:]
+    title = f"{len(rest)} more candidates" + (" of many; all are in loops.csv" if len(order) > _MAX_LOOPS else "")
+    more = folded(title, table(head, rest, text_columns=(3, 4, 5))) if rest else ""
+    return section("Loops", note(text), _reasons(run.loops), shown, more)
+
+
+def _rank(decision: str) -> int:
+    return _DECISIONS.index(decision) if decision in _DECISIONS else len(_DECISIONS)
+
+
+def _loop_row(loop: LoopRow, zero_ns: int) -> list[str | Cell]:
+    return [
+        str(loop.from_id),
+        str(loop.to_id),
+        number((loop.to_t_ns - zero_ns) * 1e-9, 1),
+        Cell(loop.decision, mark=loop.decision),
+        Cell(loop.reason, kind="text long"),
+        loop.source,
+        number(loop.score),
+        number(loop.inliers, 0),
+        number(loop.sigma_m),
+        number(loop.consistency, 0),
+        number(loop.chi2, 1),
+        number(loop.weight, 2),
+    ]
+
+
+def _reasons(loops: list[LoopRow]) -> str:
+    """Return how often each reason occurred; reasons that differ only in their numbers are one."""
+    refused = Counter(re.sub(r"\d+(\.\d+)?", "…", loop.reason) for loop in loops if loop.decision != "accepted")
+    if len(refused) < 2:
+        return ""
+    rows: list[list[str | Cell]] = [
+        [Cell(reason, kind="text long"), str(count)] for reason, count in refused.most_common(8)
+    ]
+    return card(table(["why not accepted", "candidates"], rows))
+
+
+def _timing(run: RunFiles) -> str:
+    stages = {
+        name: {key: float(value) for key, value in stage.items() if isinstance(value, int | float)}
+        for name, stage in _dict(run.metrics, "timing_ms").items()
+        if isinstance(stage, dict)
+    }
+    if not stages:
+        return ""
+    frames, duration = run.metrics.get("frames"), run.metrics.get("duration_s")
+    both = isinstance(frames, int) and isinstance(duration, int | float) and frames > 1
+    figure = plots.timing(stages, 1e3 * duration / (frames - 1) if both else None)  # type: ignore[operator]
+    total = sum(stage.get("total_s", 0.0) for stage in stages.values())
+    rows: list[list[str | Cell]] = []
+    for name, stage in sorted(stages.items(), key=lambda item: -item[1].get("total_s", 0.0)):
+        share = stage.get("total_s", 0.0) / total if total > 0.0 else None
+        quantiles = [number(stage.get(key), 2) for key in ("p50", "p95", "p99")]
+        rows.append(
+            [name, *quantiles, number(stage.get("count"), 0), number(stage.get("total_s"), 2), percent(share, 0)]
+        )
+    head = ["stage", "p50 [ms]", "p95", "p99", "calls", "total [s]", "share"]
+    return section("Time", grid(card(figure) if figure else "", card(table(head, rows))))
+
+
+def _biases(run: RunFiles, scene: Scene) -> str:
+    figure = plots.biases(run.states, scene)
+    if not figure:
+        return ""
+    text = "Solid: graph with ±3σ. Dashed: EKF."
+    return section("Inertial biases", card(f'<div class="scroll wide">{figure}</div>'), note(text))
+
+
+def _lost(run: RunFiles) -> str:
+    """Return everything that was skipped, lost or refused, room by room; zeros are left out."""
+    rows: list[list[str | Cell]] = []
+    for room, counters in [*_dict(run.metrics, "counters").items(), ("recording", _dict(run.metrics, "problems"))]:
+        for name, count in _dict(counters).items():
+            if isinstance(count, int | float) and count:
+                rows.append([str(room), Cell(str(name).replace("_", " "), kind="text"), number(count, 0)])
+    reasons: Counter[str] = Counter()
+    if run.tracking is not None:
+        for state, reason in zip(run.tracking.tracking, run.tracking.reason, strict=True):
+            if state != "ok" and reason:
+                reasons[f"{state}: " + re.sub(r"\d+(\.\d+)?", "…", reason)] += 1
+    why: list[list[str | Cell]] = [[Cell(reason, kind="text long"), str(n)] for reason, n in reasons.most_common(10)]
+    cards = [
+        card(table(["room", "what", "count"], rows, text_columns=(0, 1)), title="Counters") if rows else "",
+        card(table(["why", "frames"], why), title="Frames that were not ok") if why else "",
+    ]
+    if not rows and not why:
+        return section("What was lost or rejected", note("Nothing.")) if run.metrics else ""
+    return section("What was lost or rejected", grid(*cards))
+
+
+def _manifest(run: RunFiles) -> str:
+    def text(data: dict[str, Any]) -> str:
+        return json.dumps(data, indent=2, ensure_ascii=False)
+
+    parts = [
+        folded(name, preformatted(text(data)))
+        for name, data in (("Configuration", run.config), ("Manifest", run.manifest))
+        if data
+    ]
+    command = run.manifest.get("command")
+    line = " ".join(str(part) for part in command) if isinstance(command, list) else command
+    again = card(preformatted(line), title="Command") if line else ""
+    return section("How it was made", again, *parts)

@@ -1,0 +1,171 @@
+"""What is in a run folder, read leniently: a file that is absent or damaged becomes a reason, not an error."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+from vislam.messages import NavState, Tracking
+from vislam.trajectory import Trajectory, read_states_csv, read_tum
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+ESTIMATES = ("ekf", "live", "graph", "batch")
+_LOOP_COLUMNS = (
+    "from_id", "to_id", "from_t_ns", "to_t_ns", "source", "score", "inliers",
+    "sigma_m", "consistency", "chi2", "weight", "decision", "reason",
+)  # fmt: skip
+_TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
+_MAX_JSON_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class LoopRow:
+    """One line of loops.csv; numbers that do not apply are NaN."""
+
+    from_id: int
+    to_id: int
+    from_t_ns: int
+    to_t_ns: int
+    source: str
+    score: float
+    inliers: float
+    sigma_m: float
+    consistency: float
+    chi2: float
+    weight: float
+    decision: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingRows:
+    """The columns of tracking.csv, one entry per frame."""
+
+    t_ns: NDArray[np.int64]
+    tracking: list[str]
+    inliers: Array
+    reason: list[str]
+
+
+@dataclass(slots=True, eq=False)
+class RunFiles:
+    """Everything the report needs of a run folder."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    config: dict[str, Any]
+    manifest: dict[str, Any]
+    truth: Trajectory | None
+    estimates: dict[str, Trajectory]
+    states: dict[str, list[NavState]]
+    loops: list[LoopRow]
+    tracking: TrackingRows | None
+    pictures: list[Path]
+    unread: dict[str, str] = field(default_factory=dict)  # file name: why it could not be used
+
+
+def read_run(folder: Path) -> RunFiles:
+    """Read a run folder. Raises DataError when it is no folder or holds nothing of a run."""
+    if not folder.is_dir():
+        raise DataError(f"{folder} is not a run folder; `vislam run SOURCE --out {folder}` makes one")
+    unread: dict[str, str] = {}
+
+    def attempt(name: str, read: Callable[[Path], T]) -> T | None:
+        path = folder / name
+        if not path.is_file():
+            return None
+        try:
+            return read(path)
+        except DataError as error:
+            unread[name] = str(error)
+        except OSError as error:
+            unread[name] = f"{path} cannot be read: {error.strerror or error}"
+        return None
+
+    found = {name: attempt(f"trajectory_{name}.tum", read_tum) for name in ESTIMATES}
+    states = {name: attempt(f"states_{name}.csv", read_states_csv) for name in ("ekf", "graph")}
+    run = RunFiles(
+        folder=folder,
+        metrics=attempt("metrics.json", _read_json) or {},
+        config=attempt("config.json", _read_json) or {},
+        manifest=attempt("manifest.json", _read_json) or {},
+        truth=attempt("trajectory_truth.tum", read_tum),
+        estimates={name: trajectory for name, trajectory in found.items() if trajectory is not None},
+        states={name: pair[1] for name, pair in states.items() if pair is not None},
+        loops=attempt("loops.csv", _read_loops) or [],
+        tracking=attempt("tracking.csv", _read_tracking),
+        pictures=sorted((folder / "map").glob("picture*.png")),
+        unread=unread,
+    )
+    if not run.metrics and not run.estimates and not unread:
+        raise DataError(f"{folder} holds neither metrics.json nor a trajectory; is it a run folder?")
+    return run
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise DataError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise DataError(f"{path} holds a {type(data).__name__} instead of an object")
+    return data
+
+
+def _rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
+    """Return (line, fields) of a CSV file with this header; a line cut short is an error."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file, restkey="", restval="")
+            if tuple(reader.fieldnames or ()) != columns:
+                raise DataError(f"{path}:1: expected the columns {','.join(columns)}, got {reader.fieldnames}")
+            rows = []
+            for row in reader:
+                if "" in row or row[columns[-2]] == "":
+                    raise DataError(f"{path}:{reader.line_num}: wrong number of columns; is the line cut short?")
+                rows.append((reader.line_num, row))
+            return rows
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise DataError(f"{path} is not a CSV file: {error}") from error
+
+
+def _read_loops(path: Path) -> list[LoopRow]:
+    loops = []
+    for line, row in _rows(path, _LOOP_COLUMNS):
+        try:
+            whole = {name: int(row[name]) for name in _LOOP_COLUMNS[:4]}
+            real = {name: _number(row[name]) for name in _LOOP_COLUMNS[5:11]}
+        except ValueError as error:
+            raise DataError(f"{path}:{line}: {error}") from error
+        loops.append(
+            LoopRow(**whole, **real, source=row["source"], decision=row["decision"], reason=row["reason"])  # type: ignore[arg-type]
+        )
+    return loops
+
+
+def _read_tracking(path: Path) -> TrackingRows:
+    rows = _rows(path, _TRACKING_COLUMNS)
+    try:
+        t_ns = np.array([int(row["t_ns"]) for _, row in rows], dtype=np.int64)
+        inliers = np.array([_number(row["inliers"]) for _, row in rows])
+        tracking = [Tracking(row["tracking"]).value for _, row in rows]
+    except (ValueError, OverflowError) as error:
+        raise DataError(f"{path}: {error}") from error
+    return TrackingRows(t_ns, tracking, inliers, [row["reason"] for _, row in rows])
+
+
+def _number(text: str) -> float:
+    return float(text) if text else math.nan

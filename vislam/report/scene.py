@@ -1,0 +1,106 @@
+"""The trajectories of a run brought into one frame for drawing, with their errors against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.errors import VislamError
+from vislam.geometry import invert, sim3_parts, transform
+from vislam.report.run_files import RunFiles
+from vislam.trajectory import Trajectory, align, associate, nees
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorCurve:
+    """Error of one estimate over time after alignment."""
+
+    t_s: Array  # [M] since the start of the run
+    position_m: Array  # [M]
+    rotation_deg: Array  # [M]
+
+
+@dataclass(slots=True, eq=False)
+class Scene:
+    """Trajectories in the map frame (z up), aligned where there is a truth; times count from `zero_ns`."""
+
+    zero_ns: int
+    end_s: float
+    alignment: str  # "" without truth
+    paths: dict[str, Trajectory] = field(default_factory=dict)
+    truth: Trajectory | None = None
+    errors: dict[str, ErrorCurve] = field(default_factory=dict)
+    nees: dict[str, dict[str, Array]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)  # why something cannot be drawn
+
+    def seconds(self, t_ns: NDArray[np.int64] | int) -> Array:
+        """Return times as seconds since the start of the run."""
+        return np.asarray(np.asarray(t_ns, dtype=np.int64) - self.zero_ns, dtype=np.float64) * 1e-9
+
+
+def build_scene(run: RunFiles) -> Scene:
+    """Align what can be aligned; what cannot be is drawn as it is and noted."""
+    stamps = [t.t_ns for t in run.estimates.values() if len(t)]
+    if run.tracking is not None and len(run.tracking.t_ns):
+        stamps.append(run.tracking.t_ns)
+    zero = min((int(t[0]) for t in stamps), default=0)
+    end = max((int(t[-1]) for t in stamps), default=zero)
+    scene = Scene(zero, (end - zero) * 1e-9, "")
+    if run.truth is None:
+        scene.paths = dict(run.estimates)
+        return scene
+    scene.alignment = _alignment(run)
+    aligned: dict[str, Trajectory] = {}
+    base = np.eye(4)  # the truth's world as seen from the map
+    for name, estimate in run.estimates.items():
+        try:
+            pairs = associate(estimate, run.truth)
+            S = align(pairs, scene.alignment)  # type: ignore[arg-type]
+        except VislamError as error:
+            scene.notes.append(f"{name} cannot be aligned to the truth: {error}")
+            continue
+        moved = pairs.aligned(S)
+        scene.errors[name] = ErrorCurve(
+            scene.seconds(pairs.t_ns), moved.position_errors_m(), np.rad2deg(moved.rotation_errors_rad())
+        )
+        aligned[name] = estimate.transformed(S)
+        _, R, t = sim3_parts(S)
+        base = invert(transform(R, t))  # the last one, the graph's or the batch's, decides
+    scene.paths = {name: trajectory.transformed(base) for name, trajectory in aligned.items()}
+    if aligned:
+        inside = (run.truth.t_ns >= zero) & (run.truth.t_ns <= end)
+        scene.truth = Trajectory(run.truth.t_ns[inside], run.truth.T_world_body[inside]).transformed(base)
+    _add_nees(run, scene)
+    return scene
+
+
+def loop_segments(run: RunFiles, scene: Scene, decision: str) -> Array:
+    """Return the ends [L, 2, 3] of the loops with this decision, on the best trajectory there is."""
+    path = next((scene.paths[name] for name in ("batch", "graph", "live") if len(scene.paths.get(name, ()))), None)
+    if path is None:
+        return np.empty((0, 2, 3))
+    rows = [loop for loop in run.loops if loop.decision == decision]
+    t_ns = np.array([[loop.from_t_ns, loop.to_t_ns] for loop in rows], dtype=np.int64).reshape(-1, 2)
+    t_ns = np.clip(t_ns, path.t_ns[0], path.t_ns[-1])  # a keyframe may lie just outside the per-frame trajectory
+    return path.at(t_ns.ravel())[:, :3, 3].reshape(-1, 2, 3)
+
+
+def _alignment(run: RunFiles) -> str:
+    accuracy = run.metrics.get("accuracy")
+    entry = accuracy.get("graph") if isinstance(accuracy, dict) else None
+    asked = entry.get("alignment") if isinstance(entry, dict) else None
+    return asked if asked in ("se3", "sim3", "yaw", "first", "none") else "se3"
+
+
+def _add_nees(run: RunFiles, scene: Scene) -> None:
+    if run.truth is None:
+        return
+    for name, states in run.states.items():
+        try:
+            scene.nees[name] = nees(states, run.truth, "yaw")
+        except VislamError as error:
+            scene.notes.append(f"no consistency of {name}: {error}")
