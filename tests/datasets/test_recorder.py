@@ -105,7 +105,9 @@ def test_a_copied_recording_plays_the_same(tmp_path: Path) -> None:
     (root / "mocap0").mkdir()
     (root / "mocap0" / "data.csv").write_text("#t\n1,0.1,0.2,0.3,0.6,0.8,0,0\n2,0.1,0.2,0.4,0.6,0.8,0,0\n")
     source = open_dataset(str(tmp_path / "a"))
-    record(source, tmp_path / "b")
+    told: list[int] = []
+    record(source, tmp_path / "b", on_frame=told.append)
+    assert told == [1, 2, 3, 4]
     copy = open_dataset(str(tmp_path / "b"))
     for one, other in zip(source.events(), copy.events(), strict=True):
         assert (one.t_ns, type(one)) == (other.t_ns, type(other))

@@ -5,6 +5,7 @@ docs/formats.md lists every key. Poses are `T_BS`: the sensor's pose in the body
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -187,7 +188,7 @@ def pose_text(T: Array) -> str:
 def camera_text(camera: Camera, T_body_cam: Array, comment: str) -> str:
     """Return the sensor file of a camera."""
     return (
-        f"sensor_type: camera\ncomment: {comment}\n{pose_text(T_body_cam)}"
+        f"sensor_type: camera\ncomment: {json.dumps(comment)}\n{pose_text(T_body_cam)}"
         f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
         f"intrinsics: {_list([camera.fx, camera.fy, camera.cx, camera.cy])}  # fu, fv, cu, cv in pixels\n"
         f"skew_px: {float(camera.skew_px)!r}\n"
@@ -200,7 +201,7 @@ def imu_text(noise: ImuNoise, comment: str) -> str:
     """Return the sensor file of an IMU that is the body frame."""
     lines = [f"{key}: {float(getattr(noise, name))!r}\n" for name, key in _NOISE_KEYS.items()]
     rate = f"rate_hz: {float(noise.rate_hz)!r}\n" if noise.rate_hz > 0.0 else ""
-    return f"sensor_type: imu\ncomment: {comment}\n{pose_text(np.eye(4))}{rate}{''.join(lines)}"
+    return f"sensor_type: imu\ncomment: {json.dumps(comment)}\n{pose_text(np.eye(4))}{rate}{''.join(lines)}"
 
 
 def depth_text(camera: Camera, units_per_m: float) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -37,7 +38,8 @@ _MAG_HEADER = "#timestamp [ns],field_x [uT],field_y [uT],field_z [uT]"
 _TRUTH_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
 _IMAGE_HEADER = "#timestamp [ns],filename"
 _ENCODING: dict[ImageFormat, list[int]] = {
-    "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],  # lossless; higher levels cost ten times the time for a tenth of the size
+    # lossless; measured on 640x480 colour: 15 ms, 368 kB; the default strategy 18 ms, 416 kB; level 3 27 ms, 398 kB
+    "png": [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE],
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
 }
 
@@ -249,19 +251,25 @@ class _RowLog:
         self._file.close()
 
 
-def record(recording: Recording, folder: Path, image_format: ImageFormat = "png") -> Recorder:
+def record(
+    recording: Recording,
+    folder: Path,
+    image_format: ImageFormat = "png",
+    on_frame: Callable[[int], None] | None = None,
+) -> Recorder:
     """Write a whole recording with its truth into a new ASL folder and return the closed recorder.
 
-    Raises UsageError, DataError and StorageError as `Recorder` does.
+    `on_frame` is told how many frames are written, after each. Raises UsageError, DataError and StorageError as
+    `Recorder` does.
     """
-    recorder = Recorder(
-        folder, recording.rig, recording.imu_noise, image_format=image_format, comment=f"vislam, {recording.name}"
-    )
-    with recorder:
+    comment = f"vislam, {recording.name}"
+    with Recorder(folder, recording.rig, recording.imu_noise, image_format=image_format, comment=comment) as recorder:
         truth = recording.truth()
         if truth is not None:
             for t_ns, T_world_body in zip(truth.t_ns.tolist(), truth.T_world_body, strict=True):
                 recorder.write_truth(t_ns, T_world_body)
         for value in recording.events():
             recorder.write(value)
+            if on_frame is not None and isinstance(value, Frame):
+                on_frame(recorder.counts["frames"])
     return recorder

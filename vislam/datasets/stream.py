@@ -104,13 +104,12 @@ class FileRecording:
         self.name = survey.root.resolve().name
         self.rig: Rig = survey.rig
         self.imu_noise: ImuNoise | None = survey.imu_noise
-        self.problems: dict[str, int] = {}
         self._survey = survey
         self._counter = Problems()
         self._counter.update(survey.problems)
         self._frames = frame_table(survey, self._counter)
         self._known = dict(self._counter)
-        self.problems = self._counter
+        self.problems: dict[str, int] = self._counter
         self.frame_count = len(self._frames.t_ns)
         if not self.frame_count:
             names = " and ".join(camera.name for camera in survey.cameras)
