@@ -17,6 +17,7 @@ from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
 
 if TYPE_CHECKING:
     from vislam.config import Config
+    from vislam.datasets.inspect import Inspection
 
 _INTERRUPTED = 130
 
@@ -195,9 +196,8 @@ def _simulate(arguments: list[str]) -> int:
     from vislam.sim import open_world
 
     options = _parse(SimulateOptions, arguments, "simulate")
-    choices = {"rig": options.rig, "duration_s": options.duration_s}
-    choices = {name: value for name, value in choices.items() if value not in (None, "default")}
-    world = open_world(options.world, seed=options.seed, **choices)
+    choices = {name: value for name, value in asdict(options).items() if name not in ("world", "out")}
+    world = open_world(options.world, **choices)
     frames = 0
     with Recorder(options.out, world.rig, world.imu_noise) as recorder, _progress(options.world) as progress:
         truth = world.truth()
@@ -274,13 +274,33 @@ def _doctor(arguments: list[str]) -> int:
     options = _parse(DoctorOptions, arguments, "doctor")
     from vislam.datasets.inspect import inspect
 
-    findings = inspect(options.source)
+    inspection = inspect(options.source)
     if options.json:
-        print(json.dumps([asdict(finding) for finding in findings]))
+        print(json.dumps(asdict(inspection)))
     else:
-        for finding in findings:
-            print(finding)
-    return DataError.exit_code if any(finding.severity == "error" for finding in findings) else 0
+        _print_inspection(inspection)
+    return DataError.exit_code if inspection.worst == "error" else 0
+
+
+def _print_inspection(inspection: Inspection) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    size = f"{inspection.duration_s:.1f} s, {inspection.size_bytes / 1e6:.1f} MB"
+    console.print(f"{inspection.source}: {inspection.format}, {size}", soft_wrap=True)
+    table = Table()
+    for title in ("stream", "count", "rate [Hz]", "longest gap [s]"):
+        table.add_column(title, justify="left" if title == "stream" else "right")
+    for stream in inspection.streams:
+        table.add_row(stream.name, str(stream.count), f"{stream.rate_hz:.1f}", f"{stream.longest_gap_s:.3f}")
+    console.print(table)
+    styles = {"ok": "green", "warning": "yellow", "error": "red"}
+    for finding in inspection.findings:
+        console.print(f"{finding.severity:<8}", style=styles[finding.severity], end="")
+        console.print(f"{finding.what} ({finding.where})", soft_wrap=True, highlight=False, markup=False)
+        if finding.next_step:
+            console.print(f"        -> {finding.next_step}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _report(arguments: list[str]) -> int:

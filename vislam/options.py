@@ -17,7 +17,7 @@ class RunOptions:
     """Options of `vislam run`."""
 
     source: Positional[str]
-    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD, or a path that is recognised by what is in it"""
+    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD[,option=value], or a path, recognised by its contents"""
     out: Path
     """Folder to make for everything that the run leaves"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
@@ -49,10 +49,18 @@ class SimulateOptions:
     """Name of a simulated world; a wrong one lists them"""
     out: Path
     """Folder to make for the recording (ASL layout, with truth)"""
-    rig: Literal["default", "rgbd", "stereo", "mono"] = "default"
-    """Cameras: what the world has by default, or one of these"""
+    rig: Literal["rgbd", "stereo", "mono"] | None = None
+    """Cameras; None: what the world has"""
     duration_s: float | None = None
     """Only the first so many seconds"""
+    camera_hz: float | None = None
+    """Frames per second; None: what the world has"""
+    image_width_px: int = 640
+    """Width of the 4:3 images"""
+    exposure_s: float = 0.0
+    """Motion blur of this exposure"""
+    readout_s: float = 0.0
+    """Rolling shutter: time from the first to the last row"""
     seed: int = 0
     """Same seed, same bytes"""
 
