@@ -190,26 +190,21 @@ def _demo(arguments: list[str]) -> int:
 
 
 def _simulate(arguments: list[str]) -> int:
-    from vislam.datasets.recorder import Recorder
-    from vislam.messages import Frame
+    from vislam.datasets.recorder import record
     from vislam.options import SimulateOptions
     from vislam.sim import open_world
 
     options = _parse(SimulateOptions, arguments, "simulate")
     choices = {name: value for name, value in asdict(options).items() if name not in ("world", "out")}
     world = open_world(options.world, **choices)
-    frames = 0
-    with Recorder(options.out, world.rig, world.imu_noise) as recorder, _progress(options.world) as progress:
-        truth = world.truth()
-        if truth is not None:
-            for t_ns, T_world_body in zip(truth.t_ns.tolist(), truth.T_world_body, strict=True):
-                recorder.write_truth(t_ns, T_world_body)
-        for value in world.events():
-            recorder.write(value)
-            if isinstance(value, Frame):
-                frames += 1
-                if progress is not None:
-                    progress(frames, world.frame_count, "")
+    with _progress(options.world) as progress:
+
+        def on_frame(done: int) -> None:
+            if progress is not None:
+                progress(done, world.frame_count, "")
+
+        recorder = record(world, options.out, on_frame=on_frame)
+    frames = recorder.counts["frames"]
     print(f"{frames} frames in {options.out}; next: vislam run {options.out} --out RUN")
     return 0
 
