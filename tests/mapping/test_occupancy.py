@@ -1,0 +1,198 @@
+import math
+
+import numpy as np
+import pyoctomap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vislam.errors import DataError
+from vislam.mapping.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octomap_io import encode_bt, encode_ot
+
+
+class SlowOctoMap:
+    """OctoMap's insertion written from its paper and headers with sets and a dictionary, one voxel at a time."""
+
+    def __init__(self, resolution):
+        self.resolution = resolution
+        self.cells = {}
+
+    def key(self, point):
+        return tuple(math.floor((1.0 / self.resolution) * float(c)) for c in point)
+
+    def centre(self, key):
+        return np.array([np.float32((k + 0.5) * self.resolution) for k in key])
+
+    def ray(self, origin, end):
+        key, last = list(self.key(origin)), self.key(end)
+        if tuple(key) == last:
+            return []
+        passed = [tuple(key)]
+        direction = end - origin
+        length = np.float32(math.sqrt(float(direction[0] * direction[0] + direction[1] * direction[1]
+                                            + direction[2] * direction[2])))  # fmt: skip
+        direction = direction / length
+        half = float(np.float32(0.5 * self.resolution))
+        step = [int(np.sign(d)) for d in direction]
+        far = [math.inf] * 3
+        delta = [math.inf] * 3
+        for a in range(3):
+            if step[a]:
+                border = (key[a] + 0.5) * self.resolution + step[a] * half
+                far[a] = (border - float(origin[a])) / float(direction[a])
+                delta[a] = self.resolution / abs(float(direction[a]))
+        while True:
+            a = 0 if far[0] < far[1] and far[0] < far[2] else (1 if far[1] <= far[0] and far[1] < far[2] else 2)
+            key[a] += step[a]
+            far[a] += delta[a]
+            if tuple(key) == last or min(far) > float(length):
+                return passed
+            passed.append(tuple(key))
+
+    def insert(self, points, origin, max_range, discretised):
+        free, hit = set(), set()
+        ends = [self.centre(k) for k in dict.fromkeys(map(self.key, points))] if discretised else points
+        for end in ends:
+            offset = end - origin
+            distance = math.sqrt(float(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]))
+            if max_range >= 0 and distance > max_range:
+                end = origin + offset / np.float32(distance) * np.float32(max_range)  # noqa: PLW2901
+                free.update(self.ray(origin, end))
+            else:
+                free.update(self.ray(origin, end))
+                hit.add(self.key(end))
+        for cell in free - hit:
+            self.change(cell, 0.4)
+        for cell in hit:
+            self.change(cell, 0.7)
+
+    def change(self, cell, probability):
+        value = self.cells.get(cell, np.float32(0)) + np.float32(math.log(probability / (1 - probability)))
+        low, high = (np.float32(math.log(p / (1 - p))) for p in (0.1192, 0.971))
+        self.cells[cell] = min(max(value, low), high)
+
+
+def random_scan(rng, count, reach):
+    origin = rng.uniform(-0.5, 0.5, 3).astype(np.float32)
+    return (origin + rng.uniform(-reach, reach, (count, 3))).astype(np.float32), origin
+
+
+@settings(max_examples=40)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0.05, 0.1, 0.13]),
+    st.sampled_from([-1.0, 0.7]),
+    st.sampled_from(["discretised", "full"]),
+)
+def test_equals_a_slow_octomap_voxel_by_voxel(seed, resolution, max_range, insertion):
+    rng = np.random.default_rng(seed)
+    fast, slow = OccupancyMap(resolution), SlowOctoMap(resolution)
+    for _ in range(3):
+        points, origin = random_scan(rng, 15, 1.0)
+        fast.insert(points, origin, max_range, insertion)
+        slow.insert(points, origin, max_range, insertion == "discretised")
+    octree = fast.octree()
+    assert int((np.int64(1) << (3 * octree.levels.astype(np.int64))).sum()) == len(slow.cells)
+    centres = np.array([slow.centre(k) for k in slow.cells], dtype=np.float64)
+    np.testing.assert_array_equal(fast.log_odds_at(centres), np.array(list(slow.cells.values()), dtype=np.float32))
+    np.testing.assert_array_equal(octree.log_odds_at(centres), fast.log_odds_at(centres))
+
+
+@pytest.mark.parametrize("resolution", [0.05, 0.02])
+@pytest.mark.parametrize("insertion", ["discretised", "full"])
+def test_files_equal_those_of_octomap_byte_for_byte(tmp_path, resolution, insertion):
+    rng = np.random.default_rng(7)
+    ours, theirs = OccupancyMap(resolution), pyoctomap.OcTree(resolution)
+    for _ in range(3):
+        points, origin = random_scan(rng, 1500, 1.5)
+        ours.insert(points, origin, 2.0, insertion)
+        theirs.insertPointCloud(
+            points.astype(np.float64), origin.astype(np.float64), max_range=2.0, discretize=insertion == "discretised"
+        )
+    theirs.write(str(tmp_path / "a.ot"))
+    assert encode_ot(ours.octree()) == (tmp_path / "a.ot").read_bytes()
+    theirs.writeBinary(str(tmp_path / "a.bt"))
+    assert encode_bt(ours.max_likelihood_octree()) == (tmp_path / "a.bt").read_bytes()
+
+
+def test_a_ray_frees_its_way_and_nothing_else():
+    grid = OccupancyMap(0.1)
+    grid.insert(np.array([[1.05, 0.05, 0.05]]), np.array([0.05, 0.05, 0.05]))
+    along = np.array([[x, 0.05, 0.05] for x in (0.05, 0.55, 0.95)])
+    assert (grid.state_at(along) == Occupancy.FREE).all()
+    assert grid.state_at(np.array([[1.05, 0.05, 0.05]])) == Occupancy.OCCUPIED
+    beside = np.array([[0.55, 0.15, 0.05], [1.15, 0.05, 0.05], [-0.05, 0.05, 0.05]])
+    assert (grid.state_at(beside) == Occupancy.UNKNOWN).all()
+
+
+@pytest.mark.parametrize("insertion", ["discretised", "full"])
+def test_a_point_beyond_the_range_only_clears_the_way(insertion):
+    grid = OccupancyMap(0.1)
+    grid.insert(np.array([[3.05, 0.05, 0.05]]), np.array([0.05, 0.05, 0.05]), 2.0, insertion)
+    assert len(grid.octree().occupied_voxels()) == 0
+    states = grid.state_at(np.array([[1.95, 0.05, 0.05], [2.25, 0.05, 0.05], [3.05, 0.05, 0.05]]))
+    assert states.tolist() == [Occupancy.FREE, Occupancy.UNKNOWN, Occupancy.UNKNOWN]
+
+
+def test_clamping_lets_a_voxel_change_its_mind():
+    grid, wall, behind = OccupancyMap(0.1), np.array([[1.05, 0.05, 0.05]]), np.array([[2.05, 0.05, 0.05]])
+    origin = np.full(3, 0.05)
+    for _ in range(1000):
+        grid.insert(wall, origin)
+    np.testing.assert_allclose(grid.log_odds_at(wall), math.log(0.971 / 0.029), rtol=1e-6)
+    misses = 0
+    while grid.state_at(wall) == Occupancy.OCCUPIED:
+        grid.insert(behind, origin)
+        misses += 1
+    assert misses == 9  # 3.51 / 0.405: however often it had been seen before
+
+
+def test_points_that_are_not_finite_are_left_out():
+    points = np.array([[1.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])
+    dirty, clean = OccupancyMap(0.1), OccupancyMap(0.1)
+    assert dirty.insert(points, np.zeros(3)) == 1
+    clean.insert(points[:1], np.zeros(3))
+    assert encode_ot(dirty.octree()) == encode_ot(clean.octree())
+    assert dirty.insert(np.full((3, 3), np.nan), np.zeros(3)) == 0
+    assert dirty.insert(np.zeros((0, 3)), np.zeros(3)) == 0
+
+
+def test_queries_beyond_the_world_are_unknown():
+    grid = OccupancyMap(0.1)
+    grid.insert(np.ones((1, 3)), np.zeros(3))
+    places = np.array([[1e9, 0.0, 0.0], [-1e30, 0.0, 0.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+    assert (grid.state_at(places) == Occupancy.UNKNOWN).all()
+    assert np.isnan(grid.octree().log_odds_at(places)).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "origin", "words"),
+    [
+        ([[4000.0, 0.0, 0.0]], [0.0, 0.0, 0.0], "16-bit keys"),
+        ([[1.0, 0.0, 0.0]], [np.nan, 0.0, 0.0], "origin"),
+        ([[1500.0, 1500.0, 1500.0]], [0.0, 0.0, 0.0], "too many cells"),
+    ],
+)
+def test_impossible_scans_are_refused_and_leave_the_map_alone(points, origin, words):
+    grid = OccupancyMap(0.1)
+    grid.insert(np.ones((1, 3)), np.zeros(3))
+    before = encode_ot(grid.octree())
+    with pytest.raises(DataError, match=words):
+        grid.insert(np.array(points), np.array(origin))
+    assert encode_ot(grid.octree()) == before
+
+
+@pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, np.inf])
+def test_impossible_resolutions_are_refused(resolution):
+    with pytest.raises(DataError, match="resolution"):
+        OccupancyMap(resolution)
+
+
+def test_many_blocks_survive_the_growth_of_the_table():
+    rng = np.random.default_rng(3)
+    grid = OccupancyMap(0.1)
+    places = rng.uniform(-30, 30, (3000, 3))
+    for place in places:
+        grid.insert(place[None], place)
+    assert (grid.state_at(places.astype(np.float32)) == Occupancy.OCCUPIED).all()
