@@ -184,7 +184,7 @@ def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
             factor = 1e3 if "mrad" in unit else 1.0
             for name, style in (("graph", "-"), ("ekf", "--")):
                 if states.get(name):
-                    _draw_bias(axes, states[name], scene, attribute, first, factor, style, fill=name == "graph")
+                    _draw_bias(axes, states[name], scene, attribute, first, factor, style)
             axes.axhline(0.0, color=_CODE["line"], linewidth=0.8, zorder=0.6)
             axes.set(ylabel=unit, xlabel="time [s]")
             axes.set_xlim(0.0, max(scene.end_s, 1e-3))
@@ -193,8 +193,9 @@ def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
 
 
 def _draw_bias(
-    axes: Any, states: list[NavState], scene: Scene, attribute: str, first: int, factor: float, style: str, fill: bool
+    axes: Any, states: list[NavState], scene: Scene, attribute: str, first: int, factor: float, style: str
 ) -> None:
+    fill = style == "-"
     t = scene.seconds(np.array([s.t_ns for s in states]))
     values = factor * np.array([getattr(s, attribute) for s in states])
     variances = np.array([np.diag(s.covariance)[first : first + 3] for s in states])
@@ -301,7 +302,8 @@ def _thin(values: Array) -> Array:
 
 
 def _legend_above(axes: Any, columns: int) -> None:
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.4)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.4)
 
 
 def _svg(figure: Figure, name: str) -> str:

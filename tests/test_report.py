@@ -1,0 +1,249 @@
+"""The report says what the files say, leaves out what is absent, and survives damage."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from run_folder import DEGRADED, LOST, make_run
+
+from vislam.errors import DataError, StorageError
+from vislam.report import write_report
+from vislam.report.run_files import read_run
+from vislam.report.scene import build_scene, loop_segments
+
+
+class Page(HTMLParser):
+    """Collects the texts, headings and anything that would leave the page; fails on tags that do not match."""
+
+    VOID = ("meta", "img", "br", "link", "use", "path")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.headings, self.texts, self.open, self.outside, self.tags = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href") and not value.startswith(("data:", "#")):
+                self.outside.append(value)
+
+    def handle_endtag(self, tag):
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+
+    @property
+    def text(self):
+        return " ".join(self.texts)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("runs") / "cart")
+
+
+@pytest.fixture
+def copy(run, tmp_path):
+    """A run folder of one's own to damage."""
+    target = tmp_path / "cart"
+    (target / "map").mkdir(parents=True)
+    for path in run.rglob("*"):
+        if path.is_file() and path.name != "report.html":
+            (target / path.relative_to(run)).write_bytes(path.read_bytes())
+    return target
+
+
+def test_a_whole_run_becomes_one_self_contained_page(run):
+    path = write_report(run)
+    assert path == run / "report.html"
+    text = path.read_text()
+    page = Page(text)
+    assert page.headings == [
+        "Accuracy",
+        "Trajectories",
+        "Over time",
+        "Map",
+        "Loops",
+        "Time",
+        "Inertial biases",
+        "What was lost or rejected",
+        "How it was made",
+    ]
+    assert page.outside == []
+    assert "script" not in page.tags
+    assert not re.search(r"url\((?!#)|@import", text)
+    assert page.tags.count("svg") == 5
+    assert not re.search(r"#0[0-9a-f]0[0-9a-f]0[0-9a-f]\b", text)  # every stand-in colour was replaced
+    assert text.count("var(--ekf)") > 5
+    metrics = json.loads((run / "metrics.json").read_text())
+    for name in ("ekf", "live", "graph"):
+        assert f"{metrics['accuracy'][name]['ate_rmse_m']:.3f}" in page.texts
+    assert "60 candidates: 12 accepted, 12 parked, 36 rejected." in page.text
+    assert "scene <looks> alike, but 2.4 m apart" in page.texts  # escaped in the file, whole on the page
+    assert "<looks>" not in text
+    assert str(len(LOST)) in page.texts
+    assert "frames lost, in 1 outage" in page.texts
+    assert f"degraded: … inliers {len(DEGRADED)}" in re.sub(r"\s+", " ", page.text)
+    assert "unreadable image" in page.texts
+    assert "vislam run sim:workshop-cart --out runs/cart" in page.texts
+    assert '"code_revision": "0123456789abcdef"' in page.text
+
+
+def test_the_same_folder_gives_the_same_bytes(run):
+    first = write_report(run).read_bytes()
+    assert write_report(run).read_bytes() == first
+
+
+def test_errors_of_the_scene_are_those_of_the_metrics(run):
+    files = read_run(run)
+    scene = build_scene(files)
+    for name, curve in scene.errors.items():
+        rmse = np.sqrt(np.mean(curve.position_m**2))
+        assert rmse == pytest.approx(files.metrics["accuracy"][name]["ate_rmse_m"], abs=1e-8)  # files round to nm
+    assert scene.errors["ekf"].position_m.max() > 5 * scene.errors["graph"].position_m.max()
+    # in the map frame the graph stays where it was, and the truth comes to it
+    np.testing.assert_allclose(scene.paths["graph"].positions_m, files.estimates["graph"].positions_m, atol=1e-9)
+    gap = np.linalg.norm(scene.truth.positions_m - scene.paths["graph"].positions_m, axis=1)
+    np.testing.assert_allclose(gap, scene.errors["graph"].position_m, atol=1e-9)
+
+
+def test_loops_are_drawn_between_their_keyframes(run):
+    files = read_run(run)
+    scene = build_scene(files)
+    segments = loop_segments(files, scene, "accepted")
+    accepted = [loop for loop in files.loops if loop.decision == "accepted"]
+    assert len(segments) == len(accepted) == 12
+    expected = scene.paths["graph"].positions_m[[accepted[3].from_id * 10, accepted[3].to_id * 10]]
+    np.testing.assert_allclose(segments[3], expected, atol=1e-9)
+
+
+def test_sections_without_files_are_left_out(copy):
+    for name in ("states_ekf.csv", "states_graph.csv", "loops.csv", "tracking.csv", "map/picture.png", "config.json"):
+        (copy / name).unlink()
+    page = Page(write_report(copy).read_text())
+    assert "Map" not in page.headings
+    assert "Inertial biases" not in page.headings
+    assert "Over time" in page.headings  # the errors remain
+    assert "No candidates." in page.texts
+    assert "Configuration" not in page.texts
+
+
+def test_a_run_without_truth_has_no_errors_but_all_paths(tmp_path):
+    page = Page(write_report(make_run(tmp_path / "live", with_truth=False)).read_text())
+    assert "This run has no true trajectory to compare with." in page.texts
+    assert "Trajectories" in page.headings
+    assert not any("ATE" in text for text in page.texts)
+
+
+def test_a_run_that_never_started_says_why(tmp_path):
+    (tmp_path / "metrics.json").write_text(
+        json.dumps(
+            {
+                "name": "dark",
+                "frames": 40,
+                "keyframes": 0,
+                "duration_s": 2.0,
+                "wall_s": 0.5,
+                "realtime_factor": 4.0,
+                "initialisation": {"status": "failed", "reason": "too little parallax", "t_s": None},
+                "accuracy": {},
+                "timing_ms": {},
+                "loops": {"candidates": 0, "accepted": 0, "parked": 0, "rejected": 0},
+            }
+        )
+    )
+    for name in ("ekf", "graph"):
+        (tmp_path / f"trajectory_{name}.tum").write_text("# t_s tx ty tz qx qy qz qw\n")
+    page = Page(write_report(tmp_path).read_text())
+    assert any("failed at – (too little parallax)" in text for text in page.texts)
+    assert any("trajectory_ekf.tum holds no poses" in text for text in page.texts)
+
+
+def _half(data):
+    return data[: len(data) // 2]
+
+
+@pytest.mark.parametrize(
+    "damages",
+    [
+        [
+            ("metrics.json", _half, "metrics.json is not valid JSON"),
+            ("trajectory_graph.tum", lambda data: data[:-30], "expected 8 columns"),
+            ("loops.csv", lambda data: data[:-70], "loops.csv"),
+            ("states_graph.csv", lambda data: data[:-500], "expected 138 columns"),
+        ],
+        [
+            ("metrics.json", lambda data: b"[1, 2]", "holds a list instead of an object"),
+            ("trajectory_ekf.tum", lambda data: data.replace(b"0.3", b"nan", 1), "trajectory_ekf.tum"),
+            ("loops.csv", lambda data: data.replace(b"from_id", b"id", 1), "expected the columns"),
+            ("tracking.csv", lambda data: data.replace(b",ok,", b",fine,", 1), "not a valid Tracking"),
+        ],
+        [
+            ("metrics.json", lambda data: b"[" * 100_000, "metrics.json is not valid JSON"),
+            ("trajectory_truth.tum", lambda data: b"\xff\xfe" + data, "not text"),
+            ("loops.csv", lambda data: data.replace(b"\n0,60", b"\nzero,60", 1), "invalid literal"),
+            ("config.json", lambda data: b"\xff", "config.json is not valid JSON"),
+            ("map/picture.png", lambda data: data[:100], "From above"),
+        ],
+    ],
+)
+def test_damaged_files_are_named_and_the_rest_is_still_there(copy, damages):
+    for name, damage, _ in damages:
+        path = copy / name
+        path.write_bytes(damage(path.read_bytes()))
+    page = Page(write_report(copy).read_text())
+    for _, _, says in damages:
+        assert says in page.text
+    assert "Trajectories" in page.headings
+
+
+def test_metrics_of_the_wrong_types_do_not_break_the_page(copy):
+    nonsense = {"name": None, "frames": "many", "accuracy": {"graph": 3, "ekf": {"ate_rmse_m": None}}, "loops": []}
+    nonsense |= {"timing_ms": {"ekf": {"p50": "fast"}, "x": 1}, "warnings": "none", "counters": {"a": {"b": "c"}}}
+    (copy / "metrics.json").write_text(json.dumps(nonsense))
+    assert "Trajectories" in Page(write_report(copy).read_text()).headings
+
+
+def test_a_trajectory_from_another_clock_is_not_drawn_over_the_truth(copy):
+    lines = (copy / "trajectory_ekf.tum").read_text().splitlines()
+    (copy / "trajectory_ekf.tum").write_text(
+        "\n".join(line.replace("17000000", "16000000", 1) for line in lines) + "\n"
+    )
+    page = Page(write_report(copy).read_text())
+    assert any(text.startswith("ekf cannot be aligned to the truth") for text in page.texts)
+    assert "EKF alone" not in re.findall(r">(EKF alone)</text>", write_report(copy).read_text())
+
+
+def test_large_pictures_are_made_smaller(copy):
+    noise = np.random.default_rng(0).integers(0, 255, (1500, 2400, 3), dtype=np.uint8)
+    cv2.imwrite(str(copy / "map" / "picture_above.png"), noise)
+    text = write_report(copy).read_text()
+    encoded = re.search(r'alt="above" src="data:image/jpeg;base64,([^"]+)"', text)[1]
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (1000, 1600, 3)
+
+
+def test_folders_that_hold_no_run(tmp_path):
+    with pytest.raises(DataError, match=r"neither metrics\.json nor a trajectory"):
+        write_report(tmp_path)
+    with pytest.raises(DataError, match="not a run folder"):
+        write_report(tmp_path / "missing")
+
+
+def test_a_report_that_cannot_be_written_is_one_clear_error(copy):
+    (copy / "report.html").mkdir()
+    with pytest.raises(StorageError, match=r"report.html cannot be written"):
+        write_report(copy)
