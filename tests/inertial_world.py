@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.geometry import interpolate, rotation_from_quaternion_xyzw, se3_exp, so3_exp, so3_log, transform
+from vislam.geometry import interpolate, invert, rotation_from_quaternion_xyzw, se3_exp, so3_exp, so3_log, transform
 from vislam.imu import ImuNoise
 from vislam.messages import Array, ImuSample, ImuSpan, NavState, Tracking, VoMeasurement
 
@@ -79,6 +79,36 @@ class Motion:
         values = ideal + biases
         stamps = T0_NS + np.round(times * NS).astype(np.int64)
         return [ImuSample(int(t), v[:3].copy(), v[3:].copy()) for t, v in zip(stamps, values, strict=True)], biases
+
+
+@dataclass(frozen=True)
+class SimulatedVision:
+    """Visual odometry made from true poses: frames, keyframes, and errors of which a part is the keyframe's own."""
+
+    rotation_sigma_rad: float = np.deg2rad(0.1)
+    translation_sigma_m: float = 0.002
+    shared: float = 0.5  # of the variance, the same for all motions from one keyframe
+    keyframe_every: int = 8  # frames
+    T_body_camera: Array | None = None  # given: directions only
+
+    @property
+    def covariance(self) -> Array:
+        return np.diag(np.repeat([self.rotation_sigma_rad**2, self.translation_sigma_m**2], 3))
+
+    def motions(self, poses: list[Array], stamps: list[int], rng: np.random.Generator) -> list[VoMeasurement]:
+        """Return one motion per frame, in the manner of a front end: frame `k * keyframe_every` becomes keyframe k."""
+        root = np.linalg.cholesky(self.covariance)
+        exact = VoMeasurement(stamps[0], 0, np.eye(4), np.zeros((6, 6)), self.T_body_camera is None, Tracking.OK, 100)
+        out = [exact]
+        common = root @ rng.normal(size=6)
+        for i in range(1, len(poses)):
+            k = (i - 1) // self.keyframe_every
+            if i > 1 and (i - 1) % self.keyframe_every == 0:
+                common = root @ rng.normal(size=6)
+            xi = np.sqrt(self.shared) * common + np.sqrt(1.0 - self.shared) * (root @ rng.normal(size=6))
+            T = invert(poses[k * self.keyframe_every]) @ poses[i]
+            out.append(relative_vo(stamps[i], k, T, self.covariance, xi, self.T_body_camera))
+        return out
 
 
 def to_span(samples: list[ImuSample]) -> ImuSpan:

@@ -97,7 +97,7 @@ class InitConfig:
     max_tilt_sigma_deg: float = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
     max_velocity_sigma_m_s: float = 0.2
     max_gyro_bias_sigma_rad_s: float = 0.02
-    max_scale_sigma: float = 0.15  # relative, monocular only
+    max_scale_sigma: float = 0.1  # relative, monocular only
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
     attempt_s: float = 0.2  # between attempts: a window changes little from frame to frame

@@ -66,13 +66,11 @@ def relative_motion(x: Array, P: Array, vo: VoMeasurement, lever_m: Array, infla
         residual, J_clone, J_body = metric_residual(T_clone, T_body, T)
         residual, J_clone, J_body, noise = residual[:3], J_clone[:3], J_body[:3], covariance[:3, :3]
     else:
-        residual, J_clone, J_body = direction_residual(T_clone, T_body, T, lever_m)
-        along = _spread(J_clone, J_body)[5]
-        distance, variance = -residual[5], float(along @ P @ along)
-        if distance < -_OPPOSITE_SIGMAS * np.sqrt(variance):
-            impossible = f"moved {-distance:.2f} m against the direction seen"
-        noise = direction_noise(T, covariance, float(np.sqrt(distance * distance + variance)))
-        residual, J_clone, J_body = residual[:5], J_clone[:5], J_body[:5]
+        residual, J_clone, J_body, axes, along = direction_residual(T_clone, T_body, T, lever_m)
+        variance = _displacement_variance(P, T_clone, T[:3, 3])
+        if along < -_OPPOSITE_SIGMAS * np.sqrt(variance):
+            impossible = f"moved {-along:.2f} m against the direction seen"
+        noise = direction_noise(T, covariance, axes, float(np.sqrt(along * along + variance)))
     noise = noise + _FLOOR * np.eye(len(noise))
     return LinearMeasurement(residual, _spread(J_clone, J_body), noise, impossible)
 
@@ -118,6 +116,14 @@ def biases(x: Array, gyro_bias_rad_s: Array, accel_bias_m_s2: Array, sigmas: Arr
     H[:, 9:15] = np.eye(6)
     residual = np.concatenate([gyro_bias_rad_s - x[13:16], accel_bias_m_s2 - x[10:13]])
     return LinearMeasurement(residual, H, np.diag(sigmas**2))
+
+
+def _displacement_variance(P: Array, T_clone: Array, direction: Array) -> float:
+    """Return how well the motion since the clone is known along a direction [3] of the clone's axes, in m^2."""
+    row = np.zeros(ERRORS)
+    row[3:6] = T_clone[:3, :3] @ direction
+    row[18:21] = -row[3:6]
+    return max(float(row @ P @ row), 0.0)
 
 
 def _spread(J_clone: Array, J_body: Array) -> Array:
