@@ -15,9 +15,13 @@ import numpy as np
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, TrackingLostError, VislamError
 from vislam.imu import ImuNoise
+from vislam.mapping.cloud import Cloud
+from vislam.mapping.mapper import Mapper
+from vislam.mapping.picture import Line, render_cloud, render_octree
+from vislam.mapping.ply import read_ply
 from vislam.messages import Tracking
 from vislam.recording import Recording
-from vislam.runfolder import RunLog, write_json, write_setup
+from vislam.runfolder import RunLog, storage, write_json, write_setup
 from vislam.session import SessionWriter
 from vislam.slam import KeyframeStep, Slam, Step
 from vislam.trajectory import Trajectory, align, associate, evaluate
@@ -25,6 +29,7 @@ from vislam.viewer import open_viewer
 
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
+_PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
@@ -130,6 +135,8 @@ class Run:
         if self.slam.back is not None and self.slam.back.mapper is not None:
             with self.slam.clock.measure("map export"):
                 self.slam.back.mapper.export(self.out / "map")
+            with self.slam.clock.measure("map pictures"):
+                self._write_pictures(self.slam.back.mapper, final)
         self._show_result(final, truth)
         wall_s = time.perf_counter() - start
         metrics = self._metrics(final, truth, wall_s, loops)
@@ -145,6 +152,20 @@ class Run:
         self.log.write_states(self.out, ids, graph.states())
         loops = self.log.write_tables(self.out, {report.loop_id: report for report in graph.edge_reports()})
         return self.log.final_trajectory(ids, graph.poses()), loops
+
+    def _write_pictures(self, mapper: Mapper, final: Trajectory) -> None:
+        """Write the pictures of the map that the report shows; an empty map has none."""
+        path = [Line(final.positions_m, _PATH_COLOR)]
+        points, colors = read_ply(self.out / "map" / "cloud.ply")
+        pictures = {}
+        if len(points):
+            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path)
+        octree = mapper.occupancy.max_likelihood_octree()
+        if len(octree.occupied_voxels()):
+            pictures["picture_octree.png"] = render_octree(octree, path)
+        for name, image in pictures.items():
+            with storage(self.out / "map" / name):
+                (self.out / "map" / name).write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
     def _show_result(self, final: Trajectory, truth: Trajectory | None) -> None:
         self.viewer.log_path("graph", final.positions_m)
