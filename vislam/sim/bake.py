@@ -199,7 +199,12 @@ def bake(builder: SceneBuilder, seed: np.random.SeedSequence, threads: int = 2) 
         painted = surface.painter(np.random.default_rng(own_seed), height, width, surface.texels_per_m)
         return _levels(_lit(surface, painted, light, sphere))
 
-    jobs = list(zip(builder.surfaces, seed.spawn(len(builder.surfaces)), strict=True))
+    # Not `seed.spawn`: it counts its calls, and a second bake would then paint another world.
+    streams = [
+        np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, index))
+        for index in range(len(builder.surfaces))
+    ]
+    jobs = list(zip(builder.surfaces, streams, strict=True))
     with ThreadPoolExecutor(threads) as pool:
         images = list(pool.map(finish, jobs))
     return _pack(builder.surfaces, images)

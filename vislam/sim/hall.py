@@ -28,7 +28,7 @@ def motion(rng: np.random.Generator) -> BodySpline:
 
     def design(t_s: Array) -> tuple[Array, Array]:
         arc = travel.arc_m(t_s)
-        arc = arc + 0.35 * np.sin(2.0 * np.pi * 9.0 * arc / path.length_m) * np.clip(
+        arc = arc + 0.2 * np.sin(2.0 * np.pi * 9.0 * arc / path.length_m) * np.clip(
             arc * (path.length_m - arc), 0.0, 1.0
         )
         xy, heading = path.at(arc)

@@ -13,7 +13,7 @@ from vislam.sim.spline import BodySpline
 
 _X, _Y, _Z = 3.0, 2.3, 2.6
 _DURATION_S = 34.0
-_REST_S = 1.6
+_REST_S = 1.75
 _TURNS = 1.6  # around the room, looking outwards: the last part sees the first again
 _KNOTS_S = 0.08
 
