@@ -138,6 +138,8 @@ def _write_json(folder: Path, accuracy: dict, loops: dict[str, int], keyframes: 
 
     metrics = {
         "name": "workshop-cart",
+        "mode": "rgbd",
+        "has_imu": True,
         "frames": FRAMES,
         "keyframes": keyframes,
         "duration_s": (FRAMES - 1) * PERIOD_NS * 1e-9,

@@ -247,3 +247,16 @@ def test_a_report_that_cannot_be_written_is_one_clear_error(copy):
     (copy / "report.html").mkdir()
     with pytest.raises(StorageError, match=r"report.html cannot be written"):
         write_report(copy)
+
+
+def test_without_an_imu_there_is_no_filter_to_speak_of(copy):
+    metrics = json.loads((copy / "metrics.json").read_text()) | {"has_imu": False}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    rows = (copy / "loops.csv").read_text().splitlines()
+    rows[1] = re.sub(r"^(\d+,\d+),\d+,\d+,", r"\1,,,", rows[1])  # keyframes whose times are not known
+    (copy / "loops.csv").write_text("\n".join(rows) + "\n")
+    page = Page(write_report(copy).read_text())
+    assert "ATE of the odometry" in page.texts
+    assert "EKF alone" not in page.texts
+    files = read_run(copy)
+    assert len(loop_segments(files, build_scene(files), "accepted")) == 11

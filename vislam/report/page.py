@@ -47,13 +47,13 @@ def write_report(run: Path) -> Path:
     body = "".join(
         (
             _head(files),
-            _tiles(files),
+            _tiles(files, scene),
             _problems(files, scene),
             _accuracy(files, scene),
             _trajectories(files, scene),
             _over_time(files, scene),
             _map(files),
-            _loops(files),
+            _loops(files, scene),
             _timing(files),
             _biases(files, scene),
             _lost(files),
@@ -96,8 +96,10 @@ def _head(run: RunFiles) -> str:
             f"{number(m.get('frames'), 0)} frames and {number(m.get('keyframes'), 0)} keyframes, "
             f"{number(m.get('duration_s'), 1)} s of recording processed in {number(m.get('wall_s'), 1)} s."
         )
+    if m.get("mode"):
+        parts.append(f"Mode: {m['mode']}{', inertial' if m.get('has_imu') else ''}.")
     start = _dict(m, "initialisation")
-    if start:
+    if start and m.get("has_imu") is not False:
         when = number(start.get("t_s"), 2, " s")
         reason = f" ({start['reason']})" if start.get("reason") else ""
         parts.append(f"Initialisation: {start.get('status', 'unknown')} at {when}{reason}.")
@@ -107,7 +109,7 @@ def _head(run: RunFiles) -> str:
     return f'<h1>{escape(_name(run))}</h1><p class="lead">{escape(" ".join(parts))}</p>'
 
 
-def _tiles(run: RunFiles) -> str:
+def _tiles(run: RunFiles, scene: Scene) -> str:
     m = run.metrics
     if not m:
         return ""
@@ -116,7 +118,7 @@ def _tiles(run: RunFiles) -> str:
     if graph:
         tiles.append(tile(number(graph.get("ate_rmse_m")), "m", "ATE of the final trajectory", "graph"))
     if ekf:
-        tiles.append(tile(number(ekf.get("ate_rmse_m")), "m", "ATE of the EKF alone", "ekf"))
+        tiles.append(tile(number(ekf.get("ate_rmse_m")), "m", f"ATE of the {scene.labels['ekf']}", "ekf"))
     if graph:
         covered = graph.get("coverage")
         full = isinstance(covered, int | float) and covered >= 0.95
@@ -158,7 +160,7 @@ def _accuracy(run: RunFiles, scene: Scene) -> str:
             keys = ("ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_max_m", "rpe_1s_m")
             rows.append(
                 [
-                    Cell(plots.LABELS[name], mark=name),
+                    Cell(scene.labels[name], mark=name),
                     *(number(entry.get(key)) for key in keys),
                     number(entry.get("rpe_1s_deg"), 2),
                     number(entry.get("scale"), 4),
@@ -170,10 +172,11 @@ def _accuracy(run: RunFiles, scene: Scene) -> str:
         return section("Accuracy", note(reason)) if reason and run.metrics else ""
     head = ["", "ATE RMSE [m]", "mean", "median", "max", "RPE 1 s [m]", "[°]", "scale", "coverage"]
     graph = _dict(accuracy, "graph") or _dict(accuracy, "ekf")
+    causal = f"{scene.labels['ekf']} and live"
     text = (
         f"Alignment {graph.get('alignment', 'unknown')} over a path of {number(graph.get('path_m'), 1)} m. "
-        "Scale is the factor that would fit the estimate to the truth best. EKF and live are causal; "
-        "the graph is the final answer after all loops."
+        "Scale is the factor that would fit the estimate to the truth best. "
+        f"{causal} are causal; the graph is the final answer after all loops."
     )
     return section("Accuracy", card(table(head, rows)), note(text), _consistency(scene))
 
@@ -181,7 +184,7 @@ def _accuracy(run: RunFiles, scene: Scene) -> str:
 def _consistency(scene: Scene) -> str:
     rows: list[list[str | Cell]] = []
     for name, values in scene.nees.items():
-        row: list[str | Cell] = [Cell(plots.LABELS[name], mark=name), number(len(values["t_ns"]), 0)]
+        row: list[str | Cell] = [Cell(scene.labels[name], mark=name), number(len(values["t_ns"]), 0)]
         for part in ("rotation", "position"):
             finite = values[part][np.isfinite(values[part])]
             row += [
@@ -227,7 +230,7 @@ def _map(run: RunFiles) -> str:
     return section("Map", *cards) if len(cards) == 1 else section("Map", grid(*cards))
 
 
-def _loops(run: RunFiles) -> str:
+def _loops(run: RunFiles, scene: Scene) -> str:
     counts = _dict(run.metrics, "loops")
     if not run.loops:
         return section("Loops", note("No candidates.")) if counts else ""
@@ -248,9 +251,7 @@ def _loops(run: RunFiles) -> str:
         "χ²",
         "weight",
     ]
-    first_ns = min(loop.from_t_ns for loop in run.loops)
-    zero_ns = min((int(t.t_ns[0]) for t in run.estimates.values() if len(t)), default=first_ns)
-    rows = [_loop_row(loop, zero_ns) for loop in order[:_MAX_LOOPS]]
+    rows = [_loop_row(loop, scene.zero_ns) for loop in order[:_MAX_LOOPS]]
     text = f"{len(run.loops)} candidates: {summary}."
     shown = card(table(head, rows[:_SHOWN_LOOPS], text_columns=(3, 4, 5)))
     rest = rows[_SHOWN_LOOPS:]
@@ -267,7 +268,7 @@ def _loop_row(loop: LoopRow, zero_ns: int) -> list[str | Cell]:
     return [
         str(loop.from_id),
         str(loop.to_id),
-        number((loop.to_t_ns - zero_ns) * 1e-9, 1),
+        number((loop.to_t_ns - zero_ns) * 1e-9, 1) if loop.to_t_ns >= 0 else "–",
         Cell(loop.decision, mark=loop.decision),
         Cell(loop.reason, kind="text long"),
         loop.source,

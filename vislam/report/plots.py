@@ -39,7 +39,6 @@ _VARIABLES = {
     "#0f0f0f": "var(--axis-z)",
 }
 _CODE = {css[6:-1]: code for code, css in _VARIABLES.items()}
-LABELS = {"truth": "truth", "ekf": "EKF alone", "live": "live (causal)", "graph": "graph, final", "batch": "batch"}
 _WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
 _STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad"}
 _MAX_STRETCH = 25.0  # of the vertical axis: more would turn millimetres into mountains
@@ -130,7 +129,9 @@ def over_time(run: RunFiles, scene: Scene) -> str:
             else:
                 _draw_state(axes, run, scene)
             if name != "state":
-                for t in scene.seconds([loop.to_t_ns for loop in run.loops if loop.decision == "accepted"]):  # type: ignore[arg-type]
+                for t in scene.seconds(
+                    [loop.to_t_ns for loop in run.loops if loop.decision == "accepted" and loop.to_t_ns >= 0]
+                ):  # type: ignore[arg-type]
                     axes.axvline(t, color=_CODE["good"], linewidth=0.7, alpha=0.5, zorder=0.5)
         if scene.errors:
             _legend_above(grid[0, 0], columns=4)
@@ -230,7 +231,7 @@ def _draw_paths(axes: Any, scene: Scene, horizontal: int, vertical: int) -> None
                 color=_CODE["truth"],
                 linewidth=2.4,
                 alpha=0.55,
-                label="truth",
+                label=scene.labels["truth"],
             )
         elif name != "live" or "graph" not in scene.paths:
             # the causal path jumps at loops by design; drawn beside the final one it only hides it
@@ -239,7 +240,7 @@ def _draw_paths(axes: Any, scene: Scene, horizontal: int, vertical: int) -> None
                 points[:, vertical],
                 color=_CODE[name],
                 linewidth=_WIDTHS[name],
-                label=LABELS[name],
+                label=scene.labels[name],
             )
     best = next((scene.paths[name] for name in ("graph", "live", "ekf") if len(scene.paths.get(name, ()))), None)
     if best is not None:
@@ -268,7 +269,7 @@ def _draw_errors(axes: Any, scene: Scene, attribute: str, label: str) -> None:
         curve = scene.errors.get(name)
         if curve is not None:
             t, values = _thin(curve.t_s), _thin(getattr(curve, attribute))
-            axes.plot(t, values, color=_CODE[name], linewidth=_WIDTHS[name], label=LABELS[name])
+            axes.plot(t, values, color=_CODE[name], linewidth=_WIDTHS[name], label=scene.labels[name])
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel(label)
 

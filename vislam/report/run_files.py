@@ -31,7 +31,7 @@ _MAX_JSON_BYTES = 64 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class LoopRow:
-    """One line of loops.csv; numbers that do not apply are NaN."""
+    """One line of loops.csv; numbers that do not apply are NaN, an unknown time is -1."""
 
     from_id: int
     to_id: int
@@ -146,7 +146,7 @@ def _read_loops(path: Path) -> list[LoopRow]:
     loops = []
     for line, row in _rows(path, _LOOP_COLUMNS):
         try:
-            whole = {name: int(row[name]) for name in _LOOP_COLUMNS[:4]}
+            whole = {name: int(row[name] or -1) for name in _LOOP_COLUMNS[:4]}
             real = {name: _number(row[name]) for name in _LOOP_COLUMNS[5:11]}
         except ValueError as error:
             raise DataError(f"{path}:{line}: {error}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,8 @@ from vislam.report.run_files import RunFiles
 from vislam.trajectory import Trajectory, align, associate, nees
 
 Array = NDArray[np.float64]
+
+_LABELS = {"truth": "truth", "ekf": "EKF alone", "live": "live (causal)", "graph": "graph, final", "batch": "batch"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +39,9 @@ class Scene:
     errors: dict[str, ErrorCurve] = field(default_factory=dict)
     nees: dict[str, dict[str, Array]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # why something cannot be drawn
+    labels: dict[str, str] = field(default_factory=lambda: dict(_LABELS))
 
-    def seconds(self, t_ns: NDArray[np.int64] | int) -> Array:
+    def seconds(self, t_ns: NDArray[np.int64] | Sequence[int]) -> Array:
         """Return times as seconds since the start of the run."""
         return np.asarray(np.asarray(t_ns, dtype=np.int64) - self.zero_ns, dtype=np.float64) * 1e-9
 
@@ -50,6 +54,8 @@ def build_scene(run: RunFiles) -> Scene:
     zero = min((int(t[0]) for t in stamps), default=0)
     end = max((int(t[-1]) for t in stamps), default=zero)
     scene = Scene(zero, (end - zero) * 1e-9, "")
+    if run.metrics.get("has_imu") is False:
+        scene.labels["ekf"] = "odometry"  # without an IMU there is no filter
     if run.truth is None:
         scene.paths = dict(run.estimates)
         return scene
@@ -83,7 +89,7 @@ def loop_segments(run: RunFiles, scene: Scene, decision: str) -> Array:
     path = next((scene.paths[name] for name in ("batch", "graph", "live") if len(scene.paths.get(name, ()))), None)
     if path is None:
         return np.empty((0, 2, 3))
-    rows = [loop for loop in run.loops if loop.decision == decision]
+    rows = [loop for loop in run.loops if loop.decision == decision and min(loop.from_t_ns, loop.to_t_ns) >= 0]
     t_ns = np.array([[loop.from_t_ns, loop.to_t_ns] for loop in rows], dtype=np.int64).reshape(-1, 2)
     t_ns = np.clip(t_ns, path.t_ns[0], path.t_ns[-1])  # a keyframe may lie just outside the per-frame trajectory
     return path.at(t_ns.ravel())[:, :3, 3].reshape(-1, 2, 3)
