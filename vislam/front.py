@@ -112,13 +112,14 @@ class Front:
         span = self._span(self._last_frame_t_ns, frame.t_ns)
         with self._clock.measure("track"):
             track = self.frontend.track(frame, self._without_bias(span))
-        at_rest = self._is_at_rest(span, track.observations)
+        still_image = self._is_still(track.observations)
+        at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
         T_vo_keyframe_body = track.vo.T_keyframe_body if track.vo.has_scale else None
         if T_vo_keyframe_body is not None:
             self._T_vo_body = self._T_vo_keyframe @ T_vo_keyframe_body
         with self._clock.measure("ekf"):
-            ready = self._initialise(span, track, at_rest)
+            ready = self._initialise(span, track, still_image)
             T_odom_body, state = self._filter(frame, track, at_rest)
         T_keyframe_body = self._since_keyframe(T_vo_keyframe_body, T_odom_body)
         if track.keyframe is not None:
@@ -168,12 +169,9 @@ class Front:
         state = self._ekf.state()
         return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
 
-    def _is_at_rest(self, span: ImuSpan | None, seen: Observations) -> bool:
-        if not self._has_imu:
-            return False
-        still_imu = self._rest.add(span)
+    def _is_still(self, seen: Observations) -> bool:
         flow_px = median_flow_px(self._last_seen, seen)
-        return still_imu and flow_px is not None and flow_px < self._config.init.still_px
+        return flow_px is not None and flow_px < self._config.init.still_px
 
     def _count(self, track: TrackResult, at_rest: bool) -> None:
         self.counters["frames_lost"] += track.vo.tracking == Tracking.LOST
@@ -181,11 +179,11 @@ class Front:
         self.counters["frames_at_rest"] += at_rest
         self._rested_since_keyframe = self._rested_since_keyframe and at_rest
 
-    def _initialise(self, span: ImuSpan | None, track: TrackResult, at_rest: bool) -> list[OdometryKeyframe]:
+    def _initialise(self, span: ImuSpan | None, track: TrackResult, still_image: bool) -> list[OdometryKeyframe]:
         """Look for the first gravity-aligned state; once found, start the filter and release what waited."""
         if self._ekf is None or self.initialisation is not None:
             return []
-        found = self._initialiser.add(span, track.vo, at_rest)
+        found = self._initialiser.add(span, track.vo, still_image)
         self.last_refusal = found.reason
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
