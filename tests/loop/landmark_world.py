@@ -21,7 +21,9 @@ def make_rig() -> Rig:
     return Rig((camera,), (T_body_cam,), has_depth=True)
 
 
-def body_pose(position: tuple[float, float, float], yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Array:
+def body_pose(
+    position: tuple[float, float, float], yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0
+) -> Array:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
     T[:3, 3] = position
@@ -37,8 +39,9 @@ class LandmarkWorld:
     rig: Rig
 
     def see(
-        self, keyframe_id: int, T_world_body: Array, rng: np.random.Generator, *, noise_px: float = 0.7, flips: int = 12,
-        inverse_depth_noise: float = 0.005, clutter: int = 60, known: float = 1.0, depth: bool = True, count: int = 500,
+        self, keyframe_id: int, T_world_body: Array, rng: np.random.Generator, *, noise_px: float = 0.7,
+        flips: int = 12, inverse_depth_noise: float = 0.005, clutter: int = 60, known: float = 1.0, depth: bool = True,
+        count: int = 500,
     ) -> Keyframe:  # fmt: skip
         """Return a keyframe: noisy pixels, flipped bits, `clutter` features of nothing, `known` share with depth."""
         camera = self.rig.cameras[0]

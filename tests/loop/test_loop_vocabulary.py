@@ -147,7 +147,9 @@ def test_damaged_files_never_pass_and_never_crash(
         assert loaded.hash == vocabulary.hash
 
 
-@pytest.mark.parametrize("fault", ["child before parent", "too many children", "word weights", "nan", "format", "dtype"])
+@pytest.mark.parametrize(
+    "fault", ["child before parent", "too many children", "word weights", "nan", "format", "dtype"]
+)
 def test_a_tree_that_cannot_be_one_is_refused(vocabulary: Vocabulary, tmp_path: Path, fault: str) -> None:
     arrays = {
         "format": np.int64(1),
@@ -177,9 +179,10 @@ def test_a_tree_that_cannot_be_one_is_refused(vocabulary: Vocabulary, tmp_path: 
 def test_a_file_that_claims_gigabytes_is_refused_unread(tmp_path: Path) -> None:
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<u8", "fortran_order": False, "shape": (2**26, 4)})
-    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive, archive.open(
-        "nodes.npy", "w", force_zip64=True
-    ) as member:
+    with (
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("nodes.npy", "w", force_zip64=True) as member,
+    ):
         member.write(header.getvalue())
         for _ in range(600):
             member.write(bytes(2**20))

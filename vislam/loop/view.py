@@ -61,7 +61,8 @@ def make_view(keyframe: Keyframe, rig: Rig) -> View:
     seen = np.isfinite(xy).all(axis=1)
     points_cam = None
     if points is not None:
-        inside = transform_points(invert(rig.T_body_cams[0]), points[seen])
-        usable = np.isfinite(inside).all(axis=1) & (inside[:, 2] > 0.0)
+        known = np.isfinite(points[seen]).all(axis=1)
+        inside = transform_points(invert(rig.T_body_cams[0]), np.where(known[:, None], points[seen], np.nan))
+        usable = known & (np.nan_to_num(inside[:, 2]) > 0.0)
         points_cam = np.where(usable[:, None], inside, np.nan).astype(np.float32)
     return View(keyframe.id, keyframe.t_ns, keyframe.descriptors[seen], xy[seen].astype(np.float32), points_cam)
