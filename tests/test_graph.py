@@ -195,6 +195,24 @@ def test_mono_recovers_scale_from_a_wrong_first_velocity() -> None:
     assert abs(length / true_length - 1.0) < 0.02
 
 
+def test_mono_without_imu_stays_connected_at_the_scale_of_its_guess() -> None:
+    world = World(20.0, mono=True)
+    graph = PoseGraph(EXACT, None, GRAVITY_M_S2, T_BODY_CAM0)
+    graph.initialise(None)
+    for k in range(world.count):
+        graph.add(world.packet(k, imu=False))
+    assert np.all(np.isfinite(graph.finish().T_map_body))
+    turned = graph.poses()[-1][:3, :3].T @ (invert(world.truth[0]) @ world.truth[-1])[:3, :3]
+    assert np.linalg.norm(so3_log(np.ascontiguousarray(turned))) < np.deg2rad(5.0)  # rotation needs no scale
+
+
+def test_defaults_beat_odometry_too() -> None:
+    world = World(45.0, seed=9)
+    graph, _, packets = run(world, loop_every=10, config=GraphConfig())
+    graph.finish()
+    assert rmse_m(graph.poses(), world.truth) < 0.5 * rmse_m(world.dead_reckoning(packets), world.truth)
+
+
 def test_lost_vision_is_bridged_by_the_imu() -> None:
     world = World(30.0)
     graph, updates, _ = run(world, lost=range(70, 80))  # two seconds
