@@ -116,6 +116,7 @@ def over_time(run: RunFiles, scene: Scene) -> str:
         return ""
     ratios = {"position": 3.0, "rotation": 1.8, "inliers": 1.3, "state": 0.35}
     heights = [ratios[name] for name in panels]
+    closed = scene.seconds([loop.to_t_ns for loop in run.loops if loop.decision == "accepted" and loop.to_t_ns >= 0])
     with mpl.rc_context(_RC):
         figure = Figure(figsize=(11.2, 0.75 * sum(heights) + 0.8), layout="constrained")
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})
@@ -129,9 +130,7 @@ def over_time(run: RunFiles, scene: Scene) -> str:
             else:
                 _draw_state(axes, run, scene)
             if name != "state":
-                for t in scene.seconds(
-                    [loop.to_t_ns for loop in run.loops if loop.decision == "accepted" and loop.to_t_ns >= 0]
-                ):  # type: ignore[arg-type]
+                for t in closed:
                     axes.axvline(t, color=_CODE["good"], linewidth=0.7, alpha=0.5, zorder=0.5)
         if scene.errors:
             _legend_above(grid[0, 0], columns=4)

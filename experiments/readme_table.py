@@ -1,0 +1,168 @@
+"""The README's table, measured: runs vislam on every recording of the table and writes down what came out.
+
+    .venv/bin/python experiments/readme_table.py [--out results/readme_table] [--only NAME ...] [--reuse]
+
+Each run is a process of its own, as a user would start it. A recording that is missing or a run that fails stays in the
+table and says so. The README's block between the markers is replaced, so that no number in it is typed by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vislam.trajectory import write_text
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"
+TIMEOUT_S = 1800.0
+_START = "from vislam.cli import main; main()"  # what the script `vislam` does, also where it is not on the path
+COLUMNS = (
+    "recording",
+    "mode",
+    "ATE final [m]",
+    "ATE before loops [m]",
+    "keyframes",
+    "loops",
+    "real-time factor",
+    "coverage",
+)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of the table: what to run."""
+
+    name: str
+    recording: str  # as the reader of the table knows it
+    source: str  # "tum:FOLDER" and "euroc:FOLDER" below the data folder, or "sim:WORLD"
+    options: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run left: its metrics, or why there are none."""
+
+    entry: Entry
+    metrics: dict[str, Any] | None
+    failure: str = ""
+
+
+ENTRIES = (
+    Entry("tum_fr1_desk", "TUM fr1_desk, 20 s", "tum:tum_fr1_desk"),
+    Entry("euroc_mh01_stereo", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "stereo")),
+    Entry("euroc_mh01_mono", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "mono")),
+    Entry("corridor_loop", "simulated corridor-loop", "sim:corridor-loop"),
+    Entry("workshop_cart", "simulated workshop-cart", "sim:workshop-cart"),
+)
+
+
+def data_root() -> Path:
+    """Return the folder of recordings: VISLAM_DATA, or the one beside the repository."""
+    return Path(os.environ.get("VISLAM_DATA", REPOSITORY.parent / "shared" / "data"))
+
+
+def measure(entry: Entry, out: Path, root: Path, reuse: bool = False) -> Outcome:
+    """Run one entry in a process of its own; with `reuse`, a finished run in `out` is taken as it is."""
+    kind, _, name = entry.source.partition(":")
+    if kind != "sim" and not (root / name).is_dir():
+        return Outcome(entry, None, "recording missing")
+    if not (reuse and (out / "metrics.json").is_file()):
+        shutil.rmtree(out, ignore_errors=True)
+        source = entry.source if kind == "sim" else f"{kind}:{root / name}"
+        command = [sys.executable, "-c", _START, "run", source, "--out", str(out), *entry.options]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+        except subprocess.TimeoutExpired:
+            return Outcome(entry, None, f"no answer after {TIMEOUT_S:.0f} s")
+        if done.returncode != 0:
+            lines = done.stderr.strip().splitlines() or ["no message"]
+            return Outcome(entry, None, f"exit code {done.returncode}: {lines[-1]}")
+    try:
+        return Outcome(entry, json.loads((out / "metrics.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        return Outcome(entry, None, f"metrics.json: {error}")
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Return the outcomes as a Markdown table."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * 2 + "---:|" * (len(COLUMNS) - 2)]
+    lines += ["| " + " | ".join(row(outcome)) + " |" for outcome in outcomes]
+    return "\n".join(lines) + "\n"
+
+
+def row(outcome: Outcome) -> list[str]:
+    """Return the cells of one outcome; "before loops" is the EKF alone, or odometry where there is no IMU."""
+    metrics = outcome.metrics
+    if metrics is None:
+        reason = outcome.failure.replace("|", "/")
+        return [outcome.entry.recording, "–", reason, *["–"] * (len(COLUMNS) - 3)]
+    accuracy = metrics.get("accuracy") or {}
+    final, before = accuracy.get("graph") or {}, accuracy.get("ekf") or {}
+    loops = metrics.get("loops") or {}
+    inertial = metrics.get("has_imu", True)
+    mode = str(metrics.get("mode", "?")) + (", inertial" if inertial else "")
+    scale = final.get("scale")
+    note = f" (scale {scale:.3f})" if isinstance(scale, float) and abs(scale - 1.0) > 0.02 else ""
+    causal = _number(before.get("ate_rmse_m"), 3)
+    return [
+        outcome.entry.recording,
+        mode,
+        _number(final.get("ate_rmse_m"), 3) + note,
+        f"{causal} ({'EKF' if inertial else 'odometry'})" if causal != "–" else "–",
+        _number(metrics.get("keyframes"), 0),
+        f"{_number(loops.get('accepted'), 0)} of {_number(loops.get('candidates'), 0)}",
+        _number(metrics.get("realtime_factor"), 2),
+        _percent(final.get("coverage")),
+    ]
+
+
+def replace_block(readme: str, block: str) -> str:
+    """Return the README with the text between the markers replaced; ValueError when the markers are not there once."""
+    if readme.count(BEGIN) != 1 or readme.count(END) != 1 or readme.index(BEGIN) > readme.index(END):
+        raise ValueError(f"the README needs one line {BEGIN} followed by one line {END}")
+    head, rest = readme.split(BEGIN)
+    return f"{head}{BEGIN}\n{block.strip()}\n{END}{rest.split(END)[1]}"
+
+
+def _number(value: Any, digits: int) -> str:
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return f"{value:.{digits}f}" if good else "–"
+
+
+def _percent(value: Any) -> str:
+    return "–" if _number(value, 0) == "–" else f"{100.0 * value:.0f} %"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, write the table, update the README; 1 when a run is missing or failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "results" / "readme_table", help="folder of the runs")
+    parser.add_argument("--only", nargs="+", choices=[entry.name for entry in ENTRIES], help="leave the README alone")
+    parser.add_argument("--reuse", action="store_true", help="take runs that are already there")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    outcomes = []
+    for entry in ENTRIES:
+        if options.only is None or entry.name in options.only:
+            outcomes.append(measure(entry, options.out / entry.name, data_root(), options.reuse))
+            print(" | ".join(row(outcomes[-1])), flush=True)
+    text = table(outcomes)
+    write_text(options.out.with_suffix(".md"), text)
+    if options.only is None:
+        readme = REPOSITORY / "README.md"
+        write_text(readme, replace_block(readme.read_text(encoding="utf-8"), text))
+    return 0 if all(outcome.metrics is not None for outcome in outcomes) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
