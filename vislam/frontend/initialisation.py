@@ -86,12 +86,12 @@ class Initialiser:
             at_rest_by_image: the image hardly moved since the frame before (below `config.still_px`).
         """
         still_by_imu = self._rest.add(span)
-        follows = span is not None and self._entries and span.t_ns[0] == self._entries[-1].vo.t_ns
+        follows = span is not None and bool(self._entries) and int(span.t_ns[0]) == self._entries[-1].vo.t_ns
         if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None:
             return self._restart("vision is lost")
         if self._entries and not follows:
             self._restart("inertial data has a hole")
-        self._append(span if follows else None, vo, vo.T_keyframe_body, at_rest_by_image and follows is True)
+        self._append(span if follows else None, vo, vo.T_keyframe_body, at_rest_by_image and follows)
         self._trim(vo.t_ns)
         if still_by_imu and at_rest_by_image:
             found = self._from_rest()
