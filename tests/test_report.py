@@ -260,3 +260,13 @@ def test_without_an_imu_there_is_no_filter_to_speak_of(copy):
     assert "EKF alone" not in page.texts
     files = read_run(copy)
     assert len(loop_segments(files, build_scene(files), "accepted")) == 11
+
+
+def test_without_gravity_the_truth_says_what_is_up(copy):
+    metrics = json.loads((copy / "metrics.json").read_text()) | {"has_imu": False}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    files = read_run(copy)
+    scene = build_scene(files)
+    np.testing.assert_allclose(scene.truth.positions_m, files.truth.positions_m, atol=1e-9)
+    (copy / "trajectory_truth.tum").unlink()
+    assert any("z is that of the first camera" in text for text in Page(write_report(copy).read_text()).texts)

@@ -375,6 +375,20 @@ def test_states_csv_keeps_every_bit(tmp_path):
         np.testing.assert_array_equal(np.triu(read.covariance), np.triu(wrote.covariance))
         np.testing.assert_array_equal(read.covariance, read.covariance.T)
     text = path.read_text().splitlines()
+    fields = text[1].split(",")
+    for column, refused in (
+        (9, False),
+        (137, False),
+        (2, True),
+        (8, True),
+    ):  # velocity, covariance, position, quaternion
+        damaged = ",".join([*fields[:column], "nan", *fields[column + 1 :]])
+        path.write_text("\n".join([text[0], damaged]) + "\n")
+        if refused:
+            with pytest.raises(DataError, match=r"states\.csv:2: NaN"):
+                read_states_csv(path)
+        else:
+            read_states_csv(path)
     path.write_text("\n".join(text[:-1]) + "\n" + text[-1][:200])
     with pytest.raises(DataError, match=r"states.csv:6: expected 138 columns"):
         read_states_csv(path)

@@ -196,7 +196,8 @@ def _consistency(scene: Scene) -> str:
         return ""
     head = ["", "keyframes", "rotation mean", "median", "position mean", "median"]
     text = (
-        "Normalised estimation error squared of the keyframes after yaw alignment. A filter that knows its own "
+        f"Normalised estimation error squared of the keyframes after {'yaw' if scene.has_gravity else 'SE(3)'} "
+        "alignment. A filter that knows its own "
         "uncertainty has a mean of 3; a larger number means that it is too sure of itself."
     )
     return card(table(head, rows), title="Consistency (NEES, expected 3)") + note(text)
@@ -205,17 +206,19 @@ def _consistency(scene: Scene) -> str:
 def _trajectories(run: RunFiles, scene: Scene) -> str:
     if not any(len(path) > 1 for path in scene.paths.values()):
         return ""
-    return section(
-        "Trajectories",
-        grid(card(plots.top_view(run, scene), title="From above"), card(plots.side_view(scene), title="From the side")),
+    views = grid(
+        card(plots.top_view(run, scene), title="From above"), card(plots.side_view(scene), title="From the side")
     )
+    tilted = not scene.has_gravity and scene.truth is None
+    text = "There is no IMU to tell what is up: z is that of the first camera." if tilted else ""
+    return section("Trajectories", views, note(text) if text else "")
 
 
 def _over_time(run: RunFiles, scene: Scene) -> str:
     figure = plots.over_time(run, scene)
     if not figure:
         return ""
-    text = "Vertical green lines are accepted loops. State: green ok, yellow degraded, red lost."
+    text = "Green strokes are accepted loops. State: green ok, yellow degraded, red lost."
     return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), note(text))
 
 
@@ -255,7 +258,8 @@ def _loops(run: RunFiles, scene: Scene) -> str:
     text = f"{len(run.loops)} candidates: {summary}."
     shown = card(table(head, rows[:_SHOWN_LOOPS], text_columns=(3, 4, 5)))
     rest = rows[_SHOWN_LOOPS:]
-    title = f"{len(rest)} more candidates" + (" of many; all are in loops.csv" if len(order) > _MAX_LOOPS else "")
+    hidden = len(order) - len(rows)
+    title = f"{len(rest)} more candidates" + (f"; another {hidden} are in loops.csv" if hidden else "")
     more = folded(title, table(head, rest, text_columns=(3, 4, 5))) if rest else ""
     return section("Loops", note(text), _reasons(run.loops), shown, more)
 

@@ -43,6 +43,7 @@ _WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
 _STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad"}
 _MAX_STRETCH = 25.0  # of the vertical axis: more would turn millimetres into mountains
 _MAX_REJECTED = 200  # loops drawn: more is a red cloud
+_MAX_LOOP_LINES = 25
 _MAX_POINTS = 1500  # per line: more cannot be seen and only makes the file heavy
 _RC: dict[str, Any] = {
     "svg.fonttype": "none",
@@ -130,8 +131,7 @@ def over_time(run: RunFiles, scene: Scene) -> str:
             else:
                 _draw_state(axes, run, scene)
             if name != "state":
-                for t in closed:
-                    axes.axvline(t, color=_CODE["good"], linewidth=0.7, alpha=0.5, zorder=0.5)
+                _mark_loops(axes, closed)
         if scene.errors:
             _legend_above(grid[0, 0], columns=4)
         grid[-1, 0].set_xlabel("time [s]")
@@ -172,8 +172,11 @@ def timing(stages: Mapping[str, Mapping[str, float]], period_ms: float | None) -
 
 def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
     """Draw gyroscope and accelerometer biases of the graph with three sigma, and those of the EKF dashed."""
+    states = {
+        name: [s for s in of_one if np.isfinite(np.diag(s.covariance)[9:]).all()] for name, of_one in states.items()
+    }
     if not any(states.values()):
-        return ""
+        return ""  # without an IMU there are none
     with mpl.rc_context(_RC):
         figure = Figure(figsize=(11.2, 2.9), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -258,8 +261,10 @@ def _draw_loops(axes: Any, run: RunFiles, scene: Scene) -> None:
         axes.add_collection(LineCollection(list(rejected), colors=_CODE["bad"], linewidths=0.5, alpha=0.2, zorder=1))
         axes.plot([], [], color=_CODE["bad"], linewidth=0.7, label="loops rejected")
     if len(accepted):
-        axes.add_collection(LineCollection(list(accepted), colors=_CODE["good"], linewidths=1.1, zorder=4))
-        axes.plot(*accepted[:, 1].T, ".", color=_CODE["good"], markersize=5, zorder=4)  # most are too short to be seen
+        few = len(accepted) <= _MAX_LOOP_LINES
+        width, size, order = (1.1, 5, 4) if few else (0.5, 2, 1.5)
+        axes.add_collection(LineCollection(list(accepted), colors=_CODE["good"], linewidths=width, zorder=order))
+        axes.plot(*accepted[:, 1].T, ".", color=_CODE["good"], markersize=size, zorder=order)  # many lines are short
         axes.plot([], [], ".-", color=_CODE["good"], linewidth=1.1, markersize=5, label="loops accepted")
 
 
@@ -271,6 +276,15 @@ def _draw_errors(axes: Any, scene: Scene, attribute: str, label: str) -> None:
             axes.plot(t, values, color=_CODE[name], linewidth=_WIDTHS[name], label=scene.labels[name])
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel(label)
+
+
+def _mark_loops(axes: Any, closed_s: Array) -> None:
+    """Mark times by lines; where there are many, by short strokes at the top that leave the curves readable."""
+    few = len(closed_s) <= _MAX_LOOP_LINES
+    axes.vlines(
+        closed_s, 0.0 if few else 0.95, 1.0, transform=axes.get_xaxis_transform(), color=_CODE["good"],
+        linewidth=0.7, alpha=0.5 if few else 0.9, zorder=0.5,
+    )  # fmt: skip
 
 
 def _draw_inliers(axes: Any, run: RunFiles, scene: Scene) -> None:

@@ -29,7 +29,10 @@ class ErrorCurve:
 
 @dataclass(slots=True, eq=False)
 class Scene:
-    """Trajectories in the map frame (z up), aligned where there is a truth; times count from `zero_ns`."""
+    """Trajectories in one frame, aligned where there is a truth; times count from `zero_ns`.
+
+    The frame is the map (z up). Without an IMU the map is tilted as the first camera was, so then it is the truth's.
+    """
 
     zero_ns: int
     end_s: float
@@ -39,6 +42,7 @@ class Scene:
     errors: dict[str, ErrorCurve] = field(default_factory=dict)
     nees: dict[str, dict[str, Array]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # why something cannot be drawn
+    has_gravity: bool = True
     labels: dict[str, str] = field(default_factory=lambda: dict(_LABELS))
 
     def seconds(self, t_ns: NDArray[np.int64] | Sequence[int]) -> Array:
@@ -55,6 +59,7 @@ def build_scene(run: RunFiles) -> Scene:
     end = max((int(t[-1]) for t in stamps), default=zero)
     scene = Scene(zero, (end - zero) * 1e-9, "")
     if run.metrics.get("has_imu") is False:
+        scene.has_gravity = False
         scene.labels["ekf"] = "odometry"  # without an IMU there is no filter
     if run.truth is None:
         scene.paths = dict(run.estimates)
@@ -75,7 +80,8 @@ def build_scene(run: RunFiles) -> Scene:
         )
         aligned[name] = estimate.transformed(S)
         _, R, t = sim3_parts(S)
-        base = invert(transform(R, t))  # the last one, the graph's or the batch's, decides
+        if scene.has_gravity:
+            base = invert(transform(R, t))  # the last one, the graph's or the batch's, decides
     scene.paths = {name: trajectory.transformed(base) for name, trajectory in aligned.items()}
     if aligned:
         inside = (run.truth.t_ns >= zero) & (run.truth.t_ns <= end)
@@ -107,6 +113,6 @@ def _add_nees(run: RunFiles, scene: Scene) -> None:
         return
     for name, states in run.states.items():
         try:
-            scene.nees[name] = nees(states, run.truth, "yaw")
+            scene.nees[name] = nees(states, run.truth, "yaw" if scene.has_gravity else "se3")
         except VislamError as error:
             scene.notes.append(f"no consistency of {name}: {error}")

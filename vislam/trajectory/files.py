@@ -141,10 +141,12 @@ def read_table(
     columns: tuple[int, ...],
     with_stamp: bool = True,
     header: list[str] | None = None,
+    optional_from: int | None = None,
 ) -> tuple[list[str], Array, list[int]]:
     """Return the text of the first column, the finite numbers of the others [N, C] and the line numbers [N].
 
-    With `header`, the first line must be exactly these names.
+    With `header`, the first line must be exactly these names. Numbers from column `optional_from` on may be NaN (not
+    estimated), but not infinite.
     """
     stamps: list[str] = []
     rows: list[list[float]] = []
@@ -172,7 +174,7 @@ def read_table(
     if not rows:
         raise DataError(f"{path} holds no poses")
     numbers = np.array(rows)
-    finite = np.isfinite(numbers).all(axis=1)
+    finite = np.isfinite(numbers[:, :optional_from]).all(axis=1) & ~np.isinf(numbers).any(axis=1)
     if not finite.all():
         raise DataError(f"{path}:{lines[int(np.argmin(finite))]}: NaN or infinity; remove or repair the line")
     return stamps, numbers, lines

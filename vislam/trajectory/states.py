@@ -15,6 +15,7 @@ from vislam.messages import NavState
 from vislam.trajectory.files import read_table, stamp_ns, write_text
 
 _UPPER = np.triu_indices(15)
+_POSE_COLUMNS = 8  # after the stamp: keyframe id, position, quaternion; they are always known
 _NAMES = (
     "t_ns,keyframe_id,px,py,pz,qx,qy,qz,qw,vx,vy,vz,bgx,bgy,bgz,bax,bay,baz,"
     + ",".join(f"c{i:02d}{j:02d}" for i, j in zip(*_UPPER, strict=True))
@@ -40,8 +41,13 @@ def write_states_csv(path: Path, keyframe_ids: Sequence[int], states: Sequence[N
 
 
 def read_states_csv(path: Path) -> tuple[NDArray[np.int64], list[NavState]]:
-    """Read keyframe ids [N] and states. Raises DataError with file and line on damage."""
-    stamps, numbers, lines = read_table(path, separator=",", columns=(len(_NAMES),), header=_NAMES)
+    """Read keyframe ids [N] and states; what was not estimated (velocity and biases without an IMU) is NaN.
+
+    Raises DataError with file and line on damage.
+    """
+    stamps, numbers, lines = read_table(
+        path, separator=",", columns=(len(_NAMES),), header=_NAMES, optional_from=_POSE_COLUMNS
+    )
     norms = np.linalg.norm(numbers[:, 4:8], axis=1)
     wrong = np.abs(norms - 1.0) > 1e-3
     if wrong.any():
