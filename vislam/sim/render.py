@@ -16,9 +16,8 @@ from vislam.camera import Camera
 from vislam.errors import UsageError
 from vislam.messages import Array, ImageF32
 from vislam.sim.scene import CYLINDER, DISC, Scene
+from vislam.sim.tiles import NEAR_M, TILE_PX, fill_tiles, tile_bounds
 
-_TILE_PX = 16
-_NEAR_M = 0.02
 _MAX_PROBES = 4
 _FILTER_REUSE = 4  # pixels along a row that share one choice of mip level
 _BLEND = 2.0  # how much narrower than the distance between mip levels their blending is
@@ -47,7 +46,7 @@ class Renderer:
                 "the simulated camera's distortion cannot be inverted over the whole image; make it milder"
             )
         self._rays = np.ascontiguousarray(rays)
-        self._tiles = _tile_bounds(self._rays, _TILE_PX)
+        self._tiles = tile_bounds(self._rays)
         self._pixel_rad = 1.0 / np.sqrt(camera.fx * camera.fy)
 
     def render(self, scene: Scene, T_world_cam: Array) -> tuple[ImageF32, ImageF32]:
@@ -63,7 +62,7 @@ class Renderer:
         """
         rows = np.broadcast_to(T_world_cam, (self.camera.height, 4, 4))
         poses = np.ascontiguousarray(rows[:, :3, :])
-        lists, counts, nearest = _fill_tiles(self._tiles, poses, scene.kind, scene.geometry, scene.centre, scene.half)
+        lists, counts, nearest = fill_tiles(self._tiles, poses, scene.kind, scene.geometry, scene.centre, scene.half)
         color = np.empty((self.camera.height, self.camera.width, 3), dtype=np.float32)
         depth = np.empty((self.camera.height, self.camera.width), dtype=np.float32)
         hit = np.empty((self.camera.height, self.camera.width), dtype=np.int32)
@@ -72,121 +71,6 @@ class Renderer:
         _cast(*where, *what, color, depth, hit)
         _smooth_edges(*where, *what, np.array(_SAMPLES_AT_EDGES), hit, color)
         return color, depth
-
-
-def _tile_bounds(rays: Array, tile: int) -> Array:
-    """Return [rows, columns, 4]: x min, x max, y min, y max of the normalised rays of each tile, one pixel wider."""
-    height, width = rays.shape[0] - 2, rays.shape[1] - 2
-    bounds = np.empty((-(-height // tile), -(-width // tile), 4))
-    for row in range(bounds.shape[0]):
-        for column in range(bounds.shape[1]):
-            part = rays[row * tile : (row + 1) * tile + 2, column * tile : (column + 1) * tile + 2]
-            low, high = part.min(axis=(0, 1)), part.max(axis=(0, 1))
-            bounds[row, column] = low[0], high[0], low[1], high[1]
-    return bounds
-
-
-@njit(cache=True, nogil=True)
-def _outside(box: Array, bounds: Array, slack: float) -> bool:
-    """Tell whether a box (centre and half axes [4, 3], camera frame) misses a frustum of x/z and y/z bounds."""
-    for side in range(4):
-        axis = side // 2
-        sign = 1.0 if side % 2 == 0 else -1.0
-        bound = bounds[side]
-        reach = sign * (box[0, axis] - bound * box[0, 2])
-        for k in range(1, 4):
-            reach += abs(box[k, axis] - bound * box[k, 2])
-        if reach < -slack * (1.0 + abs(bound)):
-            return True
-    return False
-
-
-@njit(cache=True, nogil=True)
-def _to_camera(pose: Array, centre: Array, half: Array, box: Array) -> float:
-    """Fill `box` [4, 3] with a bounding box in the camera frame; return the greatest distance of its points."""
-    far = 0.0
-    for i in range(3):
-        box[0, i] = 0.0
-        for j in range(3):
-            box[0, i] += pose[j, i] * (centre[j] - pose[j, 3])
-        far += abs(box[0, i])
-        for k in range(3):
-            box[k + 1, i] = pose[0, i] * half[k, 0] + pose[1, i] * half[k, 1] + pose[2, i] * half[k, 2]
-            far += abs(box[k + 1, i])
-    return far
-
-
-@njit(cache=True, nogil=True)
-def _sway(poses: Array, first: int, last: int) -> tuple[float, float]:
-    """Return bounds of how far the camera turns (rad) and moves (m) between the middle row of a range and its ends."""
-    middle = (first + last) // 2
-    angle, shift = 0.0, 0.0
-    for row in (first, last):
-        trace, square = 0.0, 0.0
-        for i in range(3):
-            square += (poses[row, i, 3] - poses[middle, i, 3]) ** 2
-            for j in range(3):
-                trace += poses[row, i, j] * poses[middle, i, j]
-        angle = max(angle, np.sqrt(max(0.0, 3.0 - trace)))  # 3 - trace = 2 - 2 cos(angle), about angle squared
-        shift = max(shift, np.sqrt(square))
-    return 1.5 * angle, 1.5 * shift
-
-
-@njit(cache=True, nogil=True)
-def _visible(
-    poses: Array, bounds: Array, kind: NDArray[np.int64], geometry: Array, centre: Array, half: Array, nearest: Array
-) -> NDArray[np.int64]:
-    """Return the surfaces that may be in the image, nearest first; fills their least depth, infinite for the others."""
-    height = poses.shape[0]
-    angle, shift = _sway(poses, 0, height - 1)
-    pose = poses[(height - 1) // 2]
-    box = np.empty((4, 3))
-    nearest[:] = np.inf
-    count = 0
-    for p in range(kind.shape[0]):
-        if kind[p] != CYLINDER:
-            facing = 0.0
-            for k in range(3):
-                facing += geometry[p, 9 + k] * (pose[k, 3] - centre[p, k])
-            if facing < -shift:
-                continue
-        slack = shift + angle * _to_camera(pose, centre[p], half[p], box)
-        depth_radius = abs(box[1, 2]) + abs(box[2, 2]) + abs(box[3, 2]) + slack
-        if box[0, 2] + depth_radius > _NEAR_M and not _outside(box, bounds, slack):
-            nearest[p] = box[0, 2] - depth_radius
-            count += 1
-    return np.argsort(nearest)[:count]
-
-
-@njit(cache=True, nogil=True)
-def _fill_tiles(
-    tiles: Array, poses: Array, kind: NDArray[np.int64], geometry: Array, centre: Array, half: Array
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Return per tile the candidate surfaces, nearest first, their number, and each surface's least depth.
-
-    Conservative: with a rolling shutter each row of tiles uses its middle pose and a slack for how far its rows move.
-    """
-    height, rows, columns = poses.shape[0], tiles.shape[0], tiles.shape[1]
-    bounds = np.array([tiles[:, :, 0].min(), tiles[:, :, 1].max(), tiles[:, :, 2].min(), tiles[:, :, 3].max()])
-    nearest = np.empty(kind.shape[0])
-    visible = _visible(poses, bounds, kind, geometry, centre, half, nearest)
-    lists = np.empty((rows, columns, max(len(visible), 1)), dtype=np.int64)
-    counts = np.zeros((rows, columns), dtype=np.int64)
-    box = np.empty((4, 3))
-    for row in range(rows):
-        first, last = row * _TILE_PX, min(height, (row + 1) * _TILE_PX) - 1
-        angle, shift = _sway(poses, first, last)
-        bounds[0], bounds[1] = tiles[row, :, 0].min(), tiles[row, :, 1].max()
-        bounds[2], bounds[3] = tiles[row, :, 2].min(), tiles[row, :, 3].max()
-        for p in visible:
-            slack = shift + angle * _to_camera(poses[(first + last) // 2], centre[p], half[p], box)
-            if _outside(box, bounds, slack):
-                continue
-            for column in range(columns):
-                if not _outside(box, tiles[row, column], slack):
-                    lists[row, column, counts[row, column]] = p
-                    counts[row, column] += 1
-    return lists, counts, nearest
 
 
 @njit(cache=True, nogil=True)
@@ -202,7 +86,7 @@ def _meet_cylinder(g: Array, ray: Ray, ex: float, ey: float, ez: float, limit: f
     if root <= 0.0 or square <= 0.0 or rest <= 0.0:
         return np.inf, 0.0, 0.0
     t = (linear - np.sqrt(root)) / square
-    if t <= _NEAR_M or t >= limit:
+    if t <= NEAR_M or t >= limit:
         return np.inf, 0.0, 0.0
     b = g[6] * (t * dx - ex) + g[7] * (t * dy - ey) + g[8] * (t * dz - ez)
     if b < 0.0 or b > g[13]:
@@ -239,7 +123,7 @@ def _trace(
         if slope >= 0.0:
             continue
         t = (g[9] * ex + g[10] * ey + g[11] * ez) / slope
-        if t <= _NEAR_M or t >= best_t:
+        if t <= NEAR_M or t >= best_t:
             continue
         hx, hy, hz = t * dx - ex, t * dy - ey, t * dz - ez
         a = g[3] * hx + g[4] * hy + g[5] * hz
@@ -355,7 +239,7 @@ def _cast(
         filtered, of, age = (0.0, 1, 0.0, 0.0), -1, 0
         for u in range(hit.shape[1]):
             ray = _turn(pose, rays[v + 1, u + 1, 0], rays[v + 1, u + 1, 1])
-            row, column = v // _TILE_PX, u // _TILE_PX
+            row, column = v // TILE_PX, u // TILE_PX
             p, t, a, b = _trace(ray, pose, lists[row, column], counts[row, column], nearest, kind, geometry)
             hit[v, u] = p
             if p < 0:
@@ -406,7 +290,7 @@ def _smooth_edges(
         for u in range(hit.shape[1]):
             if not _at_edge(hit, v, u):
                 continue
-            row, column = v // _TILE_PX, u // _TILE_PX
+            row, column = v // TILE_PX, u // TILE_PX
             blue, green, red = 0.0, 0.0, 0.0
             for k in range(offsets.shape[0]):
                 x = rays[v + 1, u + 1, 0] + 0.5 * offsets[k, 0] * (rays[v + 1, u + 2, 0] - rays[v + 1, u, 0])
