@@ -217,7 +217,7 @@ def test_rest_takes_its_time_and_motion_ends_it() -> None:
 
 
 @pytest.mark.data
-def test_rest_on_a_real_recording(data_root) -> None:  # noqa: ANN001
+def test_rest_on_a_real_recording(data_root) -> None:
     """V1_01 stands on the floor with idling motors at its end, and flies in the middle."""
     samples = RealMotion.euroc(data_root / "euroc_v101_imu").samples
     assert all(rest_answers(samples[-201:])[16:])

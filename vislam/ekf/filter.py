@@ -133,13 +133,12 @@ class Ekf:
             if sample.t_ns - int(self._series.t_ns[0]) > 2 * self._history_ns:
                 self._series.forget_before(sample.t_ns - self._history_ns)
             return
-        if before != self._t_ns or history.event(self._applied) is not None:
+        if before != self._t_ns or dt_ns > self._max_gap_ns or history.event(self._applied) is not None:
             self._run()
             return
         values = self._series.values  # the way of nearly every sample: one step, no measurement on it
-        gap_s = dt_ns * 1e-9 if dt_ns > self._max_gap_ns else 0.0
         kernels.predict(
-            self._x, self._P, values[-2], values[-1], dt_ns * 1e-9, gap_s, self._sigmas, self._gravity, self._work
+            self._x, self._P, values[-2], values[-1], dt_ns * 1e-9, 0.0, self._sigmas, self._gravity, self._work
         )
         self._series.extra[-1] = self._x[:10]
         self._t_ns = sample.t_ns

@@ -19,7 +19,7 @@ from vislam.messages import Array
 
 NOMINAL = 23
 ERRORS = 21
-STATE = 15  # errors of the inertial state proper
+_HOLE_STEP_S = 0.01
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -227,7 +227,15 @@ def predict_run(
     track[0] = x[:10]
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
-        predict(x, P, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, work)
+        pieces = 1
+        if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
+            pieces = max(math.ceil(dt / _HOLE_STEP_S), 1)
+        for j in range(pieces):
+            before = samples[k - 1] + (j / pieces) * (samples[k] - samples[k - 1])
+            after = samples[k - 1] + ((j + 1) / pieces) * (samples[k] - samples[k - 1])
+            if pieces == 1:
+                before, after = samples[k - 1], samples[k]  # not even rounding may tell this from a single `predict`
+            predict(x, P, before, after, dt / pieces, gaps_s[k], sigmas, gravity, work)
         track[k] = x[:10]
 
 

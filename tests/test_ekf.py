@@ -1,0 +1,637 @@
+"""The filter: its linearisations, its gates, and that time of arrival does not matter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, SimulatedVision, to_span
+
+from vislam.config import EkfConfig
+from vislam.ekf import Ekf, kernels
+from vislam.ekf.measurements import chi_square_limit, relative_motion, with_shared_error
+from vislam.geometry import quaternion_wxyz, se3_exp, so3_exp, so3_log, so3_right_jacobian, transform
+from vislam.imu import preintegrate
+from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
+from vislam.relative_motion import camera_displacement, direction_residual, metric_residual
+
+LEVER = np.array([0.1, -0.05, 0.2])
+
+
+def random_pose(rng: np.random.Generator) -> Array:
+    return transform(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+
+
+def random_nominal(rng: np.random.Generator) -> Array:
+    x = rng.normal(size=kernels.NOMINAL) * 0.3
+    x[6:10] = quaternion_wxyz(random_pose(rng)[:3, :3])
+    x[19:23] = quaternion_wxyz(random_pose(rng)[:3, :3])
+    return x
+
+
+def perturbed(x: Array, d: Array) -> Array:
+    """The nominal state with an error [21] put on it, by the definition in `kernels`."""
+    y = x.copy()
+    y[0:3] += d[3:6]
+    y[3:6] += d[6:9]
+    y[13:16] += d[9:12]
+    y[10:13] += d[12:15]
+    y[16:19] += d[18:21]
+    for at, w in ((6, d[0:3]), (19, d[15:18])):
+        y[at : at + 4] = quaternion_wxyz(kernels.pose(x, 0, at)[:3, :3] @ so3_exp(w))
+    return y
+
+
+def difference(y: Array, x: Array) -> Array:
+    """The error [21] of y against x."""
+    d = np.zeros(kernels.ERRORS)
+    d[3:6], d[6:9], d[9:12], d[12:15], d[18:21] = (
+        (y - x)[0:3],
+        (y - x)[3:6],
+        (y - x)[13:16],
+        (y - x)[10:13],
+        (y - x)[16:19],
+    )
+    for at, rows in ((6, slice(0, 3)), (19, slice(15, 18))):
+        d[rows] = so3_log(kernels.pose(x, 0, at)[:3, :3].T @ kernels.pose(y, 0, at)[:3, :3])
+    return d
+
+
+def reference_step(x: Array, s0: Array, s1: Array, dt: float) -> Array:
+    """One prediction in plain numpy, written from the equations."""
+    y = x.copy()
+    R = kernels.pose(x, 0, 6)[:3, :3]
+    w, a = 0.5 * (s0 + s1)[:3] - x[13:16], 0.5 * (s0 + s1)[3:] - x[10:13]
+    acceleration = R @ so3_exp(0.5 * dt * w) @ a + np.array([0.0, 0.0, -GRAVITY_M_S2])
+    y[0:3] += x[3:6] * dt + 0.5 * acceleration * dt**2
+    y[3:6] += acceleration * dt
+    y[6:10] = quaternion_wxyz(R @ so3_exp(dt * w))
+    return y
+
+
+def step(
+    x: Array, P: Array, s0: Array, s1: Array, dt: float, gap_s: float = 0.0, white: float = 0.0
+) -> tuple[Array, Array]:
+    x, P = x.copy(), P.copy()
+    sigmas = np.array([white, white, 0.0, 0.0, 0.5, 2.0])
+    kernels.predict(x, P, s0, s1, dt, gap_s, sigmas, GRAVITY_M_S2, np.zeros((21, 21)))
+    return x, P
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_prediction_against_plain_numpy_and_its_numerical_jacobian(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, s0, s1, dt = random_nominal(rng), rng.normal(size=6), rng.normal(size=6), 0.01
+    root = rng.normal(size=(21, 21))
+    P = root @ root.T
+    y, P_next = step(x, P, s0, s1, dt)
+    assert np.abs(difference(y, reference_step(x, s0, s1, dt))).max() < 1e-13
+    F, h = np.empty((21, 21)), 1e-6
+    for k in range(21):
+        d = np.eye(21)[k] * h
+        forward = reference_step(perturbed(x, d), s0, s1, dt)
+        backward = reference_step(perturbed(x, -d), s0, s1, dt)
+        F[:, k] = (difference(forward, y) - difference(backward, y)) / (2 * h)
+    np.testing.assert_allclose(P_next, F @ P @ F.T, atol=2e-7 * np.abs(P).max())
+    np.testing.assert_array_equal(P_next, P_next.T)
+
+
+def test_prediction_is_preintegration() -> None:
+    """The same samples through the filter and through `preintegrate` end in the same state, noise included."""
+    motion = Motion.random(2)
+    samples = motion.samples(0.5)[0]
+    T, v, *_ = motion.at(0.0)
+    ekf = Ekf(EkfConfig(imu_inflation=1.0), replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0), GRAVITY_M_S2)
+    ekf.predict(samples[0])
+    ekf.initialise(NavState(T0_NS, T, v, np.zeros(3), np.zeros(3), np.zeros((15, 15))))
+    for s in samples[1:]:
+        ekf.predict(s)
+    piece, state, R, g = (
+        preintegrate(to_span(samples), noise=EUROC_NOISE),
+        ekf.state(),
+        T[:3, :3],
+        np.array([0, 0, -9.81]),
+    )
+    np.testing.assert_allclose(state.T_world_body[:3, :3], R @ piece.dR, atol=1e-12)
+    np.testing.assert_allclose(state.velocity_world_m_s, v + 0.5 * g + R @ piece.dv_m_s, atol=1e-12)
+    np.testing.assert_allclose(state.T_world_body[:3, 3], T[:3, 3] + 0.5 * v + g / 8 + R @ piece.dp_m, atol=1e-12)
+    order = [0, 1, 2, 6, 7, 8, 3, 4, 5]  # NavState has position before velocity
+    turn = np.kron(np.eye(3), R)
+    turn[:3, :3] = np.eye(3)
+    expected = turn @ piece.covariance @ turn.T
+    np.testing.assert_allclose(state.covariance[np.ix_(order, order)], expected, rtol=0.02, atol=2e-3 * expected.max())
+
+
+def numerical(f, T_a: Array, T_b: Array) -> tuple[Array, Array]:
+    out = []
+    for which in (0, 1):
+        columns = []
+        for k in range(6):
+            sides = []
+            for sign in (1.0, -1.0):
+                d = np.eye(6)[k] * 1e-6 * sign
+                poses = [T_a.copy(), T_b.copy()]
+                poses[which][:3, :3] = poses[which][:3, :3] @ so3_exp(d[:3])
+                poses[which][:3, 3] += d[3:]
+                sides.append(f(*poses))
+            columns.append(-(sides[0] - sides[1]) / 2e-6)
+        out.append(np.array(columns).T)
+    return out[0], out[1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_of_metric_motion(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_a, T_b, T_a_b = random_pose(rng), random_pose(rng), random_pose(rng)
+    residual, J_a, J_b = metric_residual(T_a, T_b, T_a_b)
+    N_a, N_b = numerical(lambda a, b: metric_residual(a, b, T_a_b)[0], T_a, T_b)
+    np.testing.assert_allclose(J_a, N_a, atol=1e-7)
+    np.testing.assert_allclose(J_b, N_b, atol=1e-7)
+    exact, *_ = metric_residual(T_a, T_b, np.linalg.inv(T_a) @ T_b)
+    np.testing.assert_allclose(exact, 0.0, atol=1e-12)
+    assert np.linalg.norm(residual) > 0.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_of_direction(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_a, T_b = random_pose(rng), random_pose(rng)
+    c = camera_displacement(T_a, T_b, LEVER)
+    u = so3_exp(rng.normal(size=3) * 0.1) @ c / np.linalg.norm(c)
+    T_a_b = transform(T_a[:3, :3].T @ T_b[:3, :3] @ so3_exp(rng.normal(size=3) * 0.1), u)
+    _, J_a, J_b, axes, along = direction_residual(T_a, T_b, T_a_b, LEVER)
+
+    def residual(a: Array, b: Array) -> Array:
+        moved = camera_displacement(a, b, LEVER)
+        across = np.linalg.norm(c) * axes.T @ (u - moved / np.linalg.norm(moved))
+        return np.concatenate([metric_residual(a, b, T_a_b)[0][:3], across])
+
+    N_a, N_b = numerical(residual, T_a, T_b)
+    np.testing.assert_allclose(J_a, N_a, atol=1e-7)
+    np.testing.assert_allclose(J_b, N_b, atol=1e-7)
+    assert along == pytest.approx(c @ u)
+    np.testing.assert_allclose(axes.T @ c, 0.0, atol=1e-12)
+
+
+def test_correction_equals_the_textbook() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(21, 21)) * 0.1
+    x, P = random_nominal(rng), root @ root.T
+    H, noise, residual = rng.normal(size=(6, 21)), np.diag(rng.uniform(0.1, 1.0, 6)), rng.normal(size=6) * 0.1
+    nis, K = kernels.innovation(P, H, noise, residual)
+    S = H @ P @ H.T + noise
+    np.testing.assert_allclose(K, P @ H.T @ np.linalg.inv(S), atol=1e-10)
+    assert nis == pytest.approx(residual @ np.linalg.inv(S) @ residual)
+    y, P_after = x.copy(), P.copy()
+    kernels.correct(y, P_after, K, H, noise, residual)
+    np.testing.assert_allclose(P_after, P - K @ S @ K.T, atol=1e-10)
+    np.testing.assert_allclose(difference(y, x), K @ residual, atol=1e-10)
+
+
+def test_clone_is_the_pose_itself() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(21, 21))
+    x, P = random_nominal(rng), root @ root.T
+    kernels.clone(x, P)
+    np.testing.assert_array_equal(kernels.pose(x, 16, 19), kernels.pose(x, 0, 6))
+    spread = np.zeros((6, 21))
+    spread[:, :6], spread[:, 15:] = np.eye(6), -np.eye(6)
+    np.testing.assert_array_equal(spread @ P @ spread.T, 0.0)  # pose minus clone is known exactly
+
+
+def test_chi_square_limits() -> None:
+    np.testing.assert_allclose([chi_square_limit(0.999, dof) for dof in (3, 5, 6)], [16.266, 20.515, 22.458], atol=1e-3)
+
+
+def test_shared_error_does_not_average_out() -> None:
+    """A hundred motions from one keyframe tell no more than its landmarks allow."""
+    x = np.zeros(kernels.NOMINAL)
+    x[6] = x[19] = 1.0
+    x[0] = 1.0
+    P = np.zeros((21, 21))
+    P[:6, :6] = np.eye(6)
+    covariance, shared = np.eye(6) * 1e-4, np.zeros((6, 6))
+    T = transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    vo = VoMeasurement(0, 0, T, covariance, True, Tracking.OK, 50)
+    for _ in range(100):
+        measurement = relative_motion(x, P, vo, np.zeros(3), 1.0)
+        white, more, shared = with_shared_error(measurement, 0.5, shared)
+        P[15:, 15:] += more
+        _, K = kernels.innovation(P, white.H, white.noise, white.residual)
+        kernels.correct(x, P, K, white.H, white.noise, white.residual)
+    np.testing.assert_allclose(np.diag(P)[:6], 0.5e-4, rtol=0.05)
+
+
+class Scene:
+    """A noisy run: samples, truth and visual motions, and a filter set up on its first state."""
+
+    def __init__(self, seed: int = 1, duration_s: float = 6.0, camera: Array | None = None) -> None:
+        self.motion, rng = Motion.random(seed), np.random.default_rng(seed)
+        self.samples, self.biases = self.motion.samples(
+            duration_s, 200.0, EUROC_NOISE, rng, np.array([0.01, -0.02, 0.03]), np.array([0.1, -0.05, 0.08])
+        )
+        self.stamps = [T0_NS + 50_000_000 * k + 1_234_567 for k in range(int(duration_s * 20) - 1)]
+        poses = [self.motion.pose((t - T0_NS) * 1e-9) for t in self.stamps]
+        self.vision = SimulatedVision(T_body_camera=camera)
+        self.motions = self.vision.motions(poses, self.stamps, rng)
+        self.keyframes = range(0, len(self.stamps), self.vision.keyframe_every)
+
+    def ekf(self, **config: float) -> Ekf:
+        settings = EkfConfig(**{"imu_inflation": 1.0, "vo_inflation": 1.0, **config})
+        ekf = Ekf(settings, EUROC_NOISE, GRAVITY_M_S2)
+        ekf.initialise(self.start())
+        return ekf
+
+    def start(self, bias_sigmas: tuple[float, float] = (0.05, 0.2)) -> NavState:
+        T, v, *_ = self.motion.at(0.0)
+        sigmas = np.repeat([0.02, 0.001, 0.05, *bias_sigmas], 3)
+        return NavState(T0_NS, T, v, np.zeros(3), np.zeros(3), np.diag(sigmas**2))
+
+    def measure(self, ekf: Ekf, i: int) -> None:
+        if i > 0:
+            ekf.update_vo(self.motions[i])
+        if i in self.keyframes:
+            ekf.add_keyframe(i // self.vision.keyframe_every, self.stamps[i])
+
+    def run(self, ekf: Ekf, delay_s: float = 0.0) -> Ekf:
+        """Feed samples, and each frame as soon as a sample `delay_s` after it is there."""
+        i = 0
+        for s in self.samples:
+            ekf.predict(s)
+            while i < len(self.stamps) and s.t_ns >= self.stamps[i] + delay_s * NS:
+                self.measure(ekf, i)
+                i += 1
+        for k in range(i, len(self.stamps)):
+            self.measure(ekf, k)
+        return ekf
+
+
+def assert_same(a: NavState, b: NavState) -> None:
+    assert a.t_ns == b.t_ns
+    for name in ("T_world_body", "velocity_world_m_s", "gyro_bias_rad_s", "accel_bias_m_s2", "covariance"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene()
+
+
+def test_tracks_truth(scene: Scene) -> None:
+    ekf = scene.run(scene.ekf())
+    state = ekf.state()
+    T, v, *_ = scene.motion.at((state.t_ns - T0_NS) * 1e-9)
+    assert np.linalg.norm(state.T_world_body[:3, 3] - T[:3, 3]) < 0.05
+    assert np.linalg.norm(state.velocity_world_m_s - v) < 0.05
+    assert np.linalg.norm(state.gyro_bias_rad_s - scene.biases[-1, :3]) < 2e-3
+    assert ekf.counters["vo_accepted"] == len(scene.stamps) - 1
+    assert ekf.counters["keyframes"] == len(scene.keyframes)
+    assert np.linalg.eigvalsh(ekf.state().covariance)[0] > 0.0
+
+
+@pytest.mark.parametrize("delay_s", [0.02, 0.1, 0.35])
+def test_late_is_the_same_as_on_time(scene: Scene, delay_s: float) -> None:
+    on_time, late = scene.run(scene.ekf()), scene.run(scene.ekf(), delay_s)
+    assert_same(on_time.state(), late.state())
+    assert late.counters["rewinds"] > 100
+    for t_ns in scene.stamps[-40:]:
+        a, b = on_time.pose_at(t_ns), late.pose_at(t_ns)
+        assert a is not None
+        assert b is not None
+        np.testing.assert_array_equal(a, b)
+
+
+def test_order_of_arrival_does_not_matter(scene: Scene) -> None:
+    """Frames of the last seconds in any order, clones among them; ties in time keep motion before keyframe."""
+    straight = scene.run(scene.ekf(history_s=20.0))
+    shuffled = scene.ekf(history_s=20.0)
+    for s in scene.samples:
+        shuffled.predict(s)
+    order = np.random.default_rng(0).permutation(len(scene.stamps))
+    for i in order:
+        scene.measure(shuffled, int(i))
+    assert_same(straight.state(), shuffled.state())
+    outcome = ("vo_accepted", "vo_gated", "vo_no_keyframe", "keyframes")
+    assert [straight.counters[name] for name in outcome] == [shuffled.counters[name] for name in outcome]
+
+
+def test_replay_is_deterministic(scene: Scene) -> None:
+    assert_same(scene.run(scene.ekf()).state(), scene.run(scene.ekf()).state())
+
+
+def test_measurement_ahead_of_the_imu_waits(scene: Scene) -> None:
+    ahead, on_time = scene.ekf(), scene.ekf()
+    for s in scene.samples[:10]:
+        ahead.predict(s)
+        on_time.predict(s)
+    t_ns = scene.samples[12].t_ns + 1_000_000
+    result = ahead.add_keyframe(0, t_ns)
+    assert not result.accepted
+    assert "waits" in result.reason
+    for s in scene.samples[10:20]:
+        ahead.predict(s)
+        on_time.predict(s)
+    on_time.add_keyframe(0, t_ns)
+    assert ahead.counters["keyframes"] == 1
+    assert_same(ahead.state(), on_time.state())
+
+
+def test_start_in_the_past_runs_through_the_samples(scene: Scene) -> None:
+    first, later = scene.ekf(), Ekf(EkfConfig(imu_inflation=1.0, vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2)
+    for s in scene.samples[:200]:
+        first.predict(s)
+        later.predict(s)
+    assert not later.initialised
+    assert later.dead_reckoning_s == float("inf")
+    later.initialise(scene.start())
+    assert_same(first.state(), later.state())
+
+
+def test_start_can_place_the_keyframe(scene: Scene) -> None:
+    """A filter that starts between keyframes uses the next motions at once, relative to a keyframe it never saw."""
+    i = 3 * scene.vision.keyframe_every + 4
+    source = scene.run(scene.ekf())
+    state = source.state_at(scene.stamps[i])
+    assert state is not None
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    for s in scene.samples:
+        ekf.predict(s)
+    ekf.initialise(state, scene.motions[i])
+    for k in (i + 1, i + 2):
+        result = ekf.update_vo(scene.motions[k])
+        assert result.accepted, result.reason
+    blind = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    blind.predict(scene.samples[-1])
+    blind.initialise(state)
+    assert not blind.update_vo(scene.motions[i + 1]).accepted
+    assert blind.counters["vo_no_keyframe"] == 1
+
+
+def test_without_vision_the_filter_knows_that_it_does_not_know(scene: Scene) -> None:
+    ekf = scene.ekf()
+    sigma, shown = [], []
+    for k, s in enumerate(scene.samples):
+        ekf.predict(s)
+        if k % 200 == 0:
+            sigma.append(np.trace(ekf.state().covariance[3:6, 3:6]))
+            shown.append(ekf.dead_reckoning_s)
+    assert (np.diff(sigma) > 0).all()
+    np.testing.assert_allclose(shown, range(len(shown)), atol=1e-9)
+    lost = replace(scene.motions[5], T_keyframe_body=None, tracking=Tracking.LOST)
+    before = ekf.state()
+    assert not ekf.update_vo(lost).accepted
+    assert ekf.counters["vo_lost"] == 1
+    assert_same(before, ekf.state())
+
+
+def test_outage_of_vision_and_recovery(scene: Scene) -> None:
+    """2 s without vision: a new keyframe afterwards, errors inside 4 sigma, no reset."""
+    ekf = scene.ekf()
+    i, gone, again = 0, 40, 80  # frames 40..79 never come; 80 starts keyframe 10
+    for s in scene.samples:
+        ekf.predict(s)
+        while i < len(scene.stamps) and s.t_ns >= scene.stamps[i]:
+            if i < gone or i > again:
+                scene.measure(ekf, i)
+            elif i == again:
+                ekf.add_keyframe(i // scene.vision.keyframe_every, scene.stamps[i])
+            i += 1
+    state = ekf.state()
+    T, *_ = scene.motion.at((state.t_ns - T0_NS) * 1e-9)
+    error = T[:3, 3] - state.T_world_body[:3, 3]
+    assert error @ np.linalg.solve(state.covariance[3:6, 3:6], error) < 3 * 16
+    assert ekf.counters["soft_resets"] == 0
+    assert ekf.counters["vo_gated"] <= 1
+
+
+def test_hole_of_one_second_in_the_imu(scene: Scene) -> None:
+    """Bridged with honest uncertainty, also when frames inside the hole cut it into small steps."""
+    cut = [s for s in scene.samples if not 2.0 < (s.t_ns - T0_NS) / NS < 3.0]
+    plain, split, whole = scene.ekf(), scene.ekf(), scene.ekf()
+    for ekf in (plain, split, whole):
+        ekf.initialise(replace(scene.start((1e-3, 1e-2)), gyro_bias_rad_s=scene.biases[0, :3]))
+    for s in cut:
+        plain.predict(s)
+        split.predict(s)
+    for k in range(42, 58, 4):
+        split.add_keyframe(k, scene.stamps[k])  # a clone moves nothing, but stops the integration there
+    assert plain.counters["imu_gaps"] == 1
+    after = T0_NS + 3 * NS
+    a, b = plain.state_at(after), split.state_at(after)
+    for s in scene.samples:
+        whole.predict(s)
+    c = whole.state_at(after)
+    assert a is not None
+    assert b is not None
+    assert c is not None
+    sigma = [np.sqrt(np.trace(state.covariance[6:9, 6:9])) for state in (a, b, c)]
+    assert sigma[0] == pytest.approx(sigma[1], rel=0.1)
+    assert sigma[0] > 3.0
+    assert sigma[2] < 1.0  # tilt of 0.02 rad for 3 s
+    _, v, *_ = scene.motion.at(3.0)
+    error = v - a.velocity_world_m_s
+    assert error @ np.linalg.solve(a.covariance[6:9, 6:9], error) < 16.0
+
+
+def test_bad_samples_change_nothing_but_counters(scene: Scene) -> None:
+    clean, dirty = scene.ekf(), scene.ekf()
+    for k, s in enumerate(scene.samples[:400]):
+        clean.predict(s)
+        dirty.predict(s)
+        if k == 100:
+            dirty.predict(s)
+            dirty.predict(scene.samples[50])
+            dirty.predict(ImuSample(s.t_ns + 1, np.array([np.nan, 0, 0]), np.zeros(3)))
+    assert_same(clean.state(), dirty.state())
+    counters = dirty.counters
+    assert (counters["imu_duplicate"], counters["imu_backward"], counters["imu_nan"]) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"T_keyframe_body": np.full((4, 4), np.nan)}, "rigid"),
+        ({"T_keyframe_body": 2.0 * np.eye(4)}, "rigid"),
+        ({"covariance": np.full((6, 6), np.inf)}, "finite"),
+        ({"covariance": -np.eye(6)}, "positive"),
+        ({"covariance": np.eye(3)}, "6x6"),
+    ],
+)
+def test_unusable_motion_is_refused(scene: Scene, change: dict, reason: str) -> None:
+    ekf = scene.run(scene.ekf())
+    before = ekf.state()
+    result = ekf.update_vo(replace(scene.motions[-1], **change))
+    assert not result.accepted
+    assert reason in result.reason
+    assert ekf.counters["vo_invalid"] == 1
+    assert_same(before, ekf.state())
+
+
+def test_too_late_and_too_early() -> None:
+    scene = Scene(duration_s=3.0)
+    ekf = scene.run(scene.ekf(history_s=0.5))
+    result = ekf.add_keyframe(99, T0_NS + NS)
+    assert not result.accepted
+    assert "older than the history" in result.reason
+    assert ekf.counters["too_late"] == 1
+    assert ekf.pose_at(T0_NS + NS) is None
+    assert ekf.pose_at(scene.samples[-1].t_ns + 1) is None
+    fresh = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    assert not fresh.update_zero_velocity(0).accepted
+    assert fresh.pose_at(0) is None
+    with pytest.raises(ValueError, match="initialise"):
+        fresh.state()
+
+
+def test_an_outlier_is_gated(scene: Scene) -> None:
+    ekf = scene.run(scene.ekf())
+    before, last = ekf.state(), scene.motions[-1]
+    assert last.T_keyframe_body is not None
+    wrong = replace(last, T_keyframe_body=last.T_keyframe_body @ se3_exp(np.array([0, 0, 0, 0.5, 0, 0])))
+    result = ekf.update_vo(wrong)
+    assert not result.accepted
+    assert result.nis > 22.46
+    assert "innovation" in result.reason
+    assert_same(before, ekf.state())
+
+
+def test_sustained_rejection_widens_the_covariance_without_a_jump() -> None:
+    scene = Scene(duration_s=5.0)
+    ekf = scene.run(scene.ekf())
+    state = ekf.state()
+    wrong = replace(
+        state, velocity_world_m_s=state.velocity_world_m_s + np.array([1.5, 0.0, 0.0]), covariance=np.eye(15) * 1e-8
+    )
+    ekf.initialise(replace(wrong, t_ns=scene.stamps[40]))  # certain and wrong
+    ekf.add_keyframe(5, scene.stamps[40])
+    widened = None
+    for i in range(41, len(scene.stamps)):
+        before = ekf.state_at(scene.stamps[i])
+        ekf.update_vo(replace(scene.motions[i], keyframe_id=5))
+        after = ekf.state_at(scene.stamps[i])
+        if ekf.counters["soft_resets"]:
+            widened = (before, after)
+            break
+    assert widened is not None
+    before, after = widened
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before.T_world_body, after.T_world_body)
+    assert np.trace(after.covariance) > np.trace(before.covariance) + 1.0
+
+
+def test_zero_velocity_stops_the_drift_and_shows_the_gyro_bias() -> None:
+    bias = np.array([0.01, -0.02, 0.03])
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    sigmas = np.repeat([0.01, 0.001, 0.05, 0.05, 0.1], 3)
+    ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
+    for k in range(1, 2001):
+        ekf.predict(ImuSample(T0_NS + k * 5_000_000, bias, np.array([0.05, 0.0, GRAVITY_M_S2])))
+        if k % 10 == 0:
+            assert ekf.update_zero_velocity(T0_NS + k * 5_000_000 - 1_000_000).accepted
+    state = ekf.state()
+    assert np.linalg.norm(state.T_world_body[:3, 3]) < 0.05
+    np.testing.assert_allclose(state.gyro_bias_rad_s, bias, atol=1e-3)
+    moving = ekf.state()
+    ekf.initialise(replace(moving, velocity_world_m_s=np.array([1.0, 0, 0])))
+    assert not ekf.update_zero_velocity(moving.t_ns).accepted
+    assert ekf.counters["zero_velocity_gated"] == 1
+
+
+def test_feedback_moves_biases_only(scene: Scene) -> None:
+    ekf = scene.run(scene.ekf())
+    before = ekf.state()
+    result = ekf.feed_back(before.gyro_bias_rad_s + 5e-4, before.accel_bias_m_s2 + 0.02, 1e-3, np.full(3, 0.05))
+    assert result.accepted
+    after = ekf.state()
+    np.testing.assert_array_equal(before.T_world_body, after.T_world_body)
+    np.testing.assert_array_equal(before.velocity_world_m_s, after.velocity_world_m_s)
+    assert (after.gyro_bias_rad_s > before.gyro_bias_rad_s).all()
+    assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
+    gained = (before.covariance - after.covariance)[9:, 9:]  # the rest keeps its own and changes its correlations
+    assert np.linalg.eigvalsh(gained)[0] > -1e-12
+    np.testing.assert_allclose(after.covariance[:9, :9], before.covariance[:9, :9], atol=1e-15)
+    assert not ekf.feed_back(before.gyro_bias_rad_s + 1.0, before.accel_bias_m_s2, 1e-3, 0.05).accepted
+    assert not ekf.feed_back(np.full(3, np.nan), before.accel_bias_m_s2, 1e-3, 0.05).accepted
+    assert (ekf.counters["bias_accepted"], ekf.counters["bias_gated"], ekf.counters["bias_invalid"]) == (1, 1, 1)
+
+
+def test_pose_history_is_continuous(scene: Scene) -> None:
+    ekf = scene.run(scene.ekf())
+    t_ns = scene.stamps[-20] + np.arange(0, 400_000_000, 500_000)
+    poses = [ekf.pose_at(int(t)) for t in t_ns]
+    assert all(pose is not None for pose in poses)
+    positions = np.array([pose[:3, 3] for pose in poses if pose is not None])
+    truth = np.array([scene.motion.pose((t - T0_NS) * 1e-9)[:3, 3] for t in t_ns])
+    assert np.abs(np.diff(positions, axis=0) - np.diff(truth, axis=0)).max() < 5e-3
+    newest = ekf.pose_at(scene.samples[-1].t_ns)
+    assert newest is not None
+    np.testing.assert_allclose(newest, ekf.state().T_world_body, atol=1e-12)
+
+
+CAMERA = transform(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, -0.05, 0.2]))
+
+
+def test_directions_alone_keep_attitude_and_slow_the_drift() -> None:
+    scene = Scene(seed=3, camera=CAMERA)
+    free, seen = scene.ekf(), scene.ekf()
+    seen = Ekf(EkfConfig(imu_inflation=1.0, vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
+    seen.initialise(scene.ekf().state())
+    scene.run(seen)
+    for s in scene.samples:
+        free.predict(s)
+    T, *_ = scene.motion.at((seen.state().t_ns - T0_NS) * 1e-9)
+    drift = [np.linalg.norm(T[:3, 3] - ekf.state().T_world_body[:3, 3]) for ekf in (free, seen)]
+    assert drift[1] < 0.2 * drift[0]
+    assert seen.counters["vo_accepted"] > 0.95 * len(scene.stamps)
+
+
+def test_direction_from_behind_is_refused_and_no_parallax_gives_rotation() -> None:
+    scene = Scene(seed=3, camera=CAMERA)
+    ekf = Ekf(EkfConfig(imu_inflation=1.0, vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
+    ekf.initialise(scene.ekf().state())
+    scene.run(ekf)
+    last = scene.motions[-1]
+    assert last.T_keyframe_body is not None
+    backward, still = last.T_keyframe_body.copy(), last.T_keyframe_body.copy()
+    backward[:3, 3] *= -1.0
+    still[:3, 3] = 0.0
+    result = ekf.update_vo(replace(last, T_keyframe_body=backward))
+    assert not result.accepted
+    assert ekf.counters["vo_opposed"] == 1
+    before = ekf.state()
+    assert ekf.update_vo(replace(last, T_keyframe_body=still)).accepted
+    after = ekf.state()
+    assert np.linalg.norm(after.T_world_body[:3, 3] - before.T_world_body[:3, 3]) < 0.02
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10**6))
+def test_covariance_stays_positive(seed: int) -> None:
+    """Random gates, clones, outliers and rests in random order never break it."""
+    rng = np.random.default_rng(seed)
+    scene = Scene(seed=1, duration_s=1.5)
+    ekf = scene.ekf()
+    for s in scene.samples:
+        ekf.predict(s)
+        if rng.random() < 0.1:
+            ekf.add_keyframe(int(rng.integers(0, 3)), s.t_ns - int(rng.integers(0, 10**8)))
+        if rng.random() < 0.2:
+            T = se3_exp(rng.normal(size=6) * 0.05)
+            covariance = np.diag(rng.uniform(1e-8, 1e-2, 6))
+            t_ns = s.t_ns - int(rng.integers(0, 10**8))
+            ekf.update_vo(VoMeasurement(t_ns, int(rng.integers(0, 3)), T, covariance, True, Tracking.OK, 9))
+        if rng.random() < 0.02:
+            ekf.update_zero_velocity(s.t_ns)
+        P = ekf._P
+        assert np.linalg.eigvalsh(P)[0] > -1e-12 * np.trace(P)
+    np.testing.assert_array_equal(P, P.T)
+
+
+def test_right_jacobian_of_one_step() -> None:
+    J = np.empty((3, 3))
+    kernels._right_jacobian(0.01, -0.02, 0.015, 0.005, J)
+    np.testing.assert_allclose(J, 0.005 * so3_right_jacobian(np.array([0.01, -0.02, 0.015])), atol=1e-8)
