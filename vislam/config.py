@@ -228,13 +228,13 @@ class LoopConfig:
     min_agreeing_direction: int = 2  # witnesses of an edge without scale, which is never taken alone
     max_disagreeing_share: float = 0.25  # of the witnesses; the edges that were wrong by sigmas had at least a third
     neighbour_keyframes: int = 5  # witnesses are at most so far away, so that odometry to them is good
-    max_verifications: int = 6  # per keyframe, about 4 ms each: bounds the time of a keyframe
-    max_odometry: int = 4  # candidates per keyframe that the map's poses suggest
+    max_verifications: int = 5  # per keyframe, 4 to 7 ms each: bounds its time; 4 and 6 give the same accuracy
+    max_odometry: int = 3  # candidates per keyframe that the map's poses suggest
     odometry_skip_keyframes: int = 5  # the newest ones are tied by visual odometry already
     min_overlap: float = 0.35  # share of what is seen that a candidate should see too, by the map
     min_apart_keyframes: int = 3  # between odometry candidates, so that they constrain different places
     nominal_depth_m: float = 3.0  # of features without depth, to guess what two keyframes share
-    max_appearance: int = 3  # candidates per keyframe that look alike
+    max_appearance: int = 2  # candidates per keyframe that look alike
     retrieved: int = 10  # keyframes asked of the index before they are grouped into islands
     island_gap: int = 3  # ids in one island differ by at most this
     appearance_skip_keyframes: int = 20  # the newest ones always look most alike
@@ -269,7 +269,7 @@ class MapConfig:
     move_voxels: float = 1.0  # a keyframe corrected by more than this many voxels is integrated again
     move_deg: float = 1.0  # or turned by more than this: 7 cm at 4 m
     rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 5 ms each
-    cloud_voxel_m: float = 0.01  # one averaged point per voxel in cloud.ply
+    cloud_voxel_m: float = 0.015  # one averaged point per voxel in cloud.ply
     cloud_max_points: int = 1_500_000  # a larger cloud gets larger voxels: 22 MB
     cloud_min_points: int = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
     cloud_neighbours: int = 12  # statistical outlier removal: mean distance to so many neighbours

@@ -161,7 +161,7 @@ def test_a_tilted_copy_of_a_place_contradicts_gravity() -> None:
 
 
 def test_an_unsure_edge_waits_for_a_witness() -> None:
-    """Held to a sigma that none has, an edge is too unsure alone; parked, then promoted when a later keyframe says the same."""
+    """Held to a sigma that none has, an edge is too unsure alone: parked until a later keyframe says the same."""
     world, rng, poses = room(3, clutter_depth_m=0.5), np.random.default_rng(4), lap_poses(1.4, PER_LAP, 1.0)
     away = np.eye(4)
     away[:3, 3] = [30.0, 0.0, 0.0]
