@@ -282,9 +282,13 @@ class RunViewer:
         positions = np.array([T[:3, 3] for T in self._poses.values()])
         centre = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
         extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2.0)
-        return rrb.EyeControls3D(
-            position=centre + extent * np.array([-0.8, -1.1, 1.2]), look_target=centre, eye_up=[0.0, 0.0, 1.0]
+        up, back = np.array([0.0, 0.0, 1.0]), np.array([-0.6, -0.8, 0.0])
+        first = next(iter(self._poses.values()))[:3, :3] @ (
+            self._rig.T_body_cams[0][:3, :3] if self._rig else np.eye(3)
         )
+        if self._rig and -first[2, 1] < 0.3:  # without an IMU the map lies as the first camera did: look from behind it
+            up, back = -first[:, 1], -first[:, 2]
+        return rrb.EyeControls3D(position=centre + extent * (1.4 * back + 1.2 * up), look_target=centre, eye_up=up)
 
 
 def _keyframe_entity(keyframe_id: int) -> str:
