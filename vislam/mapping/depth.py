@@ -109,19 +109,34 @@ def _away_from_edges(depth: ImageF32, step: int, min_depth: float, ratio: float,
     out = np.zeros(((rows + step - 1) // step, (columns + step - 1) // step), np.uint16)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            v, u = i * step, j * step
-            z = depth[v, u]
-            if not (z >= min_depth and z < np.inf):
-                continue
-            smooth = True
-            for vv in range(max(v - reach, 0), min(v + reach, rows - 1) + 1):
-                for uu in range(max(u - reach, 0), min(u + reach, columns - 1) + 1):
-                    other = depth[vv, uu]
-                    if other > 0.0 and abs(other - z) > ratio * z * max(abs(vv - v), abs(uu - u)):
-                        smooth = False
-            if smooth:
+            z = depth[i * step, j * step]
+            if z >= min_depth and z < np.inf:
                 out[i, j] = np.uint16(min(np.floor(z / unit + 0.5), 65535.0))
+    for gap in range(1, reach + 1):  # also across holes that are narrower than the border
+        limit = np.float32(1.0 + ratio * gap)
+        for v in range(rows):
+            for u in range(columns):
+                z = depth[v, u]
+                if not (z > 0.0 and z < np.inf):
+                    continue
+                if u + gap < columns and _jumps(z, depth[v, u + gap], limit):
+                    _blank(out, step, v, v, u + gap - reach, u + reach)
+                if v + gap < rows and _jumps(z, depth[v + gap, u], limit):
+                    _blank(out, step, v + gap - reach, v + reach, u, u)
     return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _jumps(a: float, b: float, limit: float) -> bool:
+    return b > 0.0 and b < np.inf and (b > a * limit or a > b * limit)
+
+
+@njit(cache=True, nogil=True)
+def _blank(out: ImageU16, step: int, top: int, bottom: int, left: int, right: int) -> None:
+    """Zero the kept pixels in an inclusive box of full-size pixels."""
+    for i in range((max(top, 0) + step - 1) // step, min(bottom // step, out.shape[0] - 1) + 1):
+        for j in range((max(left, 0) + step - 1) // step, min(right // step, out.shape[1] - 1) + 1):
+            out[i, j] = 0
 
 
 @njit(cache=True, nogil=True)

@@ -28,6 +28,7 @@ _SUPERSAMPLING = 2
 _FIELD_OF_VIEW = np.deg2rad(38.0)
 _MARGIN = 0.05  # of the picture's size, left free on each side
 _NEAR_M = 0.02
+_LOOK_AHEAD_VOXELS = 3.0  # from a surface towards the eye: past the surface's own voxels, not past the next thing
 _HIDDEN_ALPHA = 0.3  # of a line behind a surface
 _EDL_STRENGTH = 60.0
 _BLENDED_M = 0.025  # depth noise of one surface seen from several keyframes
@@ -81,6 +82,26 @@ class _Eye:
         return _Eye(self.R, self.t, self.focal_px * factor, (self.centre_px + 0.5) * factor - 0.5)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """What a picture shows, turned so that up is z."""
+
+    points: NDArray[np.floating]  # [N, 3]
+    lines: list[Line]
+    style: Style
+    R_up: Array  # [3, 3] from the map frame
+    octree: Octree | None  # in the map frame
+
+    def seen_from(self, eye: _Eye, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return which points [N, 3] have known space in front of them, on their way to the eye."""
+        if self.octree is None:
+            return np.ones(len(points), np.bool_)
+        towards = -eye.R.T @ eye.t - points
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        before = points + towards * (_LOOK_AHEAD_VOXELS * self.octree.resolution_m)
+        return ~np.isnan(self.octree.log_odds_at(before @ self.R_up))
+
+
 @dataclass(eq=False)
 class _Canvas:
     """What is drawn so far, at the supersampled size."""
@@ -91,24 +112,31 @@ class _Canvas:
     surface: F32  # [H, W, 4] colour, and 1 where anything is
 
 
-def render_cloud(cloud: Cloud, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
-    """Return the picture [H, W, 3] RGB of a coloured cloud, seen from above at an angle."""
+def render_cloud(
+    cloud: Cloud, lines: Sequence[Line] = (), style: Style | None = None, octree: Octree | None = None
+) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of a coloured cloud, seen from above at an angle.
+
+    With the octree of the same map, surfaces that no keyframe saw from the picture's side are left out: near walls
+    open the view into their rooms.
+    """
     style = style or Style()
     R_up = level_rotation(np.array(style.up, dtype=np.float64))
     points, lines = cloud.points_m @ R_up.T, _turned(lines, R_up)
     below = points[:, 2] <= _ceiling_m(style, lines)
     points, colors = points[below], cloud.colors[below].astype(np.float32)
     spacing_m = _spacing_m(points)
-    canvas = _canvas(points, lines, style)
+    scene = _Scene(points, lines, style, R_up, octree)
+    canvas = _canvas(scene)
     pixels, z = canvas.eye.see(points)
-    ahead = z > _NEAR_M
+    ahead = (z > _NEAR_M) & scene.seen_from(canvas.eye, points)
     pixels, z, colors = pixels[ahead], z[ahead], colors[ahead]
     # discs close the surface; wider ones blend into each other and smooth the noise of depth
     radius = np.clip(canvas.eye.focal_px * spacing_m[ahead] / z, 1.0, 40.0).astype(np.float32)
     splat_depth(pixels, z, np.float32(0.8) * radius, canvas.depth)
     canvas.noise_m = _BLENDED_M
     canvas.surface = splat_colors(pixels, z, np.float32(1.25) * radius, colors, canvas.depth, _BLENDED_M)
-    return _finish(canvas, points, lines, style)
+    return _finish(canvas, scene)
 
 
 def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
@@ -119,54 +147,64 @@ def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = No
     below = points[:, 2] <= _ceiling_m(style, lines)
     triangles = mesh.triangles[below[mesh.triangles].all(axis=1)]
     used = points[np.unique(triangles)]
-    canvas = _canvas(used, lines, style)
+    scene = _Scene(used, lines, style, R_up, None)
+    canvas = _canvas(scene)
     _draw_triangles(canvas, points, mesh.colors.astype(np.float32), triangles)
-    return _finish(canvas, used, lines, style)
+    return _finish(canvas, scene)
 
 
 def render_octree(octree: Octree, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
-    """Return the picture [H, W, 3] RGB of an octree's occupied voxels as cubes coloured by height."""
+    """Return the picture [H, W, 3] RGB of an octree's occupied voxels as cubes coloured by height.
+
+    Only sides that border on free space are drawn: what was never seen from a side does not hide what was.
+    """
     style = style or Style()
     R_up = level_rotation(np.array(style.up, dtype=np.float64))
     lines = _turned(lines, R_up)
     voxels = octree.occupied_voxels()
+    open_sides = _open_sides(voxels, octree)
     centres = (voxels + 0.5) * octree.resolution_m @ R_up.T
     below = centres[:, 2] <= _ceiling_m(style, lines)
-    voxels, centres = voxels[below], centres[below]
-    canvas = _canvas(centres, lines, style)
+    voxels, centres, open_sides = voxels[below], centres[below], open_sides[below]
+    scene = _Scene(centres, lines, style, R_up, octree)
+    canvas = _canvas(scene)
     eye_voxels = (R_up.T @ (-canvas.eye.R.T @ canvas.eye.t)) / octree.resolution_m
-    corners, faces, owner, normals = _visible_faces(voxels, eye_voxels)
+    corners, faces, owner, normals = _visible_faces(voxels, open_sides, eye_voxels)
     colors = _height_colors(centres[:, 2])[owner] * (0.80 + 0.20 * (normals @ R_up.T)[:, 2:])
     colors *= 1.0 - 0.10 * np.abs((normals @ R_up.T)[:, :1])  # the two kinds of walls differ
     vertices = (corners * octree.resolution_m @ R_up.T).reshape(-1, 3)
     _draw_triangles(canvas, vertices, np.repeat(colors, 4, axis=0).astype(np.float32), faces)
-    return _finish(canvas, centres, lines, style)
+    return _finish(canvas, scene)
 
 
-def _visible_faces(voxels: NDArray[np.int64], eye: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int64], Array]:
-    """Return the free faces that look at the eye: corners [F, 4, 3], triangles [2F, 3], voxel [F], normal [F, 3]."""
-    base = voxels.min(axis=0, initial=0) - 1
-    extent = voxels.max(axis=0, initial=0) - base + 2
-    strides = np.array([1, extent[0], extent[0] * extent[1]])
-    codes = (voxels - base) @ strides
-    known = np.sort(codes)
+def _open_sides(voxels: NDArray[np.int64], octree: Octree) -> NDArray[np.bool_]:
+    """Return which of the six sides [N, 6] of voxels (-x, +x, -y, +y, -z, +z) border on free space."""
+    out = np.zeros((len(voxels), 6), np.bool_)
+    for side in range(6):
+        step = np.zeros(3)
+        step[side // 2] = 2 * (side % 2) - 1
+        out[:, side] = octree.log_odds_at((voxels + 0.5 + step) * octree.resolution_m) < 0.0
+    return out
+
+
+def _visible_faces(
+    voxels: NDArray[np.int64], open_sides: NDArray[np.bool_], eye: Array
+) -> tuple[Array, NDArray[np.int32], NDArray[np.int64], Array]:
+    """Return the open faces that look at the eye: corners [F, 4, 3], triangles [2F, 3], voxel [F], normal [F, 3]."""
     corners, owners, normals = [], [], []
-    for axis in range(3):
-        for side in (0, 1):
-            neighbour = codes + strides[axis] * (2 * side - 1)
-            place = np.minimum(np.searchsorted(known, neighbour), max(len(known) - 1, 0))
-            free = known[place] != neighbour if len(known) else np.zeros(0, np.bool_)
-            faces_eye = (eye[axis] - (voxels[:, axis] + side)) * (2 * side - 1) > 0.0
-            chosen = np.flatnonzero(free & faces_eye)
-            square = np.zeros((4, 3))
-            square[:, axis] = side
-            square[:, (axis + 1) % 3] = [0, 1, 1, 0]
-            square[:, (axis + 2) % 3] = [0, 0, 1, 1]
-            normal = np.zeros(3)
-            normal[axis] = 2 * side - 1
-            corners.append(voxels[chosen][:, None, :] + square)
-            owners.append(chosen)
-            normals.append(np.tile(normal, (len(chosen), 1)))
+    for face in range(6):
+        axis, side = face // 2, face % 2
+        faces_eye = (eye[axis] - (voxels[:, axis] + side)) * (2 * side - 1) > 0.0
+        chosen = np.flatnonzero(open_sides[:, face] & faces_eye)
+        square = np.zeros((4, 3))
+        square[:, axis] = side
+        square[:, (axis + 1) % 3] = [0, 1, 1, 0]
+        square[:, (axis + 2) % 3] = [0, 0, 1, 1]
+        normal = np.zeros(3)
+        normal[axis] = 2 * side - 1
+        corners.append(voxels[chosen][:, None, :] + square)
+        owners.append(chosen)
+        normals.append(np.tile(normal, (len(chosen), 1)))
     quads = np.concatenate(corners)
     first = 4 * np.arange(len(quads))[:, None]
     triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])]).astype(np.int32)
@@ -208,13 +246,12 @@ def _spacing_m(points: NDArray[np.floating]) -> Array:
     return np.clip(cell_m / np.sqrt(in_cell), usual, 1.7 * usual)
 
 
-def _canvas(points: NDArray[np.floating], lines: Sequence[Line], style: Style) -> _Canvas:
+def _canvas(scene: _Scene) -> _Canvas:
+    style = scene.style
     size = (style.size[0] * _SUPERSAMPLING, style.size[1] * _SUPERSAMPLING)
-    subject = _subject(points, lines)
-    if style.azimuth_deg is not None:
-        eye = _framed(subject, np.deg2rad(style.azimuth_deg), np.deg2rad(style.elevation_deg), size)
-    else:
-        eye = _best_eye(points, subject, lines, style, size)
+    subject = _subject(scene.points, scene.lines)
+    azimuth_rad = _best_azimuth_rad(scene, subject) if style.azimuth_deg is None else np.deg2rad(style.azimuth_deg)
+    eye = _framed(subject, azimuth_rad, np.deg2rad(style.elevation_deg), size)
     return _Canvas(eye, np.full(size[::-1], np.inf, np.float32), 0.0, np.zeros((*size[::-1], 4), np.float32))
 
 
@@ -250,24 +287,24 @@ def _framed(subject: Array, azimuth_rad: float, elevation_rad: float, size: tupl
     return _Eye(R, t, focal, 0.5 * np.array(size) - 0.5)
 
 
-def _best_eye(
-    points: NDArray[np.floating], subject: Array, lines: Sequence[Line], style: Style, size: tuple[int, int]
-) -> _Eye:
-    """Return the eye, of sixteen around the subject, that is near to it and sees most of the lines."""
-    small = (size[0] // 16, size[1] // 16)
-    path = np.concatenate([line.points_m for line in lines]) if lines else subject
-    some = np.asarray(points[:: max(1, len(points) // 20000)], dtype=np.float64)
-    best, best_score = None, -np.inf
+def _best_azimuth_rad(scene: _Scene, subject: Array) -> float:
+    """Return where to stand, of sixteen places around the subject: near to it, seeing much of map and lines."""
+    small = (scene.style.size[0] // 8, scene.style.size[1] // 8)
+    path = np.concatenate([line.points_m for line in scene.lines]) if scene.lines else subject
+    some = np.asarray(scene.points[:: max(1, len(scene.points) // 20000)], dtype=np.float64)
+    extent = float(np.linalg.norm(subject.max(axis=0) - subject.min(axis=0)))
+    best, best_score = 0.0, -np.inf
     for azimuth in np.arange(16) * np.pi / 8.0 + np.deg2rad(5.0):
-        eye = _framed(subject, azimuth, np.deg2rad(style.elevation_deg), small)
+        eye = _framed(subject, azimuth, np.deg2rad(scene.style.elevation_deg), small)
+        shown = scene.seen_from(eye, some)
         depth = np.full(small[::-1], np.inf, np.float32)
-        pixels, z = eye.see(some)
+        pixels, z = eye.see(some[shown])
         splat_depth(pixels, z, np.full(len(z), 1.0, np.float32), depth)
-        nearness = float(np.linalg.norm(subject.max(axis=0) - subject.min(axis=0))) / eye.t[2]
-        score = float(_is_visible(path, eye, depth).mean()) + nearness
+        visible = float(_is_visible(path, eye, depth).mean()) if len(path) else 0.0
+        score = visible + extent / eye.t[2] + float(shown.mean() if len(shown) else 0.0)
         if score > best_score + 1e-9:
-            best, best_score = azimuth, score
-    return _framed(subject, float(best or 0.0), np.deg2rad(style.elevation_deg), size)
+            best, best_score = float(azimuth), score
+    return best
 
 
 def _is_visible(points: Array, eye: _Eye, depth: F32) -> NDArray[np.bool_]:
@@ -283,15 +320,16 @@ def _draw_triangles(canvas: _Canvas, points: NDArray[np.floating], colors: F32, 
     fill_triangles(pixels, z, colors, np.ascontiguousarray(triangles[ahead]), canvas.depth, canvas.surface)
 
 
-def _finish(canvas: _Canvas, points: NDArray[np.floating], lines: Sequence[Line], style: Style) -> ImageU8:
+def _finish(canvas: _Canvas, scene: _Scene) -> ImageU8:
     """Light the surface, put it on paper, draw the lines and reduce to the asked size."""
+    style, points = scene.style, scene.points
     paper = np.full((*canvas.depth.shape, 3), _PAPER[style.background], np.uint8)
     if style.floor_grid and len(points):
         _draw_floor_grid(paper, canvas.eye, points, _GRID_LINE[style.background])
     light_onto(paper, canvas.surface, canvas.depth, _SUPERSAMPLING, _EDL_STRENGTH, canvas.noise_m)
     image = np.asarray(cv2.resize(paper, style.size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     eye = canvas.eye.scaled(1.0 / _SUPERSAMPLING)
-    for line in lines:
+    for line in scene.lines:
         visible = _is_visible(line.points_m, canvas.eye, canvas.depth)
         image = _with_line(image, eye, line, visible)
     return image
