@@ -61,7 +61,7 @@ def make_view(keyframe: Keyframe, rig: Rig) -> View:
     seen = np.isfinite(xy).all(axis=1)
     points_cam = None
     if points is not None:
-        known = np.isfinite(points[seen]).all(axis=1)
+        known = np.asarray(np.isfinite(points[seen]).all(axis=1), dtype=np.bool_)
         inside = transform_points(invert(rig.T_body_cams[0]), np.where(known[:, None], points[seen], np.nan))
         usable = known & (np.nan_to_num(inside[:, 2]) > 0.0)
         points_cam = np.where(usable[:, None], inside, np.nan).astype(np.float32)
