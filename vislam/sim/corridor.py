@@ -22,7 +22,7 @@ def motion(rng: np.random.Generator) -> BodySpline:
     """Return one round and eight metres more, with the bob and sway of walking."""
     around = [(_X, -_Y + 0.1), (_X - 0.1, _Y), (-_X, _Y - 0.1), (-_X + 0.1, -_Y)]
     inner = [(2.0, -_Y - 0.15), (6.0, -_Y + 0.2)]
-    path = rounded_path([(-4.0, -_Y), *inner, *around, (-4.5, -_Y + 0.05), (0.0, -_Y - 0.1), (4.0, -_Y)], 0.85)
+    path = rounded_path([(-4.0, -_Y), *inner, *around, (-4.5, -_Y + 0.05), (0.0, -_Y - 0.1), (4.0, -_Y)], 1.2)
     travel = Travel(path.length_m, _SPEED_M_S, 1.2, 2.3, 1.0)
     seed = int(rng.integers(0, 2**32))
 

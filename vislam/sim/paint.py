@@ -235,7 +235,7 @@ def tiles(
                 low = np.array([column * step - shift[0], row * step - shift[1]]) + 0.006 * ppm
                 high = low + step - 0.012 * ppm
                 points = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-                own = shade(rng, color, spread if rng.random() > 0.06 else 5.0 * spread)
+                own = shade(rng, color, spread if rng.random() > 0.06 else 3.0 * spread)
                 cv2.fillConvexPoly(image, np.round(points * 16).astype(np.int32), own, cv2.LINE_AA, 4)
         chips(rng, image, int(10 * height * width / ppm**2), (0.006 * ppm, 0.025 * ppm), 0.3)
         grey = noise(rng, height, width, (0.8 * ppm, 0.1 * ppm, 1.0), (0.04, 0.03, grain))

@@ -28,7 +28,7 @@ from vislam.trajectory import Trajectory
 _START_NS = 1_000_000_000_000  # not zero, so that nobody can rely on it
 _MARGIN_S = 0.05  # frames keep this distance from both ends, so that shutters and blur stay inside the motion
 Event = ImuSample | MagSample | Frame
-_AHEAD = 2  # frames under way or waiting, per worker
+_AHEAD = 3  # frames under way or waiting, per worker: enough to ride over a slow keyframe
 
 
 @dataclass(frozen=True, slots=True)
