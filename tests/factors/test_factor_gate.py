@@ -34,6 +34,13 @@ def test_chi2_of_true_loops_has_its_degrees_of_freedom(world: World) -> None:
     assert 4.5 < np.mean(values) < 6.5
 
 
+def test_a_graph_that_knows_nothing_lets_a_loop_pass(world: World) -> None:
+    model = _model(world.loop(0, 5, 105))
+    ignorant = np.zeros((6, 6))
+    ignorant[3, 3] = 1e30
+    assert model.chi2(world.truth[5], world.truth[105], ignorant) < model.threshold
+
+
 def test_group_forms_only_from_loops_that_agree(world: World) -> None:
     park, travel = CarPark(GraphConfig()), _travel(world)
     true = [_model(world.loop(n, 5 + 4 * n, 105 + 4 * n)) for n in range(3)]

@@ -11,7 +11,7 @@ from vislam.config import GraphConfig
 from vislam.factors import motion
 from vislam.factors.imu import Preintegrated, Preintegrator
 from vislam.factors.journal import KeyframeRecord, StartRecord
-from vislam.factors.keys import B, V, X, bias_of
+from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
 from vislam.factors.noise import gaussian, huber, inflated
 from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
@@ -169,7 +169,7 @@ class Builder:
             T = before.T_map_body @ transform(measured[:3, :3].copy(), step_m * measured[:3, 3])
         if integrated is None:
             velocity = (T[:3, 3] - before.T_map_body[:3, 3]) / duration_s
-        return Guess(np.ascontiguousarray(T), velocity, before.bias)
+        return Guess(nearest_rigid(T), velocity, before.bias)
 
 
 def insert_guess(values: gtsam.Values, k: int, guess: Guess, has_imu: bool) -> None:

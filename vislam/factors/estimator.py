@@ -13,8 +13,8 @@ import numpy as np
 
 from vislam.config import GraphConfig
 from vislam.factors.builder import Builder, Guess, Step, insert_guess, read_guess
-from vislam.factors.journal import KeyframeRecord, StartRecord
-from vislam.factors.keys import X, poses_of
+from vislam.factors.journal import SPEED_MAX_M_S, KeyframeRecord, StartRecord
+from vislam.factors.keys import X, nearest_rigid, poses_of
 from vislam.factors.loop import LoopModel
 from vislam.factors.solver import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
 from vislam.geometry import invert
@@ -154,22 +154,22 @@ class Estimator:
         try:
             values = optimize(graph, self._values, _BATCH_ITERATIONS)
             batch_cost = float(graph.error(values))
-            if batch_cost >= cost or not np.all(np.isfinite(poses_of(values))):
+            if not batch_cost < cost:
                 return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch reached {batch_cost:.6g}"
         except FAILURES as error:
             return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch failed: {_short(error)}"
         try:
             self._restart(values, [], self._new_solver(), from_batch=False)
+            self._take(values)
         except FAILURES as error:
-            note += self._recover(values, [], error) + "; "
-        self._take(values)
+            note += self._recover(self._values, [], error) + "; "
         return f"{note}batch at cost {batch_cost:.6g}, {self.solver_name} had {cost:.6g}"
 
     def _step(self, record: KeyframeRecord, previous: KeyframeRecord, values: gtsam.Values) -> Step:
         before = read_guess(values, previous.id, self.has_imu)
         motion = np.eye(4)
         if previous.id > 0:
-            motion = invert(values.atPose3(X(previous.id - 1)).matrix()) @ before.T_map_body
+            motion = nearest_rigid(invert(values.atPose3(X(previous.id - 1)).matrix()) @ before.T_map_body)
         return self._builder.keyframe(
             record, previous, before, last_motion=motion, has_imu=self.has_imu, vo_scale=self.vo_scale
         )
@@ -187,10 +187,14 @@ class Estimator:
         return ""
 
     def _take(self, values: gtsam.Values) -> None:
-        """Adopt an estimate; RuntimeError when it is not finite or not complete."""
+        """Adopt an estimate; RuntimeError when it is not complete, not finite or diverged."""
         poses = poses_of(values)
         if len(poses) != len(self._records) or not np.all(np.isfinite(poses)):
             raise RuntimeError("the solver's estimate is not finite or not complete")
+        durations_s = np.diff([record.t_ns for record in self._records]) * 1e-9
+        speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / durations_s
+        if np.any(speeds > SPEED_MAX_M_S):
+            raise RuntimeError(f"the solver diverged: a speed of {float(speeds.max()):.3g} m/s")
         self._values, self.poses = values, poses
 
     def _recover(self, values: gtsam.Values, fresh: list[LoopModel], error: Exception) -> str:
@@ -210,8 +214,10 @@ class Estimator:
         slots = solver.update(graph, values, [])
         self._solver = solver
         self._number(slots, self.loops)
-        estimate = solver.estimate()
-        self._take(estimate if np.all(np.isfinite(poses_of(estimate))) else values)
+        try:
+            self._take(solver.estimate())
+        except FAILURES:  # nothing converges: keep what was there, with the guess of the newest keyframe
+            self._values, self.poses = values, poses_of(values)
         return cause + "going on with batch Levenberg-Marquardt"
 
     def _new_solver(self) -> Solver:

@@ -8,10 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.errors import DataError
+from vislam.factors.keys import nearest_rigid
 from vislam.factors.noise import checked_covariance
 from vislam.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
 
 _RIGID = 1e-4  # how far R^T R may be from identity
+_USELESS_RAD = 0.5  # odometry that knows rotation or translation no better than this is as good as lost
+_USELESS_M = 10.0
+SPEED_MAX_M_S = 300.0  # nothing that carries a camera here is faster: such odometry, or such an estimate, is broken
 _TIME_SLACK_NS = 1_000_000  # an IMU span may overlap its keyframes by this much
 
 
@@ -93,6 +97,8 @@ def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> 
             raise DataError(f"{what}: its odometry is relative to keyframe {vo.keyframe_id}, expected {previous.id}")
         T = _checked_pose(vo.T_keyframe_body, f"{what}: odometry")
         covariance = checked_covariance(vo.covariance, 6, f"{what}: odometry")
+        if not _is_useful(T, covariance, vo.has_scale, (keyframe.t_ns - previous.t_ns) * 1e-9):
+            T = covariance = None
     imu = None if packet.imu is None else _checked_span(packet.imu, previous.t_ns, keyframe.t_ns, what)
     degraded = vo.tracking is Tracking.DEGRADED
     return KeyframeRecord(keyframe.id, keyframe.t_ns, T, covariance, vo.has_scale, degraded, imu, packet.at_rest)
@@ -108,6 +114,14 @@ def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:
     return LoopRecord(edge.id, edge.from_id, edge.to_id, T, covariance, edge.has_scale, newest_id)
 
 
+def _is_useful(T: Array, covariance: Array, has_scale: bool, duration_s: float) -> bool:
+    """Return whether odometry says something that can be believed; Gauss-Newton diverges on motions without."""
+    sigma_rad = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) if has_scale else 0.0
+    speed = float(np.linalg.norm(T[:3, 3])) / duration_s if has_scale else 0.0
+    return bool(sigma_rad < _USELESS_RAD and sigma_m < _USELESS_M and speed < SPEED_MAX_M_S)
+
+
 def _checked_pose(T: Array, what: str) -> Array:
     matrix = np.array(T, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
@@ -116,7 +130,7 @@ def _checked_pose(T: Array, what: str) -> Array:
     error = float(np.max(np.abs(R.T @ R - np.eye(3))))
     if error > _RIGID or np.linalg.det(R) < 0.0 or not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise DataError(f"{what}: pose is not a rigid motion, R^T R misses identity by {error:.3g}")
-    return matrix
+    return nearest_rigid(matrix)
 
 
 def _checked_span(span: ImuSpan, t0_ns: int, t1_ns: int, what: str) -> ImuSpan:

@@ -31,6 +31,18 @@ def bias_of(gyro_rad_s: Array, accel_m_s2: Array) -> gtsam.imuBias.ConstantBias:
     return gtsam.imuBias.ConstantBias(accel_m_s2, gyro_rad_s)
 
 
+def nearest_rigid(T: Array) -> Array:
+    """Return the rigid motion [4, 4] nearest to T, whose rotation is orthonormal but for rounding.
+
+    Without this, rounding grows by a constant factor where motions are continued from the ones before.
+    """
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = np.eye(4)
+    out[:3, :3] = U @ Vt
+    out[:3, 3] = T[:3, 3]
+    return out
+
+
 def poses_of(values: gtsam.Values) -> Array:
     """Return all poses [M, 4, 4], in the order of keyframe ids."""
     rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)

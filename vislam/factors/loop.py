@@ -20,6 +20,8 @@ from vislam.factors.visual import (
 from vislam.geometry import invert, se3_adjoint, se3_log
 from vislam.messages import Array
 
+_RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
+
 
 class LoopModel:
     """One loop edge, metric or scale-free: its factor, its residual and its chi-square."""
@@ -67,6 +69,7 @@ class LoopModel:
         """Return the chi-square of the residual; with the covariance [6, 6] of the relative pose, of the innovation."""
         residual, J = self.residual(T_from, T_to)
         S = self.covariance if relative_covariance is None else self.covariance + J @ relative_covariance @ J.T
+        S = conditioned(S, _RATIO_MAX)  # a graph that knows nothing about a pair gives a singular one
         return float(residual @ np.linalg.solve(S, residual))
 
     def weight(self, T_from: Array, T_to: Array) -> float:
