@@ -109,6 +109,9 @@ class Run:
         self.viewer.log_frame(frame, track.observations, track.vo.tracking)
         if step.T_map_body is not None:
             self.viewer.log_pose("live", frame.t_ns, step.T_map_body)
+        if step.front.T_odom_body is not None:
+            self.viewer.log_pose("ekf", frame.t_ns, step.front.T_odom_body)
+        self.viewer.log_scalars(frame.t_ns, _plotted(step))
         if track.vo.tracking != Tracking.OK:
             self.viewer.log_note(frame.t_ns, f"{track.vo.tracking}: {track.reason}")
         for keyframe in step.keyframes:
@@ -240,6 +243,16 @@ class Run:
                 f"{self.recording.name}: only {metrics['coverage_frames']:.0%} of the frames have a pose "
                 f"({metrics['initialisation']['reason']}); see tracking.csv and report.html in {self.out}"
             )
+
+
+def _plotted(step: Step) -> dict[str, float]:
+    """Return the numbers of a step that the viewer draws over time."""
+    track, state = step.front.track, step.front.state
+    values = {"tracking/inliers": float(track.vo.inliers), "tracking/parallax_px": track.median_parallax_px}
+    if state is not None:
+        for name, bias in (("gyro_bias_rad_s", state.gyro_bias_rad_s), ("accel_bias_m_s2", state.accel_bias_m_s2)):
+            values |= {f"{name}/{axis}": float(value) for axis, value in zip("xyz", bias, strict=True)}
+    return values
 
 
 def execute(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vislam.config import Config, dump
 from vislam.errors import StorageError, UsageError
-from vislam.messages import Array, LoopCandidate, NavState
+from vislam.messages import Array, LoopCandidate, LoopDecision, NavState
 from vislam.slam import KeyframeStep, Step
 from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
 
@@ -241,8 +241,9 @@ class RunLog:
         write_text(out / "tracking.csv", _csv(_TRACKING_HEADER, self._tracking))
         rows, decisions = [], {"candidates": len(self._candidates), "accepted": 0, "parked": 0, "rejected": 0}
         for candidate in self._candidates:
-            report = loop_reports.get(self._edge_ids.get((candidate.from_id, candidate.to_id), -1))
-            decision, reason = candidate.decision, candidate.reason
+            decision, reason, report = candidate.decision, candidate.reason, None
+            if decision == LoopDecision.ACCEPTED:  # a pair that was parked before has a row for that, too
+                report = loop_reports.get(self._edge_ids.get((candidate.from_id, candidate.to_id), -1))
             if report is not None:
                 decision, reason = report.decision, f"{candidate.reason}; {report.reason}"
             decisions[str(decision)] += 1
