@@ -180,6 +180,22 @@ def test_poisoned_update_is_survived(
     assert not failing.used_after_throw
 
 
+def test_batch_solver_takes_and_drops_loops(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = Failing(monkeypatch)
+    graph = started(world, 108)
+    failing.armed = 3
+    update = graph.add(world.packet(108))
+    assert update.details is not None and update.details["solver"] == "batch-lm"
+    assert graph.add(world.packet(109), [world.loop(1, 5, 105)]).accepted_loop_ids == (1,)
+    before = graph.poses()
+    estimator = graph._estimator
+    estimator.drop([estimator.loops[1]])
+    assert estimator.loops == {}
+    assert np.max(np.abs(graph.poses() - before)) > 1e-4
+    assert graph.relative_covariance(5, 105).shape == (6, 6)
+    assert "cost" in graph.finish().note
+
+
 @pytest.mark.parametrize(("failures", "kept"), [(1, True), (2, False)])
 def test_poisoned_loop_keeps_the_chain(
     world: World, monkeypatch: pytest.MonkeyPatch, failures: int, kept: bool
