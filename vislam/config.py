@@ -45,19 +45,21 @@ class FrontEndConfig:
     min_corner_response: float = 1.0  # (grey levels / px)^2, smaller eigenvalue; sensor noise gives less
     flow_window_px: int = 21  # Lucas-Kanade window: larger is robuster to blur, smaller to parallax
     flow_levels: int = 3  # pyramid levels above the image: reach of about 80 px around the predicted place
-    max_back_px: float = 0.7  # forward-backward disagreement of a good match
+    max_back_px: float = 1.5  # forward-backward disagreement of a good match; 0.7 drops blurred ones that still help
     max_misses: int = 2  # frames in a row that a track may fail before it is dropped
-    readout_s: float = 0.0  # rolling shutter: time between the first and the last row; 0 is global
-    track_sigma_px: float = 0.6  # Lucas-Kanade noise in one image
+    track_sigma_px: float = 0.8  # Lucas-Kanade noise of hand-held video; 0.3 in sharp images
+    readout_s: float | None = None  # rolling shutter, first to last row; 0 is global, None estimates it while running
 
     min_depth_m: float = 0.3  # nearer is out of focus or out of range
     max_depth_m: float = 8.0  # of depth images: beyond, structured light guesses
     depth_sigma_rho: float = 2e-3  # 1/m: sigma of z is this times z^2; 1.4e-3 is a Kinect's own, the rest registration
-    depth_edge_rho: float = 0.03  # 1/m: a larger step within 4x4 px is an edge, its depth belongs to nobody
+    depth_spread: float = 0.5  # of the spread of 1/z within 8x8 px: what a wrong registration by some pixels costs
+    depth_edge_rho: float = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
     stereo_window_px: int = 15  # smaller than in time: depth edges hurt, blur is the same in both images
     stereo_levels: int = 3  # pyramid levels above the image
     stereo_sigma_px: float = 0.3  # noise of the disparity
     epipolar_gate_px: float = 1.5  # distance from the epipolar line that calibration and noise explain
+    blind_sigma_m: float = 0.05  # trust in the predicted translation while no depth has been seen
 
     cauchy: float = 2.0  # scale of the robust kernel in standard deviations
     min_inliers: int = 15  # fewer: lost; six unknowns need some redundancy
@@ -67,9 +69,11 @@ class FrontEndConfig:
     patience_s: float = 0.4  # so long a lost keyframe is searched for before a new one starts
     min_start_corners: int = 40  # an image with fewer cannot start a keyframe
 
-    keyframe_parallax_px: float = 25.0  # median with rotation taken out
+    keyframe_parallax_px: float = 40.0  # median with rotation taken out
     keyframe_rotation_deg: float = 15.0  # patches turn with the camera and stop matching
-    keyframe_min_alive: float = 0.6  # fraction of the keyframe's tracks that are still followed
+    keyframe_min_alive: float = 0.5  # fraction of the keyframe's tracks that are still followed
+    keyframe_min_alive_unfit: float = 0.2  # the same for a frame without depth, which makes a poor keyframe
+    keyframe_min_inliers: int = 60  # fewer: new corners are worth the drift
     keyframe_min_interval_s: float = 0.15  # brisk motion: at most about six keyframes a second
     keyframe_max_interval_s: float = 2.0  # a camera at rest still reports
     described_features: int = 1000  # ORB keypoints per keyframe for loop closing
@@ -114,7 +118,7 @@ class EkfConfig:
     max_gap_s: float = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
     gap_gyro_rad_s: float = 0.5  # what the rate may have been inside a hole, against its interpolation
     gap_accel_m_s2: float = 2.0  # the same for specific force
-    imu_inflation: float = 4.0  # on the white-noise sigmas: vibration and aliasing are not in the data sheets
+    imu_inflation: float = 10.0  # on the white-noise sigmas, for vibration; flying EuRoC: innovations fit at 10, not 4
     vo_inflation: float = 1.5  # on the sigmas of visual odometry: covariances from residuals miss model errors
     vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
     gate_probability: float = 0.999  # chi-square gate on every innovation
@@ -217,6 +221,7 @@ class LoopConfig:
     sigma_floor_deg: float = 0.25
     direction_floor_deg: float = 2.0  # of a direction without scale: the lever arm of the camera is not in it
     max_sigma_m: float = 0.03  # a pose this good needs no witness; for a scene at 2 m, grows with depth
+    max_sigma_any_m: float = 0.10  # a worse pose is no edge and no witness: it can be half a metre off
     agreement_m: float = 0.15  # a witness differs by less; for a scene at 2 m, grows with depth
     agreement_deg: float = 8.0  # a witness differs by less
     agreement_sigmas: float = 3.0  # and by less than both standard deviations, taken together, explain

@@ -162,10 +162,10 @@ def test_a_tilted_copy_of_a_place_contradicts_gravity() -> None:
 
 def test_an_unsure_edge_waits_for_a_witness() -> None:
     """Held to a sigma that none has, an edge is too unsure alone: parked until a later keyframe says the same."""
-    world, rng, poses = room(3, clutter_depth_m=0.5), np.random.default_rng(4), lap_poses(1.4, PER_LAP, 1.0)
+    world, rng, poses = room(3), np.random.default_rng(4), lap_poses(1.4, PER_LAP)
     away = np.eye(4)
     away[:3, 3] = [30.0, 0.0, 0.0]
-    keyframes = [world.see(i, pose, rng, noise_px=1.3, count=300) for i, pose in enumerate(poses)]
+    keyframes = [world.see(i, pose, rng) for i, pose in enumerate(poses)]
     estimates = [pose if i < PER_LAP else away @ pose for i, pose in enumerate(poses)]
     strict = replace(CONFIG, max_sigma_m=1e-4, max_odometry=0, max_verifications=1)
     detector = LoopDetector(strict, world.rig, 0)

@@ -98,6 +98,8 @@ def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -
     for name, share in (("the other way round", found.reverse_agreement), ("in depth", found.depth_agreement)):
         if share < config.min_agreement_share:
             return f"only {share:.0%} agree {name}, needs {config.min_agreement_share:.0%}"
+    if found.has_scale and not found.sigma_m <= config.max_sigma_any_m:
+        return f"sigma {100.0 * found.sigma_m:.0f} cm, limit {100.0 * config.max_sigma_any_m:g}"
     if not found.has_scale and found.covariance is not None:
         worst = np.rad2deg(np.sqrt([np.linalg.eigvalsh(found.covariance[:3, :3])[-1], found.sigma_m**2]))
         if not (worst[0] <= config.max_rotation_sigma_deg and worst[1] <= config.max_direction_sigma_deg):

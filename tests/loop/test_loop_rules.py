@@ -1,0 +1,169 @@
+"""Candidates and acceptance rules one by one."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from landmark_world import body_pose, make_rig
+
+from vislam.config import LoopConfig
+from vislam.geometry import invert, se3_exp, transform_points
+from vislam.loop.candidates import AppearanceCandidates, islands, odometry_candidates, view_bounds
+from vislam.loop.checks import Measured, agree, agrees_with_map, judge, tilt_error_rad
+from vislam.loop.pose_table import PoseTable
+from vislam.loop.verifier import Verification
+from vislam.messages import Array, GraphUpdate, LoopDecision
+
+CONFIG = LoopConfig()
+GOOD = Verification(
+    "", 100, 40, 80, np.eye(4), np.eye(6) * 1e-4, True, sigma_m=0.02, median_depth_m=2.0, reverse_agreement=0.9,
+    depth_agreement=0.9,
+)  # fmt: skip
+
+
+@given(st.dictionaries(st.integers(0, 60), st.floats(0.01, 1.0), max_size=20), st.integers(1, 5))
+def test_islands_keep_every_keyframe_and_are_apart(retrieved: dict[int, float], gap: int) -> None:
+    ids = list(retrieved)
+    found = islands(ids, [retrieved[i] for i in ids], gap)
+    members = [[i for i in ids if island.first_id <= i <= island.last_id] for island in found]
+    assert sorted(itertools.chain(*members)) == sorted(ids)
+    for island, inside in zip(found, members, strict=True):
+        assert island.score == pytest.approx(sum(retrieved[i] for i in inside))
+        assert retrieved[island.best_id] == max(retrieved[i] for i in inside)
+    ordered = sorted(found, key=lambda island: island.first_id)
+    assert all(b.first_id - a.last_id > gap for a, b in itertools.pairwise(ordered))
+
+
+def test_places_that_persist_come_before_better_scores() -> None:
+    appearance = AppearanceCandidates(max_gap=3)
+    appearance.select([10, 11], [0.3, 0.2])
+    second = appearance.select([40, 12], [0.9, 0.2])
+    assert [(c.id, c.consistency) for c in second] == [(12, 1), (40, 0)]
+    assert [c.consistency for c in appearance.select([14], [0.1])] == [2]
+
+
+def _near(T_old: list[Array], T_new: Array, count: int = 5) -> list[int]:
+    rig = make_rig()
+    T_cam = T_new @ rig.T_body_cams[0]
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 8), np.linspace(-0.45, 0.45, 8))
+    points = np.column_stack([x.ravel(), y.ravel(), np.ones(64)]) * 3.0
+    cams = np.stack([invert(T @ rig.T_body_cams[0]) for T in T_old])
+    found = odometry_candidates(
+        transform_points(T_cam, points), T_cam[:3, 3].copy(), np.arange(len(T_old)), cams, view_bounds(rig.cameras[0]),
+        count, 0.35, 1,
+    )  # fmt: skip
+    return [candidate.id for candidate in found]
+
+
+def test_odometry_candidates_see_the_same_things() -> None:
+    new = body_pose((0.0, 0.0, 0.0), 0.0)
+    same, shifted = body_pose((0.1, 0.0, 0.0), 0.0), body_pose((0.0, 0.6, 0.0), -5.0)
+    turned, opposite = body_pose((0.0, 0.0, 0.0), 90.0), body_pose((6.0, 0.0, 0.0), 180.0)
+    far, close = body_pose((-8.0, 0.0, 0.0), 0.0), body_pose((2.3, 0.0, 0.0), 0.0)
+    assert _near([turned, shifted, opposite, same, far, close], new) == [3, 1]
+    assert _near([same] * 4, new, count=2) == [0, 1]
+
+
+def test_odometry_candidates_keep_apart() -> None:
+    new = body_pose((0.0, 0.0, 0.0), 0.0)
+    rig = make_rig()
+    cams = np.stack([invert(new @ rig.T_body_cams[0])] * 10)
+    points = transform_points(new @ rig.T_body_cams[0], np.array([[0.0, 0.0, 2.0]]))
+    found = odometry_candidates(
+        points, (new @ rig.T_body_cams[0])[:3, 3].copy(), np.arange(10), cams, view_bounds(rig.cameras[0]), 9, 0.3, 4
+    )
+    assert [candidate.id for candidate in found] == [0, 4, 8]
+
+
+@given(st.floats(-180.0, 180.0), st.floats(0.0, 60.0), st.floats(-180.0, 180.0))
+def test_tilt_ignores_heading_and_measures_the_rest(yaw: float, tilt: float, axis_deg: float) -> None:
+    T_from, T_to = body_pose((1.0, 2.0, 0.0), 40.0, 10.0, -5.0), body_pose((0.0, 1.0, 0.5), -70.0, -3.0, 8.0)
+    axis = np.array([np.cos(np.deg2rad(axis_deg)), np.sin(np.deg2rad(axis_deg)), 0.0]) * np.deg2rad(tilt)
+    error = se3_exp(np.concatenate([axis, np.zeros(3)])) @ body_pose((3.0, -1.0, 0.2), yaw)  # heading, then a tilt
+    measured = invert(T_from) @ error @ T_to
+    assert np.rad2deg(tilt_error_rad(measured, T_from, T_to)) == pytest.approx(tilt, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "tilt_deg", "agreeing", "disagreeing", "decision", "says"),
+    [
+        ({}, None, 0, 0, LoopDecision.ACCEPTED, "sigma 2.0 cm"),
+        ({}, 2.0, 3, 1, LoopDecision.ACCEPTED, "3 of 4 neighbours agree"),
+        ({}, None, 1, 2, LoopDecision.PARKED, "2 of 3 neighbours disagree"),
+        ({"sigma_m": 0.05}, None, 0, 0, LoopDecision.PARKED, "above 3.0 cm"),
+        ({"sigma_m": 0.05}, None, 1, 0, LoopDecision.ACCEPTED, "1 of 1"),
+        ({"sigma_m": 0.05, "median_depth_m": 8.0}, None, 0, 0, LoopDecision.ACCEPTED, "sigma 5.0 cm"),
+        ({"sigma_m": 0.5}, None, 9, 0, LoopDecision.REJECTED, "sigma 50 cm"),
+        ({"sigma_m": float("nan")}, None, 9, 0, LoopDecision.REJECTED, "sigma nan"),
+        ({}, 12.0, 9, 0, LoopDecision.REJECTED, "12.0 deg off gravity"),
+        ({"reverse_agreement": 0.2}, None, 9, 0, LoopDecision.REJECTED, "20% agree the other way round"),
+        ({"depth_agreement": 0.1}, None, 9, 0, LoopDecision.REJECTED, "10% agree in depth"),
+        ({"T_a_b": None, "reason": "5 matches, needs 12"}, None, 0, 0, LoopDecision.REJECTED, "5 matches, needs 12"),
+        ({"has_scale": False}, None, 1, 0, LoopDecision.PARKED, "needs 2 without depth"),
+        ({"has_scale": False}, None, 2, 0, LoopDecision.ACCEPTED, "2 of 2"),
+        ({"has_scale": False, "sigma_m": 0.3}, None, 9, 0, LoopDecision.REJECTED, "17.2 deg only"),
+    ],
+)
+def test_each_rule_decides_with_its_reason(
+    change: dict[str, float | None], tilt_deg: float | None, agreeing: int, disagreeing: int, decision: LoopDecision,
+    says: str,
+) -> None:  # fmt: skip
+    tilt = None if tilt_deg is None else float(np.deg2rad(tilt_deg))
+    judgement = judge(replace(GOOD, **change), tilt, agreeing, disagreeing, CONFIG)
+    assert judgement.decision is decision
+    assert says in judgement.reason
+
+
+def _table(poses: dict[int, Array]) -> PoseTable:
+    table = PoseTable()
+    for keyframe_id, pose in poses.items():
+        table.add(keyframe_id, pose)
+    return table
+
+
+def test_witnesses_agree_through_odometry() -> None:
+    """Two measurements of different pairs, in a map whose second half has drifted away as a whole."""
+    drift = body_pose((5.0, 1.0, 0.0), 30.0)
+    truth = {i: body_pose((0.3 * i, 0.1 * i, 0.0), 5.0 * i) for i in (1, 3)}
+    truth |= {i: body_pose((0.3 * (i - 50), 0.2, 0.0), 4.0 * (i - 50)) for i in (50, 52)}
+    table = _table({i: T if i < 10 else drift @ T for i, T in truth.items()})
+
+    def measured(a: int, b: int, error: Array, sigma_m: float = 0.02, scale: bool = True) -> Measured:
+        T = invert(truth[a]) @ truth[b] @ error
+        if not scale:
+            T[:3, 3] /= np.linalg.norm(T[:3, 3])
+        return Measured(a, b, T, scale, 2.0, sigma_m)
+
+    one = measured(1, 50, np.eye(4))
+    assert agree(one, measured(3, 52, np.eye(4)), table, CONFIG)
+    assert not agree(one, measured(3, 52, body_pose((0.2, 0.0, 0.0), 0.0)), table, CONFIG)
+    assert not agree(one, measured(3, 52, body_pose((0.0, 0.0, 0.0), 10.0)), table, CONFIG)
+    # as far as both sigmas explain, and no further
+    near = body_pose((0.0, 0.1, 0.0), 0.0)
+    assert agree(one, measured(3, 52, near, 0.03), table, CONFIG)
+    assert not agree(measured(1, 50, np.eye(4), 0.002), measured(3, 52, near, 0.002), table, CONFIG)
+    # without scale: rotations alike and rays that meet
+    flat = measured(1, 50, np.eye(4), scale=False)
+    assert agree(flat, measured(3, 52, np.eye(4), scale=False), table, CONFIG)
+    assert not agree(flat, measured(3, 52, body_pose((0.0, 0.0, 0.0), 20.0), scale=False), table, CONFIG)
+    backwards = measured(3, 52, np.eye(4), scale=False)
+    backwards.T_from_to[:3, 3] *= -1.0
+    assert not agree(flat, backwards, table, CONFIG)
+    assert not agree(one, measured(3, 52, np.eye(4), scale=False), table, CONFIG)
+    # the map itself is a witness only where it has not drifted
+    assert not agrees_with_map(one, table, CONFIG)
+    table.move(GraphUpdate(1, np.array([50, 52, 99]), np.stack([truth[50], truth[52], np.eye(4)]), np.eye(4), None))
+    assert agrees_with_map(one, table, CONFIG)
+
+
+def test_the_pose_table_grows_and_refuses_nonsense() -> None:
+    table = _table({2 * i: body_pose((float(i), 0.0, 0.0), 0.0) for i in range(200)})
+    assert len(table) == 200
+    assert table.ids.tolist() == list(range(0, 400, 2))
+    assert table[398][0, 3] == 199.0
+    for keyframe_id, pose in ((398, np.eye(4)), (500, np.full((4, 4), np.nan))):
+        with pytest.raises(ValueError, match=f"keyframe {keyframe_id}"):
+            table.add(keyframe_id, pose)
