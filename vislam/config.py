@@ -214,8 +214,9 @@ class LoopConfig:
     min_inliers_direction: int = 25  # of the essential matrix; wrong matches reached 15 in 5,735 pairs
     min_parallax_px: float = 6.0  # median that rotation does not explain; less, and the direction is noise
     max_plane_share: float = 0.8  # of the matches; a plane seen twice fits two directions (one was wrong by 109 deg)
-    # the fit's own covariance is several times too small (coarse octaves, depth bias, rolling shutter): with these three the
-    # mean squared error per degree of freedom is 1.0 on TUM fr1_desk, 0.4 on EuRoC MH_01, against motion capture
+    # the fit's own covariance is several times too small (coarse octaves, depth bias, rolling shutter): with these three
+    # the mean squared error per degree of freedom is 1.1 on TUM fr1_desk, 0.3 on EuRoC MH_01 (motion capture), and 0.1
+    # on simulated images, which are kinder than real ones
     covariance_inflation: float = 16.0  # of the fit's variance
     sigma_floor_m: float = 0.005
     sigma_floor_deg: float = 0.25
@@ -227,7 +228,7 @@ class LoopConfig:
     agreement_sigmas: float = 3.0  # and by less than both standard deviations, taken together, explain
     agreement_slack_m: float = 0.03  # beside what odometry adds between neighbours
     min_agreement_share: float = 0.5  # of matches that also agree the other way round, and in depth
-    max_tilt_deg: float = 5.0  # against gravity; true edges stay within 3 deg
+    max_tilt_deg: float = 5.0  # against gravity; well above the error of a good edge and of the map's own tilt
     max_rotation_sigma_deg: float = 2.0  # of an edge without scale
     max_direction_sigma_deg: float = 5.0  # of its direction
     min_agreeing_direction: int = 2  # witnesses of an edge without scale, which is never taken alone
@@ -245,7 +246,7 @@ class LoopConfig:
     appearance_skip_keyframes: int = 20  # the newest ones always look most alike
     appearance_skip_s: float = 5.0  # and so do those of the last seconds
     first_training: int = 10  # keyframes; before, none is old enough to be a candidate by appearance anyway
-    training_descriptors: int = 200_000  # at most, 0.5 s of training; more retrieves little better
+    training_descriptors: int = 200_000  # at most: bounds a training to about half a second
     vocabulary_branching: int = 10  # children of a node
     vocabulary_depth: int = 5  # levels; one less while there are few descriptors
 
@@ -267,10 +268,10 @@ class MapConfig:
     edge_ratio: float = 0.03  # a step to a neighbour pixel of more than this share of depth is an object's border
     edge_px: int = 2  # pixels left out on both sides of such a border, where sensors mix near and far
     speckle_pixels: int = 40  # smaller connected surfaces, in kept pixels, are noise
-    stereo_scale: float = 0.5  # image scale for dense stereo; 30 ms per 752x480 keyframe
-    stereo_disparity_sigma_px: float = 0.3  # of semi-global matching at that scale
+    stereo_scale: float = 0.5  # image scale for dense stereo; 15 ms per 752x480 keyframe, at 1.0 four times that
+    stereo_disparity_sigma_px: float = 0.2  # of semi-global matching at that scale
     stereo_max_range_m: float = 10.0  # as max_range_m, for dense stereo
-    stereo_max_sigma_m: float = 0.15  # farther stereo points, with a larger error of depth, only clear the way
+    stereo_max_sigma_m: float = 0.25  # farther stereo points, with a larger error of depth, only clear the way
     move_voxels: float = 1.0  # a keyframe corrected by more than this many voxels is integrated again
     move_deg: float = 1.0  # or turned by more than this: 7 cm at 4 m
     rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 5 ms each
