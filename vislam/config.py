@@ -214,7 +214,7 @@ class LoopConfig:
     min_inliers_direction: int = 25  # of the essential matrix; wrong matches reached 15 in 5,735 pairs
     min_parallax_px: float = 6.0  # median that rotation does not explain; less, and the direction is noise
     max_plane_share: float = 0.8  # of the matches; a plane seen twice fits two directions (one was wrong by 109 deg)
-    # the fit's own covariance is several times too small (coarse octaves, depth bias, rolling shutter): with these three
+    # the fit's own covariance is several times too small (coarse octaves, depth bias, rolling shutter): with these
     # the mean squared error per degree of freedom is 1.1 on TUM fr1_desk, 0.3 on EuRoC MH_01 (motion capture), and 0.1
     # on simulated images, which are kinder than real ones
     covariance_inflation: float = 16.0  # of the fit's variance
