@@ -256,7 +256,7 @@ class MapConfig:
     """Clouds, the occupancy octree, the navigation grid and the mesh."""
 
     enabled: bool = True
-    resolution_m: float = 0.05  # octree voxel and grid cell; fine enough for table edges, 4 ms per keyframe
+    resolution_m: float = 0.05  # octree voxel and grid cell; fine enough for table edges, 8 ms per keyframe
     insertion: Literal["discretised", "full"] = "discretised"  # one ray per end voxel; full: one per pixel, 10x dearer
     hit_probability: float = 0.7  # OctoMap's sensor model, so that our maps are its maps
     miss_probability: float = 0.4
@@ -274,7 +274,7 @@ class MapConfig:
     stereo_max_sigma_m: float = 0.25  # farther stereo points, with a larger error of depth, only clear the way
     move_voxels: float = 1.0  # a keyframe corrected by more than this many voxels is integrated again
     move_deg: float = 1.0  # or turned by more than this: 7 cm at 4 m
-    rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 5 ms each
+    rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 2 ms each
     cloud_voxel_m: float = 0.015  # one averaged point per voxel in cloud.ply
     cloud_max_points: int = 1_500_000  # a larger cloud gets larger voxels: 22 MB
     cloud_min_points: int = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud

@@ -109,15 +109,17 @@ class Alignment:
 def solve_gyro_bias(window: Window) -> Array:
     """Return the gyro bias [3] in rad/s that makes inertial rotations between neighbours agree with visual ones."""
     bias = np.zeros(3)
-    for _ in range(4):
-        A, b = np.eye(3) * 1e-9, np.zeros(3)
-        for i, span in enumerate(window.spans):
-            piece = preintegrate(span, bias)
-            error = so3_log(piece.dR.T @ window.rotations[i].T @ window.rotations[i + 1])
-            J = so3_left_jacobian_inverse(error) @ piece.dR_dgyro
-            A += J.T @ J
-            b += J.T @ error
-        bias = bias + np.linalg.solve(A, b)
+    for _ in range(2):  # integrated anew once: the first guess, zero, can be far off
+        pieces = [preintegrate(span, bias) for span in window.spans]
+        for _ in range(2):
+            A, b = np.eye(3) * 1e-9, np.zeros(3)
+            for i, piece in enumerate(pieces):
+                dR, _, _ = piece.corrected(bias, piece.accel_bias_m_s2)
+                error = so3_log(dR.T @ window.rotations[i].T @ window.rotations[i + 1])
+                J = so3_left_jacobian_inverse(error) @ piece.dR_dgyro
+                A += J.T @ J
+                b += J.T @ error
+            bias = bias + np.linalg.solve(A, b)
     return bias
 
 
@@ -222,11 +224,14 @@ def refine(window: Window, start: LinearSolution) -> Alignment:
     T[:, :3, 3] = (start.positions_m - start.positions_m[0]) @ R_world_visual.T
     v = start.velocities_m_s @ R_world_visual.T
     gyro_bias, accel_bias = start.gyro_bias_rad_s.copy(), start.accel_bias_m_s2.copy()
+    pieces = [preintegrate(span, gyro_bias, accel_bias, window.noise) for span in window.spans]
+    weights: list[Array] = [np.linalg.inv(piece.covariance + _FLOOR * np.eye(9)) for piece in pieces]
     cost = np.inf
     for _ in range(_ROUNDS):
         system = _NormalEquations(nodes)
         _add_priors(system, window, T[0], gyro_bias, accel_bias)
-        _add_inertial(system, window, T, v, gyro_bias, accel_bias)
+        for i, (piece, weight) in enumerate(zip(pieces, weights, strict=True)):
+            _add_inertial(system, i, piece, weight, (T, v, gyro_bias, accel_bias), window.gravity_m_s2)
         _add_visual(system, window, T)
         step = np.linalg.solve(system.H, system.g)
         d = step[: 9 * nodes].reshape(nodes, 9)
@@ -264,48 +269,54 @@ class _NormalEquations:
         self.cost = 0.0
         self.rows = 0
 
-    def add(self, columns: Sequence[int], residual: Array, J: Array, covariance: Array) -> None:
-        """Add a residual with `residual(x + d) = residual - J @ d`."""
-        weighted = np.linalg.solve(covariance, J)
+    def add(self, columns: Sequence[int], residual: Array, J: Array, weight: Array) -> None:
+        """Add a residual with `residual(x + d) = residual - J @ d` and the inverse of its covariance."""
+        weighted = weight @ J
         self.H[np.ix_(columns, columns)] += J.T @ weighted
         self.g[list(columns)] += weighted.T @ residual
-        self.cost += float(residual @ np.linalg.solve(covariance, residual))
+        self.cost += float(residual @ weight @ residual)
         self.rows += len(residual)
 
 
 def _add_priors(system: _NormalEquations, window: Window, T_first: Array, gyro_bias: Array, accel_bias: Array) -> None:
     size = len(system.g)
     heading = T_first[2:3, :3]  # body-side rotation about the world's z
-    system.add(range(3), np.zeros(1), heading, np.eye(1) * _GAUGE**2)
-    system.add(range(3, 6), -T_first[:3, 3], np.eye(3), np.eye(3) * _GAUGE**2)
+    system.add(range(3), np.zeros(1), heading, np.eye(1) / _GAUGE**2)
+    system.add(range(3, 6), -T_first[:3, 3], np.eye(3), np.eye(3) / _GAUGE**2)
     sigmas = np.repeat([window.gyro_bias_sigma_rad_s, window.accel_bias_sigma_m_s2], 3)
-    system.add(range(size - 6, size), -np.concatenate([gyro_bias, accel_bias]), np.eye(6), np.diag(sigmas**2))
+    system.add(range(size - 6, size), -np.concatenate([gyro_bias, accel_bias]), np.eye(6), np.diag(1.0 / sigmas**2))
 
 
 def _add_inertial(
-    system: _NormalEquations, window: Window, T: Array, v: Array, gyro_bias: Array, accel_bias: Array
+    system: _NormalEquations,
+    i: int,
+    piece: Preintegrated,
+    weight: Array,
+    state: tuple[Array, Array, Array, Array],
+    gravity_m_s2: float,
 ) -> None:
+    """Add the inertial piece from node i to i + 1, at poses, velocities, gyro bias and accel bias `state`."""
+    T, v, gyro_bias, accel_bias = state
     size = len(system.g)
-    gravity = np.array([0.0, 0.0, -window.gravity_m_s2])
-    for i, span in enumerate(window.spans):
-        piece = preintegrate(span, gyro_bias, accel_bias, window.noise)
-        R0, R1, dt = T[i, :3, :3], T[i + 1, :3, :3], piece.dt_s
-        rotation = so3_log(R1.T @ R0 @ piece.dR)
-        velocity = R0.T @ (v[i + 1] - v[i] - gravity * dt)
-        position = R0.T @ (T[i + 1, :3, 3] - T[i, :3, 3] - v[i] * dt - 0.5 * gravity * dt * dt)
-        residual = np.concatenate([rotation, piece.dv_m_s - velocity, piece.dp_m - position])
-        J = np.zeros((9, 24))  # of `predicted`: node i, node i + 1, gyro bias, accel bias
-        right = so3_right_jacobian_inverse(rotation)
-        J[:3, :3] = -right @ piece.dR.T
-        J[:3, 9:12] = so3_left_jacobian_inverse(rotation)
-        J[:3, 18:21] = -right @ piece.dR_dgyro
-        J[3:6, :3], J[6:, :3] = skew(velocity), skew(position)
-        J[3:6, 6:9], J[3:6, 15:18] = -R0.T, R0.T
-        J[6:, 3:6], J[6:, 6:9], J[6:, 12:15] = -R0.T, -dt * R0.T, R0.T
-        J[3:6, 18:21], J[3:6, 21:] = -piece.dv_dgyro, -piece.dv_daccel
-        J[6:, 18:21], J[6:, 21:] = -piece.dp_dgyro, -piece.dp_daccel
-        columns = [*range(9 * i, 9 * i + 18), *range(size - 6, size)]
-        system.add(columns, residual, J, piece.covariance + _FLOOR * np.eye(9))
+    gravity = np.array([0.0, 0.0, -gravity_m_s2])
+    dR, dv, dp = piece.corrected(gyro_bias, accel_bias)
+    R0, R1, dt = T[i, :3, :3], T[i + 1, :3, :3], piece.dt_s
+    rotation = so3_log(R1.T @ R0 @ dR)
+    velocity = R0.T @ (v[i + 1] - v[i] - gravity * dt)
+    position = R0.T @ (T[i + 1, :3, 3] - T[i, :3, 3] - v[i] * dt - 0.5 * gravity * dt * dt)
+    residual = np.concatenate([rotation, dv - velocity, dp - position])
+    J = np.zeros((9, 24))  # of what the states predict: node i, node i + 1, gyro bias, accel bias
+    right = so3_right_jacobian_inverse(rotation)
+    J[:3, :3] = -right @ dR.T
+    J[:3, 9:12] = so3_left_jacobian_inverse(rotation)
+    J[:3, 18:21] = -right @ piece.dR_dgyro
+    J[3:6, :3], J[6:, :3] = skew(velocity), skew(position)
+    J[3:6, 6:9], J[3:6, 15:18] = -R0.T, R0.T
+    J[6:, 3:6], J[6:, 6:9], J[6:, 12:15] = -R0.T, -dt * R0.T, R0.T
+    J[3:6, 18:21], J[3:6, 21:] = -piece.dv_dgyro, -piece.dv_daccel
+    J[6:, 18:21], J[6:, 21:] = -piece.dp_dgyro, -piece.dp_daccel
+    columns = [*range(9 * i, 9 * i + 18), *range(size - 6, size)]
+    system.add(columns, residual, J, weight)
 
 
 def _add_visual(system: _NormalEquations, window: Window, T: Array) -> None:
@@ -322,4 +333,5 @@ def _add_visual(system: _NormalEquations, window: Window, T: Array) -> None:
             covariance = motion.covariance
             rows = 6 if motion.has_scale else 3
         J = np.hstack([J_a, J_b])[:rows]
-        system.add(columns, residual[:rows], J, covariance[:rows, :rows] + _FLOOR * np.eye(rows))
+        weight = np.linalg.inv(covariance[:rows, :rows] + _FLOOR * np.eye(rows))
+        system.add(columns, residual[:rows], J, weight)
