@@ -118,6 +118,21 @@ def test_a_reader_keeps_the_map_it_holds():
     assert mapper.occupancy is not held
 
 
+@pytest.mark.parametrize(
+    ("tangent", "followed"),
+    [
+        ([0.0, 0.0, 0.0, 0.049, 0.0, 0.0], False),
+        ([0.0, 0.0, 0.0, 0.0, 0.051, 0.0], True),
+        ([0.0, np.deg2rad(0.95), 0.0, 0.0, 0.0, 0.0], False),
+        ([0.0, 0.0, np.deg2rad(-1.05), 0.0, 0.0, 0.0], True),
+    ],
+)
+def test_one_voxel_or_one_degree_decides(tangent, followed):
+    mapper = mapper_at(TRUE[:3])
+    mapper.move(update([1], [TRUE[1] @ se3_exp(np.array(tangent))]))
+    assert mapper.counters["rebuilds"] == int(followed)
+
+
 def test_poses_of_unknown_keyframes_are_ignored():
     mapper = mapper_at(TRUE[:3])
     before = digest(mapper)
@@ -204,6 +219,13 @@ def test_a_stereo_frame_without_its_partner_falls_back():
     mapper.add(sparse_keyframe(1, None), np.eye(4))
     assert mapper.counters["keyframes_sparse"] == 1
     assert mapper.counters["keyframes_without_depth"] == 1
+
+
+def test_stereo_images_of_another_size_are_refused():
+    rig = Rig((CAMERA, CAMERA), (T_BODY_CAM0, T_BODY_CAM0 @ transform(np.eye(3), np.array([0.1, 0.0, 0.0]))))
+    frame = Frame(0, 0, (np.zeros((120, 160), np.uint8), np.zeros((240, 320), np.uint8)))
+    with pytest.raises(DataError, match="320x240"):
+        Mapper(CONFIG, rig).add(Keyframe(0, 0, frame, np.zeros((0, 2)), np.zeros((0, 32), np.uint8), None), np.eye(4))
 
 
 def test_export_is_whole_and_the_same_every_time(tmp_path):

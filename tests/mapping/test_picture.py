@@ -92,6 +92,35 @@ def test_octree_cubes_show_height_by_colour():
     assert np.flatnonzero(warm.any(axis=1)).mean() < np.flatnonzero(cold.any(axis=1)).mean()  # high is red and up
 
 
+def room_seen_from_inside():
+    """A floor and four walls with their octree; the wall at y = -1, seen from inside only, is blue."""
+    along, up = (grid.ravel() for grid in np.meshgrid(np.arange(-1.0, 1.0, 0.02), np.arange(0.0, 1.2, 0.02)))
+    sides = [(along, np.full(along.size, y), up) for y in (-1.0, 1.0)]
+    sides += [(np.full(along.size, x), along, up) for x in (-1.0, 1.0)]
+    walls = np.concatenate([np.column_stack(side) for side in sides]).astype(np.float32)
+    floor = plate(0.0, RED).points_m
+    colors = np.where(np.arange(len(walls))[:, None] < along.size, BLUE, RED)
+    cloud = Cloud(
+        np.concatenate([walls, floor]), np.concatenate([colors, np.tile(RED, (len(floor), 1))]).astype(np.uint8)
+    )
+    grid = OccupancyMap(0.1)
+    for eye in ([0.0, 0.0, 0.6], [0.5, 0.5, 0.9], [-0.5, -0.5, 0.9]):
+        grid.insert(cloud.points_m, np.array(eye))
+    return cloud, grid.octree()
+
+
+def test_near_walls_open_the_view_into_the_room():
+    cloud, octree = room_seen_from_inside()
+    style = Style(size=SIZE, azimuth_deg=-90.0, elevation_deg=30.0, floor_grid=False)
+    assert share(render_cloud(cloud, style=style), BLUE) > 0.1
+    assert share(render_cloud(cloud, style=style, octree=octree), BLUE) < 0.005
+    from_behind = Style(size=SIZE, azimuth_deg=90.0, elevation_deg=30.0, floor_grid=False)
+    assert share(render_cloud(cloud, style=from_behind, octree=octree), BLUE) > 0.1
+    image = render_octree(octree, style=style)
+    floor = image[SIZE[1] // 2 : -20, SIZE[0] // 2]  # the lower middle looks past the near wall onto the floor
+    assert (floor[:, 2].astype(int) > floor[:, 0].astype(int) + 40).mean() > 0.5
+
+
 def test_a_mesh_is_drawn_with_its_colours():
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     mesh = Mesh(corners, np.tile(np.array(BLUE, np.uint8), (4, 1)), np.array([[0, 1, 2], [0, 2, 3]], np.int32))

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import MapConfig
-from vislam.geometry import invert, so3_log
 from vislam.mapping.depth import DepthView, scan_points
 from vislam.mapping.occupancy import OccupancyMap
 from vislam.mapping.store import KeyframeStore, Scan
@@ -58,7 +57,7 @@ class CorrectedOccupancy:
     def advance(self, max_keyframes: int) -> None:
         """Do one slice of rebuilding: start when keyframes have moved by more than the limits, swap when complete."""
         if self._next is None:
-            if not any(self._moved(i) for i in self._poses):
+            if not self._any_moved():
                 return
             self._next, self._next_poses = _new_map(self._config), {}
         waiting = [i for i in self._poses if i not in self._next_poses][:max_keyframes]
@@ -80,10 +79,16 @@ class CorrectedOccupancy:
         self._next, self._next_poses = _new_map(self._config), {}
         self.advance(len(self._poses))
 
-    def _moved(self, keyframe_id: int) -> bool:
-        change = invert(self._current_poses[keyframe_id]) @ self._poses[keyframe_id]
-        far = np.linalg.norm(change[:3, 3]) > self._config.move_voxels * self._config.resolution_m
-        return bool(far or np.linalg.norm(so3_log(change[:3, :3].copy())) > np.deg2rad(self._config.move_deg))
+    def _any_moved(self) -> bool:
+        """Return whether a keyframe is farther from where it was integrated than the limits allow."""
+        if not self._poses:
+            return False
+        old = np.array([self._current_poses[i] for i in self._poses])
+        new = np.array(list(self._poses.values()))
+        far_m = self._config.move_voxels * self._config.resolution_m
+        moved = np.linalg.norm(new[:, :3, 3] - old[:, :3, 3], axis=1) > far_m
+        trace = np.einsum("nij,nij->n", old[:, :3, :3], new[:, :3, :3])  # 1 + 2 cos(angle) of the turn between them
+        return bool((moved | (trace < 1.0 + 2.0 * np.cos(np.deg2rad(self._config.move_deg)))).any())
 
     def _integrate(self, occupancy: OccupancyMap, scan: Scan, T_map_body: Array) -> None:
         config = self._config

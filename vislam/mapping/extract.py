@@ -21,7 +21,7 @@ class ScanExtractor:
 
     def __init__(self, config: MapConfig, rig: Rig) -> None:
         self._config = config
-        self._camera = rig.cameras[0]
+        self._cameras = rig.cameras
         self._stereo = DenseStereo(rig, config) if rig.is_stereo and not rig.has_depth else None
         self.view: DepthView = self._stereo.view if self._stereo else rgbd_view(rig, config)
         self.counters = {"keyframes_dense": 0, "keyframes_sparse": 0, "keyframes_without_depth": 0}
@@ -43,12 +43,14 @@ class ScanExtractor:
         if self._stereo is not None:
             if len(frame.images) < 2:
                 return None
+            for camera, picture in zip(self._cameras, frame.images, strict=False):
+                camera.check_image(picture)
             depth_m, grey = self._stereo.match(frame.images[0], frame.images[1])
             return Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(grey))
         if frame.depth_m is None:
             return None
         image = frame.images[0] if frame.color is None else frame.color
-        self._camera.check_image(image)
+        self._cameras[0].check_image(image)
         depth = filter_depth(frame.depth_m, self._config.pixel_step, self.view, self._config)
         return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
 

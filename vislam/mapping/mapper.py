@@ -55,7 +55,8 @@ class Mapper:
 
         Raises DataError on a pose that is not rigid, an id seen before, or images that are not the camera's size.
         """
-        T = _rigid(T_map_body, keyframe.id)
+        T = np.array(T_map_body, dtype=np.float64)
+        _check_rigid(T[None], np.array([keyframe.id]))
         scan = self._extractor.extract(keyframe)
         if scan is None:
             return
@@ -63,9 +64,11 @@ class Mapper:
         self._occupancy.add(keyframe.id, scan, T)
 
     def move(self, update: GraphUpdate) -> None:
-        """Take over corrected poses, and re-integrate a bounded number of keyframes if some moved by a voxel."""
-        for keyframe_id, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
-            _rigid(T, keyframe_id)
+        """Take over corrected poses, and re-integrate a bounded number of keyframes if some moved by a voxel.
+
+        Raises DataError, and changes nothing, when a pose is not rigid.
+        """
+        _check_rigid(np.asarray(update.T_map_body, dtype=np.float64), update.ids)
         self._occupancy.move(update.ids, update.T_map_body)
         self._occupancy.advance(self._config.rebuild_keyframes_per_call)
 
@@ -141,14 +144,19 @@ class Mapper:
         return Cloud((points_body @ T_frame_body[:3, :3].T + T_frame_body[:3, 3]).astype(np.float32), scan.colors)
 
 
-def _rigid(T: Array, keyframe_id: int) -> Array:
-    """Return a copy of a pose; raises DataError when it is not a rigid transform."""
-    pose = np.array(T, dtype=np.float64)
-    rigid = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
-    if rigid:
-        R = pose[:3, :3]
-        rigid = bool(np.allclose(R @ R.T, np.eye(3), atol=_RIGID_TOLERANCE) and np.linalg.det(R) > 0.0)
-        rigid = rigid and bool(np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]))
-    if not rigid:
-        raise DataError(f"the map pose of keyframe {keyframe_id} is not a rigid transform: {pose.tolist()}")
-    return pose
+def _check_rigid(T: Array, keyframe_ids: NDArray[np.int64]) -> None:
+    """Raise DataError when one of the poses [M, 4, 4] is not a rigid transform."""
+    if len(keyframe_ids) == 0:
+        return
+    if T.shape != (len(keyframe_ids), 4, 4):
+        raise DataError(
+            f"the map pose of keyframe {keyframe_ids[0]} is not a rigid transform: its shape is {T.shape[1:]}"
+        )
+    R = T[:, :3, :3]
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        rigid = (error <= _RIGID_TOLERANCE) & (np.linalg.det(R) > 0.0)
+    rigid &= np.isfinite(T).all(axis=(1, 2)) & (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    if not rigid.all():
+        first = int(np.flatnonzero(~rigid)[0])
+        raise DataError(f"the map pose of keyframe {keyframe_ids[first]} is not a rigid transform: {T[first].tolist()}")

@@ -18,7 +18,7 @@ from vislam.geometry import level_rotation
 from vislam.mapping.cloud import Cloud, cells_of
 from vislam.mapping.mesh import Mesh
 from vislam.mapping.octree import Octree
-from vislam.mapping.raster import fill_triangles, light_onto, splat_colors, splat_depth
+from vislam.mapping.raster import fill_triangles, light_onto, project_points, splat_colors, splat_depth
 
 Array = NDArray[np.float64]
 ImageU8 = NDArray[np.uint8]
@@ -28,11 +28,12 @@ _SUPERSAMPLING = 2
 _FIELD_OF_VIEW = np.deg2rad(38.0)
 _MARGIN = 0.05  # of the picture's size, left free on each side
 _NEAR_M = 0.02
-_LOOK_AHEAD_VOXELS = 3.0  # from a surface towards the eye: past the surface's own voxels, not past the next thing
+_LOOK_AHEAD_VOXELS = (3.0, 6.0)  # from a surface towards the eye: past its own voxels, also at a grazing angle
 _HIDDEN_ALPHA = 0.3  # of a line behind a surface
 _EDL_STRENGTH = 60.0
 _BLENDED_M = 0.025  # depth noise of one surface seen from several keyframes
 _CEILING_ABOVE_PATH_M = 0.5
+_WALL_HEIGHT_M = 1.8  # of walls that are left standing at least
 _PALENESS = 0.15  # of the colours of height, so that shading and lines stand out
 _PAPER = {"white": (255, 255, 255), "dark": (18, 20, 26)}
 _GRID_LINE = {"white": (226, 229, 233), "dark": (44, 48, 58)}
@@ -44,7 +45,7 @@ class Line:
 
     points_m: Array  # [N, 3]
     color: tuple[int, int, int]  # RGB
-    width_px: float = 3.0
+    width_px: float = 2.5
     marks_ends: bool = True  # a ring at the start, a dot at the end
 
 
@@ -55,7 +56,7 @@ class Style:
     size: tuple[int, int] = (1600, 900)  # width, height
     background: Literal["white", "dark"] = "white"
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # opposite to gravity, where the map is not levelled
-    ceiling_m: float | None = None  # cut away what is higher along up; None: half a metre above the lines
+    ceiling_m: float | None = None  # cut away what is higher along up; None: above the lines and at 1.8 m or more
     azimuth_deg: float | None = None  # where the eye stands, seen from the middle; None: where it sees the lines best
     elevation_deg: float = 42.0
     floor_grid: bool = True  # lines every metre at the height of the lowest points
@@ -72,10 +73,9 @@ class _Eye:
 
     def see(self, points: NDArray[np.floating]) -> tuple[F32, F32]:
         """Return pixels [N, 2] and depth [N] of points [N, 3]; meaningless where depth is not positive."""
-        local = points @ self.R.T + self.t
-        z = np.maximum(local[:, 2], _NEAR_M)
-        pixels = self.focal_px * local[:, :2] / z[:, None] + self.centre_px
-        return pixels.astype(np.float32), local[:, 2].astype(np.float32)
+        rows = np.ascontiguousarray(points, dtype=np.float64)
+        pixels, z = project_points(rows, self.R, self.t, self.focal_px, self.centre_px, _NEAR_M)
+        return pixels, z
 
     def scaled(self, factor: float) -> _Eye:
         """Return the eye for the picture resized by a factor."""
@@ -98,8 +98,11 @@ class _Scene:
             return np.ones(len(points), np.bool_)
         towards = -eye.R.T @ eye.t - points
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        before = points + towards * (_LOOK_AHEAD_VOXELS * self.octree.resolution_m)
-        return ~np.isnan(self.octree.log_odds_at(before @ self.R_up))
+        known = np.zeros(len(points), np.bool_)
+        for voxels in _LOOK_AHEAD_VOXELS:
+            before = points + towards * (voxels * self.octree.resolution_m)
+            known |= ~np.isnan(self.octree.log_odds_at(before @ self.R_up))
+        return known
 
 
 @dataclass(eq=False)
@@ -123,7 +126,7 @@ def render_cloud(
     style = style or Style()
     R_up = level_rotation(np.array(style.up, dtype=np.float64))
     points, lines = cloud.points_m @ R_up.T, _turned(lines, R_up)
-    below = points[:, 2] <= _ceiling_m(style, lines)
+    below = points[:, 2] <= _ceiling_m(style, lines, points)
     points, colors = points[below], cloud.colors[below].astype(np.float32)
     spacing_m = _spacing_m(points)
     scene = _Scene(points, lines, style, R_up, octree)
@@ -144,7 +147,7 @@ def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = No
     style = style or Style()
     R_up = level_rotation(np.array(style.up, dtype=np.float64))
     points, lines = mesh.points_m @ R_up.T, _turned(lines, R_up)
-    below = points[:, 2] <= _ceiling_m(style, lines)
+    below = points[:, 2] <= _ceiling_m(style, lines, points)
     triangles = mesh.triangles[below[mesh.triangles].all(axis=1)]
     used = points[np.unique(triangles)]
     scene = _Scene(used, lines, style, R_up, None)
@@ -164,7 +167,7 @@ def render_octree(octree: Octree, lines: Sequence[Line] = (), style: Style | Non
     voxels = octree.occupied_voxels()
     open_sides = _open_sides(voxels, octree)
     centres = (voxels + 0.5) * octree.resolution_m @ R_up.T
-    below = centres[:, 2] <= _ceiling_m(style, lines)
+    below = centres[:, 2] <= _ceiling_m(style, lines, centres)
     voxels, centres, open_sides = voxels[below], centres[below], open_sides[below]
     scene = _Scene(centres, lines, style, R_up, octree)
     canvas = _canvas(scene)
@@ -226,11 +229,14 @@ def _turned(lines: Sequence[Line], R: Array) -> list[Line]:
     return [replace(line, points_m=line.points_m[np.isfinite(line.points_m).all(axis=1)] @ R.T) for line in lines]
 
 
-def _ceiling_m(style: Style, lines: Sequence[Line]) -> float:
+def _ceiling_m(style: Style, lines: Sequence[Line], points: NDArray[np.floating]) -> float:
     if style.ceiling_m is not None:
         return style.ceiling_m
     heights = [float(line.points_m[:, 2].max()) for line in lines if len(line.points_m)]
-    return max(heights) + _CEILING_ABOVE_PATH_M if heights else np.inf
+    if not heights or len(points) == 0:
+        return np.inf
+    floor = float(np.percentile(points[:: max(1, len(points) // 20000), 2], 1.0))
+    return max(max(heights) + _CEILING_ABOVE_PATH_M, floor + _WALL_HEIGHT_M)
 
 
 def _spacing_m(points: NDArray[np.floating]) -> Array:
@@ -301,7 +307,7 @@ def _best_azimuth_rad(scene: _Scene, subject: Array) -> float:
         pixels, z = eye.see(some[shown])
         splat_depth(pixels, z, np.full(len(z), 1.0, np.float32), depth)
         visible = float(_is_visible(path, eye, depth).mean()) if len(path) else 0.0
-        score = visible + extent / eye.t[2] + float(shown.mean() if len(shown) else 0.0)
+        score = visible + extent / eye.t[2] + 3.0 * float(shown.mean() if len(shown) else 0.0)
         if score > best_score + 1e-9:
             best, best_score = float(azimuth), score
     return best
@@ -337,10 +343,11 @@ def _finish(canvas: _Canvas, scene: _Scene) -> ImageU8:
 
 def _draw_floor_grid(image: ImageU8, eye: _Eye, points: NDArray[np.floating], color: tuple[int, int, int]) -> None:
     """Draw a line every metre (every 5 or 25 in large maps) a little below the points."""
-    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    some = points[:: max(1, len(points) // 20000)]
+    low, high = np.percentile(some, [0.5, 99.5], axis=0)
     step = next(s for s in (1.0, 5.0, 25.0, 1e9) if (high - low)[:2].max() / s <= 40.0)
     first, last = np.floor(low[:2] / step) * step - step, np.ceil(high[:2] / step) * step + step
-    height = float(np.percentile(points[:, 2], 0.5))
+    height = float(low[2])
     for axis in (0, 1):
         for value in np.arange(first[axis], last[axis] + 0.5 * step, step):
             along = np.linspace(first[1 - axis], last[1 - axis], 64)

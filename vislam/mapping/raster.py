@@ -14,6 +14,28 @@ F32 = NDArray[np.float32]
 
 
 @njit(cache=True, nogil=True)
+def project_points(
+    points: NDArray[np.float64],
+    R: NDArray[np.float64],
+    t: NDArray[np.float64],
+    focal_px: float,
+    centre: NDArray[np.float64],
+    near: float,
+) -> tuple[F32, F32]:
+    """Return pixels [N, 2] and depth [N] of points [N, 3]; depth below `near` divides as if it were `near`."""
+    pixels, depth = np.empty((len(points), 2), np.float32), np.empty(len(points), np.float32)
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + t[0]
+        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + t[1]
+        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + t[2]
+        depth[i] = z
+        z = max(z, near)
+        pixels[i, 0], pixels[i, 1] = focal_px * x / z + centre[0], focal_px * y / z + centre[1]
+    return pixels, depth
+
+
+@njit(cache=True, nogil=True)
 def splat_depth(pixels: F32, z: F32, radius: F32, depth: F32) -> None:
     """Lower the depth buffer [H, W] where discs at pixels [N, 2] with radius [N] px are nearer."""
     rows, columns = depth.shape
