@@ -225,7 +225,7 @@ def refine(window: Window, start: LinearSolution) -> Alignment:
     v = start.velocities_m_s @ R_world_visual.T
     gyro_bias, accel_bias = start.gyro_bias_rad_s.copy(), start.accel_bias_m_s2.copy()
     pieces = [preintegrate(span, gyro_bias, accel_bias, window.noise) for span in window.spans]
-    weights: list[Array] = [np.linalg.inv(piece.covariance + _FLOOR * np.eye(9)) for piece in pieces]
+    weights = [_inverse(piece.covariance + _FLOOR * np.eye(9)) for piece in pieces]
     cost = np.inf
     for _ in range(_ROUNDS):
         system = _NormalEquations(nodes)
@@ -251,6 +251,10 @@ def refine(window: Window, start: LinearSolution) -> Alignment:
     half = np.linalg.solve(factor, np.eye(len(factor)))
     ratio = cost / max(system.rows - len(system.g), 1)
     return Alignment(T, v, gyro_bias, accel_bias, half.T @ half, float(ratio))
+
+
+def _inverse(covariance: Array) -> Array:
+    return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
 
 def _up_to_z(gravity: Array, R_visual_body: Array) -> Array:
