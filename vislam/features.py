@@ -123,27 +123,26 @@ def _choose_apart(points: Array, live: Array, count: int, distance: float, width
 
 def follow(
     source: ImageU8, target: ImageU8, pixels: Array, guess: Array, settings: FlowSettings
-) -> tuple[Array, Bools]:
+) -> tuple[Array, Array]:
     """Follow corners [N, 2] of `source` into `target`, starting at `guess` [N, 2] (NaN: not tried).
 
     Returns:
-        Pixels [N, 2] in target (NaN where lost) and which were found: inside the image and back at their start within
-        `max_back_px` when followed the other way.
+        Pixels [N, 2] in target and the mean grey difference [N] of the windows. Both are NaN where the corner was lost:
+        outside the image, or not back at its start within `max_back_px` when followed the other way.
     """
-    found = np.full(pixels.shape, np.nan)
-    ok = np.zeros(len(pixels), dtype=np.bool_)
-    tried = np.flatnonzero(np.isfinite(guess).all(axis=1) & np.isfinite(pixels).all(axis=1) & _near(guess, target))
+    found, difference = np.full(pixels.shape, np.nan), np.full(len(pixels), np.nan)
+    tried = np.flatnonzero(np.isfinite(pixels).all(axis=1) & _near(guess, target))
     if len(tried) == 0:
-        return found, ok
+        return found, difference
     start = pixels[tried].astype(np.float32)
-    there, seen = _flow(source, target, start, guess[tried].astype(np.float32), settings.levels, settings)
-    back, seen_back = _flow(target, source, there, start, settings.back_levels, settings)
+    there, seen, error = _flow(source, target, start, guess[tried].astype(np.float32), settings.levels, settings)
+    back, seen_back, _ = _flow(target, source, there, start, settings.back_levels, settings)
     good = seen & seen_back & (np.linalg.norm(back - start, axis=1) <= settings.max_back_px)
     height, width = target.shape
     good &= (there[:, 0] >= 0.0) & (there[:, 0] <= width - 1) & (there[:, 1] >= 0.0) & (there[:, 1] <= height - 1)
     found[tried[good]] = there[good]
-    ok[tried[good]] = True
-    return found, ok
+    difference[tried[good]] = error[good]
+    return found, difference
 
 
 def _near(pixels: Array, image: ImageU8) -> Bools:
@@ -161,13 +160,13 @@ def _flow(
     guess: NDArray[np.float32],
     levels: int,
     s: FlowSettings,
-) -> tuple[NDArray[np.float32], Bools]:
+) -> tuple[NDArray[np.float32], Bools, NDArray[np.float32]]:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, s.iterations, s.epsilon_px)
-    there, status, _ = cv2.calcOpticalFlowPyrLK(
+    there, status, error = cv2.calcOpticalFlowPyrLK(
         source, target, pixels[:, None], guess[:, None].copy(), winSize=(s.window_px, s.window_px), maxLevel=levels,
         criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=s.min_eigenvalue,
     )  # fmt: skip
-    return there[:, 0], status[:, 0] == 1
+    return there[:, 0], status[:, 0] == 1, error[:, 0]
 
 
 def describe(

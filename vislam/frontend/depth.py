@@ -26,6 +26,14 @@ class DepthReading:
         depth[near] = 1.0 / self.rho[near]
         return depth
 
+    def joined(self, other: DepthReading) -> DepthReading:
+        """Return this reading followed by another of the same sensor."""
+        right = None
+        if self.right_px is not None and other.right_px is not None:
+            right = np.vstack([self.right_px, other.right_px])
+        rho, sigma = np.concatenate([self.rho, other.rho]), np.concatenate([self.sigma_rho, other.sigma_rho])
+        return DepthReading(rho, sigma, right)
+
 
 class DepthSensor(Protocol):
     """A source of inverse depth for pixels of cam0."""
@@ -35,5 +43,8 @@ class DepthSensor(Protocol):
         ...
 
     def measure(self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array) -> DepthReading:
-        """Measure the depth of raw pixels [N, 2] with directions `xy` [N, 2], where about `expected_rho` [N] is likely."""
+        """Measure the depth of raw pixels [N, 2] with directions `xy` [N, 2], where about `expected_rho` [N] is likely.
+
+        NaN in `expected_rho` means that nothing is expected.
+        """
         ...

@@ -1,12 +1,17 @@
-"""When a frame becomes a keyframe."""
+"""When a frame becomes a keyframe, and what a keyframe is made of."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from vislam.camera import Camera
 from vislam.config import FrontEndConfig
+from vislam.features import describe
+from vislam.geometry import transform_points
+from vislam.messages import Array, Frame, Keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +21,9 @@ class Departure:
     dt_s: float
     rotation_rad: float
     parallax_px: float  # median, rotation taken out
-    alive: float  # fraction of the keyframe's tracks that are still good
+    alive: float  # fraction of the keyframe's tracks that are still followed
+    inliers: int
+    fit: bool  # whether the frame has what a keyframe of this front end needs, such as depth
 
 
 def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
@@ -25,10 +32,13 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
     A keyframe costs a little drift and a node in the graph; a late one costs tracks. So distance decides, and time only
     makes sure that the graph hears of a camera that hardly moves.
     """
-    if departure.alive < config.keyframe_min_alive:
+    least = config.keyframe_min_alive if departure.fit else config.keyframe_min_alive_unfit
+    if departure.alive < least:
         return f"only {departure.alive:.0%} of the tracks left"
-    if departure.dt_s < config.keyframe_min_interval_s:
+    if not departure.fit or departure.dt_s < config.keyframe_min_interval_s:
         return ""
+    if departure.inliers < config.keyframe_min_inliers:
+        return f"only {departure.inliers} tracks agree"
     if departure.parallax_px > config.keyframe_parallax_px:
         return f"parallax of {departure.parallax_px:.0f} px"
     if departure.rotation_rad > np.deg2rad(config.keyframe_rotation_deg):
@@ -36,3 +46,15 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
     if departure.dt_s >= config.keyframe_max_interval_s:
         return f"{departure.dt_s:.1f} s since the last keyframe"
     return ""
+
+
+def make_keyframe(
+    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int,
+    measure_depth: Callable[[Array], Array] | None,
+) -> Keyframe:  # fmt: skip
+    """Describe a frame for loop closing; `measure_depth` gives z-depths [N] in metres of raw pixels [N, 2]."""
+    pixels, descriptors = describe(frame.images[0], features)
+    points = None
+    if measure_depth is not None:
+        points = transform_points(T_body_cam, camera.unproject(pixels) * measure_depth(pixels)[:, None])
+    return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points)

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from vislam.messages import Array
 
 UNKNOWN_RHO = 0.25  # 1/m: where a point of unknown depth is assumed, four metres away ...
 UNKNOWN_RHO_SIGMA = 0.75  # 1/m: ... or anywhere between a metre and infinity
+_KNOWN_FRACTION = 0.25  # sigma of rho relative to rho
+_KNOWN_FAR = 0.02  # 1/m: sigma below which a point is known to be far, whatever its rho
 _MIN_Z = 0.05  # of a landmark moved into another camera, relative to its old z-depth: nearer is behind or beside
 
 
@@ -99,9 +102,9 @@ def move(landmarks: Array, covariances: Array, T_key_cam: Array) -> tuple[Array,
 
 @njit(cache=True, nogil=True)
 def fuse(
-    landmarks: Array, covariances: Array, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array
+    landmarks: Array, covariances: Array, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array, gate: float
 ) -> tuple[Array, Array]:
-    """Update landmarks with a measurement of themselves in their own camera (Kalman).
+    """Update landmarks with a measurement of themselves in their own camera (Kalman, one component after the other).
 
     Args:
         landmarks: [N, 3].
@@ -110,24 +113,63 @@ def fuse(
         rho: measured inverse depths [N] in 1/m; NaN: unknown.
         sigma_xy: standard deviation of `xy`.
         sigma_rho: standard deviations [N] of `rho` in 1/m.
+        gate: a component further off than this many standard deviations is left out.
 
     Returns:
         Updated landmarks and covariances.
     """
-    out, P_out = landmarks.copy(), covariances.copy()
+    out, P = landmarks.copy(), covariances.copy()
     for i in range(len(landmarks)):
         for k in range(3):
-            # one component at a time: the measurement noise is diagonal
             value = xy[i, k] if k < 2 else rho[i]
             sigma = sigma_xy if k < 2 else sigma_rho[i]
-            if not np.isfinite(value):
-                continue
-            S = P_out[i, k, k] + sigma * sigma
-            gain = P_out[i, :, k].copy() / S
+            variance = P[i, k, k] + sigma * sigma
             innovation = value - out[i, k]
-            row = P_out[i, k, :].copy()
+            if not innovation * innovation <= gate * gate * variance:  # also leaves out NaN
+                continue
+            column = P[i, :, k].copy()
             for a in range(3):
-                out[i, a] += gain[a] * innovation
+                out[i, a] += column[a] / variance * innovation
                 for b in range(3):
-                    P_out[i, a, b] -= gain[a] * row[b]
-    return out, P_out
+                    P[i, a, b] -= column[a] * column[b] / variance
+    return out, P
+
+
+class Landmarks:
+    """The landmarks of the tracks, row by row: means [N, 3] and covariances [N, 3, 3]."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.mean: Array = np.empty((0, 3))
+        self.covariance: Array = np.empty((0, 3, 3))
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which landmarks [N] have a depth that is good enough to stand on."""
+        sigma = np.sqrt(self.covariance[:, 2, 2])
+        return np.asarray(sigma < np.maximum(_KNOWN_FRACTION * self.mean[:, 2], _KNOWN_FAR), dtype=np.bool_)
+
+    def keep(self, which: NDArray[np.bool_]) -> None:
+        """Drop the rows that are not in `which` [N]."""
+        self.mean, self.covariance = self.mean[which], self.covariance[which]
+
+    def append(self, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array) -> None:
+        """Add landmarks seen at `xy` [M, 2] with inverse depths `rho` [M], NaN where unknown."""
+        known = np.isfinite(rho)
+        covariance: Array = np.zeros((len(xy), 3, 3))
+        covariance[:, 0, 0] = covariance[:, 1, 1] = sigma_xy**2
+        covariance[:, 2, 2] = np.where(known, sigma_rho, UNKNOWN_RHO_SIGMA) ** 2
+        self.mean = np.vstack([self.mean, np.column_stack([xy, np.where(known, rho, UNKNOWN_RHO)])])
+        self.covariance = np.concatenate([self.covariance, covariance])
+
+    def expected_rho(self, xy: Array) -> Array:
+        """Return the inverse depth [M] of the nearest known landmark to each direction [M, 2]; NaN without any."""
+        known = self.known
+        if not known.any() or len(xy) == 0:
+            return np.full(len(xy), np.nan)
+        places = self.mean[known, :2].astype(np.float32)
+        distance = np.square(xy[:, None].astype(np.float32) - places[None]).sum(axis=2)
+        return np.asarray(self.mean[known, 2][np.argmin(distance, axis=1)])

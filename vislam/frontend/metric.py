@@ -4,28 +4,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import FrontEndConfig
-from vislam.errors import DataError
-from vislam.features import describe, match
 from vislam.frontend.depth import DepthReading, DepthSensor
-from vislam.frontend.keyframes import Departure, keyframe_reason
-from vislam.frontend.landmarks import UNKNOWN_RHO, UNKNOWN_RHO_SIGMA, fuse, move
+from vislam.frontend.intake import Intake
+from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
+from vislam.frontend.landmarks import Landmarks, fuse, move
+from vislam.frontend.locate import pnp_ransac, recognise
 from vislam.frontend.prediction import MotionPredictor, body_motion
-from vislam.frontend.refine import PoseEstimate, refine_pose
+from vislam.frontend.refine import PoseEstimate, extra_parameter, refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations
+from vislam.frontend.shutter import Shutter
 from vislam.frontend.tracker import Tracker
-from vislam.geometry import invert, se3_adjoint, so3_log, transform, transform_points
+from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
 Bools = NDArray[np.bool_]
 
-# squared Mahalanobis distances that one good residual in a thousand exceeds, by degrees of freedom
-_CHI2_GATE = np.array([0.0, 10.8, 13.8, 16.3])
+_CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
+_RANSAC_PX = 3.0
+_RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
+_FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
+_ADOPT_ROUNDS = 3  # depth moves from this frame to the keyframe by a pose that depends on it
+_ADOPT_SIGMA = 0.05  # of the inverse depth, for what remains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,16 +37,21 @@ class _Attempt:
     """One try to place a frame relative to the keyframe."""
 
     pixels: Array  # [N, 2] of all tracks, NaN where not found
-    xy: Array  # [N, 2] on z = 1
-    reading: DepthReading
+    seen: Array  # [N, 2] their directions on z = 1
+    xy: Array  # [N, 2] the same as of the middle row's time
+    expected_rho: Array  # [N] in this frame
+    twist_per_s: Array  # [6] velocity of the camera
+    landmarks: Landmarks
     estimate: PoseEstimate
-    inliers: Bools  # [N]
     failure: str  # empty when the pose can be trusted
 
     @property
-    def ratio(self) -> float:
-        followed = int(np.isfinite(self.pixels[:, 0]).sum())
-        return float(self.inliers.sum()) / max(followed, 1)
+    def followed(self) -> int:
+        return int(np.isfinite(self.xy[:, 0]).sum())
+
+    @property
+    def inliers(self) -> int:
+        return int(self.estimate.inliers.sum())
 
 
 class MetricFrontEnd:
@@ -55,132 +64,164 @@ class MetricFrontEnd:
         self._camera = rig.cameras[0]
         self._T_body_cam = rig.T_body_cams[0]
         self._depth = depth
-        self._seed = seed
+        self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
+        self._shutter = Shutter(self._camera, config.readout_s)
         self._sigma_xy = config.track_sigma_px / self._camera.fx
-        self._landmarks: Array = np.empty((0, 3))
-        self._covariances: Array = np.empty((0, 3, 3))
+        self._landmarks = Landmarks()
         self._keyframe: Keyframe | None = None
-        self._next_id = 0
+        self._keyframe_tracks = 0
+        self._keyframe_twist: Array = np.zeros(6)
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
-        self._t_ns = -1  # of the last frame
-        self._t_good_ns = -1  # of the last frame that was placed
+        self._t_placed_ns = -1  # of the last frame that was placed
+        self._lost = False
 
     def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
-        self._camera.check_image(frame.images[0])
-        if frame.t_ns <= self._t_ns:
-            raise DataError(f"frame {frame.index} at {frame.t_ns} ns does not come after {self._t_ns} ns; skip it")
-        cv2.setRNGSeed(self._seed + frame.index)
-        dt_s = (frame.t_ns - self._t_ns) * 1e-9
-        self._t_ns = frame.t_ns
+        dt_s = self._intake.accept(frame)
         if self._keyframe is None:
             return self._start(frame, "")
-        T_now_next = self._predictor.predict(dt_s, imu)
         T_before = self._T_key_cam
-        self._T_key_cam = T_before @ T_now_next
-        attempt = self._attempt(frame, self._T_key_cam)
+        T_guess = T_before @ self._predictor.predict(dt_s, imu)
+        attempt = self._attempt(frame, T_before, T_guess, dt_s)
         if attempt.failure:
-            T_found = self._relocalise(frame)
+            T_found = self._recognise(frame, self._keyframe)
             if T_found is not None:
-                attempt = self._attempt(frame, T_found)
+                attempt = self._attempt(frame, T_before, T_found, dt_s)
         if attempt.failure:
-            return self._lose(frame, attempt)
+            self._T_key_cam = T_guess
+            return self._lose(frame, self._keyframe, attempt)
         self._T_key_cam = attempt.estimate.T_key_cam
-        if self._t_good_ns == frame.t_ns - round(dt_s * 1e9):
+        if not self._lost:
             self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
-        self._t_good_ns = frame.t_ns
-        return self._report(frame, attempt)
+        self._lost = False
+        self._t_placed_ns = frame.t_ns
+        self._landmarks = attempt.landmarks
+        self._learn_shutter(attempt)
+        return self._report(frame, self._keyframe, attempt)
 
-    # -- one frame ---------------------------------------------------------------------------------------------------
+    # -- placing one frame -------------------------------------------------------------------------------------------
 
-    def _attempt(self, frame: Frame, T_guess: Array) -> _Attempt:
-        predicted, _ = move(self._landmarks, self._covariances, T_guess)
-        rays = np.column_stack([predicted[:, :2], np.ones(len(predicted))])
-        pixels = self._tracker.follow(frame.images[0], self._camera.project(rays))
-        xy = self._camera.normalise(pixels)
-        reading = self._depth.measure(frame, pixels, xy, predicted[:, 2])
-        estimate = self._solve(T_guess, xy, reading)
-        inliers = _inliers(estimate)
-        followed = int(np.isfinite(xy[:, 0]).sum())
-        count = int(inliers.sum())
-        failure = ""
+    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float) -> _Attempt:
+        landmarks = self._landmarks
+        twist = se3_log(invert(T_before) @ T_guess) / dt_s
+        predicted, _ = move(landmarks.mean, landmarks.covariance, T_guess)
+        pixels = self._tracker.follow(frame.images[0], self._shutter.project(predicted, twist))
+        seen = self._camera.normalise(pixels)
+        xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
+        landmarks, estimate = self._place(frame, T_guess, landmarks, pixels, xy)
+        if estimate.converged:
+            twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
+            if self._shutter.readout_s > 0.0:
+                xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
+                estimate = self._solve(estimate.T_key_cam, landmarks, xy)
+        failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
+        return _Attempt(pixels, seen, xy, predicted[:, 2], twist, landmarks, estimate, failure)
+
+    def _failure(self, estimate: PoseEstimate, followed: int) -> str:
+        agree = int(estimate.inliers.sum())
         if followed < self._config.min_inliers:
-            failure = f"only {followed} of {len(self._tracker)} tracks found"
-        elif not estimate.converged:
-            failure = "the motion does not converge"
-        elif count < self._config.min_inliers or count < self._config.min_inlier_ratio * followed:
-            failure = f"only {count} of {followed} tracks agree on a motion"
-        return _Attempt(pixels, xy, reading, estimate, inliers, failure)
+            return f"only {followed} of {len(self._tracker)} tracks found"
+        if not estimate.converged:
+            return "the motion does not converge"
+        if agree < max(self._config.min_inliers, self._config.min_inlier_ratio * followed):
+            return f"only {agree} of {followed} tracks agree on a motion"
+        return ""
 
-    def _solve(self, T_guess: Array, xy: Array, reading: DepthReading) -> PoseEstimate:
+    def _place(
+        self, frame: Frame, T_guess: Array, landmarks: Landmarks, pixels: Array, xy: Array
+    ) -> tuple[Landmarks, PoseEstimate]:
+        """Solve for the pose; a keyframe that had no depth of its own borrows this frame's."""
+        if self._sees_scale or not self._depth.available(frame):
+            return landmarks, self._solve(T_guess, landmarks, xy)
+        nothing: Array = np.full(len(pixels), np.nan)
+        reading = self._depth.measure(frame, pixels, xy, nothing)
+        T = T_guess
+        for _ in range(_ADOPT_ROUNDS):
+            adopted = _adopt(landmarks, reading, xy, T)
+            estimate = self._solve(T, adopted, xy)
+            T = estimate.T_key_cam
+        return adopted, estimate
+
+    @property
+    def _sees_scale(self) -> bool:
+        return int(self._landmarks.known.sum()) >= self._config.min_inliers
+
+    def _solve(self, T_guess: Array, landmarks: Landmarks, xy: Array) -> PoseEstimate:
         """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
-        estimate = self._refine(T_guess, xy, reading, None)
-        followed = np.isfinite(xy[:, 0])
-        if _inliers(estimate).sum() < 0.6 * followed.sum():
-            T_ransac = self._ransac(xy, followed)
+        estimate = self._refine(T_guess, landmarks, xy)
+        followed = int(np.isfinite(xy[:, 0]).sum())
+        if estimate.inliers.sum() < _RANSAC_BELOW * followed:
+            known = landmarks.known & (landmarks.mean[:, 2] > 0.0)
+            mean = landmarks.mean[known]
+            points = np.column_stack([mean[:, :2], np.ones(len(mean))]) / mean[:, 2:]
+            threshold = _RANSAC_PX / self._camera.fx
+            T_ransac = pnp_ransac(points, xy[known], threshold, self._config.min_inliers)
             if T_ransac is not None:
-                other = self._refine(T_ransac, xy, reading, None)
-                if _inliers(other).sum() > _inliers(estimate).sum():
+                other = self._refine(T_ransac, landmarks, xy)
+                if other.inliers.sum() > estimate.inliers.sum():
                     estimate = other
-        return self._refine(estimate.T_key_cam, xy, reading, _inliers(estimate)) if estimate.converged else estimate
+        if not estimate.converged:
+            return estimate
+        return self._refine(estimate.T_key_cam, landmarks, np.where(estimate.inliers[:, None], xy, np.nan))
 
-    def _refine(self, T: Array, xy: Array, reading: DepthReading, only: Bools | None) -> PoseEstimate:
-        used = xy if only is None else np.where(only[:, None], xy, np.nan)
-        import os
-        rr = reading.rho if int(os.environ.get("CURD","1")) else np.full(len(used), np.nan)
-        return refine_pose(
-            T, self._landmarks, self._covariances, used, rr, self._sigma_xy, reading.sigma_rho, self._config.cauchy
+    def _refine(self, T: Array, landmarks: Landmarks, xy: Array) -> PoseEstimate:
+        sigma_m = np.inf if int(landmarks.known.sum()) >= self._config.min_inliers else self._config.blind_sigma_m
+        return refine_pose(T, landmarks.mean, landmarks.covariance, xy, self._sigma_xy, self._config.cauchy, sigma_m)
+
+    def _recognise(self, frame: Frame, keyframe: Keyframe) -> Array | None:
+        config = self._config
+        return recognise(
+            keyframe, frame.images[0], self._camera, self._T_body_cam, config.described_features, config.min_inliers
         )
 
-    def _ransac(self, xy: Array, followed: Bools) -> Array | None:
-        """Return T_key_cam [4, 4] by P3P RANSAC over the landmarks of known depth, or None."""
-        known = followed & (np.sqrt(self._covariances[:, 2, 2]) < 0.2 * self._landmarks[:, 2])
-        landmarks = self._landmarks[known]
-        points = np.column_stack([landmarks[:, :2], np.ones(len(landmarks))]) / landmarks[:, 2:]
-        return pnp_ransac(points, xy[known], 3.0 / self._camera.fx, self._config.min_inliers)
-
-    def _relocalise(self, frame: Frame) -> Array | None:
-        """Return T_key_cam [4, 4] found by matching ORB descriptors with the keyframe, or None."""
-        keyframe = self._keyframe
-        if keyframe is None or keyframe.points_body_m is None:
-            return None
-        pixels, descriptors = describe(frame.images[0], self._config.described_features)
-        pairs = match(keyframe.descriptors, descriptors)
-        pairs = pairs[np.isfinite(keyframe.points_body_m[pairs[:, 0], 0])]
-        xy = self._camera.normalise(pixels[pairs[:, 1]])
-        seen = np.isfinite(xy[:, 0])
-        points = transform_points(invert(self._T_body_cam), keyframe.points_body_m[pairs[seen, 0]])
-        return pnp_ransac(points, xy[seen], 4.0 / self._camera.fx, self._config.min_inliers)
+    def _learn_shutter(self, attempt: _Attempt) -> None:
+        """Let the shear that is left in this frame correct the readout time."""
+        if not self._shutter.learns or not self._sees_scale or not self._keyframe_twist.any():
+            return
+        mean, covariance = self._landmarks.mean, self._landmarks.covariance
+        xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
+        of_key = self._shutter.slope(self._tracker.pixels, mean[:, :2], mean[:, 2], self._keyframe_twist)
+        of_now = self._shutter.slope(attempt.pixels, xy, attempt.expected_rho, attempt.twist_per_s)
+        # a landmark's own shear is carried by the rotation between the two, nearly one over such short times
+        change = extra_parameter(
+            self._T_key_cam, mean, covariance, xy, self._sigma_xy, self._config.cauchy, of_key - of_now
+        )
+        self._shutter.learn(*change)
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 
-    def _report(self, frame: Frame, attempt: _Attempt) -> TrackResult:
-        keyframe = self._keyframe
-        assert keyframe is not None
+    def _report(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt) -> TrackResult:
         vo = self._measurement(frame, keyframe.id, attempt)
-        parallax_px = self._parallax_px(attempt)
-        observations = self._observations(attempt)
         departure = Departure(
             dt_s=(frame.t_ns - keyframe.t_ns) * 1e-9,
             rotation_rad=float(np.linalg.norm(so3_log(np.ascontiguousarray(self._T_key_cam[:3, :3])))),
-            parallax_px=parallax_px,
-            alive=float(np.isfinite(attempt.xy[:,0]).sum()) / max(self._keyframe_tracks, 1),
+            parallax_px=self._parallax_px(attempt),
+            alive=attempt.followed / max(self._keyframe_tracks, 1),
+            inliers=attempt.inliers,
+            fit=self._depth.available(frame),
         )
         reason = keyframe_reason(departure, self._config)
         if reason:
-            new = self._make_keyframe(frame, attempt)
-            return TrackResult(vo, observations, new, parallax_px, reason)
-        alive = self._tracker.judge(attempt.inliers)
-        self._landmarks, self._covariances = self._landmarks[alive], self._covariances[alive]
-        why = "" if vo.tracking is Tracking.OK else f"{vo.inliers} inliers, {attempt.ratio:.0%} of the tracks"
-        return TrackResult(vo, observations, None, parallax_px, why)
+            new, observations = self._continue_from(frame, attempt)
+            return TrackResult(vo, observations, new, departure.parallax_px, reason)
+        good = attempt.estimate.inliers
+        observations = Observations(self._tracker.ids[good].copy(), attempt.pixels[good])
+        self._landmarks.keep(self._tracker.judge(good))
+        return TrackResult(vo, observations, None, departure.parallax_px, self._weakness(attempt))
+
+    def _weakness(self, attempt: _Attempt) -> str:
+        """Return why the tracking is degraded, or an empty string."""
+        if not self._sees_scale:
+            return "no depth yet, the distance moved is a guess"
+        if attempt.inliers < self._config.degraded_inliers:
+            return f"only {attempt.inliers} inliers"
+        if attempt.inliers < self._config.degraded_inlier_ratio * attempt.followed:
+            return f"only {attempt.inliers} of {attempt.followed} tracks agree"
+        return ""
 
     def _measurement(self, frame: Frame, keyframe_id: int, attempt: _Attempt) -> VoMeasurement:
-        config = self._config
-        inliers = int(attempt.inliers.sum())
-        weak = inliers < config.degraded_inliers or attempt.ratio < config.degraded_inlier_ratio
         adjoint = se3_adjoint(self._T_body_cam)
         covariance = adjoint @ attempt.estimate.covariance @ adjoint.T
         return VoMeasurement(
@@ -189,122 +230,104 @@ class MetricFrontEnd:
             T_keyframe_body=body_motion(attempt.estimate.T_key_cam, self._T_body_cam),
             covariance=0.5 * (covariance + covariance.T),
             has_scale=True,
-            tracking=Tracking.DEGRADED if weak else Tracking.OK,
-            inliers=inliers,
+            tracking=Tracking.DEGRADED if self._weakness(attempt) else Tracking.OK,
+            inliers=attempt.inliers,
         )
 
     def _parallax_px(self, attempt: _Attempt) -> float:
-        rays = np.column_stack([attempt.xy, np.ones(len(attempt.xy))])[attempt.inliers]
+        good = attempt.estimate.inliers
+        rays = np.column_stack([attempt.xy, np.ones(len(attempt.xy))])[good]
         turned = rays @ self._T_key_cam[:3, :3].T
-        moved = turned[:, :2] / turned[:, 2:] - self._landmarks[attempt.inliers, :2]
-        return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx) if len(moved) else 0.0
+        moved = turned[:, :2] / turned[:, 2:] - self._landmarks.mean[good, :2]
+        return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx)
 
-    def _observations(self, attempt: _Attempt) -> Observations:
-        good = attempt.inliers
-        right = attempt.reading.right_px
-        return Observations(
-            track_ids=self._tracker.ids[good].copy(),
-            pixels_px=attempt.pixels[good],
-            right_px=None if right is None else right[good],
-            depth_m=attempt.reading.depth_m[good],
-        )
-
-    def _lose(self, frame: Frame, attempt: _Attempt) -> TrackResult:
-        assert self._keyframe is not None
-        if (frame.t_ns - self._t_good_ns) * 1e-9 >= self._config.patience_s:
+    def _lose(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt) -> TrackResult:
+        self._lost = True
+        late = (frame.t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s
+        if late and self._depth.available(frame):
             return self._start(frame, attempt.failure)
-        vo = lost_motion(frame.t_ns, self._keyframe.id, True, int(attempt.inliers.sum()))
+        vo = lost_motion(frame.t_ns, keyframe.id, True, attempt.inliers)
         return TrackResult(vo, no_observations(), None, 0.0, attempt.failure)
 
     # -- keyframes ---------------------------------------------------------------------------------------------------
 
     def _start(self, frame: Frame, failure: str) -> TrackResult:
         """Begin anew with this frame as keyframe, if there is enough to see in it."""
-        self._tracker.begin(frame.images[0], np.zeros(len(self._tracker), dtype=np.bool_), self._tracker.pixels)
-        last_id = self._next_id - 1
-        if len(self._tracker) < self._config.min_start_corners:
-            reason = f"{failure + '; ' if failure else ''}only {len(self._tracker)} corners, mean grey {frame.images[0].mean():.0f}"
-            return TrackResult(lost_motion(frame.t_ns, last_id, True), no_observations(), None, 0.0, reason)
-        self._landmarks, self._covariances = np.empty((0, 3)), np.empty((0, 3, 3))
+        last_id = self._keyframe.id if self._keyframe is not None else -1
+        count = self._tracker.begin(frame.images[0], np.zeros(len(self._tracker), dtype=np.bool_), self._tracker.pixels)
+        self._landmarks = Landmarks()
+        if count < self._config.min_start_corners:
+            self._tracker.forget()
+            reason = f"only {count} corners in an image of mean grey {frame.images[0].mean():.0f}"
+            vo = lost_motion(frame.t_ns, last_id, True)
+            return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {reason}" if failure else reason)
         self._predictor.forget()
-        reading = self._add_landmarks(frame, len(self._tracker))
-        keyframe = self._install(frame)
-        observations = Observations(
-            self._tracker.ids.copy(), self._tracker.pixels.copy(), reading.right_px, reading.depth_m
-        )
+        self._lost = False
+        reading = self._add_landmarks(frame, count, np.zeros(6))
+        keyframe = self._install(frame, np.zeros(6))
+        observations = self._observations(self._tracker.pixels, reading)
         if last_id < 0:
-            return TrackResult(identity_motion(frame.t_ns, 0, True, len(self._tracker)), observations, keyframe, 0.0, "first")
+            return TrackResult(
+                identity_motion(frame.t_ns, 0, True, count), observations, keyframe, 0.0, "first keyframe"
+            )
         return TrackResult(lost_motion(frame.t_ns, last_id, True), observations, keyframe, 0.0, f"restarted: {failure}")
 
-    def _make_keyframe(self, frame: Frame, attempt: _Attempt) -> Keyframe:
+    def _continue_from(self, frame: Frame, attempt: _Attempt) -> tuple[Keyframe, Observations]:
         """Carry the agreeing landmarks into this frame, improve them by what it measures, fill the gaps."""
-        kept = attempt.inliers
-        landmarks, covariances = move(self._landmarks[kept], self._covariances[kept], self._T_key_cam)
-        reading = attempt.reading
-        self._landmarks, self._covariances = fuse(
-            landmarks, covariances, attempt.xy[kept], reading.rho[kept], self._sigma_xy, reading.sigma_rho[kept]
+        kept = attempt.estimate.inliers
+        reading = self._depth.measure(frame, attempt.pixels[kept], attempt.seen[kept], attempt.expected_rho[kept])
+        landmarks = Landmarks()
+        moved = move(self._landmarks.mean[kept], self._landmarks.covariance[kept], self._T_key_cam)
+        landmarks.mean, landmarks.covariance = fuse(
+            *moved, attempt.xy[kept], reading.rho, self._sigma_xy, reading.sigma_rho, _FUSE_GATE
         )
+        self._landmarks = landmarks
         # the patch that is followed from now on is the one where the landmark is believed to be
         pixels = attempt.pixels.copy()
-        pixels[kept] = self._camera.project(np.column_stack([self._landmarks[:, :2], np.ones(len(self._landmarks))]))
-        self._add_landmarks(frame, self._tracker.begin(frame.images[0], kept, pixels))
-        return self._install(frame)
+        pixels[kept] = self._shutter.project(landmarks.mean, attempt.twist_per_s)
+        count = self._tracker.begin(frame.images[0], kept, pixels)
+        fresh = self._add_landmarks(frame, count, attempt.twist_per_s)
+        seen_at = np.vstack([attempt.pixels[kept], self._tracker.pixels[len(self._tracker) - count :]])
+        observations = self._observations(seen_at, reading.joined(fresh))
+        return self._install(frame, attempt.twist_per_s), observations
 
-    def _add_landmarks(self, frame: Frame, count: int) -> DepthReading:
+    def _add_landmarks(self, frame: Frame, count: int, twist_per_s: Array) -> DepthReading:
         """Give the tracker's last `count` corners landmarks; return their depth reading."""
         pixels = self._tracker.pixels[len(self._tracker) - count :]
-        reading = self._measure(frame, pixels)
-        landmarks = np.column_stack([self._camera.normalise(pixels), reading.rho])
-        covariances = np.zeros((count, 3, 3))
-        covariances[:, 0, 0] = covariances[:, 1, 1] = (0.1 * self._sigma_xy) ** 2
-        known = np.isfinite(reading.rho)
-        covariances[:, 2, 2] = np.where(known, reading.sigma_rho, UNKNOWN_RHO_SIGMA) ** 2
-        landmarks[~known, 2] = UNKNOWN_RHO
-        self._landmarks = np.vstack([self._landmarks, landmarks])
-        self._covariances = np.concatenate([self._covariances, covariances])
+        seen = self._camera.normalise(pixels)
+        reading = self._depth.measure(frame, pixels, seen, self._landmarks.expected_rho(seen))
+        xy = self._shutter.to_instant(pixels, seen, np.nan_to_num(reading.rho), twist_per_s)
+        self._landmarks.append(xy, reading.rho, _CORNER_SIGMA * self._sigma_xy, reading.sigma_rho)
         return reading
 
-    def _measure(self, frame: Frame, pixels: Array) -> DepthReading:
-        """Measure depth where none is expected yet; the nearest landmarks' depth is the first guess."""
-        xy = self._camera.normalise(pixels)
-        expected: Array = np.full(len(pixels), UNKNOWN_RHO)
-        known = np.sqrt(self._covariances[:, 2, 2]) < 0.2 * self._landmarks[:, 2]
-        if known.any() and len(pixels):
-            distance = np.linalg.norm(xy[:, None] - self._landmarks[None, known, :2], axis=2)
-            expected = self._landmarks[known, 2][np.argmin(distance, axis=1)]
-        return self._depth.measure(frame, pixels, xy, expected)
+    def _observations(self, pixels: Array, reading: DepthReading) -> Observations:
+        return Observations(self._tracker.ids.copy(), pixels.copy(), reading.right_px, reading.depth_m)
 
-    def _install(self, frame: Frame) -> Keyframe:
-        keypoints, descriptors = describe(frame.images[0], self._config.described_features)
-        depth_m = self._measure(frame, keypoints).depth_m
-        points = self._camera.unproject(keypoints) * depth_m[:, None]
-        keyframe = Keyframe(
-            self._next_id, frame.t_ns, frame, keypoints, descriptors, transform_points(self._T_body_cam, points)
-        )
+    def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
+        def measure_depth(pixels: Array) -> Array:
+            xy = self._camera.normalise(pixels)
+            return self._depth.measure(frame, pixels, xy, self._landmarks.expected_rho(xy)).depth_m
+
+        new_id = self._keyframe.id + 1 if self._keyframe is not None else 0
+        features = self._config.described_features
+        keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, measure_depth)
         self._keyframe = keyframe
         self._keyframe_tracks = len(self._tracker)
-        self._next_id += 1
+        self._keyframe_twist = twist_per_s
         self._T_key_cam = np.eye(4)
-        self._t_good_ns = frame.t_ns
+        self._t_placed_ns = frame.t_ns
         return keyframe
 
 
-def _inliers(estimate: PoseEstimate) -> Bools:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(estimate.chi2 < _CHI2_GATE[estimate.dof], dtype=np.bool_)
-
-
-def pnp_ransac(points_key: Array, xy: Array, threshold: float, min_inliers: int) -> Array | None:
-    """Return T_key_cam [4, 4] of a camera that sees points [N, 3] of the keyframe's camera at `xy` [N, 2], or None.
-
-    P3P in RANSAC on the plane z = 1; `threshold` is a distance there.
-    """
-    if len(points_key) < max(min_inliers, 4):
-        return None
-    ok, rotation, translation, inliers = cv2.solvePnPRansac(
-        points_key, xy, np.eye(3), None, iterationsCount=200, reprojectionError=threshold, confidence=0.999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )  # fmt: skip
-    if not ok or inliers is None or len(inliers) < min_inliers:
-        return None
-    return np.asarray(invert(transform(cv2.Rodrigues(rotation)[0], translation[:, 0])))
+def _adopt(landmarks: Landmarks, reading: DepthReading, xy: Array, T_key_cam: Array) -> Landmarks:
+    """Return landmarks whose depth is what a frame at T_key_cam measured, where it did."""
+    adopted = Landmarks()
+    adopted.mean, adopted.covariance = landmarks.mean.copy(), landmarks.covariance.copy()
+    points = np.column_stack([xy, reading.rho])
+    seen = np.flatnonzero(np.isfinite(points).all(axis=1))
+    moved, _ = move(points[seen], np.zeros((len(seen), 3, 3)), np.asarray(invert(T_key_cam)))
+    usable = np.isfinite(moved[:, 2])
+    rows = seen[usable]
+    adopted.mean[rows, 2] = moved[usable, 2]
+    adopted.covariance[rows, 2, 2] = reading.sigma_rho[rows] ** 2 + (_ADOPT_SIGMA * moved[usable, 2]) ** 2
+    return adopted

@@ -9,16 +9,19 @@ from vislam.config import FrontEndConfig
 from vislam.frontend.depth import DepthReading
 from vislam.messages import Array, Frame, ImageF32
 
+_REACH_PX = 4  # half the side of the neighbourhood that says how much a wrong registration would matter
+
 
 class ImageDepth:
     """Reads inverse depth at sub-pixel positions of a depth image.
 
     Structured light and stereo measure disparity, so the noise is constant in inverse depth: sigma_z = c z^2 (Khoshelham
-    and Oude Elberink, Sensors 2012: c = 1.4e-3 /m for the first Kinect).
+    and Oude Elberink, Sensors 2012: c = 1.4e-3 /m for the first Kinect). Depth and colour are exposed at different
+    times, up to 15 px apart when the camera turns; so where the neighbourhood is not flat, sigma grows with its spread.
     """
 
     def __init__(self, config: FrontEndConfig) -> None:
-        """Take range limits and the noise constant from the configuration."""
+        """Take range limits and the noise model from the configuration."""
         self._config = config
 
     def available(self, frame: Frame) -> bool:
@@ -29,26 +32,29 @@ class ImageDepth:
         """Read inverse depth at raw pixels [N, 2]: bilinear, NaN at holes, beyond range and across depth edges."""
         config = self._config
         if frame.depth_m is None:
-            rho: Array = np.full(len(pixels), np.nan)
-        else:
-            rho = _sample(frame.depth_m, pixels, config.min_depth_m, config.max_depth_m, config.depth_edge_rho)
-        return DepthReading(rho, np.full(len(pixels), config.depth_sigma_rho))
+            unknown: Array = np.full(len(pixels), np.nan)
+            return DepthReading(unknown, np.full(len(pixels), config.depth_sigma_rho))
+        rho, spread = _sample(frame.depth_m, pixels, config.min_depth_m, config.max_depth_m, config.depth_edge_rho)
+        return DepthReading(rho, np.hypot(config.depth_sigma_rho, config.depth_spread * spread))
 
 
 @njit(cache=True, nogil=True)
-def _sample(depth: ImageF32, pixels: Array, nearest: float, farthest: float, edge_rho: float) -> Array:
-    """Interpolate 1/depth bilinearly: planes are linear in inverse depth. A neighbourhood with a step gives NaN."""
+def _sample(depth: ImageF32, pixels: Array, nearest: float, farthest: float, edge_rho: float) -> tuple[Array, Array]:
+    """Return inverse depths [N], interpolated bilinearly (planes are linear in 1/z), and their spread nearby [N].
+
+    NaN where less than a quarter of the interpolation is valid, or where the neighbourhood spreads more than `edge_rho`.
+    """
     height, width = depth.shape
-    out = np.full(len(pixels), np.nan)
+    out, spread = np.full(len(pixels), np.nan), np.zeros(len(pixels))
     for i in range(len(pixels)):
         x, y = pixels[i]
-        if not (x >= 1.0 and y >= 1.0 and x < width - 2 and y < height - 2):
+        if not (x >= _REACH_PX and y >= _REACH_PX and x < width - _REACH_PX and y < height - _REACH_PX):
             continue
         column, row = int(x), int(y)
         lowest, highest = np.inf, -np.inf
         value, weight = 0.0, 0.0
-        for r in range(row - 1, row + 3):
-            for c in range(column - 1, column + 3):
+        for r in range(row - _REACH_PX + 1, row + _REACH_PX + 1):
+            for c in range(column - _REACH_PX + 1, column + _REACH_PX + 1):
                 z = float(depth[r, c])
                 if not (z >= nearest and z <= farthest):
                     continue
@@ -59,4 +65,5 @@ def _sample(depth: ImageF32, pixels: Array, nearest: float, farthest: float, edg
                 weight += w
         if weight > 0.25 and highest - lowest <= edge_rho:
             out[i] = value / weight
-    return out
+            spread[i] = highest - lowest
+    return out, spread

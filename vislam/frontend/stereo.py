@@ -13,6 +13,9 @@ from vislam.geometry import invert
 from vislam.messages import Array, Frame
 
 
+_START_DISPARITIES = (8.0, 25.0, 60.0)  # px; with the reach of Lucas-Kanade they cover 0 to about 90
+
+
 class StereoDepth:
     """Measures inverse depth by matching corners of the left image in the right one; no rectification needed."""
 
@@ -33,21 +36,39 @@ class StereoDepth:
         return len(frame.images) > 1
 
     def measure(self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array) -> DepthReading:
-        """Match raw left pixels [N, 2] in the right image, starting where `expected_rho` [N] puts them."""
-        sigma: Array = np.full(len(pixels), self._sigma_rho)
-        if not self.available(frame):
-            return DepthReading(np.full(len(pixels), np.nan), sigma, np.full((len(pixels), 2), np.nan))
-        R, t = self._T_right_left[:3, :3], self._T_right_left[:3, 3]
-        rays = np.column_stack([xy, np.ones(len(xy))]) @ R.T
-        guess = self._right.project(rays + np.clip(expected_rho, 0.0, self._max_rho)[:, None] * t)
-        right_px, ok = follow(frame.images[0], frame.images[1], pixels, guess, self._flow)
-        right_xy = self._right.normalise(right_px)
-        rho, off_line = _triangulate(rays, t, right_xy)
-        # a point at infinity may measure slightly negative; beyond that the match is wrong
-        good = ok & (off_line * self._right.fx <= self._config.epipolar_gate_px)
-        good &= (rho > -3.0 * self._sigma_rho) & (rho <= self._max_rho)
-        right_px[~good] = np.nan
-        return DepthReading(np.where(good, np.maximum(rho, 0.0), np.nan), sigma, right_px)
+        """Match raw left pixels [N, 2] in the right image, starting where `expected_rho` [N] puts them.
+
+        Where nothing is expected (NaN), several disparities are tried and the most similar match is taken.
+        """
+        right_px: Array = np.full((len(pixels), 2), np.nan)
+        rho: Array = np.full(len(pixels), np.nan)
+        if self.available(frame) and len(pixels) > 0:
+            left, right = frame.images[:2]
+            rays = np.column_stack([xy, np.ones(len(xy))]) @ self._T_right_left[:3, :3].T
+            best = np.full(len(pixels), np.inf)
+            for start_rho in self._starts(expected_rho):
+                guess = self._right.project(rays + start_rho[:, None] * self._T_right_left[:3, 3])
+                found, difference = follow(left, right, pixels, guess, self._flow)
+                candidate_rho = self._accepted(rays, found)
+                better = np.isfinite(candidate_rho) & (difference < best)
+                right_px[better], rho[better], best[better] = found[better], candidate_rho[better], difference[better]
+        return DepthReading(rho, np.full(len(pixels), self._sigma_rho), right_px)
+
+    def _starts(self, expected_rho: Array) -> list[Array]:
+        known = np.isfinite(expected_rho)
+        if known.all():
+            return [np.clip(expected_rho, 0.0, self._max_rho)]
+        pixel_rho = self._sigma_rho / self._config.stereo_sigma_px
+        return [np.where(known, np.clip(expected_rho, 0.0, self._max_rho), px * pixel_rho) for px in _START_DISPARITIES]
+
+    def _accepted(self, rays: Array, right_px: Array) -> Array:
+        """Triangulate; NaN where the match is off the epipolar line, behind the cameras or too near."""
+        rho, off_line = _triangulate(rays, self._T_right_left[:3, 3].copy(), self._right.normalise(right_px))
+        with np.errstate(invalid="ignore"):
+            # a point at infinity may measure slightly negative; beyond that the match is wrong
+            good = (off_line * self._right.fx <= self._config.epipolar_gate_px) & (rho <= self._max_rho)
+            good &= rho > -3.0 * self._sigma_rho
+        return np.where(good, np.maximum(rho, 0.0), np.nan)
 
 
 @njit(cache=True, nogil=True)

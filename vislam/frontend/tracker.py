@@ -30,15 +30,18 @@ class Tracker:
         self.ids: NDArray[np.int64] = np.empty(0, dtype=np.int64)
         self.pixels: Array = np.empty((0, 2))  # [N, 2] in the keyframe
         self.misses: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # [N] frames in a row without a good match
-        self.ages: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # [N] keyframes that the track has survived
 
     def __len__(self) -> int:
         return len(self.ids)
 
+    def forget(self) -> None:
+        """Drop all tracks."""
+        self._keep(np.zeros(len(self.ids), dtype=np.bool_))
+
     def follow(self, image: ImageU8, guess: Array) -> Array:
         """Return the pixels [N, 2] of all tracks in `image`, searched around `guess` [N, 2]; NaN where not found."""
         if self._image is None:
-            return np.empty((0, 2))
+            return np.full((len(self), 2), np.nan)
         return follow(self._image, image, self.pixels, guess, self._flow)[0]
 
     def judge(self, good: Bools) -> Bools:
@@ -60,7 +63,6 @@ class Tracker:
         """
         self._keep(kept)
         self.pixels = pixels[kept].copy()
-        self.ages = self.ages + 1
         config = self._config
         fresh = detect_corners(
             image, config.max_tracks - len(self.ids), config.cell_px, config.min_distance_px, self.pixels,
@@ -71,10 +73,8 @@ class Tracker:
         self._next_id += count
         self.pixels = np.vstack([self.pixels, fresh])
         self.misses = np.zeros(len(self.ids), dtype=np.int64)
-        self.ages = np.concatenate([self.ages, np.zeros(count, dtype=np.int64)])
         self._image = image
         return count
 
     def _keep(self, which: Bools) -> None:
-        self.ids, self.pixels = self.ids[which], self.pixels[which]
-        self.misses, self.ages = self.misses[which], self.ages[which]
+        self.ids, self.pixels, self.misses = self.ids[which], self.pixels[which], self.misses[which]
