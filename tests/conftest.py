@@ -1,6 +1,9 @@
 """Fixtures every test may use."""
 
 import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
+
 from pathlib import Path
 from typing import NoReturn
 

@@ -6,6 +6,7 @@ Exit codes: 0 done, 2 usage, 3 input or data, 4 tracking lost or a quality gate 
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,9 @@ from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
 if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets.inspect import Inspection
+
+# the matrices here are small: threads cost more than they bring, and replay must not depend on them
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _INTERRUPTED = 130
 

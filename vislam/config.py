@@ -61,6 +61,8 @@ class FrontEndConfig:
     epipolar_gate_px: float = 1.5  # distance from the epipolar line that calibration and noise explain
     blind_sigma_m: float = 0.05  # trust in the predicted translation while no depth has been seen
 
+    mono_min_parallax_px: float = 3.0  # less, and the direction of motion drowns in noise: only rotation is told
+
     cauchy: float = 2.0  # scale of the robust kernel in standard deviations
     min_inliers: int = 15  # fewer: lost; six unknowns need some redundancy
     degraded_inliers: int = 40  # fewer: degraded

@@ -13,7 +13,7 @@ from vislam.ekf import Ekf
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.initialisation import Initialisation, Initialiser
-from vislam.geometry import invert
+from vislam.geometry import invert, level_rotation, transform
 from vislam.imu import ImuBuffer, ImuNoise, RestDetector, subtract_bias
 from vislam.messages import (
     Array,
@@ -80,23 +80,25 @@ class Front:
             self._buffer = ImuBuffer(config.imu)
             self._rest = RestDetector(config.init, noise)
             self._initialiser = Initialiser(config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
-            self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2)
+            self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
         self._last_frame_t_ns: int | None = None
         self._last_seen: Observations | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
         self._rested_since_keyframe = True
         self._mag: MagSample | None = None
-        self._T_vo_keyframe = np.eye(4)
+        # without gravity, up is where the first image has it
+        self._T_upright = transform(level_rotation(-rig.T_body_cams[0][:3, 1]), np.zeros(3))
+        self._T_vo_keyframe = np.eye(4) if self._has_imu else self._T_upright
         self._T_odom_keyframe: Array | None = None
-        self._T_vo_body = np.eye(4)
+        self._T_vo_body = self._T_vo_keyframe.copy()
         self._waiting: list[OdometryKeyframe] = []  # in frame `vo`, until gravity is known
 
     def add(self, value: ImuSample | MagSample) -> None:
         """Take a sample of an inertial sensor; the filter predicts at once."""
         if isinstance(value, MagSample):
             self._mag = value
-        elif self._has_imu and self._buffer.add(value) and self._ekf is not None and self._ekf.initialised:
+        elif self._has_imu and self._ekf is not None and self._buffer.add(value):
             self._ekf.predict(value)
 
     def is_ready(self, frame_t_ns: int, newest_frame_t_ns: int) -> bool:
@@ -143,7 +145,7 @@ class Front:
         Without scale nothing can be done with them, and the list is empty.
         """
         if self._has_imu and self.initialisation is None and self.frontend.mode != "mono":
-            return self._release(np.eye(4))
+            return self._release(self._T_upright)
         return []
 
     @property
@@ -161,6 +163,7 @@ class Front:
             return None
         if self._buffer.gap_s(from_t_ns, to_t_ns) > self._config.imu.max_gap_s:
             self.counters["imu_outages"] += 1
+            return None
         return self._buffer.span(from_t_ns, to_t_ns)
 
     def _without_bias(self, span: ImuSpan | None) -> ImuSpan | None:
@@ -189,10 +192,6 @@ class Front:
             return []
         self.initialisation = found
         self._ekf.initialise(found.last, track.vo)
-        newest = self._buffer.newest_t_ns
-        ahead = self._buffer.span(found.last.t_ns, newest) if newest is not None else None
-        for sample in samples_after_first(ahead):
-            self._ekf.predict(sample)
         return self._release(found.T_odom_vo)
 
     def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
@@ -256,7 +255,9 @@ class Front:
             )
         self.counters["imu_given_up"] = 1
         self._ekf, self._has_imu = None, False
-        return self._release(np.eye(4))
+        released = self._release(self._T_upright)
+        self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
+        return released
 
 
 def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:
@@ -281,11 +282,3 @@ def median_flow_px(before: Observations | None, after: Observations) -> float | 
     if len(i) < _MIN_SHARED_TRACKS:
         return None
     return float(np.median(np.linalg.norm(after.pixels_px[j] - before.pixels_px[i], axis=1)))
-
-
-def samples_after_first(span: ImuSpan | None) -> list[ImuSample]:
-    """Return the samples of a span without its first, which the filter has already reached."""
-    if span is None:
-        return []
-    rows = zip(span.t_ns[1:].tolist(), span.gyro_rad_s[1:], span.accel_m_s2[1:], strict=True)
-    return [ImuSample(t_ns, gyro, accel) for t_ns, gyro, accel in rows]

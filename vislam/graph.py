@@ -60,9 +60,10 @@ class PoseGraph:
         """Return everything that was measured, as plain records in the order of arrival."""
         return list(self._journal)
 
-    def initialise(self, state: NavState | None) -> None:
-        """Set the state of keyframe 0 in map: gravity-aligned pose, velocity, biases; None without an IMU: identity.
+    def initialise(self, state: NavState | None, T_map_body: Array | None = None) -> None:
+        """Set the state of keyframe 0 in map: gravity-aligned pose, velocity, biases; None without an IMU.
 
+        Then `T_map_body` [4, 4] says where keyframe 0 is put, by default at the identity.
         Raises DataError on numbers that cannot be used and UsageError when it does not fit the graph.
         """
         if self._keyframes:
@@ -70,7 +71,7 @@ class PoseGraph:
         if (state is None) != (self._noise is None):
             have = "no IMU" if self._noise is None else "an IMU"
             raise UsageError(f"the graph was set up with {have}; initialise it with a state exactly when it has an IMU")
-        self._start = start_record(state)
+        self._start = start_record(state, T_map_body)
         self._start_t_ns = None if state is None else state.t_ns
 
     def add(

@@ -56,14 +56,20 @@ class Back:
     """What runs at the rate of keyframes: loop detector, graph, mapper."""
 
     def __init__(
-        self, config: Config, rig: Rig, noise: ImuNoise | None, first_state: NavState | None, clock: StageClock
+        self,
+        config: Config,
+        rig: Rig,
+        noise: ImuNoise | None,
+        clock: StageClock,
+        first_state: NavState | None,
+        T_map_body: Array,
     ) -> None:
-        """Build the stages; `first_state` is that of keyframe 0, None where no IMU tells gravity."""
+        """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity."""
         has_gravity = first_state is not None
         self.graph = PoseGraph(
             config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig.T_body_cams[0]
         )
-        self.graph.initialise(first_state)
+        self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self.mapper = Mapper(config.map, rig) if config.map.enabled else None
         self.clock = clock
@@ -112,7 +118,7 @@ class Slam:
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock)
         self.back: Back | None = None  # begins with the first keyframe, when gravity is known
-        self._make_back = partial(Back, config, rig, noise)
+        self._make_back = partial(Back, config, rig, noise, self.clock)
         self._frames: deque[Frame] = deque()
 
     def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
@@ -137,7 +143,7 @@ class Slam:
 
     def _add(self, odometry: OdometryKeyframe) -> KeyframeStep:
         if self.back is None:
-            self.back = self._make_back(self.front.first_state, self.clock)
+            self.back = self._make_back(self.front.first_state, odometry.T_odom_body)
         step = self.back.add(odometry)
         self.front.feed_back(step.update)
         return step

@@ -61,10 +61,11 @@ class LoopRecord:
 Record = StartRecord | KeyframeRecord | LoopRecord
 
 
-def start_record(state: NavState | None) -> StartRecord:
-    """Return the record of an initial state, identity without one; raises DataError when it cannot be used."""
+def start_record(state: NavState | None, T_map_body: Array | None = None) -> StartRecord:
+    """Return the record of an initial state, or of a pose alone; raises DataError when it cannot be used."""
     if state is None:
-        return StartRecord(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15), False)
+        pose = np.eye(4) if T_map_body is None else _checked_pose(T_map_body, "initial pose")
+        return StartRecord(pose, np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15), False)
     what = f"initial state at {state.t_ns} ns"
     vectors = (state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2)
     if not all(np.shape(v) == (3,) and np.all(np.isfinite(v)) for v in vectors):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from vislam.errors import UsageError
+from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
 from vislam.sim.bake import bake
 from vislam.sim.render import Renderer
@@ -104,7 +105,7 @@ class Simulation:
             raise UsageError(f"world '{name}' lasts {whole_s:.1f} s, asked for {options.duration_s} s; ask for less")
         self.duration_s = options.duration_s or whole_s
         self.rig = make_rig(world, options.rig or world.rig, options.image_width_px)
-        self.imu_noise = CONSUMER_IMU
+        self.imu_noise: ImuNoise | None = CONSUMER_IMU
         self.problems: dict[str, int] = {}
         self._imu_s = _times(0.0, self.duration_s, CONSUMER_IMU.rate_hz)
         imu_motion = self.spline.at(self._imu_s)
