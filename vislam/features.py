@@ -1,8 +1,8 @@
-"""Image features: detect corners, follow them, describe and match keypoints. The one place that talks to OpenCV features.
+"""Image features: detect corners, follow them, describe and match keypoints. Only here is OpenCV asked for features.
 
 Corners are Shi-Tomasi (CVPR 1994), followed by pyramidal Lucas-Kanade (Bouguet 2000) with a forward-backward check
-(Kalal, ICPR 2010); keypoints are ORB (Rublee, ICCV 2011). OpenCV's Python binding of Lucas-Kanade refuses pyramids built
-beforehand, so images go in as they are; a pyramid costs 0.6 ms of the 6 ms that 400 corners take.
+(Kalal, ICPR 2010); keypoints are ORB (Rublee, ICCV 2011). OpenCV's Python binding of Lucas-Kanade refuses pyramids
+built beforehand, so images go in as they are; a pyramid costs 0.6 ms of the 6 ms that 400 corners take.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def describe(
     Returns:
         Pixels [N, 2] and descriptors [N, 32], N <= count; both empty for an image without features.
     """
-    orb = cv2.ORB_create(4 * count, fastThreshold=fast_threshold, edgeThreshold=_ORB_BORDER_PX)
+    orb = cv2.ORB.create(4 * count, fastThreshold=fast_threshold, edgeThreshold=_ORB_BORDER_PX)
     keypoints = orb.detect(image, None)
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
@@ -217,7 +217,7 @@ def _popcount(x: np.uint64) -> int:
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
     x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+    return int((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
 @njit(cache=True, nogil=True)

@@ -8,6 +8,7 @@ from vislam.camera import Rig
 from vislam.config import FrontEndConfig
 from vislam.errors import UsageError
 from vislam.frontend.metric import MetricFrontEnd
+from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.result import FrontEnd, TrackResult
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
@@ -30,6 +31,7 @@ def _stereo(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
 FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {
     "rgbd": _rgbd,
     "stereo": _stereo,
+    "mono": MonoFrontEnd,
 }
 
 

@@ -39,13 +39,13 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
         return ""
     if departure.inliers < config.keyframe_min_inliers:
         return f"only {departure.inliers} tracks agree"
-    if departure.parallax_px > config.keyframe_parallax_px:
-        return f"parallax of {departure.parallax_px:.0f} px"
-    if departure.rotation_rad > np.deg2rad(config.keyframe_rotation_deg):
-        return f"turned by {np.rad2deg(departure.rotation_rad):.0f} deg"
-    if departure.dt_s >= config.keyframe_max_interval_s:
-        return f"{departure.dt_s:.1f} s since the last keyframe"
-    return ""
+    turned_deg = float(np.rad2deg(departure.rotation_rad))
+    limits = (
+        (departure.parallax_px, config.keyframe_parallax_px, f"parallax of {departure.parallax_px:.0f} px"),
+        (turned_deg, config.keyframe_rotation_deg, f"turned by {turned_deg:.0f} deg"),
+        (departure.dt_s, config.keyframe_max_interval_s, f"{departure.dt_s:.1f} s since the last keyframe"),
+    )
+    return next((reason for value, limit, reason in limits if value >= limit), "")
 
 
 def make_keyframe(

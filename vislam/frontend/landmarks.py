@@ -1,8 +1,8 @@
 """Landmarks of the current keyframe as inverse-depth points with covariances, and the compiled kernels on them.
 
-A landmark is `(x, y, rho)`: its direction on the plane z = 1 of the keyframe's cam0 and its inverse z-depth in 1/m (Civera,
-TRO 2008). Depth noise of stereo and structured light is nearly constant in rho, points far away are ordinary numbers,
-and a point of unknown depth is one with a wide sigma of rho: it then constrains only what its epipolar line sees.
+A landmark is `(x, y, rho)`: its direction on the plane z = 1 of the keyframe's cam0 and its inverse z-depth in 1/m
+(Civera, TRO 2008). Depth noise of stereo and structured light is nearly constant in rho, points far away are ordinary
+numbers, and a point of unknown depth is one with a wide sigma of rho: it constrains only what its epipolar line sees.
 """
 
 from __future__ import annotations

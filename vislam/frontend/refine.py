@@ -131,7 +131,9 @@ def _refine(
     H = full[:6, :6].copy()
     if np.isfinite(prior_sigma_m):
         H[3:, 3:] += np.eye(3) / prior_sigma_m**2
-    converged = size < _SETTLED and _solvable(H)
+    # where the translation is a guess anyway, it may wander by a part of its sigma
+    settled = 0.2 * prior_sigma_m if np.isfinite(prior_sigma_m) else _SETTLED
+    converged = size < settled and _solvable(H)
     together = _common_error(H, r, A, chi2, xy, cauchy) if converged else np.nan
     return T, H, chi2, variance, together, converged
 

@@ -15,9 +15,10 @@ _REACH_PX = 4  # half the side of the neighbourhood that says how much a wrong r
 class ImageDepth:
     """Reads inverse depth at sub-pixel positions of a depth image.
 
-    Structured light and stereo measure disparity, so the noise is constant in inverse depth: sigma_z = c z^2 (Khoshelham
-    and Oude Elberink, Sensors 2012: c = 1.4e-3 /m for the first Kinect). Depth and colour are exposed at different
-    times, up to 15 px apart when the camera turns; so where the neighbourhood is not flat, sigma grows with its spread.
+    Structured light and stereo measure disparity, so the noise is constant in inverse depth: sigma_z = c z^2
+    (Khoshelham and Oude Elberink, Sensors 2012: c = 1.4e-3 /m for the first Kinect). Depth and colour are exposed at
+    different times, up to 15 px apart when the camera turns; so where the neighbourhood is not flat, sigma grows with
+    its spread.
     """
 
     def __init__(self, config: FrontEndConfig) -> None:
@@ -42,7 +43,7 @@ class ImageDepth:
 def _sample(depth: ImageF32, pixels: Array, nearest: float, farthest: float, edge_rho: float) -> tuple[Array, Array]:
     """Return inverse depths [N], interpolated bilinearly (planes are linear in 1/z), and their spread nearby [N].
 
-    NaN where less than a quarter of the interpolation is valid, or where the neighbourhood spreads more than `edge_rho`.
+    NaN where less than a quarter of the interpolation is valid, or the neighbourhood spreads more than `edge_rho`.
     """
     height, width = depth.shape
     out, spread = np.full(len(pixels), np.nan), np.zeros(len(pixels))

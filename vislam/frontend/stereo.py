@@ -12,7 +12,6 @@ from vislam.frontend.depth import DepthReading
 from vislam.geometry import invert
 from vislam.messages import Array, Frame
 
-
 _START_DISPARITIES = (8.0, 25.0, 60.0)  # px; with the reach of Lucas-Kanade they cover 0 to about 90
 
 

@@ -1,0 +1,169 @@
+"""Motion between two views of one camera: rotation and the direction of translation, from epipolar lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.geometry import so3_exp
+from vislam.messages import Array
+
+CHI2_GATE = 10.8  # squared deviation with one degree of freedom that one good residual in 1000 exceeds
+_MAX_ITERATIONS = 20
+_CONVERGED = 1e-7  # rad, of rotation and direction together
+_SETTLED = 5e-3  # a step that still matters after the last iteration
+_CONFIDENCE = 0.999
+_MAX_TRIES = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoViewEstimate:
+    """Pose of a camera relative to the keyframe's camera, up to scale."""
+
+    R_key_cam: Array  # [3, 3]
+    direction_key: Array  # [3] unit vector from the keyframe's camera to the camera
+    covariance: Array  # [6, 6] of R_key_cam (right side) and of `direction_key` (key axes), singular along it
+    inliers: NDArray[np.bool_]  # [N]
+    converged: bool
+
+
+def refine_two_view(
+    R_key_cam: Array, direction_key: Array, key_xy: Array, xy: Array, sigma_xy: float, cauchy: float
+) -> TwoViewEstimate:
+    """Refine rotation and direction so that points lie on their epipolar lines.
+
+    Args:
+        R_key_cam: start [3, 3].
+        direction_key: start [3], any length above zero.
+        key_xy: directions [N, 2] on z = 1 in the keyframe.
+        xy: the same points in the camera [N, 2]; NaN: not used.
+        sigma_xy: standard deviation of `xy`.
+        cauchy: scale of the Cauchy kernel in standard deviations.
+
+    Returns:
+        The estimate, with the sign of the direction that puts most points in front of both cameras.
+    """
+    start = direction_key / np.linalg.norm(direction_key)
+    R, t, H, basis, chi2, variance, converged = _refine(R_key_cam, start, key_xy, xy, sigma_xy, cauchy)
+    with np.errstate(invalid="ignore"):
+        inliers = np.asarray(chi2 < CHI2_GATE, dtype=np.bool_)
+    covariance: Array = np.full((6, 6), np.nan)
+    if converged:
+        embed = np.zeros((6, 5))
+        embed[:3, :3] = np.eye(3)
+        embed[3:, 3:] = basis
+        covariance = embed @ np.linalg.inv(H) @ embed.T * max(1.0, float(variance))
+    if _in_front(R, t, key_xy[inliers], xy[inliers]) < _in_front(R, -t, key_xy[inliers], xy[inliers]):
+        t = -t
+    return TwoViewEstimate(R, t, covariance, inliers, bool(converged))
+
+
+def essential_ransac(key_xy: Array, xy: Array, threshold: float, min_inliers: int) -> tuple[Array, Array] | None:
+    """Return R_key_cam [3, 3] and a unit direction [3] by five-point RANSAC (Nister, PAMI 2004), or None.
+
+    Points [N, 2] are on z = 1, NaN rows are ignored, `threshold` is a distance there.
+    """
+    usable = np.isfinite(xy).all(axis=1)
+    if usable.sum() < max(min_inliers, 6):
+        return None
+    a, b = np.ascontiguousarray(key_xy[usable]), np.ascontiguousarray(xy[usable])
+    E, mask = cv2.findEssentialMat(
+        a, b, np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=threshold, maxIters=_MAX_TRIES
+    )
+    if E is None or E.shape != (3, 3) or mask is None or int(mask.sum()) < min_inliers:
+        return None
+    _, R_cam_key, t_cam_key, _ = cv2.recoverPose(E, a, b, np.eye(3), mask=mask)
+    R = np.ascontiguousarray(R_cam_key.T)
+    return R, -R @ t_cam_key[:, 0]
+
+
+@njit(cache=True, nogil=True)
+def _tangent_basis(t: Array) -> Array:
+    axis = np.zeros(3)
+    axis[np.argmin(np.abs(t))] = 1.0
+    first = np.cross(t, axis)
+    first /= np.sqrt(np.sum(first * first))
+    basis = np.empty((3, 2))
+    basis[:, 0] = first
+    basis[:, 1] = np.cross(t, first)
+    return basis
+
+
+@njit(cache=True, nogil=True)
+def _linearise(R: Array, t: Array, basis: Array, key_xy: Array, xy: Array, sigma: float) -> tuple[Array, Array]:
+    """Return whitened distances [N] from the epipolar lines and Jacobians [N, 5] by rotation and direction.
+
+    The residual is `x_key . (t x R x_cam)` over the length of the line's normal in the camera's image. The normal's own
+    change is left out: it is multiplied by the residual, which vanishes at the solution.
+    """
+    r, J = np.full(len(xy), np.nan), np.zeros((len(xy), 5))
+    x_key, x_cam = np.ones(3), np.ones(3)
+    for i in range(len(xy)):
+        if not np.isfinite(xy[i, 0]):
+            continue
+        x_key[:2], x_cam[:2] = key_xy[i], xy[i]
+        turned = R @ x_cam
+        line = R.T @ np.cross(x_key, t)
+        length = sigma * np.sqrt(line[0] * line[0] + line[1] * line[1])
+        if length < 1e-12:
+            continue  # at the epipole every direction fits
+        r[i] = np.sum(line * x_cam) / length
+        J[i, :3] = np.cross(x_cam, line) / length
+        J[i, 3:] = basis.T @ np.cross(turned, x_key) / length
+    return r, J
+
+
+@njit(cache=True, nogil=True)
+def _refine(
+    R_start: Array, t_start: Array, key_xy: Array, xy: Array, sigma: float, cauchy: float
+) -> tuple[Array, Array, Array, Array, Array, float, bool]:
+    R, t = R_start.copy(), t_start.copy()
+    H, basis, variance, size = np.zeros((5, 5)), _tangent_basis(t), np.nan, np.inf
+    chi2 = np.full(len(xy), np.nan)
+    for iteration in range(_MAX_ITERATIONS + 1):
+        basis = _tangent_basis(t)
+        r, J = _linearise(R, t, basis, key_xy, xy, sigma)
+        chi2 = r * r
+        seen = np.isfinite(chi2)
+        if np.sum(seen) < 5:
+            return R, t, H, basis, chi2, variance, False
+        # the kernel starts as wide as the residuals are and closes with them
+        last = iteration == _MAX_ITERATIONS or size < _CONVERGED
+        scale = cauchy if last else max(cauchy, 1.5 * np.sqrt(np.median(chi2[seen])))
+        H, b = np.zeros((5, 5)), np.zeros(5)
+        weighted, weights = 0.0, 0.0
+        for i in range(len(r)):
+            if not seen[i]:
+                continue
+            w = 1.0 / (1.0 + chi2[i] / (scale * scale))
+            for a in range(5):
+                b[a] += w * J[i, a] * r[i]
+                for c in range(5):
+                    H[a, c] += w * J[i, a] * J[i, c]
+            weighted += w * chi2[i]
+            weights += w
+        variance = weighted / weights
+        if not (np.all(np.isfinite(H)) and np.linalg.cond(H) < 1e12):
+            return R, t, H, basis, chi2, variance, False
+        if last:
+            break
+        step = np.linalg.solve(H, -b)
+        R = R @ so3_exp(step[:3].copy())
+        t = t + basis @ step[3:].copy()
+        t /= np.sqrt(np.sum(t * t))
+        size = np.sqrt(np.sum(step * step))
+    return R, t, H, basis, chi2, variance, size < _SETTLED
+
+
+def _in_front(R: Array, t: Array, key_xy: Array, xy: Array) -> int:
+    """Return how many points have positive depth in both cameras."""
+    a = np.column_stack([key_xy, np.ones(len(key_xy))])
+    b = np.column_stack([xy, np.ones(len(xy))]) @ R.T
+    normal = np.cross(a, b)
+    in_key = np.einsum("ni,ni->n", np.cross(t, b), normal)
+    in_cam = np.einsum("ni,ni->n", np.cross(t, a), normal)
+    return int(((in_key > 0.0) & (in_cam > 0.0)).sum())

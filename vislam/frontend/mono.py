@@ -1,0 +1,249 @@
+"""Visual odometry of a single camera: rotation and direction of motion since the keyframe, without scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.camera import Rig
+from vislam.config import FrontEndConfig
+from vislam.frontend.epipolar import TwoViewEstimate, essential_ransac, refine_two_view
+from vislam.frontend.intake import Intake
+from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
+from vislam.frontend.prediction import MotionPredictor
+from vislam.frontend.refine import refine_pose
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations
+from vislam.frontend.tracker import Tracker
+from vislam.geometry import so3_log, transform
+from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+
+_RANSAC_PX = 1.5
+_RANSAC_BELOW = 0.6  # of the tracks agree: the start may have led astray
+_ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
+_FIXED_M = 1e-3  # holds the translation of points at infinity, which do not see it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """Where a frame is relative to the keyframe; direction zero when there is no parallax."""
+
+    view: TwoViewEstimate
+    pixels: Array  # [N, 2], NaN where not found
+    parallax_px: float
+    failure: str
+
+    @property
+    def followed(self) -> int:
+        return int(np.isfinite(self.pixels[:, 0]).sum())
+
+    @property
+    def inliers(self) -> int:
+        return int(self.view.inliers.sum())
+
+
+class MonoFrontEnd:
+    """Frame-to-keyframe odometry from epipolar geometry; below a few pixels of parallax only the rotation is told.
+
+    The translation column of its measurements is the unit direction in which cam0 (not the body's origin) moved, in
+    body axes of the keyframe: without scale, the lever arm between the two cannot be taken out here.
+    """
+
+    mode = "mono"
+
+    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
+        """Take the rig's first camera."""
+        self._config = config
+        self._camera = rig.cameras[0]
+        self._T_body_cam = rig.T_body_cams[0]
+        self._R_body_cam = np.ascontiguousarray(self._T_body_cam[:3, :3])
+        self._intake = Intake(rig, seed)
+        self._tracker = Tracker(config)
+        self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
+        self._sigma_xy = config.track_sigma_px / self._camera.fx
+        self._keyframe: Keyframe | None = None
+        self._keyframe_tracks = 0
+        self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
+        self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
+        self._direction_key: Array = np.zeros(3)  # zero: not known yet
+        self._t_placed_ns = -1
+        self._lost = False
+
+    def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
+        """Place `frame` relative to the last keyframe; see FrontEnd.track."""
+        dt_s = self._intake.accept(frame)
+        if self._keyframe is None:
+            return self._start(frame, "")
+        R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])
+        R_before = self._R_key_cam
+        R_guess = R_before @ R_now_next
+        last = np.column_stack([self._camera.normalise(self._last_px), np.ones(len(self._last_px))])
+        guess = self._camera.project(last @ R_now_next)
+        pixels = self._tracker.follow(frame.images[0], guess)
+        found = np.isfinite(pixels[:, 0])
+        self._last_px = np.where(found[:, None], pixels, guess)
+        motion = self._locate(R_guess, pixels)
+        if motion.failure:
+            self._R_key_cam = R_guess
+            return self._lose(frame, self._keyframe, motion)
+        self._R_key_cam, self._direction_key = motion.view.R_key_cam, motion.view.direction_key
+        if not self._lost:
+            self._predictor.observe(transform(R_before.T @ self._R_key_cam, np.zeros(3)), dt_s)
+        self._lost = False
+        self._t_placed_ns = frame.t_ns
+        return self._report(frame, self._keyframe, motion)
+
+    # -- placing one frame -------------------------------------------------------------------------------------------
+
+    def _locate(self, R_guess: Array, pixels: Array) -> _Motion:
+        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
+        still = self._turn(R_guess, key_xy, xy)
+        parallax_px = self._parallax_px(still.R_key_cam if still.converged else R_guess, key_xy, xy)
+        view = still
+        if not still.converged or parallax_px > self._config.mono_min_parallax_px:
+            both = self._two_view(R_guess, key_xy, xy)
+            # a direction that does not settle is no reason to give up a rotation that does
+            if both.converged or not still.converged:
+                view = both
+                parallax_px = self._parallax_px(view.R_key_cam, key_xy, xy)
+        return _Motion(view, pixels, parallax_px, self._failure(view, int(np.isfinite(xy[:, 0]).sum())))
+
+    def _failure(self, view: TwoViewEstimate, followed: int) -> str:
+        agree = int(view.inliers.sum())
+        if followed < self._config.min_inliers:
+            return f"only {followed} of {len(self._tracker)} tracks found"
+        if not view.converged:
+            return "the motion does not converge"
+        if agree < max(self._config.min_inliers, self._config.min_inlier_ratio * followed):
+            return f"only {agree} of {followed} tracks agree on a motion"
+        return ""
+
+    def _turn(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
+        """Explain the image by rotation alone: all points at infinity."""
+        points = np.column_stack([key_xy, np.zeros(len(key_xy))])
+        no_noise: Array = np.zeros((len(points), 3, 3))
+        start = transform(np.ascontiguousarray(R_guess), np.zeros(3))
+        pose = refine_pose(start, points, no_noise, xy, self._sigma_xy, self._config.cauchy, _FIXED_M)
+        covariance = pose.covariance.copy()
+        covariance[3:, :] = covariance[:, 3:] = 0.0
+        covariance[3:, 3:] = np.eye(3) * _ANY_DIRECTION
+        R = np.ascontiguousarray(pose.T_key_cam[:3, :3])
+        return TwoViewEstimate(R, np.zeros(3), covariance, pose.inliers, pose.converged)
+
+    def _two_view(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
+        """Refine from the prediction if the direction is known already; search by RANSAC if that is not good enough."""
+        config = self._config
+        best: TwoViewEstimate | None = None
+        if self._direction_key.any():
+            best = refine_two_view(R_guess, self._direction_key, key_xy, xy, self._sigma_xy, config.cauchy)
+        if best is None or not best.converged or best.inliers.sum() < _RANSAC_BELOW * np.isfinite(xy[:, 0]).sum():
+            start = essential_ransac(key_xy, xy, _RANSAC_PX / self._camera.fx, config.min_inliers)
+            if start is not None:
+                other = refine_two_view(*start, key_xy, xy, self._sigma_xy, config.cauchy)
+                if best is None or other.inliers.sum() > best.inliers.sum():
+                    best = other
+        if best is None:
+            nothing = np.zeros(len(xy), dtype=np.bool_)
+            return TwoViewEstimate(R_guess, np.zeros(3), np.full((6, 6), np.nan), nothing, False)
+        return best
+
+    def _parallax_px(self, R_key_cam: Array, key_xy: Array, xy: Array) -> float:
+        seen = np.isfinite(xy[:, 0])
+        if not seen.any():
+            return 0.0
+        turned = np.column_stack([xy[seen], np.ones(int(seen.sum()))]) @ R_key_cam.T
+        moved = turned[:, :2] / turned[:, 2:] - key_xy[seen]
+        return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx)
+
+    # -- what comes of it --------------------------------------------------------------------------------------------
+
+    def _report(self, frame: Frame, keyframe: Keyframe, motion: _Motion) -> TrackResult:
+        weakness = self._weakness(motion)
+        vo = self._measurement(frame, keyframe.id, motion, Tracking.DEGRADED if weakness else Tracking.OK)
+        good = motion.view.inliers
+        departure = Departure(
+            dt_s=(frame.t_ns - keyframe.t_ns) * 1e-9,
+            rotation_rad=float(np.linalg.norm(so3_log(self._R_key_cam))),
+            parallax_px=motion.parallax_px,
+            alive=motion.followed / max(self._keyframe_tracks, 1),
+            inliers=motion.inliers,
+            fit=True,
+        )
+        reason = keyframe_reason(departure, self._config)
+        if reason:
+            pixels = motion.pixels.copy()
+            self._tracker.begin(frame.images[0], good, pixels)
+            new = self._install(frame)
+            return TrackResult(vo, self._observations(), new, motion.parallax_px, reason)
+        observations = Observations(self._tracker.ids[good].copy(), motion.pixels[good])
+        self._last_px = self._last_px[self._tracker.judge(good)]
+        return TrackResult(vo, observations, None, motion.parallax_px, weakness)
+
+    def _weakness(self, motion: _Motion) -> str:
+        if motion.inliers < self._config.degraded_inliers:
+            return f"only {motion.inliers} inliers"
+        if motion.inliers < self._config.degraded_inlier_ratio * motion.followed:
+            return f"only {motion.inliers} of {motion.followed} tracks agree"
+        return ""
+
+    def _measurement(self, frame: Frame, keyframe_id: int, motion: _Motion, tracking: Tracking) -> VoMeasurement:
+        """Express rotation and direction in body axes; the perturbation is on the body side, as for metric motion."""
+        view, R_body_cam = motion.view, self._R_body_cam
+        R_key_body = R_body_cam @ view.R_key_cam @ R_body_cam.T
+        change = np.zeros((6, 6))
+        change[:3, :3] = R_body_cam
+        change[3:, 3:] = R_key_body.T @ R_body_cam
+        covariance = change @ view.covariance @ change.T
+        return VoMeasurement(
+            t_ns=frame.t_ns,
+            keyframe_id=keyframe_id,
+            T_keyframe_body=np.asarray(transform(R_key_body, R_body_cam @ view.direction_key)),
+            covariance=0.5 * (covariance + covariance.T),
+            has_scale=False,
+            tracking=tracking,
+            inliers=motion.inliers,
+        )
+
+    def _lose(self, frame: Frame, keyframe: Keyframe, motion: _Motion) -> TrackResult:
+        self._lost = True
+        if (frame.t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s:
+            return self._start(frame, motion.failure)
+        vo = lost_motion(frame.t_ns, keyframe.id, False, motion.inliers)
+        return TrackResult(vo, no_observations(), None, 0.0, motion.failure)
+
+    # -- keyframes ---------------------------------------------------------------------------------------------------
+
+    def _start(self, frame: Frame, failure: str) -> TrackResult:
+        """Begin anew with this frame as keyframe, if there is enough to see in it."""
+        last_id = self._keyframe.id if self._keyframe is not None else -1
+        self._tracker.forget()
+        count = self._tracker.begin(frame.images[0], np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
+        self._last_px = self._tracker.pixels.copy()
+        if count < self._config.min_start_corners:
+            self._tracker.forget()
+            self._last_px = np.empty((0, 2))
+            reason = f"only {count} corners in an image of mean grey {frame.images[0].mean():.0f}"
+            vo = lost_motion(frame.t_ns, last_id, False)
+            return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {reason}" if failure else reason)
+        self._predictor.forget()
+        self._lost = False
+        keyframe = self._install(frame)
+        if last_id < 0:
+            vo = identity_motion(frame.t_ns, 0, False, count)
+            return TrackResult(vo, self._observations(), keyframe, 0.0, "first keyframe")
+        vo = lost_motion(frame.t_ns, last_id, False)
+        return TrackResult(vo, self._observations(), keyframe, 0.0, f"restarted: {failure}")
+
+    def _observations(self) -> Observations:
+        return Observations(self._tracker.ids.copy(), self._tracker.pixels.copy())
+
+    def _install(self, frame: Frame) -> Keyframe:
+        new_id = self._keyframe.id + 1 if self._keyframe is not None else 0
+        features = self._config.described_features
+        keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, None)
+        self._keyframe = keyframe
+        self._keyframe_tracks = len(self._tracker)
+        self._last_px = self._tracker.pixels.copy()
+        self._R_key_cam, self._direction_key = np.eye(3), np.zeros(3)
+        self._t_placed_ns = frame.t_ns
+        return keyframe
