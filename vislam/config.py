@@ -59,7 +59,6 @@ class FrontEndConfig:
     stereo_levels: int = 3  # pyramid levels above the image
     stereo_sigma_px: float = 0.3  # noise of the disparity
     epipolar_gate_px: float = 1.5  # distance from the epipolar line that calibration and noise explain
-    blind_sigma_m: float = 0.05  # trust in the predicted translation while no depth has been seen
 
     mono_min_parallax_px: float = 3.0  # less, and the direction of motion drowns in noise: only rotation is told
 

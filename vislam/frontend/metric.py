@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the land
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
-_ADOPT_ROUNDS = 3  # depth moves from this frame to the keyframe by a pose that depends on it
-_ADOPT_SIGMA = 0.05  # of the inverse depth, for what remains
+_BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +40,6 @@ class _Attempt:
     xy: Array  # [N, 2] the same as of the middle row's time
     expected_rho: Array  # [N] in this frame
     twist_per_s: Array  # [6] velocity of the camera
-    landmarks: Landmarks
     estimate: PoseEstimate
     failure: str  # empty when the pose can be trusted
 
@@ -76,6 +74,8 @@ class MetricFrontEnd:
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
         self._t_placed_ns = -1  # of the last frame that was placed
         self._lost = False
+        self._blind = False  # the keyframe is the first and has no depth
+        self._blind_px: Array = np.empty((0, 2))  # where its tracks were last seen
 
     def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
@@ -84,6 +84,8 @@ class MetricFrontEnd:
             return self._start(frame, "")
         T_before = self._T_key_cam
         T_guess = T_before @ self._predictor.predict(dt_s, imu)
+        if self._blind:
+            return self._leave_blindness(frame, self._keyframe, T_guess)
         attempt = self._attempt(frame, T_before, T_guess, dt_s)
         if attempt.failure:
             T_found = self._recognise(frame, self._keyframe)
@@ -97,7 +99,6 @@ class MetricFrontEnd:
             self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
         self._lost = False
         self._t_placed_ns = frame.t_ns
-        self._landmarks = attempt.landmarks
         self._learn_shutter(attempt)
         return self._report(frame, self._keyframe, attempt)
 
@@ -110,14 +111,14 @@ class MetricFrontEnd:
         pixels = self._tracker.follow(frame.images[0], self._shutter.project(predicted, twist))
         seen = self._camera.normalise(pixels)
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
-        landmarks, estimate = self._place(frame, T_guess, landmarks, pixels, xy)
+        estimate = self._solve(T_guess, xy)
         if estimate.converged:
             twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
             if self._shutter.readout_s > 0.0:
                 xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
-                estimate = self._solve(estimate.T_key_cam, landmarks, xy)
+                estimate = self._solve(estimate.T_key_cam, xy)
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
-        return _Attempt(pixels, seen, xy, predicted[:, 2], twist, landmarks, estimate, failure)
+        return _Attempt(pixels, seen, xy, predicted[:, 2], twist, estimate, failure)
 
     def _failure(self, estimate: PoseEstimate, followed: int) -> str:
         agree = int(estimate.inliers.sum())
@@ -129,46 +130,27 @@ class MetricFrontEnd:
             return f"only {agree} of {followed} tracks agree on a motion"
         return ""
 
-    def _place(
-        self, frame: Frame, T_guess: Array, landmarks: Landmarks, pixels: Array, xy: Array
-    ) -> tuple[Landmarks, PoseEstimate]:
-        """Solve for the pose; a keyframe that had no depth of its own borrows this frame's."""
-        if self._sees_scale or not self._depth.available(frame):
-            return landmarks, self._solve(T_guess, landmarks, xy)
-        nothing: Array = np.full(len(pixels), np.nan)
-        reading = self._depth.measure(frame, pixels, xy, nothing)
-        T = T_guess
-        for _ in range(_ADOPT_ROUNDS):
-            adopted = _adopt(landmarks, reading, xy, T)
-            estimate = self._solve(T, adopted, xy)
-            T = estimate.T_key_cam
-        return adopted, estimate
-
-    @property
-    def _sees_scale(self) -> bool:
-        return int(self._landmarks.known.sum()) >= self._config.min_inliers
-
-    def _solve(self, T_guess: Array, landmarks: Landmarks, xy: Array) -> PoseEstimate:
+    def _solve(self, T_guess: Array, xy: Array) -> PoseEstimate:
         """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
-        estimate = self._refine(T_guess, landmarks, xy)
+        estimate = self._refine(T_guess, xy)
         followed = int(np.isfinite(xy[:, 0]).sum())
         if estimate.inliers.sum() < _RANSAC_BELOW * followed:
-            known = landmarks.known & (landmarks.mean[:, 2] > 0.0)
-            mean = landmarks.mean[known]
-            points = np.column_stack([mean[:, :2], np.ones(len(mean))]) / mean[:, 2:]
-            threshold = _RANSAC_PX / self._camera.fx
-            T_ransac = pnp_ransac(points, xy[known], threshold, self._config.min_inliers)
+            known = self._landmarks.known & (self._landmarks.mean[:, 2] > 0.0)
+            T_ransac = self._ransac(_points(self._landmarks.mean[known]), xy[known])
             if T_ransac is not None:
-                other = self._refine(T_ransac, landmarks, xy)
+                other = self._refine(T_ransac, xy)
                 if other.inliers.sum() > estimate.inliers.sum():
                     estimate = other
         if not estimate.converged:
             return estimate
-        return self._refine(estimate.T_key_cam, landmarks, np.where(estimate.inliers[:, None], xy, np.nan))
+        return self._refine(estimate.T_key_cam, np.where(estimate.inliers[:, None], xy, np.nan))
 
-    def _refine(self, T: Array, landmarks: Landmarks, xy: Array) -> PoseEstimate:
-        sigma_m = np.inf if int(landmarks.known.sum()) >= self._config.min_inliers else self._config.blind_sigma_m
-        return refine_pose(T, landmarks.mean, landmarks.covariance, xy, self._sigma_xy, self._config.cauchy, sigma_m)
+    def _refine(self, T: Array, xy: Array) -> PoseEstimate:
+        mean, covariance = self._landmarks.mean, self._landmarks.covariance
+        return refine_pose(T, mean, covariance, xy, self._sigma_xy, self._config.cauchy)
+
+    def _ransac(self, points_m: Array, xy: Array) -> Array | None:
+        return pnp_ransac(points_m, xy, _RANSAC_PX / self._camera.fx, self._config.min_inliers)
 
     def _recognise(self, frame: Frame, keyframe: Keyframe) -> Array | None:
         config = self._config
@@ -178,7 +160,7 @@ class MetricFrontEnd:
 
     def _learn_shutter(self, attempt: _Attempt) -> None:
         """Let the shear that is left in this frame correct the readout time."""
-        if not self._shutter.learns or not self._sees_scale or not self._keyframe_twist.any():
+        if not self._shutter.learns or self._weakness(attempt) or not self._keyframe_twist.any():
             return
         mean, covariance = self._landmarks.mean, self._landmarks.covariance
         xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
@@ -213,8 +195,6 @@ class MetricFrontEnd:
 
     def _weakness(self, attempt: _Attempt) -> str:
         """Return why the tracking is degraded, or an empty string."""
-        if not self._sees_scale:
-            return "no depth yet, the distance moved is a guess"
         if attempt.inliers < self._config.degraded_inliers:
             return f"only {attempt.inliers} inliers"
         if attempt.inliers < self._config.degraded_inlier_ratio * attempt.followed:
@@ -249,28 +229,73 @@ class MetricFrontEnd:
         vo = lost_motion(frame.t_ns, keyframe.id, True, attempt.inliers)
         return TrackResult(vo, no_observations(), None, 0.0, attempt.failure)
 
+    # -- a first keyframe without depth ------------------------------------------------------------------------------
+
+    def _leave_blindness(self, frame: Frame, keyframe: Keyframe, T_guess: Array) -> TrackResult:
+        """Follow a first keyframe that has no depth until a frame comes that has: then place it by its own depth."""
+        rays = np.column_stack([self._camera.normalise(self._blind_px), np.ones(len(self._blind_px))])
+        pixels = self._tracker.follow(frame.images[0], self._camera.project(rays @ T_guess[:3, :3]))
+        self._blind_px = np.where(np.isfinite(pixels), pixels, self._blind_px)
+        if not self._depth.available(frame):
+            vo = lost_motion(frame.t_ns, keyframe.id, True)
+            return TrackResult(vo, no_observations(), None, 0.0, "no depth has been seen yet")
+        xy = self._camera.normalise(pixels)
+        reading = self._depth.measure(frame, pixels, xy, np.full(len(xy), np.nan))
+        points = np.column_stack([xy, reading.rho])
+        usable = np.isfinite(points).all(axis=1) & (reading.rho > 0.0)
+        T_cam_key = self._ransac(_points(points[usable]), self._landmarks.mean[usable, :2])
+        if T_cam_key is None:
+            return self._start(frame, "the first keyframe, which had no depth, is out of sight")
+        moved, _ = move(points[usable], np.zeros((int(usable.sum()), 3, 3)), T_cam_key)
+        self._landmarks.mean[usable, 2] = moved[:, 2]
+        self._landmarks.covariance[usable, 2, 2] = (_BLIND_SIGMA * moved[:, 2]) ** 2
+        estimate = self._solve(np.asarray(invert(T_cam_key)), xy)
+        failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
+        if failure:
+            return self._start(frame, failure)
+        attempt = _Attempt(pixels, xy, xy, reading.rho, np.zeros(6), estimate, "")
+        self._T_key_cam = estimate.T_key_cam
+        # followed for long, through a rolling shutter of which nothing was known: true, but not to the millimetre
+        vo = replace(self._measurement(frame, keyframe.id, attempt), tracking=Tracking.DEGRADED)
+        parallax_px = self._parallax_px(attempt)
+        new, observations = self._continue_from(frame, attempt)
+        self._blind = False
+        return TrackResult(vo, observations, new, parallax_px, "the first depth")
+
     # -- keyframes ---------------------------------------------------------------------------------------------------
 
     def _start(self, frame: Frame, failure: str) -> TrackResult:
         """Begin anew with this frame as keyframe, if there is enough to see in it."""
         last_id = self._keyframe.id if self._keyframe is not None else -1
-        count = self._tracker.begin(frame.images[0], np.zeros(len(self._tracker), dtype=np.bool_), self._tracker.pixels)
+        self._tracker.forget()
         self._landmarks = Landmarks()
-        if count < self._config.min_start_corners:
+        count = self._tracker.begin(frame.images[0], np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
+        reading = self._add_landmarks(frame, count, np.zeros(6))
+        lack = self._lack(frame, last_id)
+        if lack:
             self._tracker.forget()
-            reason = f"only {count} corners in an image of mean grey {frame.images[0].mean():.0f}"
+            self._landmarks = Landmarks()
             vo = lost_motion(frame.t_ns, last_id, True)
-            return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {reason}" if failure else reason)
+            return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {lack}" if failure else lack)
         self._predictor.forget()
         self._lost = False
-        reading = self._add_landmarks(frame, count, np.zeros(6))
+        self._blind, self._blind_px = not self._depth.available(frame), self._tracker.pixels.copy()
         keyframe = self._install(frame, np.zeros(6))
         observations = self._observations(self._tracker.pixels, reading)
         if last_id < 0:
-            return TrackResult(
-                identity_motion(frame.t_ns, 0, True, count), observations, keyframe, 0.0, "first keyframe"
-            )
-        return TrackResult(lost_motion(frame.t_ns, last_id, True), observations, keyframe, 0.0, f"restarted: {failure}")
+            vo = identity_motion(frame.t_ns, 0, True, count)
+            return TrackResult(vo, observations, keyframe, 0.0, "first keyframe")
+        vo = lost_motion(frame.t_ns, last_id, True)
+        return TrackResult(vo, observations, keyframe, 0.0, f"restarted: {failure}")
+
+    def _lack(self, frame: Frame, last_id: int) -> str:
+        """Return what a frame lacks to start from, or an empty string; only the very first may be without depth."""
+        corners, deep = len(self._tracker), int(self._landmarks.known.sum())
+        if corners < self._config.min_start_corners:
+            return f"only {corners} corners in an image of mean grey {frame.images[0].mean():.0f}"
+        if deep < self._config.min_inliers and (last_id >= 0 or self._depth.available(frame)):
+            return f"only {deep} of {corners} corners have depth"
+        return ""
 
     def _continue_from(self, frame: Frame, attempt: _Attempt) -> tuple[Keyframe, Observations]:
         """Carry the agreeing landmarks into this frame, improve them by what it measures, fill the gaps."""
@@ -319,15 +344,6 @@ class MetricFrontEnd:
         return keyframe
 
 
-def _adopt(landmarks: Landmarks, reading: DepthReading, xy: Array, T_key_cam: Array) -> Landmarks:
-    """Return landmarks whose depth is what a frame at T_key_cam measured, where it did."""
-    adopted = Landmarks()
-    adopted.mean, adopted.covariance = landmarks.mean.copy(), landmarks.covariance.copy()
-    points = np.column_stack([xy, reading.rho])
-    seen = np.flatnonzero(np.isfinite(points).all(axis=1))
-    moved, _ = move(points[seen], np.zeros((len(seen), 3, 3)), np.asarray(invert(T_key_cam)))
-    usable = np.isfinite(moved[:, 2])
-    rows = seen[usable]
-    adopted.mean[rows, 2] = moved[usable, 2]
-    adopted.covariance[rows, 2, 2] = reading.sigma_rho[rows] ** 2 + (_ADOPT_SIGMA * moved[usable, 2]) ** 2
-    return adopted
+def _points(inverse_depth: Array) -> Array:
+    """Return points [N, 3] in metres of inverse-depth points [N, 3] with rho > 0."""
+    return np.column_stack([inverse_depth[:, :2], np.ones(len(inverse_depth))]) / inverse_depth[:, 2:]

@@ -20,6 +20,7 @@ _SIGMA_S = 0.02  # before anything is known: cameras take 0 to 33 ms
 _MAX_S = 0.05
 _GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter: half a pixel at 60 deg/s
 _TRUST = 0.1  # of a frame's information: successive frames share landmarks and their errors
+_FRAME_SIGMA_S = 0.01  # no single frame may claim to know it better: its velocity may be wrong
 _STEP_S = 1e-3  # for the derivative by the readout
 
 
@@ -45,7 +46,7 @@ class Shutter:
 
     def learn(self, change_s: float, information: float) -> None:
         """Take in one frame's estimate: the applied readout plus `change_s`, with `information` in 1/s^2."""
-        weight = _TRUST * information
+        weight = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)
         measured = self.readout_s + change_s
         self._information += weight
         self._estimate_s += weight / self._information * (measured - self._estimate_s)
