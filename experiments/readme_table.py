@@ -2,7 +2,8 @@
 
     .venv/bin/python experiments/readme_table.py [--out results/readme_table] [--only NAME ...] [--reuse]
 
-Each run is a process of its own, as a user would start it. A recording that is missing or a run that fails stays in the
+Each run is a process of its own, as a user would start it; simulated worlds are recorded first, so that rendering does
+not count. A recording that is missing or a run that fails stays in the
 table and says so. The README's block between the markers is replaced, so that no number in it is typed by hand.
 """
 
@@ -30,7 +31,7 @@ COLUMNS = (
     "recording",
     "mode",
     "ATE final [m]",
-    "ATE before loops [m]",
+    "ATE EKF alone [m]",
     "keyframes",
     "loops",
     "real-time factor",
@@ -62,6 +63,7 @@ ENTRIES = (
     Entry("euroc_mh01_stereo", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "stereo")),
     Entry("euroc_mh01_mono", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "mono")),
     Entry("corridor_loop", "simulated corridor-loop", "sim:corridor-loop"),
+    Entry("corridor_open", "the same, loop closing off", "sim:corridor-loop", ("--loop.no-enabled",)),
     Entry("workshop_cart", "simulated workshop-cart", "sim:workshop-cart"),
 )
 
@@ -78,19 +80,28 @@ def measure(entry: Entry, out: Path, root: Path, reuse: bool = False) -> Outcome
         return Outcome(entry, None, "recording missing")
     if not (reuse and (out / "metrics.json").is_file()):
         shutil.rmtree(out, ignore_errors=True)
-        source = entry.source if kind == "sim" else f"{kind}:{root / name}"
-        command = [sys.executable, "-c", _START, "run", source, "--out", str(out), *entry.options]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-        except subprocess.TimeoutExpired:
-            return Outcome(entry, None, f"no answer after {TIMEOUT_S:.0f} s")
-        if done.returncode != 0:
-            lines = done.stderr.strip().splitlines() or ["no message"]
-            return Outcome(entry, None, f"exit code {done.returncode}: {lines[-1]}")
+        folder = out.parent / "recordings" / name if kind == "sim" else root / name
+        failure = _call("simulate", name, "--out", str(folder)) if kind == "sim" and not folder.exists() else ""
+        failure = failure or _call("run", str(folder), "--out", str(out), *entry.options)
+        if failure:
+            return Outcome(entry, None, failure)
     try:
         return Outcome(entry, json.loads((out / "metrics.json").read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         return Outcome(entry, None, f"metrics.json: {error}")
+
+
+def _call(*arguments: str) -> str:
+    """Run a verb in a process of its own; return why it failed, or an empty string."""
+    command = [sys.executable, "-c", _START, *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return f"no answer after {TIMEOUT_S:.0f} s"
+    if done.returncode == 0:
+        return ""
+    lines = done.stderr.strip().splitlines() or ["no message"]
+    return f"exit code {done.returncode}: {lines[-1]}"
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
@@ -101,7 +112,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def row(outcome: Outcome) -> list[str]:
-    """Return the cells of one outcome; "before loops" is the EKF alone, or odometry where there is no IMU."""
+    """Return the cells of one outcome; where there is no IMU, odometry stands in for the EKF."""
     metrics = outcome.metrics
     if metrics is None:
         reason = outcome.failure.replace("|", "/")
@@ -118,7 +129,7 @@ def row(outcome: Outcome) -> list[str]:
         outcome.entry.recording,
         mode,
         _number(final.get("ate_rmse_m"), 3) + note,
-        f"{causal} ({'EKF' if inertial else 'odometry'})" if causal != "–" else "–",
+        causal if inertial or causal == "–" else f"{causal} (odometry)",
         _number(metrics.get("keyframes"), 0),
         f"{_number(loops.get('accepted'), 0)} of {_number(loops.get('candidates'), 0)}",
         _number(metrics.get("realtime_factor"), 2),

