@@ -221,7 +221,7 @@ class Front:
     def _since_keyframe(self, T_vo_keyframe_body: Array | None, T_odom_body: Array | None) -> Array | None:
         if T_vo_keyframe_body is not None:
             return T_vo_keyframe_body
-        if T_odom_body is not None and self._T_odom_keyframe is not None:
+        if self._ekf is not None and T_odom_body is not None and self._T_odom_keyframe is not None:
             return invert(self._T_odom_keyframe) @ T_odom_body
         return None
 

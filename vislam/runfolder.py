@@ -190,20 +190,19 @@ class RunLog:
     def final_trajectory(self, ids: list[int], T_map_body: Array) -> Trajectory:
         """Return the pose of every frame from the final poses of the keyframes that they were tracked against.
 
-        Frames whose motion since their keyframe is unknown are interpolated between keyframes.
+        Frames whose motion since their keyframe is unknown are interpolated between those that are known.
         """
         poses = dict(zip(ids, T_map_body, strict=True))
-        keyframes = Trajectory(np.array([self._keyframe_t_ns[i] for i in ids], dtype=np.int64), np.array(T_map_body))
-        t_ns, frames = [], []
-        for stamp, keyframe_id, T in zip(self._t_ns, self._keyframe_ids, self._since_keyframe, strict=True):
+        known = {self._keyframe_t_ns[i]: T for i, T in poses.items()}
+        for t_ns, keyframe_id, T in zip(self._t_ns, self._keyframe_ids, self._since_keyframe, strict=True):
             if T is not None and keyframe_id in poses:
-                frames.append(poses[keyframe_id] @ T)
-            elif len(keyframes) > 1 and keyframes.t_ns[0] <= stamp <= keyframes.t_ns[-1]:
-                frames.append(keyframes.at(stamp))
-            else:
-                continue
-            t_ns.append(stamp)
-        return Trajectory(np.array(t_ns, dtype=np.int64), np.array(frames).reshape(-1, 4, 4))
+                known[t_ns] = poses[keyframe_id] @ T
+        stamps = np.array(sorted(known), dtype=np.int64)
+        anchors = Trajectory(stamps, np.array([known[t] for t in stamps.tolist()]).reshape(-1, 4, 4))
+        if len(anchors) == 0:
+            return anchors
+        frames = np.array([t for t in self._t_ns if stamps[0] <= t <= stamps[-1]], dtype=np.int64)
+        return Trajectory(frames, anchors.at(frames))
 
     def odometry_trajectory(self) -> Trajectory:
         """Return the causal poses in odom: those of the filter, or of visual odometry without an IMU."""
