@@ -62,7 +62,7 @@ class FrontEndConfig:
 
     mono_min_parallax_px: float = 3.0  # less, and the direction of motion drowns in noise: only rotation is told
 
-    cauchy: float = 2.0  # scale of the robust kernel in standard deviations
+    cauchy: float = 3.0  # scale of the robust kernel in standard deviations
     min_inliers: int = 15  # fewer: lost; six unknowns need some redundancy
     degraded_inliers: int = 40  # fewer: degraded
     min_inlier_ratio: float = 0.3  # of the followed tracks; below, the agreement may be chance
@@ -72,7 +72,7 @@ class FrontEndConfig:
 
     keyframe_parallax_px: float = 40.0  # median with rotation taken out
     keyframe_rotation_deg: float = 15.0  # patches turn with the camera and stop matching
-    keyframe_min_alive: float = 0.5  # fraction of the keyframe's tracks that are still followed
+    keyframe_min_alive: float = 0.45  # fraction of the keyframe's tracks that are still followed
     keyframe_min_alive_unfit: float = 0.2  # the same for a frame without depth, which makes a poor keyframe
     keyframe_min_inliers: int = 60  # fewer: new corners are worth the drift
     keyframe_min_interval_s: float = 0.15  # brisk motion: at most about six keyframes a second
@@ -105,7 +105,7 @@ class InitConfig:
     max_scale_sigma: float = 0.1  # relative, monocular only
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
-    attempt_s: float = 0.2  # between attempts: a window changes little from frame to frame
+    attempt_s: float = 0.5  # between attempts: without scale one costs 0.3 s, and a window changes little in this time
     max_nodes: int = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
     min_directions: int = 8  # monocular: motions with parallax in the window; four unknown states need some redundancy
 

@@ -26,6 +26,7 @@ from vislam.messages import (
     NavState,
     Observations,
     Tracking,
+    VoMeasurement,
 )
 
 _MIN_SHARED_TRACKS = 10  # fewer say nothing about the motion of the camera
@@ -118,8 +119,8 @@ class Front:
         at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
         T_vo_keyframe_body = track.vo.T_keyframe_body if track.vo.has_scale else None
-        if T_vo_keyframe_body is not None:
-            self._T_vo_body = self._T_vo_keyframe @ T_vo_keyframe_body
+        if track.vo.T_keyframe_body is not None:
+            self._T_vo_body = self._T_vo_keyframe @ scaled_motion(track.vo)
         with self._clock.measure("ekf"):
             ready = self._initialise(span, track, still_image)
             T_odom_body, state = self._filter(frame, track, at_rest)
@@ -195,11 +196,22 @@ class Front:
         return self._release(found.T_odom_vo)
 
     def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
-        """Return the waiting keyframes in `odom`, and settle the state of the first."""
-        released = [OdometryKeyframe(w.packet, T_odom_vo @ w.T_odom_body) for w in self._waiting]
+        """Return the waiting keyframes in `odom`, and settle the state of the first.
+
+        Without scale the visual chain has no positions; those that the initialisation solved for take their place.
+        """
+        found = self.initialisation
+        solved = {}
+        if found is not None and found.T_odom_body is not None and self.frontend.mode == "mono":
+            solved = dict(zip(found.t_ns, found.T_odom_body, strict=True))
+        released = [
+            OdometryKeyframe(w.packet, solved.get(w.packet.keyframe.t_ns, T_odom_vo @ w.T_odom_body))
+            for w in self._waiting
+        ]
         self._waiting = []
         self._T_odom_keyframe = T_odom_vo @ self._T_vo_keyframe
-        found = self.initialisation
+        if self.frontend.mode == "mono":
+            self._T_odom_keyframe = solved.get(self._keyframe_t_ns)
         if released and found is not None and found.first is not None:
             self.first_state = first_keyframe_state(found.first, released[0])
         return released
@@ -272,6 +284,14 @@ def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavStat
     covariance[6:9, :] = covariance[:, 6:9] = 0.0
     covariance[6:9, 6:9] = np.eye(3) * _UNKNOWN_VELOCITY_M_S**2
     return NavState(t_ns, keyframe.T_odom_body, np.zeros(3), first.gyro_bias_rad_s, first.accel_bias_m_s2, covariance)
+
+
+def scaled_motion(vo: VoMeasurement) -> Array:
+    """Return the motion [4, 4] since the keyframe as far as it is known: without scale, its rotation alone."""
+    assert vo.T_keyframe_body is not None
+    if vo.has_scale:
+        return vo.T_keyframe_body
+    return transform(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]), np.zeros(3))
 
 
 def median_flow_px(before: Observations | None, after: Observations) -> float | None:

@@ -61,6 +61,8 @@ class SimulateOptions:
     """Motion blur of this exposure"""
     readout_s: float = 0.0
     """Rolling shutter: time from the first to the last row"""
+    workers: int = 2
+    """Threads that render; they change nothing but the time"""
     seed: int = 0
     """Same seed, same bytes"""
 
