@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _INTERRUPTED = 130
+_DEMO_CAMERA_HZ = 10  # rendering takes most of the demo's time
 
 Options = TypeVar("Options")
 
@@ -187,7 +188,7 @@ def _demo(arguments: list[str]) -> int:
 
     options = _parse(DemoOptions, arguments, "demo")
     _complain(f"simulating '{options.world}' and running the pipeline on it; about two minutes ...")
-    source = f"sim:{options.world}"
+    source = f"sim:{options.world},camera_hz={_DEMO_CAMERA_HZ}"
     metrics = _run_source(source, Config(seed=options.seed), options.out, True, ["vislam", "demo", *arguments])
     _print_summary(metrics, options.out)
     return 0

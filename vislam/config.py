@@ -23,6 +23,7 @@ _STRICT = ConfigDict(extra="forbid")
 class ImuConfig:
     """Inertial noise; None keeps what the recording's own sensor file says."""
 
+    enabled: bool = True  # off: vision alone, as if the recording had no IMU
     gyro_noise_density: float | None = None  # rad/s/sqrt(Hz)
     accel_noise_density: float | None = None  # m/s^2/sqrt(Hz)
     gyro_bias_walk: float | None = None  # rad/s^2/sqrt(Hz)

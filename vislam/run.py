@@ -34,8 +34,8 @@ _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as
 
 
 def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
-    """Return the recording's noise model with what the configuration overrides; None without an IMU."""
-    if recorded is None:
+    """Return the recording's noise model with what the configuration overrides; None without an IMU or with it off."""
+    if recorded is None or not config.enabled:
         return None
     overrides = {name: value for name in asdict(recorded) if (value := getattr(config, name, None)) is not None}
     return ImuNoise(**{**asdict(recorded), **overrides})
@@ -51,7 +51,8 @@ class Run:
         self.config = config
         self.out = out
         write_setup(out, config, source, command)
-        self.slam = Slam(config, recording.rig, imu_noise(config.imu, recording.imu_noise))
+        self.noise = imu_noise(config.imu, recording.imu_noise)
+        self.slam = Slam(config, recording.rig, self.noise)
         self.log = RunLog()
         self.session = SessionWriter(out / "session.db", {"source": source, "config": asdict(config)})
         self.viewer = open_viewer(out / "run.rrd", config.view.enabled, recording.rig, config.view)
@@ -199,7 +200,7 @@ class Run:
         return {
             "name": self.recording.name,
             "mode": front.frontend.mode,
-            "has_imu": self.recording.imu_noise is not None,
+            "has_imu": self.noise is not None,
             "frames": len(self.log),
             "frames_expected": self.recording.frame_count,
             "keyframes": self.log.keyframes,
