@@ -62,10 +62,14 @@ def refine_two_view(
     return TwoViewEstimate(R, t, covariance, inliers, bool(converged))
 
 
-def essential_ransac(key_xy: Array, xy: Array, threshold: float, min_inliers: int) -> tuple[Array, Array] | None:
+def essential_ransac(
+    R_guess: Array, key_xy: Array, xy: Array, threshold: float, min_inliers: int
+) -> tuple[Array, Array] | None:
     """Return R_key_cam [3, 3] and a unit direction [3] by five-point RANSAC (Nister, PAMI 2004), or None.
 
-    Points [N, 2] are on z = 1, NaN rows are ignored, `threshold` is a distance there.
+    Points [N, 2] are on z = 1, NaN rows are ignored, `threshold` is a distance there. An essential matrix leaves two
+    rotations half a turn apart; the one nearer to `R_guess` is taken, which is safe where depths are too uncertain to
+    decide. The sign of the direction is left to `refine_two_view`.
     """
     usable = np.isfinite(xy).all(axis=1)
     if usable.sum() < max(min_inliers, 6):
@@ -76,9 +80,10 @@ def essential_ransac(key_xy: Array, xy: Array, threshold: float, min_inliers: in
     )
     if E is None or E.shape != (3, 3) or mask is None or int(mask.sum()) < min_inliers:
         return None
-    _, R_cam_key, t_cam_key, _ = cv2.recoverPose(E, a, b, np.eye(3), mask=mask)
+    first, second, t_cam_key = cv2.decomposeEssentialMat(E)
+    R_cam_key = first if np.trace(first @ R_guess) >= np.trace(second @ R_guess) else second
     R = np.ascontiguousarray(R_cam_key.T)
-    return R, -R @ t_cam_key[:, 0]
+    return R, R @ t_cam_key[:, 0]
 
 
 @njit(cache=True, nogil=True)

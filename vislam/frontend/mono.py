@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,9 @@ from vislam.geometry import so3_log, transform
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
 _RANSAC_PX = 1.5
-_RANSAC_BELOW = 0.6  # of the tracks agree: the start may have led astray
+_RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second solution that a flat scene has
+_TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a translation
+_VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 _FIXED_M = 1e-3  # holds the translation of points at infinity, which do not see it
 
@@ -65,7 +67,7 @@ class MonoFrontEnd:
         self._keyframe_tracks = 0
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
-        self._direction_key: Array = np.zeros(3)  # zero: not known yet
+        self._direction_key: Array = np.zeros(3)  # to the last frame, or where it will probably go; zero: not known
         self._t_placed_ns = -1
         self._lost = False
 
@@ -86,7 +88,9 @@ class MonoFrontEnd:
         if motion.failure:
             self._R_key_cam = R_guess
             return self._lose(frame, self._keyframe, motion)
-        self._R_key_cam, self._direction_key = motion.view.R_key_cam, motion.view.direction_key
+        self._R_key_cam = motion.view.R_key_cam
+        if motion.view.direction_key.any():
+            self._direction_key = motion.view.direction_key
         if not self._lost:
             self._predictor.observe(transform(R_before.T @ self._R_key_cam, np.zeros(3)), dt_s)
         self._lost = False
@@ -100,13 +104,15 @@ class MonoFrontEnd:
         still = self._turn(R_guess, key_xy, xy)
         parallax_px = self._parallax_px(still.R_key_cam if still.converged else R_guess, key_xy, xy)
         view = still
-        if not still.converged or parallax_px > self._config.mono_min_parallax_px:
+        followed = int(np.isfinite(xy[:, 0]).sum())
+        explained = still.converged and still.inliers.sum() >= _TURN_EXPLAINS * followed
+        if not explained or parallax_px > self._config.mono_min_parallax_px:
             both = self._two_view(R_guess, key_xy, xy)
             # a direction that does not settle is no reason to give up a rotation that does
             if both.converged or not still.converged:
-                view = both
+                view = _without_vague_direction(both)
                 parallax_px = self._parallax_px(view.R_key_cam, key_xy, xy)
-        return _Motion(view, pixels, parallax_px, self._failure(view, int(np.isfinite(xy[:, 0]).sum())))
+        return _Motion(view, pixels, parallax_px, self._failure(view, followed))
 
     def _failure(self, view: TwoViewEstimate, followed: int) -> str:
         agree = int(view.inliers.sum())
@@ -124,20 +130,17 @@ class MonoFrontEnd:
         no_noise: Array = np.zeros((len(points), 3, 3))
         start = transform(np.ascontiguousarray(R_guess), np.zeros(3))
         pose = refine_pose(start, points, no_noise, xy, self._sigma_xy, self._config.cauchy, _FIXED_M)
-        covariance = pose.covariance.copy()
-        covariance[3:, :] = covariance[:, 3:] = 0.0
-        covariance[3:, 3:] = np.eye(3) * _ANY_DIRECTION
         R = np.ascontiguousarray(pose.T_key_cam[:3, :3])
-        return TwoViewEstimate(R, np.zeros(3), covariance, pose.inliers, pose.converged)
+        return _turn_only(TwoViewEstimate(R, np.zeros(3), pose.covariance, pose.inliers, pose.converged))
 
     def _two_view(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
-        """Refine from the prediction if the direction is known already; search by RANSAC if that is not good enough."""
+        """Refine from the prediction, for a new keyframe going on as before; search by RANSAC if not all agree."""
         config = self._config
         best: TwoViewEstimate | None = None
         if self._direction_key.any():
             best = refine_two_view(R_guess, self._direction_key, key_xy, xy, self._sigma_xy, config.cauchy)
         if best is None or not best.converged or best.inliers.sum() < _RANSAC_BELOW * np.isfinite(xy[:, 0]).sum():
-            start = essential_ransac(key_xy, xy, _RANSAC_PX / self._camera.fx, config.min_inliers)
+            start = essential_ransac(R_guess, key_xy, xy, _RANSAC_PX / self._camera.fx, config.min_inliers)
             if start is not None:
                 other = refine_two_view(*start, key_xy, xy, self._sigma_xy, config.cauchy)
                 if best is None or other.inliers.sum() > best.inliers.sum():
@@ -226,6 +229,7 @@ class MonoFrontEnd:
             vo = lost_motion(frame.t_ns, last_id, False)
             return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {reason}" if failure else reason)
         self._predictor.forget()
+        self._direction_key = np.zeros(3)
         self._lost = False
         keyframe = self._install(frame)
         if last_id < 0:
@@ -244,6 +248,21 @@ class MonoFrontEnd:
         self._keyframe = keyframe
         self._keyframe_tracks = len(self._tracker)
         self._last_px = self._tracker.pixels.copy()
-        self._R_key_cam, self._direction_key = np.eye(3), np.zeros(3)
+        self._direction_key = self._R_key_cam.T @ self._direction_key
+        self._R_key_cam = np.eye(3)
         self._t_placed_ns = frame.t_ns
         return keyframe
+
+
+def _without_vague_direction(view: TwoViewEstimate) -> TwoViewEstimate:
+    """Return the estimate without its direction if that is hardly known."""
+    vague = view.converged and float(np.trace(view.covariance[3:, 3:])) > _VAGUE_RAD**2
+    return _turn_only(view) if vague else view
+
+
+def _turn_only(view: TwoViewEstimate) -> TwoViewEstimate:
+    """Return the rotation alone: no direction, and the covariance of a unit vector of which nothing is known."""
+    covariance = view.covariance.copy()
+    covariance[3:, :] = covariance[:, 3:] = 0.0
+    covariance[3:, 3:] = np.eye(3) * _ANY_DIRECTION
+    return replace(view, direction_key=np.zeros(3), covariance=covariance)
