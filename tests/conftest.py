@@ -5,11 +5,11 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
 from pathlib import Path
-from typing import NoReturn
 
 import cv2
 import pytest
 from hypothesis import settings
+from needs import missing
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -18,13 +18,6 @@ settings.register_profile("vislam", deadline=None, derandomize=True)
 settings.load_profile("vislam")
 
 cv2.setNumThreads(1)  # as in deterministic replay
-
-
-def missing(what: str) -> NoReturn:
-    """Skip a test for want of data or a tool; with VISLAM_REQUIRE_ALL (as in CI) fail it instead."""
-    if os.environ.get("VISLAM_REQUIRE_ALL"):
-        pytest.fail(what)
-    pytest.skip(what)
 
 
 @pytest.fixture(scope="session")

@@ -92,6 +92,7 @@ class Front:
         self._T_upright = transform(level_rotation(-rig.T_body_cams[0][:3, 1]), np.zeros(3))
         self._T_vo_keyframe = np.eye(4) if self._has_imu else self._T_upright
         self._T_odom_keyframe: Array | None = None
+        self._T_odom_body: Array | None = None
         self._T_vo_body = self._T_vo_keyframe.copy()
         self._waiting: list[OdometryKeyframe] = []  # in frame `vo`, until gravity is known
 
@@ -228,7 +229,17 @@ class Front:
             self._ekf.update_zero_velocity(frame.t_ns)
         if track.keyframe is not None:
             self._ekf.add_keyframe(track.keyframe.id, frame.t_ns)
-        return self._ekf.pose_at(frame.t_ns), self._ekf.state_at(frame.t_ns)
+        T_odom_body = self._ekf.pose_at(frame.t_ns)
+        if T_odom_body is None:
+            T_odom_body = self._without_filter(track.vo)
+        self._T_odom_body = T_odom_body
+        return T_odom_body, self._ekf.state_at(frame.t_ns)
+
+    def _without_filter(self, vo: VoMeasurement) -> Array | None:
+        """Return the pose in `odom` where inertial data stopped before the frame: vision carries the last one on."""
+        if self._T_odom_keyframe is None or vo.T_keyframe_body is None:
+            return self._T_odom_body
+        return self._T_odom_keyframe @ scaled_motion(vo)
 
     def _since_keyframe(self, T_vo_keyframe_body: Array | None, T_odom_body: Array | None) -> Array | None:
         if T_vo_keyframe_body is not None:

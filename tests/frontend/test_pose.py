@@ -118,14 +118,46 @@ def test_covariance_grows_with_errors_that_a_region_shares() -> None:
 
 
 def test_points_of_unknown_depth_constrain_across_their_epipolar_line() -> None:
-    """With all depths unknown, direction and rotation are seen, but the distance keeps its prior."""
+    """With all depths unknown, direction and rotation are seen, but hardly the distance."""
     rng = np.random.default_rng(2)
     landmarks, T = scene(rng, 200), se3_exp(np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0]))
     xy = seen_from(landmarks, T)[:, :2]
     P = np.tile(np.diag([1e-10, 1e-10, UNKNOWN_RHO_SIGMA**2]), (200, 1, 1))
-    estimate = refine_pose(T, landmarks, P, xy, SIGMA, 3.0, translation_sigma_m=0.05)
+    estimate = refine_pose(T, landmarks, P, xy, SIGMA, 3.0)
     sigma = np.sqrt(np.diag(estimate.covariance))
     assert estimate.converged and sigma[3] > 10.0 * sigma[4]
+
+
+def test_depth_constrains_where_directions_do_not() -> None:
+    """Features in a narrow strip: a turn and a shift look alike, until depth tells them apart; wrong depth does not."""
+    rng, errors = np.random.default_rng(6), {"without": [], "with": [], "wrong": []}
+    for _ in range(30):
+        landmarks, T = scene(rng, 80), se3_exp(rng.normal(0.0, 0.05, 6))
+        landmarks[:, :2] *= [0.15, 0.05]
+        there = seen_from(landmarks, T)
+        xy = there[:, :2] + rng.normal(0.0, SIGMA, (80, 2))
+        P = np.tile(np.diag([1e-10, 1e-10, 4e-6]), (80, 1, 1))
+        rho = there[:, 2] + rng.normal(0.0, 2e-3, 80)
+        wrong = np.where(rng.random(80) < 0.3, rho + 0.3, rho)
+        sigma = np.full(80, 2e-3)
+        for name, given_rho in (("without", None), ("with", rho), ("wrong", wrong)):
+            found = refine_pose(np.eye(4), landmarks, P, xy, SIGMA, 3.0, given_rho, sigma)
+            assert found.converged
+            errors[name].append(np.linalg.norm(se3_log(invert(T) @ found.T_key_cam)))
+    medians = {name: float(np.median(values)) for name, values in errors.items()}
+    assert medians["with"] < 0.7 * medians["without"] and medians["wrong"] < 1.2 * medians["with"]
+
+
+def test_rotation_alone_leaves_the_translation() -> None:
+    landmarks = scene(np.random.default_rng(1), 60)
+    landmarks[:, 2] = 0.0
+    R = so3_exp(np.array([0.05, -0.1, 0.02]))
+    T = np.eye(4)
+    T[:3, :3] = R
+    estimate = refine_pose(
+        np.eye(4), landmarks, np.zeros((60, 3, 3)), seen_from(landmarks, T)[:, :2], SIGMA, 3.0, rotation_only=True
+    )
+    assert estimate.converged and np.allclose(estimate.T_key_cam, T, atol=1e-9)
 
 
 def test_nothing_to_see_does_not_converge() -> None:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from conftest import missing
+from needs import missing
 
 from vislam.errors import DataError, StorageError
 from vislam.mapping._open3d import load_open3d

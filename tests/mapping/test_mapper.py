@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from box_world import CAMERA, CONFIG, RIG, ROOM_HIGH, ROOM_LOW, T_BODY_CAM0, depth_image, keyframe, pose
-from conftest import missing
+from needs import missing
 
 from vislam.camera import Rig
 from vislam.errors import DataError, StorageError

@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import missing
+from needs import missing
 
 from vislam.errors import DataError
 from vislam.mapping.occupancy import OccupancyMap
