@@ -48,13 +48,14 @@ class FrontEndConfig:
     flow_levels: int = 3  # pyramid levels above the image: reach of about 80 px around the predicted place
     max_back_px: float = 1.5  # forward-backward disagreement of a good match; 0.7 drops blurred ones that still help
     max_misses: int = 2  # frames in a row that a track may fail before it is dropped
-    track_sigma_px: float = 0.8  # Lucas-Kanade noise of hand-held video; 0.3 in sharp images
+    track_sigma_px: float = 1.0  # Lucas-Kanade noise of hand-held video; 0.3 in sharp images
     readout_s: float | None = None  # rolling shutter, first to last row; 0 is global, None estimates it while running
 
     min_depth_m: float = 0.3  # nearer is out of focus or out of range
     max_depth_m: float = 8.0  # of depth images: beyond, structured light guesses
     depth_sigma_rho: float = 2e-3  # 1/m: sigma of z is this times z^2; 1.4e-3 is a Kinect's own, the rest registration
     depth_spread: float = 0.5  # of the spread of 1/z within 8x8 px: what a wrong registration by some pixels costs
+    depth_now_factor: float = 3.0  # on the sigma of depth between keyframes, which is not averaged over time
     depth_edge_rho: float = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
     stereo_window_px: int = 15  # smaller than in time: depth edges hurt, blur is the same in both images
     stereo_levels: int = 3  # pyramid levels above the image
@@ -73,7 +74,7 @@ class FrontEndConfig:
 
     keyframe_parallax_px: float = 40.0  # median with rotation taken out
     keyframe_rotation_deg: float = 15.0  # patches turn with the camera and stop matching
-    keyframe_min_alive: float = 0.45  # fraction of the keyframe's tracks that are still followed
+    keyframe_min_alive: float = 0.5  # fraction of the keyframe's tracks that are still followed
     keyframe_min_alive_unfit: float = 0.2  # the same for a frame without depth, which makes a poor keyframe
     keyframe_min_inliers: int = 60  # fewer: new corners are worth the drift
     keyframe_min_interval_s: float = 0.15  # brisk motion: at most about six keyframes a second

@@ -38,6 +38,8 @@ class DepthReading:
 class DepthSensor(Protocol):
     """A source of inverse depth for pixels of cam0."""
 
+    every_frame: bool  # whether measuring is cheap enough to do in every frame, not only in keyframes
+
     def available(self, frame: Frame) -> bool:
         """Return whether this frame carries depth at all."""
         ...

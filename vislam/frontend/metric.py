@@ -111,12 +111,15 @@ class MetricFrontEnd:
         pixels = self._tracker.follow(frame.images[0], self._shutter.project(predicted, twist))
         seen = self._camera.normalise(pixels)
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
-        estimate = self._solve(T_guess, xy)
+        depth_now = None
+        if self._depth.every_frame and self._depth.available(frame):
+            depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2])
+        estimate = self._solve(T_guess, xy, depth_now)
         if estimate.converged:
             twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
             if self._shutter.readout_s > 0.0:
                 xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
-                estimate = self._solve(estimate.T_key_cam, xy)
+                estimate = self._solve(estimate.T_key_cam, xy, depth_now)
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         return _Attempt(pixels, seen, xy, predicted[:, 2], twist, estimate, failure)
 
@@ -130,24 +133,27 @@ class MetricFrontEnd:
             return f"only {agree} of {followed} tracks agree on a motion"
         return ""
 
-    def _solve(self, T_guess: Array, xy: Array) -> PoseEstimate:
+    def _solve(self, T_guess: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
-        estimate = self._refine(T_guess, xy)
+        estimate = self._refine(T_guess, xy, depth_now)
         followed = int(np.isfinite(xy[:, 0]).sum())
         if estimate.inliers.sum() < _RANSAC_BELOW * followed:
             known = self._landmarks.known & (self._landmarks.mean[:, 2] > 0.0)
             T_ransac = self._ransac(_points(self._landmarks.mean[known]), xy[known])
             if T_ransac is not None:
-                other = self._refine(T_ransac, xy)
+                other = self._refine(T_ransac, xy, depth_now)
                 if other.inliers.sum() > estimate.inliers.sum():
                     estimate = other
         if not estimate.converged:
             return estimate
-        return self._refine(estimate.T_key_cam, np.where(estimate.inliers[:, None], xy, np.nan))
+        return self._refine(estimate.T_key_cam, np.where(estimate.inliers[:, None], xy, np.nan), depth_now)
 
-    def _refine(self, T: Array, xy: Array) -> PoseEstimate:
+    def _refine(self, T: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         mean, covariance = self._landmarks.mean, self._landmarks.covariance
-        return refine_pose(T, mean, covariance, xy, self._sigma_xy, self._config.cauchy)
+        rho, sigma_rho = None, None
+        if depth_now is not None:
+            rho, sigma_rho = depth_now.rho, self._config.depth_now_factor * depth_now.sigma_rho
+        return refine_pose(T, mean, covariance, xy, self._sigma_xy, self._config.cauchy, rho, sigma_rho)
 
     def _ransac(self, points_m: Array, xy: Array) -> Array | None:
         return pnp_ransac(points_m, xy, _RANSAC_PX / self._camera.fx, self._config.min_inliers)
@@ -249,7 +255,7 @@ class MetricFrontEnd:
         moved, _ = move(points[usable], np.zeros((int(usable.sum()), 3, 3)), T_cam_key)
         self._landmarks.mean[usable, 2] = moved[:, 2]
         self._landmarks.covariance[usable, 2, 2] = (_BLIND_SIGMA * moved[:, 2]) ** 2
-        estimate = self._solve(np.asarray(invert(T_cam_key)), xy)
+        estimate = self._solve(np.asarray(invert(T_cam_key)), xy, None)
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         if failure:
             return self._start(frame, failure)

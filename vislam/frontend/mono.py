@@ -23,7 +23,6 @@ _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second
 _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a translation
 _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
-_FIXED_M = 1e-3  # holds the translation of points at infinity, which do not see it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +128,7 @@ class MonoFrontEnd:
         points = np.column_stack([key_xy, np.zeros(len(key_xy))])
         no_noise: Array = np.zeros((len(points), 3, 3))
         start = transform(np.ascontiguousarray(R_guess), np.zeros(3))
-        pose = refine_pose(start, points, no_noise, xy, self._sigma_xy, self._config.cauchy, _FIXED_M)
+        pose = refine_pose(start, points, no_noise, xy, self._sigma_xy, self._config.cauchy, rotation_only=True)
         R = np.ascontiguousarray(pose.T_key_cam[:3, :3])
         return _turn_only(TwoViewEstimate(R, np.zeros(3), pose.covariance, pose.inliers, pose.converged))
 

@@ -1,9 +1,9 @@
 """Pose of a camera against inverse-depth landmarks: robust Gauss-Newton with the uncertainty of both sides.
 
-The covariance of a residual is that of the pixel plus the landmark's own, carried through the projection; so a point of
-poor depth still helps where its depth does not matter. The depth that the *current* frame measures is left out: on
-fr1_desk, where depth and colour are exposed at different times, it tripled the error, and on MH_01 it changed nothing.
-It improves the landmarks instead, once per keyframe.
+The covariance of a residual is that of the measurement plus the landmark's own, carried through the projection; so a
+point of poor depth still helps where its depth does not matter. Depth that the current frame measures has a kernel of
+its own: on fr1_desk, where depth and colour are exposed at different times, one kernel for all three components tripled
+the error, while two kernels halve it where the features lie in one strip of the image.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class PoseEstimate:
 
 def refine_pose(
     T_key_cam: Array, landmarks: Array, covariances: Array, xy: Array, sigma_xy: float, cauchy: float,
-    translation_sigma_m: float = np.inf,
+    rho: Array | None = None, sigma_rho: Array | None = None, rotation_only: bool = False,
 ) -> PoseEstimate:  # fmt: skip
     """Refine T_key_cam so that landmarks appear where they are seen.
 
@@ -48,16 +48,21 @@ def refine_pose(
         covariances: [N, 3, 3] of the landmarks.
         xy: measured directions [N, 2] on z = 1; NaN: landmark not used.
         sigma_xy: standard deviation of `xy` (pixels / focal length).
-        cauchy: scale of the Cauchy kernel in standard deviations of a whole residual.
-        translation_sigma_m: how well the start's translation is known, for cameras that do not see scale.
+        cauchy: scale of the Cauchy kernel in standard deviations, for direction and depth apart.
+        rho: measured inverse depths [N] in 1/m, NaN where unknown; None: none.
+        sigma_rho: standard deviations [N] of `rho` in 1/m.
+        rotation_only: keep the translation of the start.
 
     Returns:
         The estimate; `converged` is False when the motion is not observable or the steps do not settle. The
         covariance is that of independent residuals times what the residuals show: their variance, and how much those
-        of the same image region err together (cluster-robust variance, Liang and Zeger, Biometrika 1986).
+        of the same image region err together (cluster-robust variance, Liang and Zeger, Biometrika 1986). With
+        `rotation_only` that of the translation is meaningless.
     """
+    measured = np.column_stack([xy, np.full(len(xy), np.nan) if rho is None else rho])
+    sigma = np.column_stack([np.full((len(xy), 2), sigma_xy), np.ones(len(xy)) if sigma_rho is None else sigma_rho])
     T, H, chi2, variance, together, converged = _refine(
-        T_key_cam, landmarks, covariances, xy, sigma_xy, cauchy, translation_sigma_m
+        T_key_cam, landmarks, covariances, measured, sigma, cauchy, rotation_only
     )
     covariance: Array = np.full((6, 6), np.nan)
     if converged:
@@ -84,7 +89,9 @@ def extra_parameter(
     Returns:
         The change of the parameter and its information (inverse variance); zeros when nothing can be said.
     """
-    r, A, chi2 = _whitened(T_key_cam, landmarks, covariances, xy, sigma_xy, slope)
+    measured = np.column_stack([xy, np.full(len(xy), np.nan)])
+    sigma = np.full((len(xy), 3), sigma_xy)
+    r, A, chi2 = _whitened(T_key_cam, landmarks, covariances, measured, sigma, slope)
     H, b, _ = _normal_equations(r, A, chi2, cauchy)
     if not _solvable(H[:6, :6].copy()):
         return 0.0, 0.0
@@ -97,87 +104,80 @@ def extra_parameter(
 
 @njit(cache=True, nogil=True)
 def _refine(
-    T_start: Array,
-    landmarks: Array,
-    covariances: Array,
-    xy: Array,
-    sigma_xy: float,
-    cauchy: float,
-    prior_sigma_m: float,
+    T: Array, landmarks: Array, covariances: Array, measured: Array, sigma: Array, cauchy: float, rotation_only: bool
 ) -> tuple[Array, Array, Array, float, float, bool]:
-    T = T_start.copy()
     no_slope = np.zeros((len(landmarks), 2))
-    r, A, chi2 = _whitened(T, landmarks, covariances, xy, sigma_xy, no_slope)
-    H = np.zeros((6, 6))
-    size = np.inf
-    for _ in range(_MAX_ITERATIONS):
+    r, A, chi2 = _whitened(T, landmarks, covariances, measured, sigma, no_slope)
+    H, b, variance, size = np.zeros((6, 6)), np.zeros(6), np.nan, np.inf
+    for iteration in range(_MAX_ITERATIONS + 1):
         # far from the answer every residual is an outlier: the kernel starts as wide as they are and closes with them
-        scale = max(cauchy, 1.5 * np.sqrt(_median(chi2)))
-        full, gradient, _ = _normal_equations(r, A, chi2, scale)
+        last = iteration == _MAX_ITERATIONS or size < _CONVERGED
+        scale = cauchy if last else max(cauchy, 1.5 * np.sqrt(_median(chi2)))
+        full, gradient, variance = _normal_equations(r, A, chi2, scale)
         H, b = full[:6, :6].copy(), gradient[:6].copy()
-        if np.isfinite(prior_sigma_m):
-            R_inverse = T[:3, :3].T.copy()
-            b[3:] += R_inverse @ (T[:3, 3].copy() - T_start[:3, 3].copy()) / prior_sigma_m**2
-            H[3:, 3:] += np.eye(3) / prior_sigma_m**2
+        if rotation_only:
+            H[3:, :], H[:, 3:], H[3:, 3:], b[3:] = 0.0, 0.0, np.eye(3), 0.0
         if not _solvable(H):
             return T, H, chi2, np.nan, np.nan, False
+        if last:
+            break
         step = np.linalg.solve(H, -b)
         T = T @ se3_exp(step)
         size = np.sqrt(np.sum(step * step))
-        r, A, chi2 = _whitened(T, landmarks, covariances, xy, sigma_xy, no_slope)
-        if size < _CONVERGED and scale == cauchy:
-            break
-    full, _, variance = _normal_equations(r, A, chi2, cauchy)
-    H = full[:6, :6].copy()
-    if np.isfinite(prior_sigma_m):
-        H[3:, 3:] += np.eye(3) / prior_sigma_m**2
-    # where the translation is a guess anyway, it may wander by a part of its sigma
-    settled = 0.2 * prior_sigma_m if np.isfinite(prior_sigma_m) else _SETTLED
-    converged = size < settled and _solvable(H)
-    together = _common_error(H, r, A, chi2, xy, cauchy) if converged else np.nan
-    return T, H, chi2, variance, together, converged
+        r, A, chi2 = _whitened(T, landmarks, covariances, measured, sigma, no_slope)
+    together = 1.0 if rotation_only else _common_error(H, r, A, chi2, measured, cauchy)
+    return T, H, chi2, variance, together, size < _SETTLED
 
 
 @njit(cache=True, nogil=True)
 def _whitened(
-    T: Array, landmarks: Array, covariances: Array, xy: Array, sigma_xy: float, slope: Array
+    T: Array, landmarks: Array, covariances: Array, measured: Array, sigma: Array, slope: Array
 ) -> tuple[Array, Array, Array]:
-    """Return whitened residuals [N, 2], their Jacobians [N, 2, 7] by pose and extra parameter, and chi2 [N]."""
+    """Return whitened residuals [N, 3], their Jacobians [N, 3, 7] by pose and extra parameter, and chi2 [N] of x, y.
+
+    Depth is whitened by itself: its own noise is the larger part, and where it is wrong the direction must not suffer.
+    """
     R, t = T[:3, :3].copy(), T[:3, 3].copy()
-    r_out, A_out = np.zeros((len(landmarks), 2)), np.zeros((len(landmarks), 2, 7))
+    r, A = np.zeros((len(landmarks), 3)), np.zeros((len(landmarks), 3, 7))
     chi2 = np.full(len(landmarks), np.nan)
     h, J, J_pose, S = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     for i in range(len(landmarks)):
-        if not (np.isfinite(xy[i, 0]) and predict(landmarks[i], R, t, h, J, J_pose)):
+        if not (np.isfinite(measured[i, 0]) and predict(landmarks[i], R, t, h, J, J_pose)):
             continue
         sandwich(J, covariances[i], S)
-        # lower triangular L of S[:2, :2] + sigma^2, and its inverse applied to residual and Jacobian
-        l00 = np.sqrt(S[0, 0] + sigma_xy * sigma_xy)
+        for k in range(3):
+            S[k, k] += sigma[i, k] * sigma[i, k]
+        # lower triangular L with L L^T = S[:2, :2], and its inverse applied to residual and Jacobian
+        l00 = np.sqrt(S[0, 0])
         l10 = S[1, 0] / l00
-        l11 = np.sqrt(S[1, 1] + sigma_xy * sigma_xy - l10 * l10)
-        r0 = (h[0] - xy[i, 0]) / l00
-        r1 = (h[1] - xy[i, 1] - l10 * r0) / l11
-        r_out[i, 0], r_out[i, 1] = r0, r1
+        l11 = np.sqrt(S[1, 1] - l10 * l10)
+        r[i, 0] = (h[0] - measured[i, 0]) / l00
+        r[i, 1] = (h[1] - measured[i, 1] - l10 * r[i, 0]) / l11
         for c in range(7):
             a0, a1 = (J_pose[0, c], J_pose[1, c]) if c < 6 else (slope[i, 0], slope[i, 1])
-            A_out[i, 0, c] = a0 / l00
-            A_out[i, 1, c] = (a1 - l10 * A_out[i, 0, c]) / l11
-        chi2[i] = r0 * r0 + r1 * r1
-    return r_out, A_out, chi2
+            A[i, 0, c] = a0 / l00
+            A[i, 1, c] = (a1 - l10 * A[i, 0, c]) / l11
+        chi2[i] = r[i, 0] * r[i, 0] + r[i, 1] * r[i, 1]
+        if np.isfinite(measured[i, 2]):
+            l22 = np.sqrt(S[2, 2])
+            r[i, 2] = (h[2] - measured[i, 2]) / l22
+            A[i, 2, :6] = J_pose[2] / l22
+    return r, A, chi2
 
 
 @njit(cache=True, nogil=True)
 def _normal_equations(r: Array, A: Array, chi2: Array, cauchy: float) -> tuple[Array, Array, float]:
-    """Return H [7, 7] and gradient [7] under Cauchy weights, and the weighted variance of the residuals."""
+    """Return H [7, 7] and gradient [7] under Cauchy weights, and the weighted variance of the directions' residuals."""
     H, b = np.zeros((7, 7)), np.zeros(7)
     weighted, weights = 0.0, 0.0
     for i in range(len(r)):
         if not np.isfinite(chi2[i]):
             continue
-        w = 1.0 / (1.0 + chi2[i] / (cauchy * cauchy))
-        for k in range(2):
+        w = _weight(chi2[i], cauchy)
+        for k in range(3):
+            w_k = w if k < 2 else _weight(r[i, 2] * r[i, 2], cauchy)
             for a in range(7):
-                row = w * A[i, k, a]
+                row = w_k * A[i, k, a]
                 b[a] += row * r[i, k]
                 for c in range(a, 7):
                     H[a, c] += row * A[i, k, c]
@@ -187,6 +187,11 @@ def _normal_equations(r: Array, A: Array, chi2: Array, cauchy: float) -> tuple[A
         for c in range(a):
             H[a, c] = H[c, a]
     return H, b, weighted / weights if weights > 0.0 else np.nan
+
+
+@njit(cache=True, nogil=True)
+def _weight(chi2: float, cauchy: float) -> float:
+    return 1.0 / (1.0 + chi2 / (cauchy * cauchy))
 
 
 @njit(cache=True, nogil=True)
@@ -211,15 +216,15 @@ def _common_error(H: Array, r: Array, A: Array, chi2: Array, xy: Array, cauchy: 
         for k in range(2):
             place = (xy[i, k] - lowest[k]) / max(highest[k] - lowest[k], 1e-9)
             group = group * _GROUPS + min(int(place * _GROUPS), _GROUPS - 1)
-        w = 1.0 / (1.0 + chi2[i] / (cauchy * cauchy))
         used[group] = 1.0
-        for a in range(6):
-            scores[group, a] += w * (A[i, 0, a] * r[i, 0] + A[i, 1, a] * r[i, 1])
+        for k in range(3):
+            weighted = _weight(chi2[i] if k < 2 else r[i, 2] * r[i, 2], cauchy) * r[i, k]
+            for a in range(6):
+                scores[group, a] += weighted * A[i, k, a]
     groups = np.sum(used)
     if groups < 6:
         return 1.0
-    middle = scores.T @ scores
-    return float(np.trace(np.linalg.solve(H, middle)) / 6.0 * groups / (groups - 3.0))
+    return float(np.trace(np.linalg.solve(H, scores.T @ scores)) / 6.0 * groups / (groups - 3.0))
 
 
 @njit(cache=True, nogil=True)

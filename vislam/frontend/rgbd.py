@@ -21,6 +21,8 @@ class ImageDepth:
     its spread.
     """
 
+    every_frame = True
+
     def __init__(self, config: FrontEndConfig) -> None:
         """Take range limits and the noise model from the configuration."""
         self._config = config

@@ -18,6 +18,8 @@ _START_DISPARITIES = (8.0, 25.0, 60.0)  # px; with the reach of Lucas-Kanade the
 class StereoDepth:
     """Measures inverse depth by matching corners of the left image in the right one; no rectification needed."""
 
+    every_frame = False
+
     def __init__(self, rig: Rig, config: FrontEndConfig) -> None:
         """Take the rig's first two cameras."""
         self._left, self._right = rig.cameras[0], rig.cameras[1]
