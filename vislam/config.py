@@ -55,13 +55,14 @@ class FrontEndConfig:
     max_depth_m: float = 8.0  # of depth images: beyond, structured light guesses
     depth_sigma_rho: float = 2e-3  # 1/m: sigma of z is this times z^2; 1.4e-3 is a Kinect's own, the rest registration
     depth_spread: float = 0.5  # of the spread of 1/z within 8x8 px: what a wrong registration by some pixels costs
-    depth_now_factor: float = 3.0  # on the sigma of depth between keyframes, which is not averaged over time
+    depth_now_factor: float = 2.0  # on the sigma of depth between keyframes, which is not averaged over time
     depth_edge_rho: float = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
     stereo_window_px: int = 15  # smaller than in time: depth edges hurt, blur is the same in both images
     stereo_levels: int = 3  # pyramid levels above the image
     stereo_sigma_px: float = 0.3  # noise of the disparity
     epipolar_gate_px: float = 1.5  # distance from the epipolar line that calibration and noise explain
 
+    mono_gyro_sigma_rad: float = 0.002  # of rotation by the gyro since a keyframe, beside its bias: scale, time offset
     mono_min_parallax_px: float = 3.0  # less, and the direction of motion drowns in noise: only rotation is told
 
     cauchy: float = 3.0  # scale of the robust kernel in standard deviations
