@@ -115,7 +115,7 @@ class Front:
         """Track one frame, update the filter with it, and hand over keyframes that are ready."""
         span = self._span(self._last_frame_t_ns, frame.t_ns)
         with self._clock.measure("track"):
-            track = self.frontend.track(frame, self._without_bias(span))
+            track = self.frontend.track(frame, *self._without_bias(span))
         still_image = self._is_still(track.observations)
         at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
@@ -168,11 +168,13 @@ class Front:
             return None
         return self._buffer.span(from_t_ns, to_t_ns)
 
-    def _without_bias(self, span: ImuSpan | None) -> ImuSpan | None:
+    def _without_bias(self, span: ImuSpan | None) -> tuple[ImuSpan | None, float]:
+        """Return the span with the filter's biases taken off, and how well the gyroscope's is known."""
         if span is None or self._ekf is None or not self._ekf.initialised:
-            return span
+            return span, np.inf
         state = self._ekf.state()
-        return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+        sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max()))
+        return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2), sigma_rad_s
 
     def _is_still(self, seen: Observations) -> bool:
         flow_px = median_flow_px(self._last_seen, seen)

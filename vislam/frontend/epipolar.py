@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import so3_exp
+from vislam.geometry import so3_exp, so3_log
 from vislam.messages import Array
 
 CHI2_GATE = 10.8  # squared deviation with one degree of freedom that one good residual in 1000 exceeds
@@ -31,10 +31,27 @@ class TwoViewEstimate:
     converged: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RotationPrior:
+    """What the gyroscope says of the rotation since the keyframe, once its bias is known."""
+
+    R_key_cam: Array  # [3, 3]
+    sigma_rad: float
+
+
 def refine_two_view(
-    R_key_cam: Array, direction_key: Array, key_xy: Array, xy: Array, sigma_xy: float, cauchy: float
+    R_key_cam: Array,
+    direction_key: Array,
+    key_xy: Array,
+    xy: Array,
+    sigma_xy: float,
+    cauchy: float,
+    prior: RotationPrior | None = None,
 ) -> TwoViewEstimate:
     """Refine rotation and direction so that points lie on their epipolar lines.
+
+    A flat or far scene explains a small translation as rotation nearly as well; the prior decides there. The covariance
+    is that of vision with a prior ten times as wide, since the filter and the graph know the gyroscope already.
 
     Args:
         R_key_cam: start [3, 3].
@@ -43,12 +60,16 @@ def refine_two_view(
         xy: the same points in the camera [N, 2]; NaN: not used.
         sigma_xy: standard deviation of `xy`.
         cauchy: scale of the Cauchy kernel in standard deviations.
+        prior: rotation from the gyroscope.
 
     Returns:
         The estimate, with the sign of the direction that puts most points in front of both cameras.
     """
     start = direction_key / np.linalg.norm(direction_key)
-    R, t, H, basis, chi2, variance, converged = _refine(R_key_cam, start, key_xy, xy, sigma_xy, cauchy)
+    R_prior, weight = (np.eye(3), 0.0) if prior is None else (prior.R_key_cam, prior.sigma_rad**-2)
+    R, t, H, basis, chi2, variance, converged = _refine(
+        R_key_cam, start, key_xy, xy, sigma_xy, cauchy, np.ascontiguousarray(R_prior), weight
+    )
     with np.errstate(invalid="ignore"):
         inliers = np.asarray(chi2 < CHI2_GATE, dtype=np.bool_)
     covariance: Array = np.full((6, 6), np.nan)
@@ -56,6 +77,7 @@ def refine_two_view(
         embed = np.zeros((6, 5))
         embed[:3, :3] = np.eye(3)
         embed[3:, 3:] = basis
+        H[:3, :3] -= 0.99 * weight * np.eye(3)
         covariance = embed @ np.linalg.inv(H) @ embed.T * max(1.0, float(variance))
     if _in_front(R, t, key_xy[inliers], xy[inliers]) < _in_front(R, -t, key_xy[inliers], xy[inliers]):
         t = -t
@@ -84,6 +106,20 @@ def essential_ransac(
     R_cam_key = first if np.trace(first @ R_guess) >= np.trace(second @ R_guess) else second
     R = np.ascontiguousarray(R_cam_key.T)
     return R, R @ t_cam_key[:, 0]
+
+
+def direction_given_rotation(R_key_cam: Array, key_xy: Array, xy: Array) -> Array | None:
+    """Return the unit direction [3] that best meets the epipolar constraint at a known rotation, or None.
+
+    Points [N, 2] are on z = 1, NaN rows are ignored. The constraint is linear in the direction.
+    """
+    usable = np.isfinite(xy).all(axis=1)
+    if usable.sum() < 2:
+        return None
+    a = np.column_stack([key_xy[usable], np.ones(int(usable.sum()))])
+    b = np.column_stack([xy[usable], np.ones(int(usable.sum()))]) @ R_key_cam.T
+    normals = np.cross(a, b)
+    return np.asarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
 
 
 @njit(cache=True, nogil=True)
@@ -124,7 +160,14 @@ def _linearise(R: Array, t: Array, basis: Array, key_xy: Array, xy: Array, sigma
 
 @njit(cache=True, nogil=True)
 def _refine(
-    R_start: Array, t_start: Array, key_xy: Array, xy: Array, sigma: float, cauchy: float
+    R_start: Array,
+    t_start: Array,
+    key_xy: Array,
+    xy: Array,
+    sigma: float,
+    cauchy: float,
+    R_prior: Array,
+    prior_weight: float,
 ) -> tuple[Array, Array, Array, Array, Array, float, bool]:
     R, t = R_start.copy(), t_start.copy()
     H, basis, variance, size = np.zeros((5, 5)), _tangent_basis(t), np.nan, np.inf
@@ -151,6 +194,9 @@ def _refine(
                     H[a, c] += w * J[i, a] * J[i, c]
             weighted += w * chi2[i]
             weights += w
+        b[:3] += prior_weight * so3_log(R_prior.T @ R)
+        for a in range(3):
+            H[a, a] += prior_weight
         variance = weighted / weights
         if not (np.all(np.isfinite(H)) and np.linalg.cond(H) < 1e12):
             return R, t, H, basis, chi2, variance, False

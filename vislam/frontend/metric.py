@@ -77,7 +77,7 @@ class MetricFrontEnd:
         self._blind = False  # the keyframe is the first and has no depth
         self._blind_px: Array = np.empty((0, 2))  # where its tracks were last seen
 
-    def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
+    def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         dt_s = self._intake.accept(frame)
         if self._keyframe is None:

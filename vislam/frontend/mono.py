@@ -8,7 +8,13 @@ import numpy as np
 
 from vislam.camera import Rig
 from vislam.config import FrontEndConfig
-from vislam.frontend.epipolar import TwoViewEstimate, essential_ransac, refine_two_view
+from vislam.frontend.epipolar import (
+    RotationPrior,
+    TwoViewEstimate,
+    direction_given_rotation,
+    essential_ransac,
+    refine_two_view,
+)
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.prediction import MotionPredictor
@@ -22,6 +28,7 @@ _RANSAC_PX = 1.5
 _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second solution that a flat scene has
 _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a translation
 _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
+_GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
@@ -66,11 +73,13 @@ class MonoFrontEnd:
         self._keyframe_tracks = 0
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
+        self._R_key_gyro: Array = np.eye(3)  # of the last frame, by the gyroscope alone
+        self._gyro_sigma_rad = 0.0
         self._direction_key: Array = np.zeros(3)  # to the last frame, or where it will probably go; zero: not known
         self._t_placed_ns = -1
         self._lost = False
 
-    def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
+    def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         dt_s = self._intake.accept(frame)
         if self._keyframe is None:
@@ -78,12 +87,13 @@ class MonoFrontEnd:
         R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])
         R_before = self._R_key_cam
         R_guess = R_before @ R_now_next
+        prior = self._gyro_prior(R_now_next, dt_s, gyro_sigma_rad_s if imu is not None else np.inf)
         last = np.column_stack([self._camera.normalise(self._last_px), np.ones(len(self._last_px))])
         guess = self._camera.project(last @ R_now_next)
         pixels = self._tracker.follow(frame.images[0], guess)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
-        motion = self._locate(R_guess, pixels)
+        motion = self._locate(R_guess, prior, pixels)
         if motion.failure:
             self._R_key_cam = R_guess
             return self._lose(frame, self._keyframe, motion)
@@ -98,15 +108,23 @@ class MonoFrontEnd:
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
-    def _locate(self, R_guess: Array, pixels: Array) -> _Motion:
+    def _gyro_prior(self, R_now_next: Array, dt_s: float, sigma_rad_s: float) -> RotationPrior | None:
+        """Return the rotation since the keyframe by gyroscope alone; None where a span of unknown bias is in it."""
+        self._R_key_gyro = self._R_key_gyro @ R_now_next
+        self._gyro_sigma_rad += sigma_rad_s * dt_s
+        if not np.isfinite(self._gyro_sigma_rad):
+            return None
+        return RotationPrior(self._R_key_gyro, self._config.mono_gyro_sigma_rad + self._gyro_sigma_rad)
+
+    def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
         key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
-        still = self._turn(R_guess, key_xy, xy)
+        still = self._turn(R_guess, key_xy, xy) if prior is None else self._turn_by(prior, key_xy, xy)
         parallax_px = self._parallax_px(still.R_key_cam if still.converged else R_guess, key_xy, xy)
         view = still
         followed = int(np.isfinite(xy[:, 0]).sum())
         explained = still.converged and still.inliers.sum() >= _TURN_EXPLAINS * followed
         if not explained or parallax_px > self._config.mono_min_parallax_px:
-            both = self._two_view(R_guess, key_xy, xy)
+            both = self._two_view(R_guess, prior, key_xy, xy)
             # a direction that does not settle is no reason to give up a rotation that does
             if both.converged or not still.converged:
                 view = _without_vague_direction(both)
@@ -132,8 +150,18 @@ class MonoFrontEnd:
         R = np.ascontiguousarray(pose.T_key_cam[:3, :3])
         return _turn_only(TwoViewEstimate(R, np.zeros(3), pose.covariance, pose.inliers, pose.converged))
 
-    def _two_view(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
+    def _turn_by(self, prior: RotationPrior, key_xy: Array, xy: Array) -> TwoViewEstimate:
+        """Take the gyroscope's rotation: what vision finds alone swallows small translations before a flat scene."""
+        moved_px = self._moved_xy(prior.R_key_cam, key_xy, xy) * self._camera.fx
+        with np.errstate(invalid="ignore"):
+            inliers = np.asarray(moved_px < self._config.mono_min_parallax_px, dtype=np.bool_)
+        covariance = np.eye(6) * (_GYRO_KNOWN_ALREADY * prior.sigma_rad) ** 2
+        return _turn_only(TwoViewEstimate(prior.R_key_cam, np.zeros(3), covariance, inliers, True))
+
+    def _two_view(self, R_guess: Array, prior: RotationPrior | None, key_xy: Array, xy: Array) -> TwoViewEstimate:
         """Refine from the prediction, for a new keyframe going on as before; search by RANSAC if not all agree."""
+        if prior is not None:
+            return self._two_view_by(prior, key_xy, xy)
         config = self._config
         best: TwoViewEstimate | None = None
         if self._direction_key.any():
@@ -149,13 +177,29 @@ class MonoFrontEnd:
             return TwoViewEstimate(R_guess, np.zeros(3), np.full((6, 6), np.nan), nothing, False)
         return best
 
+    def _two_view_by(self, prior: RotationPrior, key_xy: Array, xy: Array) -> TwoViewEstimate:
+        """Refine around the gyroscope's rotation from the direction that fits it, and from the last one."""
+        config = self._config
+        nothing = np.zeros(len(xy), dtype=np.bool_)
+        best = TwoViewEstimate(prior.R_key_cam, np.zeros(3), np.full((6, 6), np.nan), nothing, False)
+        starts = [self._direction_key] if self._direction_key.any() else []
+        fitting = direction_given_rotation(prior.R_key_cam, key_xy, xy)
+        for start in [*starts, *([] if fitting is None else [fitting])]:
+            found = refine_two_view(prior.R_key_cam, start, key_xy, xy, self._sigma_xy, config.cauchy, prior)
+            if found.converged >= best.converged and found.inliers.sum() > best.inliers.sum():
+                best = found
+        return best
+
     def _parallax_px(self, R_key_cam: Array, key_xy: Array, xy: Array) -> float:
-        seen = np.isfinite(xy[:, 0])
-        if not seen.any():
-            return 0.0
-        turned = np.column_stack([xy[seen], np.ones(int(seen.sum()))]) @ R_key_cam.T
-        moved = turned[:, :2] / turned[:, 2:] - key_xy[seen]
-        return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx)
+        moved = self._moved_xy(R_key_cam, key_xy, xy)
+        seen = np.isfinite(moved)
+        return float(np.median(moved[seen]) * self._camera.fx) if seen.any() else 0.0
+
+    @staticmethod
+    def _moved_xy(R_key_cam: Array, key_xy: Array, xy: Array) -> Array:
+        """Return how far points [N] moved on z = 1 once the rotation is taken out; NaN where they were not found."""
+        turned = np.column_stack([xy, np.ones(len(xy))]) @ R_key_cam.T
+        return np.asarray(np.linalg.norm(turned[:, :2] / turned[:, 2:] - key_xy, axis=1))
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 
@@ -249,6 +293,7 @@ class MonoFrontEnd:
         self._last_px = self._tracker.pixels.copy()
         self._direction_key = self._R_key_cam.T @ self._direction_key
         self._R_key_cam = np.eye(3)
+        self._R_key_gyro, self._gyro_sigma_rad = np.eye(3), 0.0
         self._t_placed_ns = frame.t_ns
         return keyframe
 

@@ -28,8 +28,10 @@ class FrontEnd(Protocol):
 
     mode: str
 
-    def track(self, frame: Frame, imu: ImuSpan | None) -> TrackResult:
+    def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
         """Follow the last keyframe into `frame`; `imu` is the bias-corrected span since the previous frame.
+
+        `gyro_sigma_rad_s` is how well the gyroscope's bias is known; infinite: not at all, the span only predicts.
 
         Raises DataError when the images do not fit the rig or time does not advance.
         """
