@@ -174,13 +174,13 @@ def describe(
 ) -> tuple[Array, Descriptors]:
     """Find and describe ORB keypoints spread over a grey image [H, W].
 
-    Four times too many are detected over eight octaves and served cell by cell, so that one rich corner of the image
+    Three times too many are detected over eight octaves and served cell by cell, so that one rich corner of the image
     does not take them all.
 
     Returns:
         Pixels [N, 2] and descriptors [N, 32], N <= count; both empty for an image without features.
     """
-    orb = cv2.ORB.create(4 * count, fastThreshold=fast_threshold, edgeThreshold=_ORB_BORDER_PX)
+    orb = cv2.ORB.create(3 * count, fastThreshold=fast_threshold, edgeThreshold=_ORB_BORDER_PX)
     keypoints = orb.detect(image, None)
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)

@@ -170,6 +170,17 @@ class Landmarks:
         known = self.known
         if not known.any() or len(xy) == 0:
             return np.full(len(xy), np.nan)
-        places = self.mean[known, :2].astype(np.float32)
-        distance = np.square(xy[:, None].astype(np.float32) - places[None]).sum(axis=2)
-        return np.asarray(self.mean[known, 2][np.argmin(distance, axis=1)])
+        return np.asarray(_nearest_rho(self.mean[known], np.ascontiguousarray(xy)))
+
+
+@njit(cache=True, nogil=True)
+def _nearest_rho(landmarks: Array, xy: Array) -> Array:
+    out = np.empty(len(xy))
+    for i in range(len(xy)):
+        best = np.inf
+        for j in range(len(landmarks)):
+            dx, dy = landmarks[j, 0] - xy[i, 0], landmarks[j, 1] - xy[i, 1]
+            distance = dx * dx + dy * dy
+            if j == 0 or distance < best:
+                best, out[i] = distance, landmarks[j, 2]
+    return out

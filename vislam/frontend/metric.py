@@ -114,12 +114,12 @@ class MetricFrontEnd:
         depth_now = None
         if self._depth.every_frame and self._depth.available(frame):
             depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2])
-        estimate = self._solve(T_guess, xy, depth_now)
+        estimate = self._search(T_guess, xy, depth_now)
         if estimate.converged:
+            # once more with the velocity that was found instead of the predicted one, and without the outliers
             twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
-            if self._shutter.readout_s > 0.0:
-                xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
-                estimate = self._solve(estimate.T_key_cam, xy, depth_now)
+            xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
+            estimate = self._polish(estimate, xy, depth_now)
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         return _Attempt(pixels, seen, xy, predicted[:, 2], twist, estimate, failure)
 
@@ -133,7 +133,7 @@ class MetricFrontEnd:
             return f"only {agree} of {followed} tracks agree on a motion"
         return ""
 
-    def _solve(self, T_guess: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
+    def _search(self, T_guess: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
         estimate = self._refine(T_guess, xy, depth_now)
         followed = int(np.isfinite(xy[:, 0]).sum())
@@ -144,8 +144,9 @@ class MetricFrontEnd:
                 other = self._refine(T_ransac, xy, depth_now)
                 if other.inliers.sum() > estimate.inliers.sum():
                     estimate = other
-        if not estimate.converged:
-            return estimate
+        return estimate
+
+    def _polish(self, estimate: PoseEstimate, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         return self._refine(estimate.T_key_cam, np.where(estimate.inliers[:, None], xy, np.nan), depth_now)
 
     def _refine(self, T: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
@@ -255,7 +256,8 @@ class MetricFrontEnd:
         moved, _ = move(points[usable], np.zeros((int(usable.sum()), 3, 3)), T_cam_key)
         self._landmarks.mean[usable, 2] = moved[:, 2]
         self._landmarks.covariance[usable, 2, 2] = (_BLIND_SIGMA * moved[:, 2]) ** 2
-        estimate = self._solve(np.asarray(invert(T_cam_key)), xy, None)
+        estimate = self._search(np.asarray(invert(T_cam_key)), xy, None)
+        estimate = self._polish(estimate, xy, None) if estimate.converged else estimate
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         if failure:
             return self._start(frame, failure)
