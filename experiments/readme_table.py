@@ -64,6 +64,20 @@ ENTRIES = (
     Entry("euroc_mh01_mono", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "mono")),
     Entry("corridor_loop", "simulated corridor-loop", "sim:corridor-loop"),
     Entry("corridor_open", "the same, loop closing off", "sim:corridor-loop", ("--loop.no-enabled",)),
+    Entry(
+        "corridor_starved",
+        "the same, no IMU, 50 tracks instead of 400",
+        "sim:corridor-loop",
+        (
+            "--imu.no-enabled",
+            "--frontend.max-tracks",
+            "50",
+            "--frontend.min-inliers",
+            "10",
+            "--frontend.keyframe-min-inliers",
+            "15",
+        ),
+    ),  # fmt: skip
     Entry("workshop_cart", "simulated workshop-cart", "sim:workshop-cart"),
 )
 
