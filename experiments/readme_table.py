@@ -77,7 +77,7 @@ ENTRIES = (
             "--frontend.keyframe-min-inliers",
             "15",
         ),
-    ),  # fmt: skip
+    ),
     Entry("workshop_cart", "simulated workshop-cart", "sim:workshop-cart"),
 )
 
