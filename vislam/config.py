@@ -75,7 +75,7 @@ class FrontEndConfig:
 
     keyframe_parallax_px: float = 40.0  # median with rotation taken out
     keyframe_rotation_deg: float = 15.0  # patches turn with the camera and stop matching
-    keyframe_min_alive: float = 0.5  # fraction of the keyframe's tracks that are still followed
+    keyframe_min_alive: float = 0.45  # fraction of the keyframe's tracks that are still followed
     keyframe_min_alive_unfit: float = 0.2  # the same for a frame without depth, which makes a poor keyframe
     keyframe_min_inliers: int = 60  # fewer: new corners are worth the drift
     keyframe_min_interval_s: float = 0.15  # brisk motion: at most about six keyframes a second
