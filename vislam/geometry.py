@@ -137,6 +137,19 @@ def se3_log(T: Array) -> Array:
 
 
 @njit(cache=True)
+def tangent_basis(direction: Array) -> Array:
+    """Return two orthonormal columns [3, 2] perpendicular to a unit direction [3]."""
+    axis = np.zeros(3)
+    axis[np.argmin(np.abs(direction))] = 1.0
+    first = np.cross(direction, axis)
+    first /= np.sqrt(np.sum(first * first))
+    out = np.empty((3, 2))
+    out[:, 0] = first
+    out[:, 1] = np.cross(direction, first)
+    return out
+
+
+@njit(cache=True)
 def se3_adjoint(T: Array) -> Array:
     """Return Ad [6, 6] with `T @ se3_exp(xi) @ invert(T) == se3_exp(Ad @ xi)`."""
     R = T[:3, :3].copy()

@@ -21,10 +21,11 @@ from vislam.geometry import (
     so3_left_jacobian_inverse,
     so3_log,
     so3_right_jacobian_inverse,
+    tangent_basis,
 )
 from vislam.imu import ImuNoise, Preintegrated, preintegrate
 from vislam.messages import Array, ImuSpan
-from vislam.relative_motion import across, camera_displacement, direction_noise, direction_residual, metric_residual
+from vislam.relative_motion import camera_displacement, direction_noise, direction_residual, metric_residual
 
 _FLOOR = 1e-10  # variance, rad^2 and m^2, of a motion that claims to be exact
 _GAUGE = 1e-5  # sigma, rad and m: first position and heading are chosen, not measured
@@ -201,7 +202,7 @@ def _linear_system(window: Window, pieces: Sequence[Preintegrated], displacement
         elif motion.has_direction:
             distance = max(float(np.linalg.norm(displacement)), _SHORT_M)
             opposite = float(displacement @ t) <= 0.0  # a bad round; start again from what was seen
-            axes = across(t.copy() if opposite else displacement / np.linalg.norm(displacement))
+            axes = tangent_basis(t.copy() if opposite else displacement / np.linalg.norm(displacement))
             lever = R_a.T @ R_b @ window.lever_m - window.lever_m
             covariance = direction_noise(motion.T_a_b, motion.covariance, axes, distance)[3:, 3:] + _FLOOR * np.eye(2)
             value = axes.T @ (np.linalg.norm(displacement) * t - lever)

@@ -14,6 +14,7 @@ from vislam.geometry import (
     so3_left_jacobian_inverse,
     so3_log,
     so3_right_jacobian_inverse,
+    tangent_basis,
 )
 from vislam.messages import Array
 
@@ -40,19 +41,6 @@ def metric_residual(T_world_a: Array, T_world_b: Array, T_a_b: Array) -> tuple[A
     J_a[3:, :3] = R_b_a @ skew(t_a_b)
     J_a[3:, 3:] = -R_b.T
     return r, J_a, J_b
-
-
-@njit(cache=True, nogil=True)
-def across(direction: Array) -> Array:
-    """Return two orthonormal columns [3, 2] perpendicular to a unit direction [3]."""
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(direction))] = 1.0
-    first = np.cross(direction, axis)
-    first /= np.sqrt(np.sum(first * first))
-    out = np.empty((3, 2))
-    out[:, 0] = first
-    out[:, 1] = np.cross(direction, first)
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -83,7 +71,7 @@ def direction_residual(
     rotation = so3_log(R_b.T @ R_a @ R_a_b)
     displacement = camera_displacement(T_world_a, T_world_b, lever_m)
     distance = np.sqrt(np.sum(displacement * displacement))
-    axes = across(displacement / distance if distance > 1e-9 else direction)
+    axes = tangent_basis(displacement / distance if distance > 1e-9 else direction)
     across_T = np.ascontiguousarray(axes.T)
     r = np.empty(5)
     r[:3] = rotation

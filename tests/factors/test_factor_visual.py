@@ -10,9 +10,8 @@ from vislam.factors.visual import (
     direction_factor,
     direction_measurement,
     direction_residual,
-    tangent_basis,
 )
-from vislam.geometry import invert, se3_exp, transform
+from vislam.geometry import invert, se3_exp, tangent_basis, transform
 
 LEVER_M = np.array([0.08, 0.03, -0.02])
 SOFT_M = 0.005

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from vislam.factors.noise import gaussian
-from vislam.geometry import skew, so3_log, so3_right_jacobian_inverse
+from vislam.geometry import skew, so3_log, so3_right_jacobian_inverse, tangent_basis
 from vislam.messages import Array
 
 _FACING_MIN = 0.1  # bounds the residual near the opposite direction
@@ -77,15 +77,6 @@ def direction_as_pose(
     angular = covariance[3:, 3:] / norm**2 + floor_rad**2 * np.eye(3)
     out[3:, 3:] = step_m**2 * (across @ angular @ across + scale_sigma**2 * np.outer(along, along))
     return mean, out
-
-
-def tangent_basis(direction: Array) -> Array:
-    """Return an orthonormal basis [3, 2] of the plane across a unit vector [3]."""
-    axis = np.zeros(3)
-    axis[int(np.argmin(np.abs(direction)))] = 1.0
-    first = np.cross(direction, axis)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)], axis=1)
 
 
 @njit(cache=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import so3_exp, so3_log
+from vislam.geometry import so3_exp, so3_log, tangent_basis
 from vislam.messages import Array
 
 CHI2_GATE = 10.8  # squared deviation with one degree of freedom that one good residual in 1000 exceeds
@@ -123,18 +123,6 @@ def direction_given_rotation(R_key_cam: Array, key_xy: Array, xy: Array) -> Arra
 
 
 @njit(cache=True, nogil=True)
-def _tangent_basis(t: Array) -> Array:
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(t))] = 1.0
-    first = np.cross(t, axis)
-    first /= np.sqrt(np.sum(first * first))
-    basis = np.empty((3, 2))
-    basis[:, 0] = first
-    basis[:, 1] = np.cross(t, first)
-    return basis
-
-
-@njit(cache=True, nogil=True)
 def _linearise(R: Array, t: Array, basis: Array, key_xy: Array, xy: Array, sigma: float) -> tuple[Array, Array]:
     """Return whitened distances [N] from the epipolar lines and Jacobians [N, 5] by rotation and direction.
 
@@ -170,10 +158,10 @@ def _refine(
     prior_weight: float,
 ) -> tuple[Array, Array, Array, Array, Array, float, bool]:
     R, t = R_start.copy(), t_start.copy()
-    H, basis, variance, size = np.zeros((5, 5)), _tangent_basis(t), np.nan, np.inf
+    H, basis, variance, size = np.zeros((5, 5)), tangent_basis(t), np.nan, np.inf
     chi2 = np.full(len(xy), np.nan)
     for iteration in range(_MAX_ITERATIONS + 1):
-        basis = _tangent_basis(t)
+        basis = tangent_basis(t)
         r, J = _linearise(R, t, basis, key_xy, xy, sigma)
         chi2 = r * r
         seen = np.isfinite(chi2)
