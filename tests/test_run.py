@@ -221,6 +221,14 @@ def test_a_run_is_never_overwritten_by_accident(tmp_path, capsys):
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "five years"
 
 
+def test_overwriting_leaves_nothing_of_the_old_run(tmp_path):
+    out = tmp_path / "run"
+    run(room(2.0), out)
+    assert (out / "map" / "cloud.ply").is_file()
+    prepare(out, overwrite=True)
+    assert [p for p in out.rglob("*") if p.is_file()] == []
+
+
 def test_a_full_disk_ends_with_a_storage_error_and_keeps_what_was_written(recorded, tmp_path):
     out = tmp_path / "run"
     script = (

@@ -26,6 +26,12 @@ from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tu
 _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
 _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
+_RUN_FILES = (
+    "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "session.db", "session.db-wal",
+    "session.db-shm", "run.rrd", "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum",
+    "trajectory_live.tum", "trajectory_graph.tum", "trajectory_truth.tum", "map/cloud.ply", "map/mesh.ply",
+    "map/octomap.bt", "map/grid.pgm", "map/grid.yaml", "map/picture_cloud.png", "map/picture_octree.png",
+)  # fmt: skip
 _TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
 _LOOPS_HEADER = (
     "from_id", "to_id", "from_t_ns", "to_t_ns", "source", "score", "inliers", "sigma_m", "consistency",
@@ -41,21 +47,10 @@ def prepare(out: Path, overwrite: bool) -> None:
         if not overwrite:
             raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
         with storage(out):
-            for name in (
-                *_run_files(),
-                *(f"{name}{suffix}" for name in ("session.db",) for suffix in ("-wal", "-shm")),
-            ):
+            for name in _RUN_FILES:
                 (out / name).unlink(missing_ok=True)
     with storage(out):
         out.mkdir(parents=True, exist_ok=True)
-
-
-def _run_files() -> tuple[str, ...]:
-    return (
-        "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "session.db", "run.rrd",
-        "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
-        "trajectory_graph.tum", "trajectory_truth.tum",
-    )  # fmt: skip
 
 
 @contextmanager
