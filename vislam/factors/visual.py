@@ -8,7 +8,6 @@ import gtsam
 import numpy as np
 from numba import njit
 
-from vislam.factors.noise import gaussian
 from vislam.geometry import skew, so3_log, so3_right_jacobian_inverse, tangent_basis
 from vislam.messages import Array
 
@@ -150,8 +149,3 @@ def direction_factor(
 def pose_factor(key_a: int, key_b: int, T_a_b: Array, model: gtsam.noiseModel.Base) -> gtsam.BetweenFactorPose3:
     """Return the metric relative pose factor."""
     return gtsam.BetweenFactorPose3(key_a, key_b, gtsam.Pose3(T_a_b), model)
-
-
-def direction_model(measured: DirectionMeasurement, ratio_max: float) -> gtsam.noiseModel.Gaussian:
-    """Return the Gaussian model of a direction measurement."""
-    return gaussian(measured.covariance, ratio_max)

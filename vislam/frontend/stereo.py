@@ -22,7 +22,7 @@ class StereoDepth:
 
     def __init__(self, rig: Rig, config: FrontEndConfig) -> None:
         """Take the rig's first two cameras."""
-        self._left, self._right = rig.cameras[0], rig.cameras[1]
+        self._right = rig.cameras[1]
         self._T_right_left = invert(rig.T_cam0_cam1)
         self._config = config
         self._flow = FlowSettings(

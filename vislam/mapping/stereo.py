@@ -25,7 +25,6 @@ class DenseStereo:
 
     def __init__(self, rig: Rig, config: MapConfig) -> None:
         """Raises DataError when the rig cannot be rectified."""
-        self._scale = config.stereo_scale
         self._rectification = rectify(rig, config.stereo_scale)
         self.view: DepthView = stereo_view(self._rectification, rig, config)
         self._focal_baseline = float(self._rectification.K[0, 0] * self._rectification.baseline_m)

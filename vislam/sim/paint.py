@@ -15,7 +15,6 @@ from vislam.sim.scene import Painter
 Color = tuple[float, float, float]  # BGR, display values 0..255
 
 _COARSE = 4
-_FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_COMPLEX)
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ0123456789"
 VIVID: tuple[Color, ...] = (
     (40, 60, 200), (30, 140, 225), (40, 200, 230), (70, 160, 60), (190, 110, 30), (150, 60, 110), (60, 60, 60),
@@ -78,10 +77,6 @@ def text(
 def word(rng: np.random.Generator, length: int) -> str:
     """Return random capitals and digits."""
     return "".join(_LETTERS[index] for index in rng.integers(0, len(_LETTERS), length))
-
-
-def _font(rng: np.random.Generator) -> int:
-    return _FONTS[int(rng.integers(0, len(_FONTS)))]
 
 
 def chips(rng: np.random.Generator, image: ImageU8, count: int, size_px: tuple[float, float], contrast: float) -> None:
