@@ -158,6 +158,22 @@ def test_duplicate_backward_and_nan_samples_are_counted_not_used(small_room, tmp
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.01
 
 
+@pytest.mark.parametrize("give_up_s", [3.0, 30.0])
+def test_an_accelerometer_in_the_wrong_unit_is_told_and_done_without(small_room, tmp_path, give_up_s):
+    def halved(events):
+        for value in events:
+            if isinstance(value, ImuSample):
+                yield ImuSample(value.t_ns, value.gyro_rad_s, 0.5 * value.accel_m_s2)
+            else:
+                yield value
+
+    metrics = run(Edited(small_room, halved), tmp_path / "run", map__enabled=False, init__give_up_s=give_up_s)
+    assert metrics["initialisation"]["status"] == "none"
+    assert any("gravity was never found" in warning and "expected 9.81" in warning for warning in metrics["warnings"])
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
+    assert metrics["coverage_frames"] == 1.0
+
+
 def test_a_recording_cut_short_plays_to_its_end(damaged, tmp_path):
     for name in ("cam0", "depth0", "imu0"):
         path = damaged / "mav0" / name / "data.csv"

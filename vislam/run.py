@@ -197,6 +197,8 @@ class Run:
             rooms = {"loop": back.loops, "map": back.mapper}
             counters |= {name: dict(room.counters) for name, room in rooms.items() if room is not None}
         found = front.initialisation
+        if self.noise is not None and found is None:
+            self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.last_refusal}")
         return {
             "name": self.recording.name,
             "mode": front.frontend.mode,
