@@ -115,6 +115,7 @@ class InitConfig:
 class EkfConfig:
     """The fast path."""
 
+    coupling: Literal["loose", "tight"] = "loose"  # loose: motions of visual odometry; tight: tracks (MSCKF)
     history_s: float = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
     checkpoint_s: float = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
     max_gap_s: float = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
@@ -137,9 +138,17 @@ class EkfConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class WindowConfig:
+    """The sliding window of tight coupling: poses, velocities, biases and landmarks of the newest keyframes."""
+
+    keyframes: int = 15  # states in the window; the oldest one is marginalised when another comes
+
+
+@dataclass(frozen=True, slots=True)
 class GraphConfig:
     """The iSAM2 pose graph: sigmas of its factors, the gate for loops, and how much work an update may do."""
 
+    coupling: Literal["loose", "tight"] = "loose"  # loose: motions of visual odometry; tight: tracks, in a window
     relinearize_rotation_rad: float = (
         0.002  # IMU factors are stiff: 0.01 left 5-13 mm against the exact optimum, this 1.4
     )
@@ -310,6 +319,7 @@ class Config:
     frontend: FrontEndConfig = field(default_factory=FrontEndConfig)
     init: InitConfig = field(default_factory=InitConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     map: MapConfig = field(default_factory=MapConfig)

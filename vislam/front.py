@@ -225,8 +225,7 @@ class Front:
             return self._T_vo_body.copy(), None
         if not self._ekf.initialised:
             return None, None
-        if track.vo.tracking != Tracking.LOST:
-            self._ekf.update_vo(track.vo)
+        self._ekf.update_vision(track.vo, track.observations)
         if at_rest:
             self._ekf.update_zero_velocity(frame.t_ns)
         if track.keyframe is not None:

@@ -64,6 +64,16 @@ class ImuSpan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Tracked features seen in one frame; pixels are raw (distorted) image coordinates."""
+
+    track_ids: NDArray[np.int64]  # [N]
+    pixels_px: Array  # [N, 2] in cam0
+    right_px: Array | None = None  # [N, 2] in cam1, NaN where not matched
+    depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """Images taken at one instant: a grey image per camera of the rig, with colour and registered depth if any."""
 
@@ -72,16 +82,7 @@ class Frame:
     images: tuple[ImageU8, ...]  # [H, W] each, cam0 first
     color: ImageU8 | None = None  # [H, W, 3] BGR of cam0
     depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observations:
-    """Tracked features seen in one frame; pixels are raw (distorted) image coordinates."""
-
-    track_ids: NDArray[np.int64]  # [N]
-    pixels_px: Array  # [N, 2] in cam0
-    right_px: Array | None = None  # [N, 2] in cam1, NaN where not matched
-    depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
+    tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +120,7 @@ class KeyframePacket:
     imu: ImuSpan | None  # since the previous keyframe; None for keyframe 0 or without an IMU
     mag: MagSample | None = None
     at_rest: bool = False  # zero velocity held over the span, decided by IMU and image together
+    time_offset_s: float = 0.0  # what has been added to the camera's own stamp to get the IMU's time
 
 
 @dataclass(frozen=True, slots=True, eq=False)

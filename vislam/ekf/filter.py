@@ -20,7 +20,7 @@ from vislam.ekf.history import OUTCOMES, Checkpoint, Event, History, Kind, Ledge
 from vislam.ekf.measurements import why_unusable
 from vislam.geometry import interpolate, invert, quaternion_wxyz, skew
 from vislam.imu import ImuNoise, ImuSeries
-from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
+from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 
 _NS = 1_000_000_000
 
@@ -161,6 +161,12 @@ class Ekf:
         if reason:
             return self._refuse("vo_invalid", reason)
         return self._insert(Event(vo.t_ns, Kind.VO, keyframe_id=vo.keyframe_id, vo=vo))
+
+    def update_vision(self, vo: VoMeasurement, observations: Observations) -> UpdateResult:
+        """Take what vision made of a frame; loosely coupled, its motion counts and its tracks do not."""
+        if vo.tracking is Tracking.LOST:
+            return UpdateResult(False, float("nan"), "vision is lost")
+        return self.update_vo(vo)
 
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:
         """Tell the filter that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""

@@ -1,0 +1,1 @@
+"""Batch optimisation: a whole run at once, as the reference of accuracy."""

@@ -1,0 +1,1 @@
+"""The experiment harness: plans, jobs, stored results, statistics and their report."""
