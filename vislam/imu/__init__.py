@@ -1,6 +1,7 @@
 """Inertial data: noise model, calibration, the buffer that cuts spans, preintegration, rest detection."""
 
 from vislam.imu.buffer import ImuBuffer
+from vislam.imu.envelope import NoiseEnvelope, NoiseRatios
 from vislam.imu.noise import ImuCalibration, ImuNoise
 from vislam.imu.preintegration import Preintegrated, preintegrate
 from vislam.imu.rest import RestDetector
@@ -11,6 +12,8 @@ __all__ = [
     "ImuCalibration",
     "ImuNoise",
     "ImuSeries",
+    "NoiseEnvelope",
+    "NoiseRatios",
     "Preintegrated",
     "RestDetector",
     "join",
