@@ -134,6 +134,7 @@ class EkfConfig:
     reset_accel_bias_m_s2: float = 0.2
     zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
+    vision_delay_s: float = 0.0  # for experiments: vision reaches the filter so much later than it was seen
     graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from vislam.messages import (
 )
 
 _MIN_SHARED_TRACKS = 10  # fewer say nothing about the motion of the camera
+_STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 _UNKNOWN_VELOCITY_M_S = 3.0  # sigma for a keyframe whose velocity the initialisation did not estimate
 
 
@@ -82,6 +84,7 @@ class Front:
             self._rest = RestDetector(config.init, noise)
             self._initialiser = Initialiser(config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
             self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
+        self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
         self._last_frame_t_ns: int | None = None
         self._last_seen: Observations | None = None
         self._keyframe_t_ns = 0
@@ -225,16 +228,23 @@ class Front:
             return self._T_vo_body.copy(), None
         if not self._ekf.initialised:
             return None, None
-        self._ekf.update_vision(track.vo, track.observations)
-        if at_rest:
-            self._ekf.update_zero_velocity(frame.t_ns)
-        if track.keyframe is not None:
-            self._ekf.add_keyframe(track.keyframe.id, frame.t_ns)
+        self._seen.append((frame.t_ns, track, at_rest))
+        newest_ns = frame.t_ns - round(self._config.ekf.vision_delay_s * 1e9) + _STAMP_JITTER_NS
+        while self._seen and self._seen[0][0] <= newest_ns:
+            self._correct(self._ekf, *self._seen.popleft())
         T_odom_body = self._ekf.pose_at(frame.t_ns)
         if T_odom_body is None:
             T_odom_body = self._without_filter(track.vo)
         self._T_odom_body = T_odom_body
         return T_odom_body, self._ekf.state_at(frame.t_ns)
+
+    def _correct(self, ekf: Ekf, t_ns: int, track: TrackResult, at_rest: bool) -> None:
+        """Give the filter what was seen in a frame, in time or later."""
+        ekf.update_vision(track.vo, track.observations)
+        if at_rest:
+            ekf.update_zero_velocity(t_ns)
+        if track.keyframe is not None:
+            ekf.add_keyframe(track.keyframe.id, t_ns)
 
     def _without_filter(self, vo: VoMeasurement) -> Array | None:
         """Return the pose in `odom` where inertial data stopped before the frame: vision carries the last one on."""
