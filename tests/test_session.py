@@ -4,45 +4,99 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
+from vislam.camera import Camera, Rig
 from vislam.errors import DataError, StorageError
 from vislam.geometry import se3_exp
-from vislam.messages import Frame, GraphUpdate, Keyframe, LoopEdge
+from vislam.imu import ImuNoise
+from vislam.messages import (
+    Frame,
+    GraphUpdate,
+    ImuSpan,
+    Keyframe,
+    KeyframePacket,
+    LoopEdge,
+    MagSample,
+    NavState,
+    Observations,
+    Tracking,
+    VoMeasurement,
+)
 from vislam.session import Session, SessionWriter
 
 SEED = 11
+NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9393e-5, 3.0e-3, 200.0)
+RIG = Rig(
+    (Camera(640, 480, 458.654, 457.296, 320.1, 240.3, 0.1, "radtan", (-0.28, 0.07, 2e-4, 1.7e-5)),),
+    (se3_exp(np.array([0.1, -0.2, 1.5, 0.01, 0.02, 0.03])),),
+    True,
+)
 
 
-def keyframe(i, rng):
+def packet(i, rng):
     image = np.zeros((4, 4), np.uint8)
     points = None if i == 2 else rng.normal(size=(7, 3))
     pixels = rng.uniform(0, 640, (7, 2)).astype(np.float32).astype(float)
-    return Keyframe(i, 1000 * i, Frame(1000 * i, i, (image,)), pixels, rng.integers(0, 256, (7, 32), np.uint8), points)
+    frame = Frame(1000 * i, i, (image,))
+    keyframe = Keyframe(i, 1000 * i, frame, pixels, rng.integers(0, 256, (7, 32), np.uint8), points)
+    lost = i == 1
+    vo = VoMeasurement(
+        1000 * i,
+        i - 1,
+        None if lost else se3_exp(rng.normal(size=6)),
+        np.diag(rng.uniform(1e-6, 1e-4, 6)),
+        i != 2,
+        Tracking.LOST if lost else Tracking.OK,
+        90 - i,
+    )
+    depth = np.array([1.5, np.nan, 2.25, 0.5])
+    right = None if i == 0 else pixels[:4] - 3.5
+    seen = Observations(np.array([3, 2**40, 7, 8], np.int64) + i, pixels[:4], right, None if i == 1 else depth)
+    span = None if i == 0 else ImuSpan(1000 * i - np.arange(5)[::-1], rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
+    mag = MagSample(1000 * i - 3, rng.normal(size=3)) if i == 2 else None
+    return KeyframePacket(keyframe, vo, seen, span, mag, i == 1, 0.0125 * i)
 
 
-def update(revision, ids, poses, accepted=()):
-    return GraphUpdate(revision, np.array(ids, np.int64), np.array(poses).reshape(-1, 4, 4), np.eye(4), None, accepted)
+def state(t_ns):
+    return NavState(t_ns, se3_exp(np.full(6, 0.3)), np.ones(3), np.full(3, 1e-3), np.full(3, 0.1), np.eye(15) / 3.0)
 
 
-def write_three(path):
+def update(revision, ids, poses, accepted=(), rejected=(), newest=None):
+    poses = np.array(poses).reshape(-1, 4, 4)
+    return GraphUpdate(revision, np.array(ids, np.int64), poses, np.eye(4), newest, accepted, rejected)
+
+
+def write_three(path, count=3):
     rng = np.random.default_rng(SEED)
-    writer = SessionWriter(path, {"source": "test", "config": {"seed": 1}})
+    writer = SessionWriter(path, {"source": "test", "config": {"seed": 1}}, RIG, NOISE, 9.80665)
     poses = [se3_exp(rng.normal(size=6)) for _ in range(3)]
-    frames = [keyframe(i, rng) for i in range(3)]
+    packets = [packet(i, rng) for i in range(3)]
     edge = LoopEdge(5, 0, 2, poses[1], np.eye(6) * 0.01, True, 40, 0.3)
     refused = LoopEdge(6, 1, 2, poses[1], np.eye(6), True, 12, 0.1)
-    for i, frame in enumerate(frames):
-        edges, accepted = ([edge, refused], (5,)) if i == 2 else ([], ())
-        writer.add(frame, poses[i], update(i + 1, [i], [poses[i]], accepted), edges)
-    return writer, frames, poses, edge
+    for i in range(count):
+        edges, accepted, rejected = ([edge, refused], (5,), (6,)) if i == 2 else ([], (), ())
+        writer.add_frame(1000 * i - 500, i - 1, None if i == 0 else poses[0])
+        writer.add_frame(1000 * i, i, np.eye(4))
+        change = update(i + 1, [i], [poses[i]], accepted, rejected, state(1000 * i))
+        writer.add(packets[i], poses[i], change, edges, state(0) if i == 0 else None)
+    return writer, packets, poses, edge
+
+
+def same(a, b):
+    """Whether two values hold the same bits, field by field; images and features are not compared."""
+    if a is None or b is None or not hasattr(a, "__slots__"):
+        return a is b or np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray) and a.dtype.kind == "f")
+    return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.name != "keyframe")
 
 
 def test_a_session_gives_back_what_was_stored(tmp_path):
     print("seed", SEED)
-    writer, frames, poses, edge = write_three(tmp_path / "session.db")
+    writer, packets, poses, edge = write_three(tmp_path / "session.db")
+    frames = [p.keyframe for p in packets]
     moved = se3_exp(np.full(6, 0.1))
     writer.move(update(4, [1], [moved]))
     writer.close()
@@ -67,6 +121,54 @@ def test_a_session_gives_back_what_was_stored(tmp_path):
     session.close()
 
 
+def test_the_factor_log_gives_back_every_measurement(tmp_path):
+    print("seed", SEED)
+    writer, packets, poses, edge = write_three(tmp_path / "session.db")
+    writer.add_frame(2500, 2, poses[2])
+    writer.close()
+    log = Session(tmp_path / "session.db").factor_log()
+    assert log.rig.cameras == RIG.cameras
+    assert log.rig.has_depth
+    assert np.array_equal(log.rig.T_body_cams[0], RIG.T_body_cams[0])
+    assert log.noise == NOISE
+    assert log.gravity_m_s2 == 9.80665
+    assert same(log.first_state, state(0))
+    for i, (kept, put) in enumerate(zip(log.keyframes, packets, strict=True)):
+        assert same(kept.packet, put), i
+        assert (kept.packet.keyframe.id, kept.packet.keyframe.t_ns) == (i, 1000 * i)
+        assert np.array_equal(kept.T_odom_body, poses[i])
+        assert np.array_equal(kept.velocity_map_m_s, np.ones(3))
+        assert np.array_equal(kept.accel_bias_m_s2, np.full(3, 0.1))
+    assert [(e.edge.id, e.accepted) for e in log.edges] == [(5, True), (6, False)]
+    assert same(log.edges[0].edge, edge)
+    assert log.frames.t_ns.tolist() == [-500, 0, 500, 1000, 1500, 2000, 2500]
+    assert log.frames.keyframe_ids.tolist() == [-1, 0, 0, 1, 1, 2, 2]
+    assert log.frames.T_keyframe_body[0] is None
+    assert np.array_equal(log.frames.T_keyframe_body[-1], poses[2])
+
+
+def test_a_loop_decided_later_changes_its_decision(tmp_path):
+    writer, *_ = write_three(tmp_path / "session.db")
+    writer.move(update(4, [], [], accepted=(6,), rejected=(5,)))
+    writer.close()
+    session = Session(tmp_path / "session.db")
+    assert [e.id for e in session.edges()] == [6]
+    assert [(e.edge.id, e.accepted) for e in session.factor_log().edges] == [(5, False), (6, True)]
+
+
+def test_a_failed_commit_leaves_no_half_keyframe(tmp_path):
+    """Whatever breaks in the middle of a keyframe, packet, edges and frames of it are all absent."""
+    writer, packets, poses, edge = write_three(tmp_path / "session.db", count=2)
+    bad = update(3, [2], [poses[2]], accepted=(("not", "an id"),))
+    writer.add_frame(1500, 1, None)
+    with pytest.raises(StorageError):
+        writer.add(packets[2], poses[2], bad, [edge])
+    log = Session(tmp_path / "session.db").factor_log()
+    assert len(log.keyframes) == 2
+    assert log.edges == []
+    assert log.frames.t_ns.tolist() == [-500, 0, 500, 1000]
+
+
 def test_a_killed_writer_leaves_every_committed_keyframe(tmp_path):
     path = tmp_path / "session.db"
     script = textwrap.dedent(f"""
@@ -81,6 +183,7 @@ def test_a_killed_writer_leaves_every_committed_keyframe(tmp_path):
         assert process.stdout.readline().strip() == "committed"
         process.send_signal(signal.SIGKILL)
     assert len(list(Session(path).keyframes())) == 3
+    assert len(Session(path).factor_log().keyframes) == 3
 
 
 def test_damage_and_strangers_are_refused(tmp_path):
@@ -104,6 +207,44 @@ def test_damage_and_strangers_are_refused(tmp_path):
         list(Session(tmp_path / "cut.db").keyframes())
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE packets SET pixels_px = x'00112233' WHERE id = 1",
+        "UPDATE packets SET track_ids = x'001122' WHERE id = 1",
+        "UPDATE packets SET imu_gyro = NULL WHERE id = 1",
+        "UPDATE packets SET vo_tracking = 'fine' WHERE id = 1",
+        "UPDATE edges SET covariance = x'' WHERE id = 5",
+        "UPDATE info SET value = '{}' WHERE key = 'rig'",
+        "UPDATE info SET value = '{\"t_ns\": 0}' WHERE key = 'first_state'",
+        "UPDATE info SET value = 'not json' WHERE key = 'imu_noise'",
+        "DELETE FROM packets WHERE id = 1",
+        "DELETE FROM packets WHERE id = 2",
+        "UPDATE frames SET T_keyframe_body = x'00' WHERE t_ns = 0",
+        "DROP TABLE frames",
+    ],
+)
+def test_a_damaged_factor_log_is_a_data_error(damage, tmp_path):
+    writer, *_ = write_three(tmp_path / "session.db")
+    writer.close()
+    database = sqlite3.connect(tmp_path / "session.db")
+    database.execute(damage)
+    database.commit()
+    database.close()
+    with pytest.raises(DataError, match="run the recording again"):
+        Session(tmp_path / "session.db").factor_log()
+
+
+def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
+    writer, *_ = write_three(tmp_path / "session.db")
+    writer.close()
+    database = sqlite3.connect(tmp_path / "session.db")
+    database.execute("PRAGMA user_version=1")
+    database.close()
+    with pytest.raises(DataError, match="format 1, this vislam reads 2; run the recording again"):
+        Session(tmp_path / "session.db")
+
+
 def test_a_place_that_cannot_be_written_is_a_storage_error(tmp_path):
     with pytest.raises(StorageError, match="cannot be written"):
-        SessionWriter(tmp_path / "absent" / "session.db", {})
+        SessionWriter(tmp_path / "absent" / "session.db", {}, RIG, None, 9.81)

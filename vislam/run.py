@@ -54,7 +54,9 @@ class Run:
         self.noise = imu_noise(config.imu, recording.imu_noise)
         self.slam = Slam(config, recording.rig, self.noise)
         self.log = RunLog()
-        self.session = SessionWriter(out / "session.db", {"source": source, "config": asdict(config)})
+        info = {"source": source, "config": asdict(config)}
+        gravity_m_s2 = config.imu.gravity_m_s2
+        self.session = SessionWriter(out / "session.db", info, recording.rig, self.noise, gravity_m_s2)
         self.viewer = open_viewer(out / "run.rrd", config.view.enabled, recording.rig, config.view)
         self.warnings: list[str] = []
 
@@ -95,6 +97,7 @@ class Run:
 
     def _take(self, step: Step) -> None:
         self.log.add(step)
+        self.session.add_frame(step.front.frame.t_ns, step.front.keyframe_id, step.front.T_keyframe_body)
         for keyframe in step.keyframes:
             self._store(keyframe)
         with self.slam.clock.measure("view"):
@@ -102,7 +105,9 @@ class Run:
 
     def _store(self, step: KeyframeStep) -> None:
         with self.slam.clock.measure("store"):
-            self.session.add(step.odometry.packet.keyframe, step.odometry.T_odom_body, step.update, step.edges)
+            odometry = step.odometry
+            first_state = self.slam.front.first_state
+            self.session.add(odometry.packet, odometry.T_odom_body, step.update, step.edges, first_state)
 
     def _show(self, step: Step) -> None:
         """Log a step for the viewer: the image with its tracks, the poses, what the back end did."""
