@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from vislam.camera import Camera, Rig
 from vislam.geometry import invert, se3_exp, transform
 from vislam.imu import ImuNoise
 from vislam.messages import (
@@ -28,6 +29,8 @@ EUROC_NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9393e-5, 3.0e-3, 200.0)
 GRAVITY_M_S2 = 9.81
 LAP_S = 20.0  # the motion repeats after this time, so loops are exact
 T_BODY_CAM0 = transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.08, 0.03, -0.02]))
+
+RIG = Rig((Camera(752, 480, 458.0, 457.0, 367.0, 248.0),), (T_BODY_CAM0,))
 
 
 def position(t: Array, scale_m: float = 3.0) -> Array:

@@ -8,9 +8,9 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from graph_world import GRAVITY_M_S2, T_BODY_CAM0, World, rmse_m, with_vo
+from graph_world import GRAVITY_M_S2, RIG, World, rmse_m, with_vo
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError
 from vislam.factors import solver as solver_module
 from vislam.graph import PoseGraph
@@ -26,7 +26,7 @@ def world() -> World:
 
 
 def started(world: World, count: int) -> PoseGraph:
-    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, T_BODY_CAM0)
+    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
     graph.initialise(world.initial_state())
     for k in range(count):
         graph.add(world.packet(k))
@@ -82,7 +82,7 @@ def test_bad_packet_is_refused_before_anything_is_touched(world: World, name: st
 
 
 def test_bad_initial_states_are_refused(world: World) -> None:
-    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, T_BODY_CAM0)
+    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
     state = world.initial_state()
     with pytest.raises(DataError, match="velocity"):
         graph.initialise(replace(state, velocity_world_m_s=np.array([0.0, np.nan, 0.0])))
@@ -269,7 +269,7 @@ def test_long_gap_in_images_and_imu(world: World) -> None:
 def test_a_loop_that_cannot_be_true_is_taken_out_again(world: World) -> None:
     """With a gate that lets everything pass, the optimised graph itself contradicts a gross outlier."""
     config = replace(EXACT, loop_gate_probability=1.0 - 1e-16)
-    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, T_BODY_CAM0)
+    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
     graph.initialise(world.initial_state())
     for k in range(110):
         graph.add(world.packet(k))

@@ -93,8 +93,8 @@ class InitConfig:
     gravity_tolerance_m_s2: float = 0.5  # of the measured norm: accelerometer bias and scale of a calibrated sensor
     window_s: float = 2.0  # metric visual odometry: gravity to 0.03 deg plus what the accelerometer bias hides
     window_min_s: float = 1.0  # try from here on
-    mono_window_s: float = 5.0  # without scale, acceleration has to be seen against its bias, which takes longer
-    mono_window_min_s: float = 1.5
+    mono_window_s: float = 4.0  # without scale, acceleration has to be seen against its bias, which takes longer
+    mono_window_min_s: float = 1.0
     node_spacing_s: float = 0.1  # frames closer than this add noise and cost, not knowledge
     vo_inflation: float = 1.5  # on the sigmas of relative motion, which share the keyframe's landmark errors
     imu_inflation: float = 4.0  # on the white-noise sigmas: vibration and aliasing are not in the data sheets
@@ -103,12 +103,20 @@ class InitConfig:
     max_tilt_sigma_deg: float = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
     max_velocity_sigma_m_s: float = 0.2
     max_gyro_bias_sigma_rad_s: float = 0.02
-    max_scale_sigma: float = 0.1  # relative, monocular only
+    max_scale_sigma: float = 0.015  # relative, monocular only; scale within 3 % is two of these
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
-    attempt_s: float = 0.5  # between attempts: without scale one costs 0.3 s, and a window changes little in this time
+    attempt_s: float = 0.3  # between attempts: one costs up to 0.1 s, and a window changes little in this time
     max_nodes: int = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
-    min_directions: int = 8  # monocular: motions with parallax in the window; four unknown states need some redundancy
+    mono_max_nodes: int = 20  # the same without scale, where every node also carries its sightings of points
+    max_points: int = 80  # monocular: points solved for; more cost time and hardly sharpen scale
+    min_points: int = 20  # monocular: fewer leave too little redundancy to tell a wrong one
+    min_parallax_px: float = 12.0  # monocular: median over the points; below, depth and so scale drown in noise
+    min_excitation_m_s2: float = 0.15  # monocular: rms change of acceleration; less is also what vibration leaves
+    time_offset: bool = True  # estimate what the camera's clock is off from the IMU's, and correct its stamps
+    time_offset_s: float = 0.0  # what is known before: added to the camera's stamps from the first frame on
+    time_offset_sigma_s: float = 0.015  # of that; drivers that stamp on arrival are off by up to 30 ms
+    max_time_offset_sigma_s: float = 0.005  # a metric start waits for this, up to its window: 1 m/s makes it 5 mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +124,8 @@ class EkfConfig:
     """The fast path."""
 
     coupling: Literal["loose", "tight"] = "loose"  # loose: motions of visual odometry; tight: tracks (MSCKF)
+    vision: Literal["relative", "accumulated"] = "relative"  # accumulated: vision's own sum of motions, taken as a pose
+    odom: Literal["corrected", "continuous"] = "corrected"
     history_s: float = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
     checkpoint_s: float = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
     max_gap_s: float = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
@@ -124,6 +134,8 @@ class EkfConfig:
     imu_inflation: float = 10.0  # on the white-noise sigmas, for vibration; flying EuRoC: innovations fit at 10, not 4
     vo_inflation: float = 1.5  # on the sigmas of visual odometry: covariances from residuals miss model errors
     vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
+    accumulated_sigma_m: float = 0.02  # the fixed R of accumulated vision
+    accumulated_sigma_deg: float = 0.5
     gate_probability: float = 0.999  # chi-square gate on every innovation
     reset_rejects: int = 5  # this many rejections in a row ...
     reset_s: float = 1.0  # ... over this long mean that the filter is wrong, not vision: P is inflated, counted
@@ -137,12 +149,74 @@ class EkfConfig:
     vision_delay_s: float = 0.0  # for experiments: vision reaches the filter so much later than it was seen
     graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
 
+    tight_clones: int = 11  # past poses that tracks tie together; half a second at 20 Hz
+    tight_points: int = 25  # long tracks kept as points of the state; they stop the drift while little moves
+    tight_point_misses: int = 1  # frames in a row that may not see such a point before it is dropped
+    tight_max_tracks: int = 60  # used per frame; bounds its time
+    tight_min_observations: int = 3  # of a track; two leave one equation
+    tight_pixel_sigma_px: float = 1.0  # of a corner followed over many frames
+    tight_stereo_sigma_px: float = 0.5  # right minus left pixel: matching, without the error of the corner
+    tight_depth_sigma_rho: float = 3e-3  # 1/m, of the inverse of a depth image
+    tight_outlier_sigmas: float = 5.0  # one observation of a track; the test of the track follows
+    tight_max_depth_ratio: float = 0.3  # sigma over inverse depth; above, a point's place is no base to linearise at
+    tight_min_range_m: float = 0.1
+    tight_max_range_m: float = 200.0  # beyond, nothing but rotation is seen
+    tight_still_px: float = 1.0  # image motion between clones below which the older one is kept instead of the newer
+    tight_rest_sigma_m: float = 0.002  # sway against the pose at which rest began
+    tight_rest_sigma_deg: float = 0.05
+    tight_imu_inflation: float = 4.0  # on the white-noise sigmas, as in `imu_inflation`
+    tight_time_offset: bool = True  # estimate what is to be added to the stamps of frames
+    tight_time_offset_sigma_s: float = 0.01  # prior; USB cameras are stamped up to 30 ms late
+    tight_extrinsic_rotation: bool = True  # refine the camera's rotation in the body
+    tight_extrinsic_sigma_deg: float = 0.5  # prior; a calibration 1 deg off is two sigmas
+    tight_readout_s: float = 0.0  # rolling shutter, first to last row; a frame's stamp is that of its middle row
+    tight_history_s: float = 2.0  # how late a measurement may come; a state is 100 to 250 kB, one per frame
+
 
 @dataclass(frozen=True, slots=True)
 class WindowConfig:
     """The sliding window of tight coupling: poses, velocities, biases and landmarks of the newest keyframes."""
 
     keyframes: int = 15  # states in the window; the oldest one is marginalised when another comes
+    iterations: int = 6  # most Gauss-Newton steps per keyframe; two or three are usual
+    tolerance: float = 1e-3  # relative decrease of the cost that ends them
+    sigma_px: float = 1.0  # of a tracked corner between keyframes
+    right_sigma_px: float = 1.0  # of the match in the right image
+    depth_sigma_rho: float = 4e-3  # 1/m: sigma of 1/z of a depth image; a Kinect's own is 1.4e-3, then registration
+    huber_k: float = 2.0  # of a reprojection error, in standard deviations
+    gate_probability: float = 0.999  # chi-square of an observation; above it after optimisation, it is taken out
+    gate_track_fraction: float = 0.34  # of a track's observations beyond the gate: the whole track goes
+    rho_sigma_1_m: float = 10.0  # prior of inverse depth: only keeps points without parallax from running away
+    split_min: int = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
+
+    imu_inflation: float = 2.0  # on white-noise sigmas: data sheets know no vibration, scale error or time jitter
+    imu_max_gap_s: float = 0.1  # a longer hole is an outage
+    imu_max_outage_s: float = 1.0  # bridged up to here with the two sigmas below; longer ones drop the factor
+    outage_accel_sigma_m_s2: float = 3.0  # what nobody measured during an outage
+    outage_gyro_sigma_rad_s: float = 1.0
+    reintegrate_gyro_rad_s: float = 0.005  # bias change after which first-order correction is not enough
+    reintegrate_accel_m_s2: float = 0.05
+    lost_speed_sigma_m_s: float = 1.0  # without IMU data the body is assumed to go on as before, this loosely
+    lost_rate_sigma_deg_s: float = 30.0
+    rest_speed_sigma_m_s: float = 0.005
+    rest_sigma_m: float = 0.001  # motion between two keyframes at rest
+    rest_sigma_deg: float = 0.05
+
+    gauge_sigma_m: float = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
+    gauge_sigma_rad: float = 1e-3
+    restart_sigma_m: float = 0.1  # of the state a window restarts from after a failed solution
+    restart_sigma_rad: float = 0.03
+    restart_speed_sigma_m_s: float = 0.3
+    restart_gyro_bias_sigma_rad_s: float = 0.01
+    restart_accel_bias_sigma_m_s2: float = 0.1
+
+    estimate_time_offset: bool = True  # of the camera against the IMU
+    time_offset_sigma_s: float = 0.02  # prior; cheap cameras stamp up to 30 ms late
+    estimate_rotation: bool = True  # of the camera on the body
+    rotation_sigma_deg: float = 0.5  # prior; a calibration by Kalibr is good to 0.1, a printed mount to 1
+    estimate_readout: bool = False  # of a rolling shutter; needs brisk rotation
+    readout_s: float = 0.0  # rolling shutter, first to last row; 0 is global
+    readout_sigma_s: float = 0.01  # prior, when it is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +232,8 @@ class GraphConfig:
     relinearize_bias: float = 0.001  # rad/s and m/s^2; preintegration's first-order correction is exact to far more
     relinearize_skip: int = 5  # updates between relinearisations; 1 costs 3x the time for the same trajectory
     loop_iterations: int = 3  # extra Gauss-Newton steps after a loop is accepted; bounds the work of an update
+    read_newest: int = 300  # poses that each keyframe reads back from the solver; up to this many plus a block: all
+    read_block: int = 200  # older poses that each keyframe reads back in turn, so that its work does not grow
     finish_iterations: int = 10  # most steps of the final convergence before batch has its try
     moved_m: float = 0.001  # poses that moved less are not published again
     moved_deg: float = 0.05
@@ -181,6 +257,13 @@ class GraphConfig:
     direction_floor_deg: float = 0.2  # mono: direction of motion
     direction_soft_m: float = 0.005  # mono: baselines shorter than this lose their say on direction
     direction_scale_sigma: float = 5.0  # mono: relative, on the expected step; wide, for only the IMU knows the scale
+    window_inflation: float = 2.0  # on sigma of a window's edges; consecutive ones share errors, here they are summed
+    window_floor_deg: float = 0.01  # no calibration lets a window know more
+    window_floor_m: float = 0.0005
+    window_refresh_sigma: float = 0.3  # a provisional edge that moved by more of its sigma is replaced at once ...
+    window_refresh_max: int = 3  # ... up to so many per keyframe, those that moved most
+    tilt_every: int = 10  # keyframes between tilt factors; errors of nearer ones are the same accelerometer bias
+    tilt_floor_deg: float = 0.1  # an accelerometer's scale and misalignment, which the window does not estimate
     huber_k: float = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
     imu_inflation: float = 2.0  # on white noise sigma: data sheets know no vibration, scale error or time jitter
     imu_integration_sigma: float = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
@@ -208,6 +291,26 @@ class GraphConfig:
     consistency_max_sigma_m: float = 0.5  # odometry looser than this between two loops proves nothing
     consistency_max_sigma_deg: float = 5.0
     vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
+
+
+@dataclass(frozen=True, slots=True)
+class BatchConfig:
+    """Batch optimisation of a finished run: visual-inertial bundle adjustment over all keyframes."""
+
+    rounds: int = 4  # of optimising, then judging every track and loop anew; the last two change almost nothing
+    iterations: int = 20  # most Levenberg-Marquardt steps of a round; converged earlier as a rule
+    start_gate_px: float = 20.0  # first round: poses of the run may be off, only gross outliers leave
+    start_cauchy_px: float = 3.0  # scale of the kernel in that round
+    huber_k: float = 2.0  # standard deviations, in later rounds
+    gate_probability: float = 0.999  # chi-square of a pixel or depth that stays, in later rounds
+    max_relative_sigma: float = 0.25  # of a landmark's distance by its own rays; farther ones lack parallax or depth
+    max_observations: int = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
+    min_seen: int = 12  # landmarks; a keyframe that sees fewer also gets the odometry of the run
+    pixel_sigma_min_px: float = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
+    pixel_sigma_max_px: float = 3.0
+    loop_probability: float = 0.9999  # a loop beyond this chi-square is refused by graduated non-convexity
+    unscaled_odometry_sigma: float = 0.1  # one camera: relative, on the steps of the run's own odometry among the loops
+    covariances: bool = True  # of all states; costs about as much as a round
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,6 +425,7 @@ class Config:
     ekf: EkfConfig = field(default_factory=EkfConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
+    batch: BatchConfig = field(default_factory=BatchConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     map: MapConfig = field(default_factory=MapConfig)
     view: ViewConfig = field(default_factory=ViewConfig)

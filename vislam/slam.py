@@ -67,7 +67,7 @@ class Back:
         """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity."""
         has_gravity = first_state is not None
         self.graph = PoseGraph(
-            config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig.T_body_cams[0]
+            config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, config.window
         )
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -18,6 +18,8 @@ from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.geometry import invert, transform
 from vislam.imu import ImuNoise
 from vislam.messages import Array
+
+Label = tuple[str, int]  # names a factor that will be replaced or taken out: its kind and a number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +40,7 @@ class Step:
     variance_rad2: float  # per axis, of the motion since the previous keyframe
     variance_m2: float
     note: str
+    named: dict[Label, gtsam.NonlinearFactor] = field(default_factory=dict)  # those that may be replaced later
 
 
 class Builder:

@@ -1,4 +1,4 @@
-"""The transactional estimate: records go in, a solver is tried, and when it fails a new one is built from the records.
+"""The transactional estimate: measurements go in, a solver is tried, and when it fails a new one is built from them.
 
 gtsam 4.3.0 throws on some healthy systems and leaves the object that threw unusable, so the ladder after a failure is:
 a fresh iSAM2 with QR factorisation, which does not have the pivot test that rejects healthy systems; the same without
@@ -8,14 +8,16 @@ loops because the usual cause is a long drift that a true loop ends.
 
 from __future__ import annotations
 
+from typing import Generic, Protocol, TypeVar
+
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.config import GraphConfig
-from vislam.factors.builder import Builder, Guess, Step, insert_guess, read_guess
-from vislam.factors.journal import SPEED_MAX_M_S, KeyframeRecord, StartRecord
-from vislam.factors.keys import X, nearest_rigid, poses_of
-from vislam.factors.loop import LoopModel
+from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
+from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
+from vislam.factors.odometry import Odometry
 from vislam.factors.solver import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
 from vislam.geometry import invert
 from vislam.messages import Array
@@ -24,27 +26,51 @@ _BATCH_ITERATIONS = 50
 _CONVERGED_M = 1e-5  # largest change of a step that finish takes for convergence; rad and m alike
 
 
-class Estimator:
-    """Owns the solver and the last good estimate; `poses` is never older than one failed attempt."""
+class Loop(Protocol):
+    """What the estimator needs of a loop edge."""
 
-    def __init__(self, config: GraphConfig, builder: Builder) -> None:
+    @property
+    def id(self) -> int:
+        """Return its number, unique in a run."""
+
+    def factor(self, robust: bool) -> gtsam.NonlinearFactor:
+        """Return the factor, under a kernel when `robust`."""
+
+
+L = TypeVar("L", bound=Loop)
+
+
+class Estimator(Generic[L]):
+    """Owns the solver and the last good estimate; `poses` is never older than one failed attempt.
+
+    On long runs a keyframe reads back the newest poses and, in turn, a block of the older ones; loops read all.
+    """
+
+    def __init__(self, config: GraphConfig, odometry: Odometry) -> None:
         """Start empty."""
         self._config = config
-        self._builder = builder
-        self._start: StartRecord | None = None
-        self._records: list[KeyframeRecord] = []
+        self._odometry = odometry
         self._factorization: Factorization = "CHOLESKY"
         self._solver: Solver = IncrementalSolver(config, self._factorization)
-        self._slots: dict[int, int] = {}
+        self._slots: dict[Label, int] = {}
         self._values = gtsam.Values()
-        self.loops: dict[int, LoopModel] = {}  # in the graph, by loop id
-        self.poses: Array = np.zeros((0, 4, 4))
+        self._count = 0
+        self._buffer: Array = np.zeros((64, 4, 4))  # poses, with room to grow
+        self._reach_m: Array = np.zeros(64)
+        self._next_old = 0  # where the next block of older poses begins
+        self._read: list[NDArray[np.int64]] = []  # ids since `take_read`
+        self.loops: dict[int, L] = {}  # in the graph, by loop id
         self.vo_scale = 1.0  # on the sigma of visual odometry, learnt from loops that it contradicted
+
+    @property
+    def poses(self) -> Array:
+        """Return T_map_body [M, 4, 4] of all keyframes: a view that the next call may change."""
+        return self._buffer[: self._count]
 
     @property
     def has_imu(self) -> bool:
         """Return whether velocities and biases are estimated."""
-        return self._start is not None and self._start.has_imu
+        return self._odometry.has_imu
 
     @property
     def solver_name(self) -> str:
@@ -55,6 +81,12 @@ class Estimator:
         """Return the estimated state of keyframe k."""
         return read_guess(self._values, k, self.has_imu)
 
+    def take_read(self) -> NDArray[np.int64]:
+        """Return the ids of the poses that were read back since the last call, ascending."""
+        ids = np.unique(np.concatenate(self._read)) if self._read else np.zeros(0, np.int64)
+        self._read = []
+        return ids
+
     def joint_covariance(self, keys: list[int]) -> Array | None:
         """Return the joint marginal covariance of variables; None when gtsam cannot give it."""
         try:
@@ -63,25 +95,28 @@ class Estimator:
             return None
         return joint if np.all(np.isfinite(joint)) else None
 
-    def begin(self, start: StartRecord, record: KeyframeRecord) -> str:
-        """Take the first state and keyframe; return what went wrong, normally nothing."""
-        self._start = start
-        self._records.append(record)
-        factors, guess = self._builder.start(start)
-        return self._extend(factors, 0, guess)
+    def begin(self) -> str:
+        """Take the first keyframe; return what went wrong, normally nothing."""
+        factors, guess = self._odometry.start()
+        self._reach_m[0] = np.inf
+        return self._extend(factors, {}, guess)
 
-    def extend(self, record: KeyframeRecord) -> tuple[Step, str]:
-        """Take the next keyframe; return its step and what went wrong, normally nothing."""
-        previous = self._records[-1]
-        step = self._step(record, previous, self._values)
-        self._records.append(record)
-        return step, self._extend(step.factors, record.id, step.guess)
+    def extend(self) -> tuple[Step, str]:
+        """Take the next keyframe of the odometry; return its step and what went wrong, normally nothing."""
+        k = self._count
+        step = self._step(k, self._values)
+        if k == len(self._buffer):
+            self._buffer = np.concatenate([self._buffer, np.zeros_like(self._buffer)])
+            self._reach_m = np.concatenate([self._reach_m, np.zeros_like(self._reach_m)])
+        self._reach_m[k] = self._odometry.reach_m(k)
+        named = self._odometry.news(self.vo_scale) | step.named
+        return step, self._extend(step.factors, named, step.guess)
 
     def distrust_odometry(self, factor: float) -> None:
         """Multiply the sigma of visual odometry; past factors follow with the next `close` in batch."""
         self.vo_scale *= factor
 
-    def close(self, fresh: list[LoopModel], batch: bool) -> str:
+    def close(self, fresh: list[L], batch: bool) -> str:
         """Take loops: first without a kernel, so that the estimate reaches them, then under the Cauchy kernel.
 
         A kernel from the start would leave a single loop after a long drift in the flat tail. `batch` starts from a
@@ -99,35 +134,35 @@ class Estimator:
             robust = _graph([edge.factor(robust=True) for edge in fresh])
             slots = self._solver.update(robust, gtsam.Values(), plain)
             self._solver.iterate(1)
-            self._take(self._solver.estimate())
+            self._take()
         except FAILURES as error:
             return self._recover(self._values, fresh, error)
         for edge, slot in zip(fresh, slots, strict=True):
-            self.loops[edge.record.id], self._slots[edge.record.id] = edge, slot
+            self.loops[edge.id], self._slots["loop", edge.id] = edge, slot
         return ""
 
-    def drop(self, edges: list[LoopModel]) -> str:
+    def drop(self, edges: list[L]) -> str:
         """Take loops out again; return what went wrong."""
-        slots = [self._slots.pop(edge.record.id) for edge in edges]
+        slots = [self._slots.pop(("loop", edge.id)) for edge in edges]
         for edge in edges:
-            del self.loops[edge.record.id]
+            del self.loops[edge.id]
         try:
             self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots)
             self._solver.iterate(self._config.loop_iterations)
-            self._take(self._solver.estimate())
+            self._take()
         except FAILURES as error:
             return self._recover(self._values, [], error)
         return ""
 
     def snapshot(self) -> tuple[gtsam.Values, float]:
         """Return the current estimate, for `revert`."""
-        return self._values, self.vo_scale
+        return gtsam.Values(self._values), self.vo_scale
 
-    def revert(self, snapshot: tuple[gtsam.Values, float], edges: list[LoopModel]) -> str:
+    def revert(self, snapshot: tuple[gtsam.Values, float], edges: list[L]) -> str:
         """Go back to an earlier estimate of the same keyframes, without some loops."""
         values, self.vo_scale = snapshot
         for edge in edges:
-            self.loops.pop(edge.record.id, None)
+            self.loops.pop(edge.id, None)
         try:
             self._restart(values, [], self._new_solver(), from_batch=False)
         except FAILURES as error:
@@ -141,15 +176,15 @@ class Estimator:
         """
         note = ""
         for _ in range(self._config.finish_iterations):
-            before = self.poses
+            before = self.poses.copy()
             try:
                 self._solver.iterate(1)
-                self._take(self._solver.estimate())
+                self._take()
             except FAILURES as error:
                 note = self._recover(self._values, [], error) + "; "
             if float(np.max(np.abs(self.poses - before))) < _CONVERGED_M:
                 break
-        graph = self._whole(self._values, self.loops)
+        graph, _ = self._whole(self._values, self.loops)
         cost = float(graph.error(self._values))
         try:
             values = optimize(graph, self._values, _BATCH_ITERATIONS)
@@ -160,44 +195,73 @@ class Estimator:
             return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch failed: {_short(error)}"
         try:
             self._restart(values, [], self._new_solver(), from_batch=False)
-            self._take(values)
+            self._adopt(values, np.arange(self._count))
         except FAILURES as error:
             note += self._recover(self._values, [], error) + "; "
         return f"{note}batch at cost {batch_cost:.6g}, {self.solver_name} had {cost:.6g}"
 
-    def _step(self, record: KeyframeRecord, previous: KeyframeRecord, values: gtsam.Values) -> Step:
-        before = read_guess(values, previous.id, self.has_imu)
+    def _step(self, k: int, values: gtsam.Values) -> Step:
+        before = read_guess(values, k - 1, self.has_imu)
         motion = np.eye(4)
-        if previous.id > 0:
-            motion = nearest_rigid(invert(values.atPose3(X(previous.id - 1)).matrix()) @ before.T_map_body)
-        return self._builder.keyframe(
-            record, previous, before, last_motion=motion, has_imu=self.has_imu, vo_scale=self.vo_scale
-        )
+        if k > 1:
+            motion = nearest_rigid(invert(values.atPose3(X(k - 2)).matrix()) @ before.T_map_body)
+        return self._odometry.step(k, before, motion, self.vo_scale)
 
-    def _extend(self, factors: list[gtsam.NonlinearFactor], k: int, guess: Guess) -> str:
+    def _extend(
+        self, factors: list[gtsam.NonlinearFactor], named: dict[Label, gtsam.NonlinearFactor], guess: Guess
+    ) -> str:
+        """Add a keyframe with its factors; those whose name is known replace the older ones."""
         new = gtsam.Values()
-        insert_guess(new, k, guess, self.has_imu)
+        insert_guess(new, self._count, guess, self.has_imu)
+        self._count += 1
+        replaced = [self._slots[label] for label in named if label in self._slots]
         try:
-            self._solver.update(_graph(factors), new, [])
-            self._take(self._solver.estimate())
+            slots = self._solver.update(_graph([*factors, *named.values()]), new, replaced)
+            self._take_some()
         except FAILURES as error:
             values = gtsam.Values(self._values)
-            values.insert(new)
+            values.insert_or_assign(new)
             return self._recover(values, [], error)
+        self._slots.update(zip(named, slots[len(factors) :], strict=True))
         return ""
 
-    def _take(self, values: gtsam.Values) -> None:
-        """Adopt an estimate; RuntimeError when it is not complete, not finite or diverged."""
-        poses = poses_of(values)
-        if len(poses) != len(self._records) or not np.all(np.isfinite(poses)):
-            raise RuntimeError("the solver's estimate is not finite or not complete")
-        durations_s = np.diff([record.t_ns for record in self._records]) * 1e-9
-        speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / durations_s
-        if np.any(speeds > SPEED_MAX_M_S):
-            raise RuntimeError(f"the solver diverged: a speed of {float(speeds.max()):.3g} m/s")
-        self._values, self.poses = values, poses
+    def _take(self) -> None:
+        """Read back the whole estimate."""
+        self._adopt(self._solver.estimate(), np.arange(self._count))
 
-    def _recover(self, values: gtsam.Values, fresh: list[LoopModel], error: Exception) -> str:
+    def _take_some(self) -> None:
+        """Read back the newest poses and the next block of older ones: all of them while they are few."""
+        config, count = self._config, self._count
+        if count <= config.read_newest + config.read_block or self._solver.reads_all:
+            self._take()
+            return
+        newest = np.arange(count - config.read_newest, count)
+        begin = self._next_old if self._next_old < newest[0] else 0
+        end = min(begin + config.read_block, int(newest[0]))
+        ids = np.concatenate([np.arange(begin, end), newest])
+        keys = [X(k) for k in ids.tolist()]
+        if self.has_imu:
+            keys += [key for k in ids.tolist() for key in (V(k), B(k))]
+        self._adopt(self._solver.estimate(keys), ids)
+        self._next_old = end
+
+    def _adopt(self, values: gtsam.Values, ids: NDArray[np.int64]) -> None:
+        """Adopt an estimate of keyframes; RuntimeError when it is not complete, not finite or diverged."""
+        poses = poses_of(values)
+        if len(poses) != len(ids) or not np.all(np.isfinite(poses)):
+            raise RuntimeError("the solver's estimate is not finite or not complete")
+        steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        beyond = (steps_m > self._reach_m[ids[1:]]) & (np.diff(ids) == 1)
+        if np.any(beyond):
+            raise RuntimeError(f"the solver diverged: a step of {float(steps_m[beyond].max()):.3g} m")
+        if len(ids) == self._count:
+            self._values = values
+        else:
+            self._values.insert_or_assign(values)
+        self._buffer[ids] = poses
+        self._read.append(ids)
+
+    def _recover(self, values: gtsam.Values, fresh: list[L], error: Exception) -> str:
         """Go down the ladder until a solver takes the records; always ends with a usable one."""
         cause = f"gtsam failed ({_short(error)}); "
         self._factorization = "QR"
@@ -210,45 +274,50 @@ class Estimator:
             what = "rebuilt with QR" + (" from a batch solution" if from_batch else "")
             return cause + what + (" without the new loops" if fresh and not loops else "")
         solver = BatchSolver()
-        graph = self._whole(values, self.loops)
+        graph, labels = self._whole(values, self.loops)
         slots = solver.update(graph, values, [])
-        self._solver = solver
-        self._number(slots, self.loops)
+        self._solver, self._slots = solver, _named(labels, slots)
         try:
-            self._take(solver.estimate())
+            self._take()
         except FAILURES:  # nothing converges: keep what was there, with the guess of the newest keyframe
-            self._values, self.poses = values, poses_of(values)
+            self._values = values
+            self._buffer[: self._count] = poses_of(values)
+            self._read.append(np.arange(self._count))
         return cause + "going on with batch Levenberg-Marquardt"
 
     def _new_solver(self) -> Solver:
         return IncrementalSolver(self._config, self._factorization)
 
-    def _restart(self, values: gtsam.Values, fresh: list[LoopModel], solver: Solver, from_batch: bool) -> None:
+    def _restart(self, values: gtsam.Values, fresh: list[L], solver: Solver, from_batch: bool) -> None:
         """Fill a new solver from the records, starting at `values`; nothing changes when it fails."""
-        loops = self.loops | {edge.record.id: edge for edge in fresh}
+        loops = self.loops | {edge.id: edge for edge in fresh}
         if from_batch:
-            plain = {edge.record.id for edge in fresh}
-            values = optimize(self._whole(values, loops, plain), values, _BATCH_ITERATIONS)
-        slots = solver.update(self._whole(values, loops), values, [])
+            plain = {edge.id for edge in fresh}
+            values = optimize(self._whole(values, loops, plain)[0], values, _BATCH_ITERATIONS)
+        graph, labels = self._whole(values, loops)
+        slots = solver.update(graph, values, [])
         solver.iterate(self._config.loop_iterations)
-        self._take(solver.estimate())
-        self._solver, self.loops = solver, loops
-        self._number(slots, loops)
-
-    def _number(self, slots: list[int], loops: dict[int, LoopModel]) -> None:
-        """Note the slots of loops, which stand at the end of the whole graph."""
-        self._slots = dict(zip(loops, slots[len(slots) - len(loops) :], strict=True))
+        self._adopt(solver.estimate(), np.arange(self._count))
+        self._solver, self.loops, self._slots = solver, loops, _named(labels, slots)
 
     def _whole(
-        self, values: gtsam.Values, loops: dict[int, LoopModel], plain: set[int] | None = None
-    ) -> gtsam.NonlinearFactorGraph:
-        """Build all factors from the records at the biases of `values`; loops in `plain` without a kernel."""
-        assert self._start is not None
-        factors, _ = self._builder.start(self._start)
-        for previous, record in zip(self._records, self._records[1:], strict=False):
-            factors += self._step(record, previous, values).factors
+        self, values: gtsam.Values, loops: dict[int, L], plain: set[int] | None = None
+    ) -> tuple[gtsam.NonlinearFactorGraph, list[Label | None]]:
+        """Build all factors at the biases of `values`, with their names; loops in `plain` without a kernel."""
+        factors, _ = self._odometry.start()
+        labels: list[Label | None] = [None] * len(factors)
+        for k in range(1, self._count):
+            step = self._step(k, values)
+            factors += [*step.factors, *step.named.values()]
+            labels += [*[None] * len(step.factors), *step.named]
         factors += [edge.factor(robust=loop_id not in (plain or set())) for loop_id, edge in loops.items()]
-        return _graph(factors)
+        labels += [("loop", loop_id) for loop_id in loops]
+        return _graph(factors), labels
+
+
+def _named(labels: list[Label | None], slots: list[int]) -> dict[Label, int]:
+    """Return the slots of factors that have a name."""
+    return {label: slot for label, slot in zip(labels, slots, strict=True) if label is not None}
 
 
 def _graph(factors: list[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:

@@ -58,20 +58,50 @@ class LoopRecord:
     offered_with: int
 
 
-Record = StartRecord | KeyframeRecord | LoopRecord
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeRecord:
+    """Motion between two consecutive keyframes, summarised by the window of tight coupling."""
+
+    to_id: int  # from the keyframe before it
+    T_previous_body: Array  # [4, 4]
+    covariance: Array  # [6, 6] perturbed on the newer keyframe's side
+    settled: bool  # no later one will replace it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiltRecord:
+    """Which way is up for a keyframe, summarised by the window of tight coupling."""
+
+    id: int
+    up_body: Array  # [3] unit
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowRecord:
+    """What the window of tight coupling said with one keyframe, as far as the graph took it."""
+
+    id: int
+    t_ns: int
+    edges: tuple[EdgeRecord, ...]  # that of this keyframe (none for the first), and those that replace older ones
+    tilts: tuple[TiltRecord, ...]
+    note: str
+
+
+Record = StartRecord | KeyframeRecord | LoopRecord | WindowRecord
 
 
 def start_record(state: NavState | None, T_map_body: Array | None = None) -> StartRecord:
     """Return the record of an initial state, or of a pose alone; raises DataError when it cannot be used."""
     if state is None:
-        pose = np.eye(4) if T_map_body is None else _checked_pose(T_map_body, "initial pose")
+        pose = np.eye(4) if T_map_body is None else checked_pose(T_map_body, "initial pose")
         return StartRecord(pose, np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15), False)
     what = f"initial state at {state.t_ns} ns"
     vectors = (state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2)
     if not all(np.shape(v) == (3,) and np.all(np.isfinite(v)) for v in vectors):
         raise DataError(f"{what}: velocity and biases must be three finite numbers each")
     return StartRecord(
-        _checked_pose(state.T_world_body, what),
+        checked_pose(state.T_world_body, what),
         np.array(state.velocity_world_m_s, dtype=np.float64),
         np.array(state.gyro_bias_rad_s, dtype=np.float64),
         np.array(state.accel_bias_m_s2, dtype=np.float64),
@@ -96,7 +126,7 @@ def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> 
     if vo.tracking is not Tracking.LOST and vo.T_keyframe_body is not None:
         if vo.keyframe_id != previous.id:
             raise DataError(f"{what}: its odometry is relative to keyframe {vo.keyframe_id}, expected {previous.id}")
-        T = _checked_pose(vo.T_keyframe_body, f"{what}: odometry")
+        T = checked_pose(vo.T_keyframe_body, f"{what}: odometry")
         covariance = checked_covariance(vo.covariance, 6, f"{what}: odometry")
         if not _is_useful(T, covariance, vo.has_scale, (keyframe.t_ns - previous.t_ns) * 1e-9):
             T = covariance = None
@@ -110,7 +140,7 @@ def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:
     what = f"loop {edge.id} from {edge.from_id} to {edge.to_id}"
     if not 0 <= edge.from_id < edge.to_id <= newest_id:
         raise DataError(f"{what}: must go from an older to a newer keyframe of 0..{newest_id}")
-    T = _checked_pose(edge.T_from_to, what)
+    T = checked_pose(edge.T_from_to, what)
     covariance = checked_covariance(edge.covariance, 6, what)
     return LoopRecord(edge.id, edge.from_id, edge.to_id, T, covariance, edge.has_scale, newest_id)
 
@@ -123,7 +153,8 @@ def _is_useful(T: Array, covariance: Array, has_scale: bool, duration_s: float) 
     return bool(sigma_rad < _USELESS_RAD and sigma_m < _USELESS_M and speed < SPEED_MAX_M_S)
 
 
-def _checked_pose(T: Array, what: str) -> Array:
+def checked_pose(T: Array, what: str) -> Array:
+    """Return a rigid motion [4, 4] freed from rounding; DataError naming `what` when it is none."""
     matrix = np.array(T, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
         raise DataError(f"{what}: pose must be 4x4 and finite, got shape {matrix.shape}")

@@ -41,6 +41,11 @@ class LoopModel:
         self.covariance = conditioned(covariance, config.covariance_ratio_max)
         self.threshold = float(chi2_distribution.ppf(config.loop_gate_probability, len(self.covariance)))
 
+    @property
+    def id(self) -> int:
+        """Return the id of the loop."""
+        return self.record.id
+
     def factor(self, robust: bool) -> gtsam.NonlinearFactor:
         """Return the factor, under a Cauchy kernel when `robust`."""
         record, config = self.record, self._config

@@ -24,6 +24,7 @@ class Solver(Protocol):
     """What the pose graph needs of a solver."""
 
     name: str
+    reads_all: bool  # whether `estimate` always gives all variables
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
         """Add factors and new values, remove factors by slot, improve the estimate; return the slots of what is new."""
@@ -31,8 +32,8 @@ class Solver(Protocol):
     def iterate(self, count: int) -> None:
         """Improve the estimate by up to `count` steps."""
 
-    def estimate(self) -> gtsam.Values:
-        """Return the current estimate."""
+    def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
+        """Return the current estimate of variables, by default of all."""
 
     def joint_covariance(self, keys: list[int]) -> Array:
         """Return the joint marginal covariance of variables, in the order of `keys`."""
@@ -44,6 +45,7 @@ class IncrementalSolver:
     def __init__(self, config: GraphConfig, factorization: Factorization) -> None:
         """Start empty."""
         self.name = f"isam2-{factorization.lower()}"
+        self.reads_all = False
         params = gtsam.ISAM2Params()
         params.setFactorization(factorization)
         params.relinearizeSkip = config.relinearize_skip
@@ -66,9 +68,9 @@ class IncrementalSolver:
         for _ in range(count):
             self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], None, None, None, True)
 
-    def estimate(self) -> gtsam.Values:
+    def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
         """See Solver."""
-        return self._isam.calculateEstimate()
+        return self._isam.calculateEstimate() if keys is None else self._isam.calculateEstimate(keys)
 
     def joint_covariance(self, keys: list[int]) -> Array:
         """See Solver."""
@@ -81,6 +83,7 @@ class BatchSolver:
     def __init__(self) -> None:
         """Start empty."""
         self.name = "batch-lm"
+        self.reads_all = True
         self._graph = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
 
@@ -101,8 +104,8 @@ class BatchSolver:
         except FAILURES:
             return
 
-    def estimate(self) -> gtsam.Values:
-        """See Solver."""
+    def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
+        """See Solver; always all, for its update looks at all of them anyway."""
         return gtsam.Values(self._values)
 
     def joint_covariance(self, keys: list[int]) -> Array:

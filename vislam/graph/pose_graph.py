@@ -1,4 +1,4 @@
-"""PoseGraph: keyframes, IMU, visual odometry and loops in one iSAM2 graph, whose sole owner it is."""
+"""PoseGraph: keyframes, odometry and loops in one iSAM2 graph, whose sole owner it is."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import GraphConfig
+from vislam.camera import Rig
+from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError, UsageError
-from vislam.factors.builder import Builder
 from vislam.factors.estimator import Estimator
 from vislam.factors.gate import CarPark, EdgeReport, Travel
 from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe_record, loop_record, start_record
-from vislam.factors.keys import B, V, X
+from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.geometry import invert
+from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.imu import ImuNoise
 from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState
-
-__all__ = ["EdgeReport", "PoseGraph"]
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _COLLAPSED = 0.1  # weight below which an older loop counts as torn by newer ones
@@ -29,16 +28,27 @@ _COLLAPSED = 0.1  # weight below which an older loop counts as torn by newer one
 class PoseGraph:
     """The back end: `initialise`, then `add` each keyframe packet with its loop edges, then `finish`.
 
+    Coupling `loose`: motions of visual odometry and preintegrated IMU are its factors. Coupling `tight`: a sliding
+    window optimises tracks and IMU of the newest keyframes, and its edges and tilts are the factors of poses alone.
     Bad input raises DataError before anything is touched. Whatever gtsam does, `add` returns an update; its note says
     what happened when a plain one was not possible. Lost vision, IMU outages and refused loops are values.
     """
 
-    def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, T_body_cam0: Array) -> None:
+    def __init__(
+        self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, rig: Rig, window: WindowConfig
+    ) -> None:
         """Set up for a rig; without `noise` there is no IMU and only poses are estimated."""
         self._config = config
         self._noise = noise
-        self._lever_m = np.array(T_body_cam0[:3, 3], dtype=np.float64)
-        self._estimator = Estimator(config, Builder(config, noise, gravity_m_s2, self._lever_m))
+        self._lever_m = np.array(rig.T_body_cams[0][:3, 3], dtype=np.float64)
+        self._source: Source
+        if config.coupling == "tight":
+            from vislam.window import SlidingWindow  # compiles a good deal, which loose coupling need not wait for
+
+            self._source = WindowSource(config, SlidingWindow(window, rig, noise, gravity_m_s2))
+        else:
+            self._source = MotionSource(config, noise, gravity_m_s2, self._lever_m)
+        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry)
         self._start: StartRecord | None = None
         self._start_t_ns: int | None = None
         self._journal: list[Record] = []
@@ -72,6 +82,7 @@ class PoseGraph:
             have = "no IMU" if self._noise is None else "an IMU"
             raise UsageError(f"the graph was set up with {have}; initialise it with a state exactly when it has an IMU")
         self._start = start_record(state, T_map_body)
+        self._source.begin(self._start, state)
         self._start_t_ns = None if state is None else state.t_ns
 
     def add(
@@ -89,10 +100,13 @@ class PoseGraph:
         if T_odom_body is not None and not np.all(np.isfinite(T_odom_body)):
             raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
         if previous is None:
-            notes = [self._begin(record)]
+            self._check_start(record)
+        said = self._source.add(packet, record, T_odom_body)
+        self._journal += [self._start, record, *said] if previous is None else [record, *said]
+        if previous is None:
+            notes = [self._estimator.begin()]
         else:
-            self._journal.append(record)
-            step, note = self._estimator.extend(record)
+            step, note = self._estimator.extend()
             moved = invert(self._estimator.poses[-2]) @ self._estimator.poses[-1]
             self._travel.append(step.variance_rad2, step.variance_m2, float(np.linalg.norm(moved[:3, 3])))
             notes = [step.note, note]
@@ -106,14 +120,13 @@ class PoseGraph:
         """Iterate to convergence and return all poses; the note tells the cost and how it was reached."""
         if not self._keyframes:
             return GraphUpdate(self._revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
-        before = self._estimator.poses[-1]
+        before = self._estimator.poses[-1].copy()
         note = self._estimator.converge()
         self._T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._T_map_odom
-        self._published = np.zeros((0, 4, 4))
-        return self._publish([], [], note)
+        return self._publish([], [], note, everything=True)
 
     def poses(self) -> Array:
-        """Return T_map_body [M, 4, 4] of all keyframes."""
+        """Return T_map_body [M, 4, 4] of all keyframes, each as it was last read back from the solver."""
         return self._estimator.poses.copy()
 
     def states(self) -> list[NavState]:
@@ -136,15 +149,12 @@ class PoseGraph:
             out.append(replace(self._reports[loop_id], weight=weight))
         return out
 
-    def _begin(self, record: KeyframeRecord) -> str:
-        assert self._start is not None
+    def _check_start(self, record: KeyframeRecord) -> None:
         if self._start_t_ns is not None and abs(record.t_ns - self._start_t_ns) > _START_SLACK_NS:
             raise DataError(
                 f"keyframe 0 at {record.t_ns} ns: the initial state is of {self._start_t_ns} ns; "
                 "give the state at the time of keyframe 0"
             )
-        self._journal += [self._start, record]
-        return self._estimator.begin(self._start, record)
 
     def _ends(self, edge: LoopModel) -> tuple[Array, Array]:
         poses = self._estimator.poses
@@ -268,42 +278,35 @@ class PoseGraph:
                 self._report(model, LoopDecision.REJECTED, f"its group tore {len(torn)} older loops")
 
     def _state(self, k: int) -> NavState:
-        """Return the state of one keyframe; gtsam's covariance turned to NavState's order and axes."""
-        guess, has_imu = self._estimator.state(k), self._estimator.has_imu
-        R = guess.T_map_body[:3, :3]
-        covariance = np.full((15, 15), np.nan)
-        joint = self._estimator.joint_covariance([X(k), V(k), B(k)] if has_imu else [X(k)])
-        if joint is not None:
-            turn = np.eye(len(joint))
-            turn[3:6, 3:6] = R
-            if has_imu:
-                turn[9:, 9:] = np.roll(np.eye(6), 3, axis=1)
-            covariance[: len(joint), : len(joint)] = turn @ joint @ turn.T
-        velocity = guess.velocity_map_m_s if has_imu else np.full(3, np.nan)
-        gyro, accel = np.array(guess.bias.gyroscope()), np.array(guess.bias.accelerometer())
-        return NavState(self._keyframes[k].t_ns, guess.T_map_body, velocity, gyro, accel, covariance)
+        return self._source.state(k, self._keyframes[k].t_ns, self._estimator)
 
-    def _publish(self, accepted: list[int], refused: list[int], note: str) -> GraphUpdate:
+    def _publish(self, accepted: list[int], refused: list[int], note: str, everything: bool = False) -> GraphUpdate:
         """Return the poses that moved since they were last published, and remember them."""
-        poses = self._estimator.poses
-        old = self._published
-        moved = np.ones(len(poses), dtype=bool)
-        shift = np.linalg.norm(poses[: len(old), :3, 3] - old[:, :3, 3], axis=1)
-        chord = np.linalg.norm(poses[: len(old), :3, :3] - old[:, :3, :3], axis=(1, 2))  # 2 sqrt(2) sin(angle / 2)
+        poses, known = self._estimator.poses, self._published
+        ids = self._estimator.take_read()
+        if everything:
+            ids = self.ids
+        grown = len(poses) - len(known)
+        if grown > 0:
+            known = np.concatenate([known, np.full((grown + len(poses) // 2, 4, 4), np.inf)])
+        fresh, old = poses[ids], known[ids]
+        shift = np.linalg.norm(fresh[:, :3, 3] - old[:, :3, 3], axis=1)
+        chord = np.linalg.norm(fresh[:, :3, :3] - old[:, :3, :3], axis=(1, 2))  # 2 sqrt(2) sin(angle / 2)
         limit = 2.0 * np.sqrt(2.0) * np.sin(0.5 * np.deg2rad(self._config.moved_deg))
-        moved[: len(old)] = (shift > self._config.moved_m) | (chord > limit)
-        self._published = np.concatenate([old, poses[len(old) :]])
-        self._published[moved] = poses[moved]
+        moved = ids[(shift > self._config.moved_m) | (chord > limit) | everything]
+        known[moved] = poses[moved]
+        self._published = known
         self._revision += 1
-        newest = self._state(len(poses) - 1) if self._estimator.has_imu else None
+        newest = self._state(len(poses) - 1) if self._noise is not None else None
         details = {
             "solver": self._estimator.solver_name,
             "parked": len(self._park.edges),
             "vo_scale": self._estimator.vo_scale,
+            **self._source.details,
         }
         return GraphUpdate(
             self._revision,
-            np.flatnonzero(moved).astype(np.int64),
+            moved,
             poses[moved],
             self._T_map_odom,
             newest,

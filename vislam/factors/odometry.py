@@ -1,0 +1,77 @@
+"""Where the factors between keyframes come from: what the estimator asks, and the answer of loose coupling."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import gtsam
+
+from vislam.factors.builder import Builder, Guess, Label, Step
+from vislam.factors.journal import SPEED_MAX_M_S, KeyframeRecord, StartRecord
+from vislam.messages import Array
+
+
+class Odometry(Protocol):
+    """Records of a run, turned into factors at the current estimate; the estimator can ask again at any time."""
+
+    @property
+    def has_imu(self) -> bool:
+        """Return whether velocities and biases are variables."""
+
+    def start(self) -> tuple[list[gtsam.NonlinearFactor], Guess]:
+        """Return the priors and the first guess of keyframe 0."""
+
+    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+        """Return what ties keyframe k to the one before, whose state is `before`.
+
+        `last_motion` [4, 4] is the motion of the step before; `vo_scale` multiplies the sigma of visual odometry.
+        """
+
+    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+        """Return factors about older keyframes that came or changed with the newest one."""
+
+    def reach_m(self, k: int) -> float:
+        """Return how far keyframe k can be from the one before; an estimate beyond has diverged."""
+
+
+class MotionOdometry:
+    """Loose coupling: motions of visual odometry and preintegrated IMU, one keyframe to the next."""
+
+    def __init__(self, builder: Builder) -> None:
+        """Start empty."""
+        self._builder = builder
+        self._start: StartRecord | None = None
+        self._records: list[KeyframeRecord] = []
+
+    @property
+    def has_imu(self) -> bool:
+        """See Odometry."""
+        return self._start is not None and self._start.has_imu
+
+    def begin(self, start: StartRecord) -> None:
+        """Take the first state."""
+        self._start = start
+
+    def append(self, record: KeyframeRecord) -> None:
+        """Take the next keyframe."""
+        self._records.append(record)
+
+    def start(self) -> tuple[list[gtsam.NonlinearFactor], Guess]:
+        """See Odometry."""
+        assert self._start is not None
+        return self._builder.start(self._start)
+
+    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+        """See Odometry."""
+        record, previous = self._records[k], self._records[k - 1]
+        return self._builder.keyframe(
+            record, previous, before, last_motion=last_motion, has_imu=self.has_imu, vo_scale=vo_scale
+        )
+
+    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+        """See Odometry; what was measured here never changes."""
+        return {}
+
+    def reach_m(self, k: int) -> float:
+        """See Odometry."""
+        return SPEED_MAX_M_S * (self._records[k].t_ns - self._records[k - 1].t_ns) * 1e-9

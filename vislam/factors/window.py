@@ -1,0 +1,119 @@
+"""Odometry of tight coupling: edges and tilts that a sliding window summarised, in a graph of poses alone."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from vislam.config import GraphConfig
+from vislam.factors.builder import Guess, Label, Step
+from vislam.factors.journal import SPEED_MAX_M_S, EdgeRecord, StartRecord, TiltRecord, WindowRecord
+from vislam.factors.keys import X, bias_of, nearest_rigid
+from vislam.factors.noise import gaussian, huber, inflated
+from vislam.factors.priors import pose_covariance
+from vislam.factors.visual import pose_factor
+from vislam.geometry import se3_log
+from vislam.messages import Array
+
+_SPREAD = 1.5  # a provisional edge is worth replacing when its variance changed by more than this factor
+_UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+
+
+class WindowOdometry:
+    """Records of a window, turned into factors; see `vislam.factors.odometry.Odometry`."""
+
+    def __init__(self, config: GraphConfig) -> None:
+        """Start empty."""
+        self._config = config
+        self._start: StartRecord | None = None
+        self._newest: WindowRecord | None = None
+        self._t_ns: list[int] = []
+        self._edges: list[EdgeRecord | None] = []  # by the newer keyframe
+        self._tilts: dict[int, TiltRecord] = {}
+
+    @property
+    def has_imu(self) -> bool:
+        """See Odometry: velocities and biases stay in the window."""
+        return False
+
+    def begin(self, start: StartRecord) -> None:
+        """Take the first state."""
+        self._start = start
+
+    def append(self, record: WindowRecord) -> None:
+        """Take what the window said with the next keyframe."""
+        self._newest = record
+        self._t_ns.append(record.t_ns)
+        self._edges.append(None)
+        for edge in record.edges:
+            self._edges[edge.to_id] = edge
+        self._tilts |= {tilt.id: tilt for tilt in record.tilts}
+
+    def edge(self, k: int) -> EdgeRecord | None:
+        """Return the edge that ends at keyframe k; None for the first."""
+        return self._edges[k] if 0 <= k < len(self._edges) else None
+
+    def worth_replacing(self, edge: EdgeRecord) -> float:
+        """Return by how many sigmas an edge differs from the one in its place; 0 when it may stay, inf if settled."""
+        old = self.edge(edge.to_id)
+        if old is None or edge.settled:
+            return float("inf")
+        moved = se3_log(np.linalg.inv(old.T_previous_body) @ edge.T_previous_body)
+        covariance = self._covariance(old, 1.0)
+        sigmas = float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
+        ratio = np.trace(self._covariance(edge, 1.0)) / np.trace(covariance)
+        if sigmas > self._config.window_refresh_sigma or not 1.0 / _SPREAD < ratio < _SPREAD:
+            return sigmas
+        return 0.0
+
+    def start(self) -> tuple[list[gtsam.NonlinearFactor], Guess]:
+        """See Odometry."""
+        start = self._start
+        assert start is not None
+        model = gaussian(pose_covariance(start, self._config), self._config.covariance_ratio_max)
+        prior = gtsam.PriorFactorPose3(X(0), gtsam.Pose3(start.T_map_body), model)
+        bias = bias_of(start.gyro_bias_rad_s, start.accel_bias_m_s2)
+        return [prior], Guess(start.T_map_body, start.velocity_map_m_s, bias)
+
+    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+        """See Odometry."""
+        edge = self._edges[k]
+        assert edge is not None and self._newest is not None
+        T = nearest_rigid(before.T_map_body @ edge.T_previous_body)
+        covariance = self._covariance(edge, vo_scale)
+        named: dict[Label, gtsam.NonlinearFactor] = {("edge", k): self._edge_factor(edge, vo_scale)}
+        if k in self._tilts:
+            named["tilt", k] = self._tilt_factor(self._tilts[k])
+        variances = float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0
+        note = self._newest.note if k == self._newest.id else ""
+        return Step([], Guess(T, before.velocity_map_m_s, before.bias), *variances, note=note, named=named)
+
+    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+        """See Odometry."""
+        assert self._newest is not None
+        out: dict[Label, gtsam.NonlinearFactor] = {}
+        for edge in self._newest.edges:
+            if edge.to_id != self._newest.id:
+                out["edge", edge.to_id] = self._edge_factor(edge, vo_scale)
+        for tilt in self._newest.tilts:
+            out["tilt", tilt.id] = self._tilt_factor(tilt)
+        return out
+
+    def reach_m(self, k: int) -> float:
+        """See Odometry."""
+        return SPEED_MAX_M_S * (self._t_ns[k] - self._t_ns[k - 1]) * 1e-9
+
+    def _covariance(self, edge: EdgeRecord, vo_scale: float) -> Array:
+        config = self._config
+        floor_rad = np.deg2rad(config.window_floor_deg)
+        return inflated(edge.covariance, vo_scale * config.window_inflation, floor_rad, config.window_floor_m)
+
+    def _edge_factor(self, edge: EdgeRecord, vo_scale: float) -> gtsam.NonlinearFactor:
+        config = self._config
+        model = huber(gaussian(self._covariance(edge, vo_scale), config.covariance_ratio_max), config.huber_k)
+        return pose_factor(X(edge.to_id - 1), X(edge.to_id), edge.T_previous_body, model)
+
+    def _tilt_factor(self, tilt: TiltRecord) -> gtsam.NonlinearFactor:
+        sigma_rad = float(np.hypot(tilt.sigma_rad, np.deg2rad(self._config.tilt_floor_deg)))
+        model = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad)
+        return gtsam.AttitudeFactorPose3(X(tilt.id), _UP, model, gtsam.Unit3(tilt.up_body))

@@ -1,0 +1,233 @@
+"""What feeds the graph between loops: measured motions (loose coupling) or a sliding window (tight coupling)."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from vislam.config import GraphConfig
+from vislam.errors import DataError
+from vislam.factors.builder import Builder
+from vislam.factors.estimator import Estimator
+from vislam.factors.journal import (
+    EdgeRecord,
+    KeyframeRecord,
+    StartRecord,
+    TiltRecord,
+    WindowRecord,
+    checked_pose,
+)
+from vislam.factors.keys import B, V, X
+from vislam.factors.loop import LoopModel
+from vislam.factors.noise import checked_covariance, conditioned
+from vislam.factors.odometry import MotionOdometry, Odometry
+from vislam.factors.window import WindowOdometry
+from vislam.imu import ImuNoise
+from vislam.messages import Array, KeyframePacket, NavState
+from vislam.window.messages import WindowEdge, WindowUpdate
+
+_RATIO_MAX = 1e12  # eigenvalues of a covariance that is solved with
+
+
+class Window(Protocol):
+    """What tight coupling needs of a sliding window."""
+
+    def initialise(self, state: NavState | None, T_local_body: Array | None = None) -> None:
+        """Set the state of keyframe 0; without an IMU its pose."""
+
+    def add(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> WindowUpdate:
+        """Take a keyframe; DataError, and nothing changed, on a packet that cannot be used."""
+
+
+class Source(Protocol):
+    """One kind of coupling."""
+
+    @property
+    def odometry(self) -> Odometry:
+        """Return the factors it gives."""
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Return what is worth telling about the last keyframe."""
+
+    def begin(self, start: StartRecord, state: NavState | None) -> None:
+        """Take the first state."""
+
+    def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
+        """Take a keyframe, validated as `record`; return what else belongs into the journal.
+
+        Raises DataError, and changes nothing, on observations that cannot be used.
+        """
+
+    def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
+        """Return the state of keyframe k in map with its covariance, NaN where nobody can tell."""
+
+
+class MotionSource:
+    """Loose coupling: the graph itself estimates velocities and biases."""
+
+    def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, lever_m: Array) -> None:
+        """Start empty."""
+        self._odometry = MotionOdometry(Builder(config, noise, gravity_m_s2, lever_m))
+
+    @property
+    def odometry(self) -> Odometry:
+        """See Source."""
+        return self._odometry
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """See Source."""
+        return {}
+
+    def begin(self, start: StartRecord, state: NavState | None) -> None:
+        """See Source."""
+        self._odometry.begin(start)
+
+    def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
+        """See Source."""
+        self._odometry.append(record)
+        return []
+
+    def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
+        """See Source; gtsam's covariance turned to NavState's order and axes."""
+        guess, has_imu = estimator.state(k), estimator.has_imu
+        covariance = np.full((15, 15), np.nan)
+        joint = estimator.joint_covariance([X(k), V(k), B(k)] if has_imu else [X(k)])
+        if joint is not None:
+            turn = np.eye(len(joint))
+            turn[3:6, 3:6] = guess.T_map_body[:3, :3]
+            if has_imu:
+                turn[9:, 9:] = np.roll(np.eye(6), 3, axis=1)
+            covariance[: len(joint), : len(joint)] = turn @ joint @ turn.T
+        velocity = guess.velocity_map_m_s if has_imu else np.full(3, np.nan)
+        gyro, accel = np.array(guess.bias.gyroscope()), np.array(guess.bias.accelerometer())
+        return NavState(t_ns, guess.T_map_body, velocity, gyro, accel, covariance)
+
+
+class WindowSource:
+    """Tight coupling: a sliding window estimates states and landmarks, and the graph takes its edges and tilts."""
+
+    def __init__(self, config: GraphConfig, window: Window) -> None:
+        """Start empty."""
+        self._config = config
+        self._odometry = WindowOdometry(config)
+        self._window = window
+        self._local: list[NavState | None] = []  # of each keyframe in the window's frame, settled or as it was newest
+        self._details: dict[str, Any] = {}
+
+    @property
+    def odometry(self) -> Odometry:
+        """See Source."""
+        return self._odometry
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """See Source."""
+        return self._details
+
+    def begin(self, start: StartRecord, state: NavState | None) -> None:
+        """See Source."""
+        self._odometry.begin(start)
+        self._window.initialise(state, start.T_map_body)
+
+    def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
+        """See Source."""
+        update = self._window.add(packet, T_odom_body)
+        said = self._record(update, record)
+        self._odometry.append(said)
+        self._local.append(update.newest)
+        for k, state in update.states:
+            self._local[k] = state
+        self._details = {
+            "calibration": update.calibration,
+            "scale_sigma": update.scale_sigma,
+            "rejected_tracks": update.rejected_tracks,
+        }
+        return [said]
+
+    def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
+        """See Source; the window's state carried to the keyframe's pose in map, whose covariance is the graph's."""
+        T_map_body = estimator.poses[k].copy()
+        pose = estimator.joint_covariance([X(k)])
+        if pose is not None:
+            turn = np.eye(6)
+            turn[3:, 3:] = T_map_body[:3, :3]
+            pose = turn @ pose @ turn.T
+        local = self._local[k]
+        if local is not None:
+            return in_map(local, T_map_body, pose)
+        covariance = np.full((15, 15), np.nan)
+        if pose is not None:
+            covariance[:6, :6] = pose
+        return NavState(t_ns, T_map_body, np.full(3, np.nan), np.zeros(3), np.zeros(3), covariance)
+
+    def _record(self, update: WindowUpdate, record: KeyframeRecord) -> WindowRecord:
+        """Choose what the graph takes: the newest edge, settled ones, and provisional ones that changed most."""
+        notes = [update.note]
+        kept, changed = [], []
+        for edge in update.odometry:
+            try:
+                taken = _edge_record(edge)
+            except DataError as error:
+                notes.append(str(error))
+                continue
+            sigmas = self._odometry.worth_replacing(taken)
+            if taken.settled or taken.to_id == record.id:
+                kept.append(taken)
+            elif sigmas > 0.0:
+                changed.append((sigmas, taken))
+        changed.sort(key=lambda item: -item[0])
+        kept += [edge for _, edge in changed[: self._config.window_refresh_max]]
+        if record.id and all(edge.to_id != record.id for edge in kept):
+            kept.append(self._stand_in(record))
+            notes.append("no usable edge from the window, went on as odometry or the last motion says")
+        tilts = tuple(
+            TiltRecord(tilt.id, np.array(tilt.up_body), float(tilt.sigma_rad))
+            for tilt in update.tilts
+            if tilt.id % self._config.tilt_every == 0 and _is_direction(tilt.up_body) and np.isfinite(tilt.sigma_rad)
+        )
+        return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, "; ".join(n for n in notes if n))
+
+    def _stand_in(self, record: KeyframeRecord) -> EdgeRecord:
+        """Return an edge to the newest keyframe where the window gave none: from odometry, else as before, loosely."""
+        config = self._config
+        if record.T_previous_body is not None and record.covariance is not None and record.has_scale:
+            return EdgeRecord(record.id, record.T_previous_body, record.covariance * config.vo_inflation**2, False)
+        last = self._odometry.edge(record.id - 1)
+        T = np.eye(4) if last is None else last.T_previous_body
+        rad, m = np.deg2rad(config.lost_rate_sigma_deg_s), config.lost_speed_sigma_m_s  # of a second, the usual gap
+        return EdgeRecord(record.id, T, np.diag(np.repeat([rad**2, m**2], 3)), False)
+
+
+def in_map(local: NavState, T_map_body: Array, pose_covariance: Array | None) -> NavState:
+    """Return a state of a window at its pose in map [4, 4].
+
+    The window says how velocity and biases depend on the pose, the graph how well the pose is known: `pose_covariance`
+    [6, 6] in NavState's axes takes the place of the window's own, and what depends on it follows.
+    """
+    R = T_map_body[:3, :3] @ local.T_world_body[:3, :3].T
+    turn = np.eye(15)
+    turn[3:6, 3:6] = turn[6:9, 6:9] = R
+    covariance = turn @ local.covariance @ turn.T
+    if pose_covariance is not None and np.all(np.isfinite(covariance)):
+        own = conditioned(covariance[:6, :6], _RATIO_MAX)
+        gain = np.linalg.solve(own, covariance[:6, 6:]).T
+        rest = covariance[6:, 6:] - gain @ own @ gain.T
+        covariance[:6, :6] = pose_covariance
+        covariance[6:, :6] = gain @ pose_covariance
+        covariance[:6, 6:] = covariance[6:, :6].T
+        covariance[6:, 6:] = rest + gain @ pose_covariance @ gain.T
+    velocity = R @ local.velocity_world_m_s
+    return NavState(local.t_ns, T_map_body, velocity, local.gyro_bias_rad_s, local.accel_bias_m_s2, covariance)
+
+
+def _edge_record(edge: WindowEdge) -> EdgeRecord:
+    what = f"the window's edge from {edge.from_id} to {edge.to_id}"
+    T = checked_pose(edge.T_from_to, what)
+    return EdgeRecord(edge.to_id, T, checked_covariance(edge.covariance, 6, what), edge.settled)
+
+
+def _is_direction(v: Array) -> bool:
+    return bool(abs(float(np.linalg.norm(v)) - 1.0) < 1e-6)
