@@ -1,0 +1,122 @@
+"""Which loops of a run to believe, decided over the whole run at once, and their factors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from vislam.batch.chain import Chain
+from vislam.config import BatchConfig, GraphConfig
+from vislam.errors import DataError
+from vislam.factor_log import LoggedEdge
+from vislam.factors.gnc import gnc_loops
+from vislam.factors.journal import LoopRecord, loop_record
+from vislam.factors.keys import X
+from vislam.factors.noise import cauchy, gaussian, inflated
+from vislam.factors.visual import direction_as_pose, pose_factor
+from vislam.geometry import invert
+from vislam.messages import Array
+
+_KEPT = 0.5  # of the weight that graduated non-convexity ends with, which is 0 or 1
+_UNSCALED_SIGMA = 5.0  # relative, of the length of a loop without scale: wide, for its length was not measured
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopVerdict:
+    """What batch decided about one offered loop edge."""
+
+    id: int
+    from_id: int
+    to_id: int
+    in_run: bool  # the run's graph held it
+    kept: bool
+    reason: str
+
+
+class Loops:
+    """The loop edges of a run: judged once on the pose graph, then kept as relative pose factors."""
+
+    def __init__(self, edges: list[LoggedEdge], chain: Chain, config: GraphConfig, lever_m: Array) -> None:
+        """Check the edges; one that cannot be used is refused with its reason."""
+        self._config = config
+        self._lever_m = lever_m
+        self._records: list[LoopRecord] = []
+        self._in_run = {logged.edge.id: logged.accepted for logged in edges}
+        self.verdicts: dict[int, LoopVerdict] = {}
+        for logged in edges:
+            edge = logged.edge
+            try:
+                self._records.append(loop_record(edge, len(chain.records) - 1))
+            except DataError as error:
+                verdict = LoopVerdict(edge.id, edge.from_id, edge.to_id, logged.accepted, False, str(error))
+                self.verdicts[edge.id] = verdict
+        self.kept: list[LoopRecord] = []
+
+    def choose(self, chain: Chain, config: BatchConfig) -> None:
+        """Decide by graduated non-convexity on the run's odometry and all its loops; odometry is never doubted."""
+        if not self._records:
+            return
+        graph = gtsam.NonlinearFactorGraph()
+        first = gtsam.noiseModel.Isotropic.Sigma(6, self._config.gauge_sigma_rad)
+        graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(chain.poses[0]), first))
+        for edge in chain.odometry_edges(config.unscaled_odometry_sigma):
+            graph.add(edge)
+        known = list(range(graph.size()))
+        for record in self._records:
+            graph.add(self._factor(record, chain.poses, robust=False))
+        values = gtsam.Values()
+        for k, T in enumerate(chain.poses):
+            values.insert(X(k), gtsam.Pose3(T))
+        _, weights = gnc_loops(graph, values, known, inlier_probability=config.loop_probability)
+        for record, weight in zip(self._records, weights[len(known) :].tolist(), strict=True):
+            kept = weight > _KEPT
+            reason = "agrees with odometry and the other loops" if kept else "refused by graduated non-convexity"
+            self._judge(record, kept, reason)
+            if kept:
+                self.kept.append(record)
+
+    def factors(self, poses: Array) -> list[gtsam.NonlinearFactor]:
+        """Return the factors of the kept loops under a kernel; `poses` [K, 4, 4] lend length to unscaled ones."""
+        return [self._factor(record, poses, robust=True) for record in self.kept]
+
+    def drop_contradicted(self, poses: Array) -> int:
+        """Let go of loops that the bundle adjustment contradicts; return how many."""
+        contradicted = []
+        for record in self.kept:
+            chi2 = 2.0 * self._factor(record, poses, robust=False).error(_pair(record, poses))
+            weight = self._config.loop_cauchy_k**2 / (self._config.loop_cauchy_k**2 + chi2)
+            if weight < self._config.loop_min_weight:
+                contradicted.append(record)
+                self._judge(record, False, f"contradicted by the bundle adjustment, chi2 {chi2:.1f}")
+        self.kept = [record for record in self.kept if not any(record is c for c in contradicted)]
+        return len(contradicted)
+
+    def _judge(self, record: LoopRecord, kept: bool, reason: str) -> None:
+        in_run = self._in_run[record.id]
+        self.verdicts[record.id] = LoopVerdict(record.id, record.from_id, record.to_id, in_run, kept, reason)
+
+    def _factor(self, record: LoopRecord, poses: Array, robust: bool) -> gtsam.NonlinearFactor:
+        config = self._config
+        T, floor_rad = record.T_from_to, np.deg2rad(config.loop_floor_deg)
+        if record.has_scale:
+            covariance = inflated(record.covariance, 1.0, floor_rad, config.loop_floor_m)
+        else:
+            moved, lever = invert(poses[record.from_id]) @ poses[record.to_id], self._lever_m
+            step_m = float(np.linalg.norm(moved[:3, 3] + moved[:3, :3] @ lever - lever))
+            T, covariance = direction_as_pose(
+                T, inflated(record.covariance, 1.0, floor_rad, 0.0), lever, max(step_m, config.direction_soft_m),
+                floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=_UNSCALED_SIGMA,
+            )  # fmt: skip
+        model: gtsam.noiseModel.Base = gaussian(covariance, config.covariance_ratio_max)
+        if robust:
+            model = cauchy(model, config.loop_cauchy_k)
+        return pose_factor(X(record.from_id), X(record.to_id), T, model)
+
+
+def _pair(record: LoopRecord, poses: Array) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(X(record.from_id), gtsam.Pose3(poses[record.from_id]))
+    values.insert(X(record.to_id), gtsam.Pose3(poses[record.to_id]))
+    return values
