@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,63 +15,21 @@ from numpy.typing import NDArray
 from vislam.messages import NavState
 from vislam.report.run_files import RunFiles
 from vislam.report.scene import Scene, loop_segments
+from vislam.report.style import CODE, RC, svg
 
 Array = NDArray[np.float64]
 
-# matplotlib cannot write CSS variables: these colours stand for them and are replaced in the SVG
-_VARIABLES = {
-    "#010101": "var(--ink)",
-    "#020202": "var(--muted)",
-    "#030303": "var(--line)",
-    "#040404": "var(--truth)",
-    "#050505": "var(--paper)",
-    "#060606": "var(--ekf)",
-    "#070707": "var(--graph)",
-    "#080808": "var(--live)",
-    "#090909": "var(--good)",
-    "#0a0a0a": "var(--bad)",
-    "#0b0b0b": "var(--warn)",
-    "#0c0c0c": "var(--batch)",
-    "#0d0d0d": "var(--axis-x)",
-    "#0e0e0e": "var(--axis-y)",
-    "#0f0f0f": "var(--axis-z)",
-}
-_CODE = {css[6:-1]: code for code, css in _VARIABLES.items()}
 _WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
 _STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad"}
 _MAX_STRETCH = 25.0  # of the vertical axis: more would turn millimetres into mountains
 _MAX_REJECTED = 200  # loops drawn: more is a red cloud
 _MAX_LOOP_LINES = 25
 _MAX_POINTS = 1500  # per line: more cannot be seen and only makes the file heavy
-_RC: dict[str, Any] = {
-    "svg.fonttype": "none",
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 8.5,
-    "axes.edgecolor": _CODE["line"],
-    "axes.labelcolor": _CODE["muted"],
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "grid.color": _CODE["line"],
-    "grid.linewidth": 0.5,
-    "xtick.color": _CODE["line"],
-    "ytick.color": _CODE["line"],
-    "xtick.labelcolor": _CODE["muted"],
-    "ytick.labelcolor": _CODE["muted"],
-    "text.color": _CODE["ink"],
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "legend.handlelength": 1.6,
-    "lines.solid_capstyle": "round",
-}
 
 
 def top_view(run: RunFiles, scene: Scene) -> str:
     """Draw all trajectories from above, with loops; equal scales."""
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         figure = Figure(figsize=(5.5, 4.7), layout="constrained")
         axes = figure.add_subplot()
         _draw_paths(axes, scene, 0, 1)
@@ -81,7 +37,7 @@ def top_view(run: RunFiles, scene: Scene) -> str:
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel="x [m]", ylabel="y [m]")
         _legend_above(axes, columns=3)
-        return _svg(figure, "top")
+        return svg(figure, "top")
 
 
 def side_view(scene: Scene) -> str:
@@ -89,7 +45,7 @@ def side_view(scene: Scene) -> str:
     positions = np.concatenate([t.positions_m for t in _all_paths(scene).values()])
     extent = np.ptp(positions, axis=0)
     along = 0 if extent[0] >= extent[1] else 1
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         figure = Figure(figsize=(5.5, 4.7), layout="constrained")
         axes = figure.add_subplot()
         _draw_paths(axes, scene, along, 2)
@@ -105,7 +61,7 @@ def side_view(scene: Scene) -> str:
             stretch = (box.height / np.ptp(axes.get_ylim())) / (box.width / np.ptp(axes.get_xlim()))
             axes.set_ylabel(f"z [m], stretched {stretch:.0f}×" if stretch >= 1.5 else "z [m]")
         _legend_above(axes, columns=4)
-        return _svg(figure, "side")
+        return svg(figure, "side")
 
 
 def over_time(run: RunFiles, scene: Scene) -> str:
@@ -118,7 +74,7 @@ def over_time(run: RunFiles, scene: Scene) -> str:
     ratios = {"position": 3.0, "rotation": 1.8, "inliers": 1.3, "state": 0.35}
     heights = [ratios[name] for name in panels]
     closed = scene.seconds([loop.to_t_ns for loop in run.loops if loop.decision == "accepted" and loop.to_t_ns >= 0])
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         figure = Figure(figsize=(11.2, 0.75 * sum(heights) + 0.8), layout="constrained")
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})
         for name, axes in zip(panels, grid[:, 0], strict=True):
@@ -137,7 +93,7 @@ def over_time(run: RunFiles, scene: Scene) -> str:
         grid[-1, 0].set_xlabel("time [s]")
         grid[-1, 0].set_xlim(0.0, max(scene.end_s, 1e-3))
         figure.align_ylabels()
-        return _svg(figure, "time")
+        return svg(figure, "time")
 
 
 def timing(stages: Mapping[str, Mapping[str, float]], period_ms: float | None) -> str:
@@ -147,27 +103,27 @@ def timing(stages: Mapping[str, Mapping[str, float]], period_ms: float | None) -
     ]
     if not rows:
         return ""
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         figure = Figure(figsize=(5.5, 0.3 * len(rows) + 0.95), layout="constrained")
         axes = figure.add_subplot()
         for k, (_, stage) in enumerate(rows):
-            axes.plot([stage["p50"], stage["p99"]], [k, k], color=_CODE["graph"], linewidth=1.2, alpha=0.45)
+            axes.plot([stage["p50"], stage["p99"]], [k, k], color=CODE["graph"], linewidth=1.2, alpha=0.45)
         for mark, key, size in (("o", "p50", 26), ("|", "p95", 46), (">", "p99", 16)):
             values = [stage[key] for _, stage in rows]
-            axes.scatter(values, range(len(rows)), marker=mark, s=size, color=_CODE["graph"], label=key, zorder=3)
+            axes.scatter(values, range(len(rows)), marker=mark, s=size, color=CODE["graph"], label=key, zorder=3)
         if period_ms:
-            axes.axvline(period_ms, color=_CODE["bad"], linewidth=0.9, linestyle=(0, (4, 3)), label="frame period")
+            axes.axvline(period_ms, color=CODE["bad"], linewidth=0.9, linestyle=(0, (4, 3)), label="frame period")
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(numticks=12))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_yticks(range(len(rows)), [name for name, _ in rows])
-        axes.tick_params(axis="y", labelcolor=_CODE["ink"], length=0)
+        axes.tick_params(axis="y", labelcolor=CODE["ink"], length=0)
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("milliseconds per call")
         _legend_above(axes, columns=4)
-        return _svg(figure, "timing")
+        return svg(figure, "timing")
 
 
 def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
@@ -177,7 +133,7 @@ def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
     }
     if not any(states.values()):
         return ""  # without an IMU there are none
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         figure = Figure(figsize=(11.2, 2.9), layout="constrained")
         left, right = figure.subplots(1, 2)
         for axes, attribute, first, unit in (
@@ -188,11 +144,11 @@ def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
             for name, style in (("graph", "-"), ("ekf", "--")):
                 if states.get(name):
                     _draw_bias(axes, states[name], scene, attribute, first, factor, style)
-            axes.axhline(0.0, color=_CODE["line"], linewidth=0.8, zorder=0.6)
+            axes.axhline(0.0, color=CODE["line"], linewidth=0.8, zorder=0.6)
             axes.set(ylabel=unit, xlabel="time [s]")
             axes.set_xlim(0.0, max(scene.end_s, 1e-3))
         _legend_above(left, columns=3)
-        return _svg(figure, "biases")
+        return svg(figure, "biases")
 
 
 def _draw_bias(
@@ -204,7 +160,7 @@ def _draw_bias(
     variances = np.array([np.diag(s.covariance)[first : first + 3] for s in states])
     band = 3.0 * factor * np.sqrt(np.maximum(variances, 0.0))
     for k, axis in enumerate("xyz"):
-        color = _CODE[f"axis-{axis}"]
+        color = CODE[f"axis-{axis}"]
         axes.plot(t, values[:, k], style, color=color, linewidth=1.4 if fill else 0.9, label=axis if fill else None)
         if fill:
             axes.fill_between(
@@ -230,7 +186,7 @@ def _draw_paths(axes: Any, scene: Scene, horizontal: int, vertical: int) -> None
             axes.plot(
                 points[:, horizontal],
                 points[:, vertical],
-                color=_CODE["truth"],
+                color=CODE["truth"],
                 linewidth=2.4,
                 alpha=0.55,
                 label=scene.labels["truth"],
@@ -240,7 +196,7 @@ def _draw_paths(axes: Any, scene: Scene, horizontal: int, vertical: int) -> None
             axes.plot(
                 points[:, horizontal],
                 points[:, vertical],
-                color=_CODE[name],
+                color=CODE[name],
                 linewidth=_WIDTHS[name],
                 label=scene.labels[name],
             )
@@ -248,7 +204,7 @@ def _draw_paths(axes: Any, scene: Scene, horizontal: int, vertical: int) -> None
     if best is not None:
         start = best.positions_m[0]
         axes.plot(
-            start[horizontal], start[vertical], "o", markersize=5, markerfacecolor=_CODE["paper"], color=_CODE["ink"],
+            start[horizontal], start[vertical], "o", markersize=5, markerfacecolor=CODE["paper"], color=CODE["ink"],
             markeredgewidth=1.1, label="start", zorder=5,
         )  # fmt: skip
 
@@ -258,14 +214,14 @@ def _draw_loops(axes: Any, run: RunFiles, scene: Scene) -> None:
     rejected = loop_segments(run, scene, "rejected")[:_MAX_REJECTED, :, :2]
     accepted = loop_segments(run, scene, "accepted")[:, :, :2]
     if len(rejected):
-        axes.add_collection(LineCollection(list(rejected), colors=_CODE["bad"], linewidths=0.5, alpha=0.2, zorder=1))
-        axes.plot([], [], color=_CODE["bad"], linewidth=0.7, label="loops rejected")
+        axes.add_collection(LineCollection(list(rejected), colors=CODE["bad"], linewidths=0.5, alpha=0.2, zorder=1))
+        axes.plot([], [], color=CODE["bad"], linewidth=0.7, label="loops rejected")
     if len(accepted):
         few = len(accepted) <= _MAX_LOOP_LINES
         width, size, order = (1.1, 5, 4) if few else (0.5, 2, 1.5)
-        axes.add_collection(LineCollection(list(accepted), colors=_CODE["good"], linewidths=width, zorder=order))
-        axes.plot(*accepted[:, 1].T, ".", color=_CODE["good"], markersize=size, zorder=order)  # many lines are short
-        axes.plot([], [], ".-", color=_CODE["good"], linewidth=1.1, markersize=5, label="loops accepted")
+        axes.add_collection(LineCollection(list(accepted), colors=CODE["good"], linewidths=width, zorder=order))
+        axes.plot(*accepted[:, 1].T, ".", color=CODE["good"], markersize=size, zorder=order)  # many lines are short
+        axes.plot([], [], ".-", color=CODE["good"], linewidth=1.1, markersize=5, label="loops accepted")
 
 
 def _draw_errors(axes: Any, scene: Scene, attribute: str, label: str) -> None:
@@ -273,7 +229,7 @@ def _draw_errors(axes: Any, scene: Scene, attribute: str, label: str) -> None:
         curve = scene.errors.get(name)
         if curve is not None:
             t, values = _thin(curve.t_s), _thin(getattr(curve, attribute))
-            axes.plot(t, values, color=_CODE[name], linewidth=_WIDTHS[name], label=scene.labels[name])
+            axes.plot(t, values, color=CODE[name], linewidth=_WIDTHS[name], label=scene.labels[name])
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel(label)
 
@@ -282,7 +238,7 @@ def _mark_loops(axes: Any, closed_s: Array) -> None:
     """Mark times by lines; where there are many, by short strokes at the top that leave the curves readable."""
     few = len(closed_s) <= _MAX_LOOP_LINES
     axes.vlines(
-        closed_s, 0.0 if few else 0.95, 1.0, transform=axes.get_xaxis_transform(), color=_CODE["good"],
+        closed_s, 0.0 if few else 0.95, 1.0, transform=axes.get_xaxis_transform(), color=CODE["good"],
         linewidth=0.7, alpha=0.5 if few else 0.9, zorder=0.5,
     )  # fmt: skip
 
@@ -290,8 +246,8 @@ def _mark_loops(axes: Any, closed_s: Array) -> None:
 def _draw_inliers(axes: Any, run: RunFiles, scene: Scene) -> None:
     assert run.tracking is not None
     t, inliers = scene.seconds(run.tracking.t_ns), run.tracking.inliers
-    axes.fill_between(_thin(t), _thin(inliers), color=_CODE["muted"], alpha=0.18, linewidth=0)
-    axes.plot(_thin(t), _thin(inliers), color=_CODE["muted"], linewidth=0.8)
+    axes.fill_between(_thin(t), _thin(inliers), color=CODE["muted"], alpha=0.18, linewidth=0)
+    axes.plot(_thin(t), _thin(inliers), color=CODE["muted"], linewidth=0.8)
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel("inliers")
 
@@ -304,7 +260,7 @@ def _draw_state(axes: Any, run: RunFiles, scene: Scene) -> None:
     starts = [0, *(k for k in range(1, len(states)) if states[k] != states[k - 1] or t[k] - t[k - 1] > 5 * period)]
     for start, stop in zip(starts, [*starts[1:], len(states)], strict=True):
         end = t[stop - 1] + period
-        axes.axvspan(t[start], end, color=_CODE[_STATE_COLORS[states[start]]], alpha=0.8, linewidth=0)
+        axes.axvspan(t[start], end, color=CODE[_STATE_COLORS[states[start]]], alpha=0.8, linewidth=0)
     axes.set_yticks([])
     axes.set_ylabel("state", rotation=0, ha="right", va="center")
     axes.grid(visible=False)
@@ -318,21 +274,3 @@ def _thin(values: Array) -> Array:
 def _legend_above(axes: Any, columns: int) -> None:
     if axes.get_legend_handles_labels()[1]:
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.4)
-
-
-def _svg(figure: Figure, name: str) -> str:
-    """Return the figure as an SVG element without a size of its own; the same figure gives the same bytes."""
-    buffer = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": f"vislam-{name}"}):
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(
-        r'\bid="(figure|axes|patch|line2d|text|matplotlib|xtick|ytick|legend|\w*Collection)_[\w.]*"', "", text
-    )
-    for code, css in _VARIABLES.items():
-        text = text.replace(code, css)
-    return text.replace("'DejaVu Sans'", "var(--font)")

@@ -1,0 +1,69 @@
+"""Where jobs run: processes of this machine, or a Dask cluster. Both are given the same function of plain data."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from vislam.errors import UsageError
+from vislam.experiment.isolated import run_isolated
+
+_ANSWER_S = 20.0  # a scheduler that is there answers much sooner
+
+Spec = dict[str, Any]
+Result = dict[str, Any]
+
+
+def run_locally(specs: Sequence[Spec], workers: int, cache: Path, keep: Path | None) -> Iterator[tuple[Spec, Result]]:
+    """Yield each job with its result as it is done, in any order; closing the iterator stops what still runs.
+
+    The threads only wait: every job is a process of its own.
+    """
+    stop = threading.Event()
+    kept = None if keep is None else str(keep)
+    with ThreadPoolExecutor(workers, thread_name_prefix="job") as pool:
+        try:
+            futures = {pool.submit(run_isolated, spec, str(cache), kept, stop): spec for spec in specs}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def run_on_dask(specs: Sequence[Spec], scheduler: str, cache: Path, keep: Path | None) -> Iterator[tuple[Spec, Result]]:
+    """Yield each job with its result as a Dask worker finishes it; Dask gives the jobs of a lost worker to others.
+
+    Workers need this very version of vislam and the same paths to the recordings. A job that took several workers
+    down with it is a failed result. Raises UsageError without Dask or without a scheduler at that address.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise UsageError("--engine dask needs the extra 'cluster': pip install 'vislam[cluster]'") from error
+    try:
+        client = distributed.Client(scheduler, timeout=_ANSWER_S)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UsageError(f"no Dask scheduler answers at '{scheduler}': {error}; start one: dask scheduler") from error
+    with client:
+        kept = None if keep is None else str(keep)
+        futures = {
+            client.submit(run_isolated, spec, str(cache), kept, key=f"vislam-{spec['key']}", pure=False): spec
+            for spec in specs
+        }
+        try:
+            for future in distributed.as_completed(list(futures), raise_errors=False):
+                yield futures[future], _outcome(future)
+        finally:
+            client.cancel(list(futures))
+
+
+def _outcome(future: Any) -> Result:
+    if future.status == "finished":
+        return dict(future.result())
+    if future.status == "cancelled":
+        return {"status": "stopped", "reason": "cancelled on the scheduler"}
+    return {"status": "failed", "reason": f"crash: {future.exception()!r}", "run": {}, "outputs": {}}

@@ -1,0 +1,66 @@
+"""What a result depends on besides its configuration: data, code, packages, and how it is measured."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from vislam.runfolder import fingerprint
+
+HARNESS_VERSION = 1  # of what a job does and measures beside the code below; a new one makes all results new
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+_PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "llvmlite")
+# they show results or ask for them and cannot change a number; all other code can
+_WITHOUT_EFFECT = ("cli.py", "options.py", "__main__.py", "report/", "viewer/", "experiment/")
+_MEASURING = ("experiment/worker.py", "experiment/measures.py", "experiment/recordings.py")
+
+
+@cache
+def environment() -> dict[str, Any]:
+    """Return what must be equal for results to be the same: code, packages, Python and harness."""
+    versions = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "none"
+    return {
+        "code_sha256": code_sha256(_PACKAGE),
+        "packages": versions,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "harness": HARNESS_VERSION,
+    }
+
+
+def code_sha256(package: Path) -> str:
+    """Return the SHA-256 of the sources that a result can depend on, committed or not."""
+    digest = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        name = file.relative_to(package).as_posix()
+        if name.startswith(_WITHOUT_EFFECT) and name not in _MEASURING:
+            continue
+        digest.update(f"{name}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def source_identity(source: str) -> str:
+    """Return what a source holds, wherever it lies: format, SHA-256 of the data, options; "missing" without data."""
+    kind, colon, rest = source.partition(":")
+    if not colon:
+        kind, rest = "", source
+    if kind == "sim":
+        return source
+    path, _, options = rest.partition(",")
+    return f"{kind}:{fingerprint(Path(path)) or 'missing'},{options}"
+
+
+def sha256_of(data: Any) -> str:
+    """Return the SHA-256 of plain data, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -1,0 +1,98 @@
+"""A plan as single runs: each with its labels, its whole configuration and the hash of all that it depends on."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from vislam.config import dump, from_data
+from vislam.experiment.identity import environment, sha256_of, source_identity
+from vislam.experiment.plan import Plan, Scalar, Sequence, nested
+
+JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """One run of the pipeline. Estimators whose configurations are equal share a key, and so the run."""
+
+    key: str  # SHA-256 of the configuration, the data, the code, the packages and the harness
+    sequence: str
+    variant: tuple[tuple[str, Scalar], ...]  # (axis, value)
+    estimator: str
+    seed: int
+    member: int  # 0: gravity as configured
+    source: str
+    config: dict[str, Any]  # resolved, all of it
+    batch: bool  # whether the batch solution is wanted too
+    timeout_s: float
+
+    @property
+    def label(self) -> str:
+        """What a person calls this job."""
+        variant = "".join(f" {name}={value}" for name, value in self.variant)
+        return f"{self.sequence}{variant} {self.estimator} seed {self.seed} member {self.member}"
+
+    def spec(self) -> dict[str, Any]:
+        """Return what a worker needs to know, as plain data."""
+        return {
+            "key": self.key,
+            "source": self.source,
+            "config": self.config,
+            "batch": self.batch,
+            "timeout_s": self.timeout_s,
+            "environment": environment(),
+        }
+
+
+def expand(plan: Plan) -> list[Job]:
+    """Return every job of a plan, in its order. Raises UsageError when a combination is no valid configuration."""
+    identities: dict[str, str] = {}
+    jobs = []
+    for sequence, variant in itertools.product(plan.sequences, variants(plan)):
+        source, settings = _conditions(plan, sequence, variant)
+        if source not in identities:
+            identities[source] = source_identity(source)
+        for estimator, seed in itertools.product(plan.estimators, plan.seeds):
+            where = f"plan '{plan.name}', sequence '{sequence.name}', estimator '{estimator.name}'"
+            data = nested({**settings, **estimator.config, **_varied(plan, variant), "seed": seed}, where)
+            resolved = from_data(data, where)
+            for member in range(plan.members):
+                config = dump(resolved)
+                config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
+                batch = "batch" in estimator.outputs
+                jobs.append(
+                    Job(
+                        sha256_of([identities[source], config, batch, environment()]),
+                        sequence.name, variant, estimator.name, seed, member, source, config, batch, plan.timeout_s,
+                    )
+                )  # fmt: skip
+    return jobs
+
+
+def variants(plan: Plan) -> list[tuple[tuple[str, Scalar], ...]]:
+    """Return every combination of the axes' values as (axis, value) pairs; one empty combination without axes."""
+    return list(itertools.product(*([(axis.name, value) for value in axis.values] for axis in plan.axes)))
+
+
+def unique(jobs: list[Job]) -> Iterator[Job]:
+    """Yield one job per key."""
+    seen = set()
+    for job in jobs:
+        if job.key not in seen:
+            seen.add(job.key)
+            yield job
+
+
+def _conditions(plan: Plan, sequence: Sequence, variant: tuple[tuple[str, Scalar], ...]) -> tuple[str, dict[str, Any]]:
+    """Return the source with its options, and the settings that do not depend on the estimator."""
+    options = dict(sequence.options)
+    options |= {axis.option: value for axis, (_, value) in zip(plan.axes, variant, strict=True) if axis.option}
+    source = ",".join([sequence.source, *(f"{name}={value}" for name, value in options.items())])
+    return source, {"map.enabled": plan.map, "view.enabled": False, **plan.config, **sequence.config}
+
+
+def _varied(plan: Plan, variant: tuple[tuple[str, Scalar], ...]) -> dict[str, Scalar]:
+    return {axis.setting: value for axis, (_, value) in zip(plan.axes, variant, strict=True) if axis.setting}

@@ -1,0 +1,152 @@
+"""What a job is judged by: every number comes from the files that its run left, and from its own process."""
+
+from __future__ import annotations
+
+import hashlib
+import resource
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.errors import DataError, VislamError
+from vislam.trajectory import (
+    Alignment,
+    Trajectory,
+    align,
+    associate,
+    evaluate,
+    read_states_csv,
+    read_tum,
+)
+from vislam.trajectory.consistency import anees, chi_square_mean
+
+_STATES = {"ekf": "states_ekf.csv", "graph": "states_graph.csv", "batch": "states_batch.csv"}
+_CURVE_POINTS = 240  # of each trajectory that are kept for pictures
+SEGMENTS_M = (1, 5, 10)
+
+
+def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float], cpu_s: float) -> dict[str, Any]:
+    """Return what belongs to the run as a whole: time, memory, counts, and the filter's innovations."""
+    timing, initialisation = metrics["timing_ms"], metrics["initialisation"]
+    p50_ms, p99_ms = np.percentile(np.array(latencies_s) * 1e3, (50, 99)) if len(latencies_s) else (None, None)
+    duration_s = metrics["duration_s"]
+    return {
+        "mode": metrics["mode"],
+        "has_imu": metrics["has_imu"],
+        "frames": metrics["frames"],
+        "keyframes": metrics["keyframes"],
+        "loops": metrics["loops"]["accepted"],
+        "initialisation": initialisation["status"],
+        "initialisation_s": initialisation["t_s"],
+        "latency_p50_ms": _plain(p50_ms),
+        "latency_p99_ms": _plain(p99_ms),
+        "filter_p50_ms": timing.get("ekf", {}).get("p50"),
+        "filter_p99_ms": timing.get("ekf", {}).get("p99"),
+        "cpu_s_per_s": cpu_s / duration_s if duration_s > 0.0 else None,
+        "peak_memory_mb": peak_memory_mb(),
+        "nis": nis_measures(metrics.get("nis") or {}),
+        "warnings": metrics["warnings"],
+    }
+
+
+def output_measures(
+    run: Path, outputs: Sequence[str], metrics: dict[str, Any], span_ns: tuple[int, int] | None
+) -> dict[str, Any]:
+    """Return accuracy and consistency of each trajectory that a run left; one that cannot be judged says why."""
+    truth_file = run / "trajectory_truth.tum"
+    truth = read_tum(truth_file) if truth_file.is_file() else None
+    measures = {}
+    for name in outputs:
+        path = run / f"trajectory_{name}.tum"
+        try:
+            if truth is None:
+                raise DataError("the recording has no truth to compare with")
+            measures[name] = _output(path, truth, alignment_of(metrics), span_ns)
+        except VislamError as error:
+            measures[name] = {"failure": str(error).replace(f"{run}/", "")}
+            continue
+        states = run / _STATES.get(name, "none")
+        if metrics["has_imu"] and states.is_file():
+            measures[name]["anees"] = _consistency(states, truth)
+    return measures
+
+
+def alignment_of(metrics: dict[str, Any]) -> Alignment:
+    """Return how a run's trajectories may be moved onto the truth: by what no sensor of it can know.
+
+    With an IMU that is yaw and position. One camera alone knows no scale either (Sim3). Cameras with depth but no IMU
+    do not know which way is up (SE3).
+    """
+    if metrics["has_imu"]:
+        return "yaw"
+    return "sim3" if metrics["mode"] == "mono" else "se3"
+
+
+def _output(path: Path, truth: Trajectory, alignment: Alignment, span_ns: tuple[int, int] | None) -> dict[str, Any]:
+    estimate = read_tum(path)
+    entry = evaluate(estimate, truth, alignment, span_ns=span_ns)
+    segments = entry["rpe_segments"]
+    scale = entry["scale"]
+    return {
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "alignment": alignment,
+        "ate_m": entry["ate_rmse_m"],
+        "ate_max_m": entry["ate_max_m"],
+        "rotation_deg": entry["rotation_rmse_deg"],
+        "scale_error": None if scale is None else scale - 1.0,
+        "completeness": entry["coverage"],
+        "path_m": entry["path_m"],
+        **{f"rpe_{length}m_percent": segments[str(length)]["percent"] for length in SEGMENTS_M},
+        **{f"rpe_{length}m_deg_per_m": segments[str(length)]["deg_per_m"] for length in SEGMENTS_M},
+        "curve": _curve(estimate, truth, alignment),
+    }
+
+
+def _curve(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dict[str, list[float]]:
+    """Return the aligned path from above and its error over time, thinned out for pictures."""
+    pairs = associate(estimate, truth)
+    pairs = pairs.aligned(align(pairs, alignment))
+    keep = np.unique(np.linspace(0, len(pairs) - 1, _CURVE_POINTS).astype(int))
+    columns = {
+        "t_s": (pairs.t_ns - truth.t_ns[0]) * 1e-9,
+        "x_m": pairs.estimate[:, 0, 3],
+        "y_m": pairs.estimate[:, 1, 3],
+        "true_x_m": pairs.reference[:, 0, 3],
+        "true_y_m": pairs.reference[:, 1, 3],
+        "error_m": pairs.position_errors_m(),
+    }
+    return {name: np.round(values[keep], 4).tolist() for name, values in columns.items()}
+
+
+def _consistency(states: Path, truth: Trajectory) -> dict[str, Any]:
+    try:
+        return {name: asdict(value) for name, value in anees(read_states_csv(states)[1], truth).items()}
+    except VislamError as error:
+        return {"failure": str(error)}
+
+
+def nis_measures(statistics: dict[str, Any]) -> dict[str, Any]:
+    """Return the filter's innovations by kind as averages with bounds, from (count, sum, degrees of freedom in all)."""
+    return {
+        kind: asdict(chi_square_mean(float(total), 1, int(freedom))) | {"count": int(count)}
+        for kind, (count, total, freedom) in statistics.items()
+        if freedom > 0
+    }
+
+
+def peak_memory_mb() -> float:
+    """Return the most resident memory that this process ever had."""
+    try:  # ru_maxrss begins with the size of the parent process, this does not
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        unit = 2**20 if sys.platform == "darwin" else 2**10
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def _plain(value: Any) -> float | None:
+    return None if value is None else float(value)

@@ -1,0 +1,188 @@
+"""The plan of a comparison: sequences, estimators, variants and seeds, from a TOML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from vislam.config import from_data
+from vislam.errors import UsageError
+
+Scalar = bool | int | float | str
+Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.coupling": "tight"}
+Output = Literal["ekf", "live", "graph", "batch"]
+
+_VARIABLE = re.compile(r"\$\{?(\w+)\}?")
+_NAME = re.compile(r"[\w.+ -]{1,60}")
+_WITHOUT_PATH = ("sim",)  # kinds of source whose name is no file
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """One recording, or a simulated world."""
+
+    source: str  # as for `vislam run`; $VARIABLES are replaced, relative paths begin at the plan
+    name: str = ""  # empty: the last part of the source
+    options: dict[str, Scalar] = field(default_factory=dict)  # of the source: appended as ,option=value
+    config: Settings = field(default_factory=dict)  # for this sequence only
+
+
+@dataclass(frozen=True, slots=True)
+class Estimator:
+    """One configuration of the pipeline, and which of its trajectories are compared."""
+
+    name: str
+    config: Settings = field(default_factory=dict)
+    outputs: tuple[Output, ...] = ("ekf", "live", "graph")  # filter and graph as they went, graph in the end
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A condition that is varied: either a setting of the configuration or an option of the source."""
+
+    name: str
+    values: tuple[Scalar, ...]
+    setting: str = ""  # dotted name
+    option: str = ""  # name
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is compared on what: every sequence x variant x estimator x seed x member is a job."""
+
+    name: str
+    sequences: tuple[Sequence, ...]
+    estimators: tuple[Estimator, ...]
+    title: str = ""
+    config: Settings = field(default_factory=dict)  # for every job
+    axes: tuple[Axis, ...] = ()  # the variants are their product
+    seeds: tuple[int, ...] = (0,)  # of the simulation and of the pipeline
+    members: int = 6  # of each ensemble: gravity differs by 1e-9 between neighbours, which shows chaos
+    timeout_s: float = 1800.0  # a job that takes longer is stopped and counts as failed
+    map: bool = False  # mapping does not change trajectories and takes time
+
+
+def load_plan(path: Path, variables: Mapping[str, str] | None = None) -> Plan:
+    """Read a plan; sources come back with variables and paths resolved.
+
+    Args:
+        path: TOML file, see docs/experiments.md.
+        variables: values of $NAMES in sources; None: the environment.
+
+    Raises:
+        UsageError: naming the file, the field, what was asked and what is allowed.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"plan {path} cannot be read: {error}; see docs/experiments.md for an example") from error
+    return plan_from_data(data, str(path), path.resolve().parent, os.environ if variables is None else variables)
+
+
+def plan_from_data(data: dict[str, Any], where: str, folder: Path, variables: Mapping[str, str]) -> Plan:
+    """Build a plan from plain data; relative paths begin at `folder`. Raises UsageError with `where`."""
+    _refuse_unknown(data, Plan, where)
+    try:
+        plan = TypeAdapter(Plan).validate_python(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field_name = ".".join(str(part) for part in first["loc"])
+        raise UsageError(f"{where}: {field_name}: {first['msg']}, got {first['input']!r}") from error
+    sequences = tuple(_resolved(sequence, where, folder, variables) for sequence in plan.sequences)
+    plan = dataclasses.replace(plan, sequences=sequences)
+    _check(plan, where)
+    return plan
+
+
+def _resolved(sequence: Sequence, where: str, folder: Path, variables: Mapping[str, str]) -> Sequence:
+    """Return a sequence with its variables replaced, its path absolute and a name."""
+
+    def value(match: re.Match[str]) -> str:
+        if match[1] not in variables:
+            raise UsageError(f"{where}: {sequence.source} needs the environment variable {match[1]}; set it")
+        return variables[match[1]]
+
+    source = _VARIABLE.sub(value, sequence.source)
+    kind, colon, rest = source.partition(":")
+    if not colon:
+        kind, rest = "", source
+    first, comma, options = rest.partition(",")
+    if kind not in _WITHOUT_PATH:
+        source = f"{kind}{colon}{folder / first}{comma}{options}"
+    return dataclasses.replace(sequence, source=source, name=sequence.name or Path(first).name)
+
+
+def _check(plan: Plan, where: str) -> None:
+    """Refuse what the types alone allow. Every combination of settings is tried, so that no job fails on a typo."""
+    for what, names in (
+        ("sequence", [s.name for s in plan.sequences]),
+        ("estimator", [e.name for e in plan.estimators]),
+        ("axis", [a.name for a in plan.axes]),
+        ("seed", [str(s) for s in plan.seeds]),
+    ):
+        if what != "axis" and not names:
+            raise UsageError(f"{where}: a plan needs at least one {what}")
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise UsageError(f"{where}: two of kind {what} are called '{twice[0]}'; give each its own name")
+        if what != "seed" and (odd := [name for name in names if not _NAME.fullmatch(name)]):
+            raise UsageError(f"{where}: '{odd[0]}' is no name of a {what}: letters, digits, and . _ + - or space")
+    if not _NAME.fullmatch(plan.name) or "/" in plan.name:
+        raise UsageError(f"{where}: '{plan.name}' is no name of a plan: letters, digits, and . _ + - or space")
+    if plan.members < 1 or plan.timeout_s <= 0.0:
+        raise UsageError(f"{where}: members must be at least 1 and timeout_s positive")
+    for axis in plan.axes:
+        if bool(axis.setting) == bool(axis.option):
+            raise UsageError(f"{where}: axis '{axis.name}' needs either a setting or an option to vary")
+        if not axis.values or len(set(map(repr, axis.values))) != len(axis.values):
+            raise UsageError(f"{where}: axis '{axis.name}' needs values, each one once")
+    for estimator in plan.estimators:
+        if not estimator.outputs or len(set(estimator.outputs)) != len(estimator.outputs):
+            raise UsageError(f"{where}: estimator '{estimator.name}' needs outputs, each one once")
+
+
+def nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return dotted settings as nested data; raises UsageError when one name is both a section and a setting."""
+    data: dict[str, Any] = {}
+    for dotted, value in settings.items():
+        *sections, name = dotted.split(".")
+        node = data
+        for section in sections:
+            node = node.setdefault(section, {})
+            if not isinstance(node, dict):
+                raise UsageError(f"{where}: '{section}' in '{dotted}' is a setting, not a section")
+        node[name] = value
+    return data
+
+
+def check_settings(settings: Mapping[str, Any], where: str) -> None:
+    """Raise UsageError when dotted settings are no valid configuration."""
+    from_data(nested(settings, where), where)
+
+
+def _refuse_unknown(data: Mapping[str, Any], cls: type, where: str, prefix: str = "") -> None:
+    known = get_type_hints(cls)
+    for name, value in data.items():
+        if name not in known:
+            raise UsageError(f"{where}: no field '{prefix}{name}'; there are: {', '.join(known)}")
+        inner = _item_type(known[name])
+        if inner is None or not isinstance(value, list):
+            continue
+        for i, item in enumerate(value):
+            if isinstance(item, dict):
+                _refuse_unknown(item, inner, where, f"{prefix}{name}[{i}].")
+
+
+def _item_type(hint: Any) -> type | None:
+    """Return the dataclass inside of `tuple[dataclass, ...]`, or None."""
+    if get_origin(hint) is not tuple:
+        return None
+    item = get_args(hint)[0]
+    return item if dataclasses.is_dataclass(item) and isinstance(item, type) else None

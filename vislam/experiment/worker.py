@@ -1,0 +1,82 @@
+"""One job in a process of its own: `python -m vislam.experiment.worker FOLDER`, from request.json to result.json.
+
+Standard input is a pipe that nothing is written to: when it closes, the process that asked is gone, and there is nobody
+left to work for.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+from vislam.config import Config, from_data
+from vislam.errors import VislamError
+from vislam.experiment.identity import environment
+from vislam.experiment.measures import output_measures, run_measures
+from vislam.experiment.recordings import TimedRecording, open_cached
+from vislam.run import Run
+from vislam.runfolder import prepare, write_json
+
+_ORPHANED = 70
+_MAX_TRACE = 4000  # characters of a traceback that are kept
+
+
+def run_job(spec: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
+    """Run the pipeline as `spec` says (see `Job.spec`) into `folder`/run and return the result as plain data.
+
+    Whatever goes wrong is a result too: status "failed" with a reason, beside what could be measured. Status
+    "mismatch": this machine has other code or packages than the one that asked.
+    """
+    if (mine := environment()) != spec["environment"]:
+        wrong = [name for name, value in mine.items() if value != spec["environment"].get(name)]
+        return {"status": "mismatch", "reason": f"{os.uname().nodename} differs in {', '.join(wrong)}"}
+    result: dict[str, Any] = {"status": "ok", "reason": "", "run": {}, "outputs": {}}
+    try:
+        _run(spec, folder / "run", cache, result)
+    except VislamError as error:
+        result |= {"status": "failed", "reason": f"{type(error).__name__}: {error}".replace(f"{folder}/", "")}
+    except Exception as error:  # a bug of the pipeline is a result of the experiment
+        result |= {"status": "failed", "reason": f"bug, {type(error).__name__}: {error}"}
+        result["traceback"] = traceback.format_exc()[-_MAX_TRACE:]
+    return result
+
+
+def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -> None:
+    config: Config = from_data(spec["config"], "job")
+    recording = TimedRecording(open_cached(spec["source"], config.seed, cache))
+    prepare(out, overwrite=False)
+    cpu_s = time.process_time()
+    try:
+        Run(recording, config, out, spec["source"], ["vislam", "compare"]).execute(recording.frame_done)
+    finally:
+        cpu_s = time.process_time() - cpu_s
+        metrics_file = out / "metrics.json"
+        if metrics_file.is_file():
+            metrics = json.loads(metrics_file.read_text(encoding="utf-8"))
+            outputs = ["ekf", "live", "graph"]
+            result["run"] = run_measures(metrics, recording.latencies_s, cpu_s)
+            result["outputs"] = output_measures(out, outputs, metrics, recording.span_ns)
+
+
+def _exit_when_orphaned() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(_ORPHANED)
+
+
+def main() -> None:
+    """Answer one job."""
+    folder = Path(sys.argv[1])
+    request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
+    threading.Thread(target=_exit_when_orphaned, daemon=True).start()
+    write_json(folder / "result.json", run_job(request["spec"], folder, Path(request["cache"])))
+
+
+if __name__ == "__main__":
+    main()
