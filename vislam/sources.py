@@ -2,23 +2,73 @@
 
 from __future__ import annotations
 
-from vislam.errors import UsageError
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vislam.errors import DataError, UsageError
 from vislam.recording import Recording
+
+if TYPE_CHECKING:
+    from vislam.sim import MeasuredInertial
 
 
 def open_source(uri: str, seed: int = 0) -> Recording:
-    """Open `euroc:PATH`, `tum:PATH`, `kitti:PATH`, `video:PATH`, `sim:WORLD[,option=value...]`, or a bare path.
+    """Open a recording on disk or a simulated one.
 
-    Raises UsageError for an unknown format or world, DataError when the recording cannot be used.
+    On disk: `euroc:PATH`, `tum:PATH`, `kitti:PATH`, `video:PATH`, or a bare path. Rendered: `sim:WORLD`. Vision
+    simulated as points, on a world's motion or on the real IMU of a recording with truth: `points:WORLD` or
+    `points:PATH`. To the simulated ones options are appended as `,option=value`.
+
+    Raises UsageError for an unknown format, world or option, DataError when the recording cannot be used.
     """
-    if uri.startswith("sim:"):
+    scheme, _, rest = uri.partition(":")
+    if scheme == "sim":
         from vislam.sim import open_world
 
-        name, *parts = uri.removeprefix("sim:").split(",")
-        for part in parts:
-            if "=" not in part:
-                raise UsageError(f"'{part}' in {uri} is no option; write sim:WORLD,option=value")
-        return open_world(name, seed=seed, **dict(part.split("=", 1) for part in parts))
+        name, options = _options(uri, rest)
+        return open_world(name, seed=seed, **options)
+    if scheme == "points":
+        from vislam.sim import POINT_WORLD_NAMES, open_points
+
+        name, options = _options(uri, rest)
+        return open_points(name if name in POINT_WORLD_NAMES else measured_inertial(name), seed=seed, **options)
     from vislam.datasets import open_dataset
 
     return open_dataset(uri)
+
+
+def measured_inertial(uri: str) -> MeasuredInertial:
+    """Read the inertial data and the truth of a recording (`euroc:PATH` or a bare path); images are not needed.
+
+    Raises DataError when it lacks an IMU, its noise or truth.
+    """
+    from vislam.datasets import survey
+    from vislam.datasets.tables import Problems, in_time_order, read_numbers
+    from vislam.sim import POINT_WORLD_NAMES, MeasuredInertial
+
+    try:
+        found = survey(uri)
+    except DataError as error:
+        raise DataError(f"{error}; simulated motions are: {', '.join(POINT_WORLD_NAMES)}") from error
+    if found.errors:
+        raise found.errors[0]
+    problems = Problems()
+    truth = None if found.truth is None else found.truth(problems)
+    if found.imu_file is None or found.imu_noise is None or truth is None:
+        lacks = "an IMU" if found.imu_file is None or found.imu_noise is None else "truth"
+        raise DataError(f"{uri} lacks {lacks}; simulated vision on a real IMU needs inertial data and true poses")
+    rows = list(in_time_order(read_numbers(found.imu_file, 6, problems), problems, "imu"))
+    values = np.array([row[1] for row in rows]).reshape(-1, 6)
+    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+    name = found.root.resolve().name
+    return MeasuredInertial(name, t_ns, values[:, :3], values[:, 3:], found.imu_noise, truth, found.rig)
+
+
+def _options(uri: str, rest: str) -> tuple[str, dict[str, str]]:
+    """Split `NAME,option=value,...`; raises UsageError for a part without `=`."""
+    name, *parts = rest.split(",")
+    for part in parts:
+        if "=" not in part:
+            raise UsageError(f"'{part}' in {uri} is no option; write {uri.partition(',')[0]},option=value")
+    return name, dict(part.split("=", 1) for part in parts)

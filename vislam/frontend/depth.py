@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.messages import Array, Frame
 
@@ -44,9 +45,12 @@ class DepthSensor(Protocol):
         """Return whether this frame carries depth at all."""
         ...
 
-    def measure(self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array) -> DepthReading:
+    def measure(
+        self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array, ids: NDArray[np.int64] | None = None
+    ) -> DepthReading:
         """Measure the depth of raw pixels [N, 2] with directions `xy` [N, 2], where about `expected_rho` [N] is likely.
 
-        NaN in `expected_rho` means that nothing is expected.
+        NaN in `expected_rho` means that nothing is expected. `ids` [N] are the tracks that the pixels belong to: where
+        a frame brings its tracks with it, only their depth is known.
         """
         ...

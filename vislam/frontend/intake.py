@@ -2,29 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
+import numpy as np
 
 from vislam.camera import Rig
 from vislam.errors import DataError
-from vislam.messages import Frame
+from vislam.messages import Frame, Observations
 
 
 class Intake:
     """Refuses frames that do not fit the rig or do not advance in time, and seeds OpenCV's random numbers per frame."""
 
     def __init__(self, rig: Rig, seed: int) -> None:
-        """Take the rig that frames must fit."""
+        """Take the rig that frames must fit.
+
+        Attributes:
+            refused_tracks: given points that were not numbers or not in the image.
+        """
+        self.refused_tracks = 0
         self._rig = rig
         self._seed = seed
         self._t_ns: int | None = None
 
-    def accept(self, frame: Frame) -> float:
-        """Return the seconds since the previous frame, 0 for the first.
+    def accept(self, frame: Frame) -> tuple[Frame, float]:
+        """Return the frame as it can be used and the seconds since the previous one, 0 for the first.
 
-        Raises DataError when time does not advance, an image is missing or has not the calibrated size.
+        Given points that are not numbers or not in the image are left out and counted. Raises DataError when time does
+        not advance, an image is missing or has not the calibrated size, or given tracks do not fit together.
         """
-        if not frame.images:
-            raise DataError(f"frame {frame.index} has no image")
+        if not frame.images and frame.tracks is None:
+            raise DataError(f"frame {frame.index} has no image and no tracks")
         if self._t_ns is not None and frame.t_ns <= self._t_ns:
             raise DataError(
                 f"frame {frame.index} at {frame.t_ns} ns does not come after the one at {self._t_ns} ns; "
@@ -34,7 +43,29 @@ class Intake:
             camera.check_image(image)
         if frame.depth_m is not None:
             self._rig.cameras[0].check_image(frame.depth_m)
+        if frame.tracks is not None:
+            frame = replace(frame, tracks=self._usable(frame.index, frame.tracks))
         dt_s = 0.0 if self._t_ns is None else (frame.t_ns - self._t_ns) * 1e-9
         self._t_ns = frame.t_ns
         cv2.setRNGSeed((self._seed + frame.index) % 2**31)
-        return dt_s
+        return frame, dt_s
+
+    def _usable(self, index: int, given: Observations) -> Observations:
+        """Return the given tracks without those that cannot be used."""
+        count = len(given.track_ids)
+        columns = {"pixels_px": (given.pixels_px, 2), "right_px": (given.right_px, 2), "depth_m": (given.depth_m, 0)}
+        for name, (values, width) in columns.items():
+            if values is not None and values.shape != ((count, width) if width else (count,)):
+                raise DataError(f"frame {index}: {count} tracks came with {name} of shape {values.shape}")
+        if len(np.unique(given.track_ids)) != count:
+            raise DataError(f"frame {index}: a track id came twice; ids must be unique within a frame")
+        good = self._rig.cameras[0].contains(given.pixels_px)
+        if good.all():
+            return given
+        self.refused_tracks += int((~good).sum())
+        return Observations(
+            given.track_ids[good],
+            given.pixels_px[good],
+            None if given.right_px is None else given.right_px[good],
+            None if given.depth_m is None else given.depth_m[good],
+        )

@@ -52,7 +52,13 @@ def make_keyframe(
     keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int,
     measure_depth: Callable[[Array], Array] | None,
 ) -> Keyframe:  # fmt: skip
-    """Describe a frame for loop closing; `measure_depth` gives z-depths [N] in metres of raw pixels [N, 2]."""
+    """Describe a frame for loop closing; `measure_depth` gives z-depths [N] in metres of raw pixels [N, 2].
+
+    A frame without images has nothing to describe.
+    """
+    if not frame.images:
+        none = None if measure_depth is None else np.empty((0, 3))
+        return Keyframe(keyframe_id, frame.t_ns, frame, np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8), none)
     pixels, descriptors = describe(frame.images[0], features)
     points = None
     if measure_depth is not None:

@@ -16,7 +16,7 @@ from vislam.frontend.landmarks import Landmarks, fuse, move
 from vislam.frontend.locate import pnp_ransac, recognise
 from vislam.frontend.prediction import MotionPredictor, body_motion
 from vislam.frontend.refine import PoseEstimate, extra_parameter, refine_pose
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
 from vislam.frontend.shutter import Shutter
 from vislam.frontend.tracker import Tracker
 from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
@@ -79,7 +79,7 @@ class MetricFrontEnd:
 
     def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
-        dt_s = self._intake.accept(frame)
+        frame, dt_s = self._intake.accept(frame)
         if self._keyframe is None:
             return self._start(frame, "")
         T_before = self._T_key_cam
@@ -108,12 +108,12 @@ class MetricFrontEnd:
         landmarks = self._landmarks
         twist = se3_log(invert(T_before) @ T_guess) / dt_s
         predicted, _ = move(landmarks.mean, landmarks.covariance, T_guess)
-        pixels = self._tracker.follow(frame.images[0], self._shutter.project(predicted, twist))
+        pixels = self._tracker.follow(frame, self._shutter.project(predicted, twist))
         seen = self._camera.normalise(pixels)
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
         depth_now = None
         if self._depth.every_frame and self._depth.available(frame):
-            depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2])
+            depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2], self._tracker.ids)
         estimate = self._search(T_guess, xy, depth_now)
         if estimate.converged:
             # once more with the velocity that was found instead of the predicted one, and without the outliers
@@ -161,6 +161,8 @@ class MetricFrontEnd:
 
     def _recognise(self, frame: Frame, keyframe: Keyframe) -> Array | None:
         config = self._config
+        if not frame.images:
+            return None
         return recognise(
             keyframe, frame.images[0], self._camera, self._T_body_cam, config.described_features, config.min_inliers
         )
@@ -241,13 +243,13 @@ class MetricFrontEnd:
     def _leave_blindness(self, frame: Frame, keyframe: Keyframe, T_guess: Array) -> TrackResult:
         """Follow a first keyframe that has no depth until a frame comes that has: then place it by its own depth."""
         rays = np.column_stack([self._camera.normalise(self._blind_px), np.ones(len(self._blind_px))])
-        pixels = self._tracker.follow(frame.images[0], self._camera.project(rays @ T_guess[:3, :3]))
+        pixels = self._tracker.follow(frame, self._camera.project(rays @ T_guess[:3, :3]))
         self._blind_px = np.where(np.isfinite(pixels), pixels, self._blind_px)
         if not self._depth.available(frame):
             vo = lost_motion(frame.t_ns, keyframe.id, True)
             return TrackResult(vo, no_observations(), None, 0.0, "no depth has been seen yet")
         xy = self._camera.normalise(pixels)
-        reading = self._depth.measure(frame, pixels, xy, np.full(len(xy), np.nan))
+        reading = self._depth.measure(frame, pixels, xy, np.full(len(xy), np.nan), self._tracker.ids)
         points = np.column_stack([xy, reading.rho])
         usable = np.isfinite(points).all(axis=1) & (reading.rho > 0.0)
         T_cam_key = self._ransac(_points(points[usable]), self._landmarks.mean[usable, :2])
@@ -277,7 +279,7 @@ class MetricFrontEnd:
         last_id = self._keyframe.id if self._keyframe is not None else -1
         self._tracker.forget()
         self._landmarks = Landmarks()
-        count = self._tracker.begin(frame.images[0], np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
+        count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         reading = self._add_landmarks(frame, count, np.zeros(6))
         lack = self._lack(frame, last_id)
         if lack:
@@ -300,7 +302,7 @@ class MetricFrontEnd:
         """Return what a frame lacks to start from, or an empty string; only the very first may be without depth."""
         corners, deep = len(self._tracker), int(self._landmarks.known.sum())
         if corners < self._config.min_start_corners:
-            return f"only {corners} corners in an image of mean grey {frame.images[0].mean():.0f}"
+            return too_few(frame, corners)
         if deep < self._config.min_inliers and (last_id >= 0 or self._depth.available(frame)):
             return f"only {deep} of {corners} corners have depth"
         return ""
@@ -308,7 +310,9 @@ class MetricFrontEnd:
     def _continue_from(self, frame: Frame, attempt: _Attempt) -> tuple[Keyframe, Observations]:
         """Carry the agreeing landmarks into this frame, improve them by what it measures, fill the gaps."""
         kept = attempt.estimate.inliers
-        reading = self._depth.measure(frame, attempt.pixels[kept], attempt.seen[kept], attempt.expected_rho[kept])
+        reading = self._depth.measure(
+            frame, attempt.pixels[kept], attempt.seen[kept], attempt.expected_rho[kept], self._tracker.ids[kept]
+        )
         landmarks = Landmarks()
         moved = move(self._landmarks.mean[kept], self._landmarks.covariance[kept], self._T_key_cam)
         landmarks.mean, landmarks.covariance = fuse(
@@ -318,7 +322,7 @@ class MetricFrontEnd:
         # the patch that is followed from now on is the one where the landmark is believed to be
         pixels = attempt.pixels.copy()
         pixels[kept] = self._shutter.project(landmarks.mean, attempt.twist_per_s)
-        count = self._tracker.begin(frame.images[0], kept, pixels)
+        count = self._tracker.begin(frame, kept, pixels)
         fresh = self._add_landmarks(frame, count, attempt.twist_per_s)
         seen_at = np.vstack([attempt.pixels[kept], self._tracker.pixels[len(self._tracker) - count :]])
         observations = self._observations(seen_at, reading.joined(fresh))
@@ -326,11 +330,15 @@ class MetricFrontEnd:
 
     def _add_landmarks(self, frame: Frame, count: int, twist_per_s: Array) -> DepthReading:
         """Give the tracker's last `count` corners landmarks; return their depth reading."""
-        pixels = self._tracker.pixels[len(self._tracker) - count :]
+        first = len(self._tracker) - count
+        pixels = self._tracker.pixels[first:]
         seen = self._camera.normalise(pixels)
-        reading = self._depth.measure(frame, pixels, seen, self._landmarks.expected_rho(seen))
+        expected_rho = self._landmarks.expected_rho(seen)
+        reading = self._depth.measure(frame, pixels, seen, expected_rho, self._tracker.ids[first:])
         xy = self._shutter.to_instant(pixels, seen, np.nan_to_num(reading.rho), twist_per_s)
-        self._landmarks.append(xy, reading.rho, _CORNER_SIGMA * self._sigma_xy, reading.sigma_rho)
+        # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy here as anywhere
+        sigma_xy = self._sigma_xy if frame.tracks is not None else _CORNER_SIGMA * self._sigma_xy
+        self._landmarks.append(xy, reading.rho, sigma_xy, reading.sigma_rho)
         return reading
 
     def _observations(self, pixels: Array, reading: DepthReading) -> Observations:

@@ -19,7 +19,7 @@ from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.refine import refine_pose
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
 from vislam.frontend.tracker import Tracker
 from vislam.geometry import so3_log, transform
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
@@ -81,7 +81,7 @@ class MonoFrontEnd:
 
     def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
-        dt_s = self._intake.accept(frame)
+        frame, dt_s = self._intake.accept(frame)
         if self._keyframe is None:
             return self._start(frame, "")
         R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])
@@ -90,7 +90,7 @@ class MonoFrontEnd:
         prior = self._gyro_prior(R_now_next, dt_s, gyro_sigma_rad_s if imu is not None else np.inf)
         last = np.column_stack([self._camera.normalise(self._last_px), np.ones(len(self._last_px))])
         guess = self._camera.project(last @ R_now_next)
-        pixels = self._tracker.follow(frame.images[0], guess)
+        pixels = self._tracker.follow(frame, guess)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
         motion = self._locate(R_guess, prior, pixels)
@@ -218,7 +218,7 @@ class MonoFrontEnd:
         reason = keyframe_reason(departure, self._config)
         if reason:
             pixels = motion.pixels.copy()
-            self._tracker.begin(frame.images[0], good, pixels)
+            self._tracker.begin(frame, good, pixels)
             new = self._install(frame)
             return TrackResult(vo, self._observations(), new, motion.parallax_px, reason)
         observations = Observations(self._tracker.ids[good].copy(), motion.pixels[good])
@@ -263,12 +263,12 @@ class MonoFrontEnd:
         """Begin anew with this frame as keyframe, if there is enough to see in it."""
         last_id = self._keyframe.id if self._keyframe is not None else -1
         self._tracker.forget()
-        count = self._tracker.begin(frame.images[0], np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
+        count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         self._last_px = self._tracker.pixels.copy()
         if count < self._config.min_start_corners:
             self._tracker.forget()
             self._last_px = np.empty((0, 2))
-            reason = f"only {count} corners in an image of mean grey {frame.images[0].mean():.0f}"
+            reason = too_few(frame, count)
             vo = lost_motion(frame.t_ns, last_id, False)
             return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {reason}" if failure else reason)
         self._predictor.forget()

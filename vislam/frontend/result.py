@@ -49,6 +49,13 @@ def lost_motion(t_ns: int, keyframe_id: int, has_scale: bool, inliers: int = 0) 
     return VoMeasurement(t_ns, keyframe_id, None, covariance, has_scale, Tracking.LOST, inliers)
 
 
+def too_few(frame: Frame, corners: int) -> str:
+    """Return why a frame with so many corners or given tracks cannot start a keyframe."""
+    if frame.tracks is not None:
+        return f"only {corners} points were given"
+    return f"only {corners} corners in an image of mean grey {frame.images[0].mean():.0f}"
+
+
 def no_observations() -> Observations:
     """Return observations of nothing."""
     return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))

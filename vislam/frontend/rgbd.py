@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.frontend.depth import DepthReading
+from vislam.frontend.tracker import given_rows
 from vislam.messages import Array, Frame, ImageF32
 
 _REACH_PX = 4  # half the side of the neighbourhood that says how much a wrong registration would matter
@@ -28,12 +30,21 @@ class ImageDepth:
         self._config = config
 
     def available(self, frame: Frame) -> bool:
-        """Return whether this frame has a depth image."""
-        return frame.depth_m is not None
+        """Return whether this frame has a depth image, or points given with their depth."""
+        return frame.depth_m is not None or (frame.tracks is not None and frame.tracks.depth_m is not None)
 
-    def measure(self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array) -> DepthReading:
+    def measure(
+        self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array, ids: NDArray[np.int64] | None = None
+    ) -> DepthReading:
         """Read inverse depth at raw pixels [N, 2]: bilinear, NaN at holes, beyond range and across depth edges."""
         config = self._config
+        if frame.tracks is not None and frame.tracks.depth_m is not None and ids is not None:
+            depth = given_rows(frame.tracks, frame.tracks.depth_m, ids)
+            with np.errstate(invalid="ignore"):
+                good = (depth >= config.min_depth_m) & (depth <= config.max_depth_m)
+            given: Array = np.full(len(depth), np.nan)
+            given[good] = 1.0 / depth[good]
+            return DepthReading(given, np.full(len(depth), config.depth_sigma_rho))
         if frame.depth_m is None:
             unknown: Array = np.full(len(pixels), np.nan)
             return DepthReading(unknown, np.full(len(pixels), config.depth_sigma_rho))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import FrontEndConfig
 from vislam.features import FlowSettings, follow
 from vislam.frontend.depth import DepthReading
+from vislam.frontend.tracker import given_rows
 from vislam.geometry import invert
 from vislam.messages import Array, Frame
 
@@ -33,19 +35,25 @@ class StereoDepth:
         self._max_rho = 1.0 / config.min_depth_m
 
     def available(self, frame: Frame) -> bool:
-        """Return whether the right image is there."""
-        return len(frame.images) > 1
+        """Return whether the right image is there, or points given with their places in it."""
+        return len(frame.images) > 1 or (frame.tracks is not None and frame.tracks.right_px is not None)
 
-    def measure(self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array) -> DepthReading:
+    def measure(
+        self, frame: Frame, pixels: Array, xy: Array, expected_rho: Array, ids: NDArray[np.int64] | None = None
+    ) -> DepthReading:
         """Match raw left pixels [N, 2] in the right image, starting where `expected_rho` [N] puts them.
 
         Where nothing is expected (NaN), several disparities are tried and the most similar match is taken.
         """
         right_px: Array = np.full((len(pixels), 2), np.nan)
         rho: Array = np.full(len(pixels), np.nan)
-        if self.available(frame) and len(pixels) > 0:
+        rays = np.column_stack([xy, np.ones(len(xy))]) @ self._T_right_left[:3, :3].T
+        if frame.tracks is not None and frame.tracks.right_px is not None and ids is not None:
+            right_px = given_rows(frame.tracks, frame.tracks.right_px, ids)
+            rho = self._accepted(rays, right_px)
+            right_px[np.isnan(rho)] = np.nan
+        elif len(frame.images) > 1 and len(pixels) > 0:
             left, right = frame.images[:2]
-            rays = np.column_stack([xy, np.ones(len(xy))]) @ self._T_right_left[:3, :3].T
             best = np.full(len(pixels), np.inf)
             for start_rho in self._starts(expected_rho):
                 guess = self._right.project(rays + start_rho[:, None] * self._T_right_left[:3, 3])

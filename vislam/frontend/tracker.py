@@ -2,6 +2,9 @@
 
 Every frame is matched against the keyframe's image, not against the previous frame: errors do not add up between
 keyframes, and a track that one blurred frame loses is found again in the next.
+
+A frame may bring points that were followed elsewhere (`Frame.tracks`). Then those take the place of corners and of
+Lucas-Kanade, and keep their ids; once such a track has been dropped it is not taken up again under the same id.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.features import FlowSettings, detect_corners, follow
-from vislam.messages import Array, ImageU8
+from vislam.messages import Array, Frame, ImageU8, Observations
 
 Bools = NDArray[np.bool_]
 
@@ -30,19 +33,24 @@ class Tracker:
         self.ids: NDArray[np.int64] = np.empty(0, dtype=np.int64)
         self.pixels: Array = np.empty((0, 2))  # [N, 2] in the keyframe
         self.misses: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # [N] frames in a row without a good match
+        self._given = False  # whether tracks are given
+        self._dropped: set[int] = set()  # given tracks that may still be there but are not wanted any more
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def forget(self) -> None:
-        """Drop all tracks."""
+        """Drop all tracks; given ones may then be taken up again."""
         self._keep(np.zeros(len(self.ids), dtype=np.bool_))
+        self._dropped.clear()
 
-    def follow(self, image: ImageU8, guess: Array) -> Array:
-        """Return the pixels [N, 2] of all tracks in `image`, searched around `guess` [N, 2]; NaN where not found."""
+    def follow(self, frame: Frame, guess: Array) -> Array:
+        """Return the pixels [N, 2] of all tracks in `frame`, searched around `guess` [N, 2]; NaN where not found."""
+        if frame.tracks is not None:
+            return given_rows(frame.tracks, frame.tracks.pixels_px, self.ids)
         if self._image is None:
             return np.full((len(self), 2), np.nan)
-        return follow(self._image, image, self.pixels, guess, self._flow)[0]
+        return follow(self._image, frame.images[0], self.pixels, guess, self._flow)[0]
 
     def judge(self, good: Bools) -> Bools:
         """Count misses of tracks that are not `good` [N] in this frame and drop those with too many.
@@ -55,26 +63,49 @@ class Tracker:
         self._keep(alive)
         return alive
 
-    def begin(self, image: ImageU8, kept: Bools, pixels: Array) -> int:
-        """Make `image` the keyframe: tracks `kept` [N] go on at `pixels` [N, 2] in it, new corners fill the gaps.
+    def begin(self, frame: Frame, kept: Bools, pixels: Array) -> int:
+        """Make `frame` the keyframe: tracks `kept` [N] go on at `pixels` [N, 2] in it, new corners fill the gaps.
 
         Returns:
             How many corners are new; they come after the kept ones.
         """
         self._keep(kept)
         self.pixels = pixels[kept].copy()
+        self._given = frame.tracks is not None
+        ids, fresh = self._detect(frame.images[0]) if frame.tracks is None else self._take(frame.tracks)
+        self.ids = np.concatenate([self.ids, ids])
+        self.pixels = np.vstack([self.pixels, fresh])
+        self.misses = np.zeros(len(self.ids), dtype=np.int64)
+        self._image = frame.images[0] if frame.images else None
+        return len(ids)
+
+    def _detect(self, image: ImageU8) -> tuple[NDArray[np.int64], Array]:
+        """Return ids [M] and pixels [M, 2] of new corners."""
         config = self._config
         fresh = detect_corners(
             image, config.max_tracks - len(self.ids), config.cell_px, config.min_distance_px, self.pixels,
             config.min_corner_response,
         )  # fmt: skip
-        count = len(fresh)
-        self.ids = np.concatenate([self.ids, np.arange(self._next_id, self._next_id + count, dtype=np.int64)])
-        self._next_id += count
-        self.pixels = np.vstack([self.pixels, fresh])
-        self.misses = np.zeros(len(self.ids), dtype=np.int64)
-        self._image = image
-        return count
+        ids = np.arange(self._next_id, self._next_id + len(fresh), dtype=np.int64)
+        self._next_id += len(fresh)
+        return ids, fresh
+
+    def _take(self, given: Observations) -> tuple[NDArray[np.int64], Array]:
+        """Return ids [M] and pixels [M, 2] of given tracks that are new."""
+        self._dropped.intersection_update(given.track_ids.tolist())
+        known = np.concatenate([self.ids, np.array(sorted(self._dropped), dtype=np.int64)])
+        chosen = np.flatnonzero(~np.isin(given.track_ids, known))[: max(self._config.max_tracks - len(self.ids), 0)]
+        return given.track_ids[chosen], given.pixels_px[chosen]
 
     def _keep(self, which: Bools) -> None:
+        if self._given:
+            self._dropped.update(self.ids[~which].tolist())
         self.ids, self.pixels, self.misses = self.ids[which], self.pixels[which], self.misses[which]
+
+
+def given_rows(given: Observations, values: Array, ids: NDArray[np.int64]) -> Array:
+    """Return the rows [N, ...] of `values` [M, ...] that belong to the tracks `ids` [N]; NaN for those not given."""
+    out: Array = np.full((len(ids), *values.shape[1:]), np.nan)
+    _, mine, theirs = np.intersect1d(ids, given.track_ids, assume_unique=True, return_indices=True)
+    out[mine] = values[theirs]
+    return out

@@ -61,6 +61,8 @@ class ScanExtractor:
         if not known.any():
             return None
         frame = keyframe.frame
+        if not frame.images:
+            return None
         image = frame.images[0] if frame.color is None else frame.color
         pixels = np.nan_to_num(np.round(keyframe.keypoints_px[known])).astype(np.int64)
         rows = np.clip(pixels[:, 1], 0, image.shape[0] - 1)

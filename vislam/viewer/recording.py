@@ -32,6 +32,7 @@ from vislam.messages import (
     Tracking,
 )
 
+_PAPER_GREY = 60
 _COLORS = {
     "ekf": (230, 126, 34),
     "live": (125, 175, 225),
@@ -90,7 +91,10 @@ class RunViewer:
         self._frames += 1
         if (self._frames - 1) % self._config.every_frames:
             return
-        jpeg, scale = self._jpeg(frame.images[0] if frame.color is None else frame.color)
+        image = _picture(frame, self._rig)
+        if image is None:
+            return
+        jpeg, scale = self._jpeg(image)
         self._stream.log(_CAMERA + "/image", jpeg)
         ages = np.array([self._frames - self._first_seen[track] for track in ids], dtype=np.float64)
         points = rr.Points2D((observations.pixels_px + 0.5) * scale - 0.5, colors=_age_colors(ages), radii=1.5)
@@ -112,8 +116,9 @@ class RunViewer:
         points, colors = self._cloud(keyframe)
         if len(points):
             self._stream.log(entity, rr.Points3D(points.astype(np.float32), colors=colors, radii=0.012))
-        image = keyframe.frame.images[0] if keyframe.frame.color is None else keyframe.frame.color
-        self._stream.log("keyframe/image", self._jpeg(image)[0])
+        image = _picture(keyframe.frame, self._rig)
+        if image is not None:
+            self._stream.log("keyframe/image", self._jpeg(image)[0])
         self._write_pose(keyframe.id, T_map_body)
         self._log_keyframe_path([keyframe.id])
 
@@ -208,7 +213,9 @@ class RunViewer:
     def _cloud(self, keyframe: Keyframe) -> tuple[Array, ImageU8]:
         """Return points [N, 3] in the body frame with RGB [N, 3]: a grid over the depth image, or the features."""
         frame = keyframe.frame
-        image = frame.color if frame.color is not None else frame.images[0]
+        image = _picture(frame, self._rig)
+        if image is None:
+            return np.empty((0, 3)), np.empty((0, 3), np.uint8)
         if frame.depth_m is not None and self._rig is not None:
             pixels, depth = _depth_grid(frame.depth_m, self._config.cloud_points, self._config.max_range_m)
             T_body_cam = self._rig.T_body_cams[0]
@@ -289,6 +296,15 @@ class RunViewer:
         if self._rig and -first[2, 1] < 0.3:  # without an IMU the map lies as the first camera did: look from behind it
             up, back = -first[:, 1], -first[:, 2]
         return rrb.EyeControls3D(position=centre + extent * (1.4 * back + 1.2 * up), look_target=centre, eye_up=up)
+
+
+def _picture(frame: Frame, rig: Rig | None) -> ImageU8 | None:
+    """Return the image to show; grey paper for a frame that brought tracks only, None when its size is not known."""
+    if frame.color is not None or frame.images:
+        return frame.color if frame.color is not None else frame.images[0]
+    if rig is None:
+        return None
+    return np.full((rig.cameras[0].height, rig.cameras[0].width), _PAPER_GREY, dtype=np.uint8)
 
 
 def _keyframe_entity(keyframe_id: int) -> str:

@@ -1,0 +1,152 @@
+"""The motion of a body that was really measured: sparse true poses, filled in between by its own inertial data.
+
+Truth at 20 Hz misses what the body does between two poses, and its derivatives are rough. The IMU knows exactly that,
+but drifts. So both are joined as a complementary filter joins them: the inertial data are integrated, and the slow
+difference to the truth is a smooth spline through the true poses. The result passes through every pose that was used
+and has the IMU's own high frequencies, so that what a virtual camera on it sees agrees with the real inertial data.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from vislam.errors import DataError
+from vislam.geometry import so3_exp
+from vislam.messages import Array
+from vislam.sim.spline import Motion
+from vislam.trajectory import Trajectory
+
+_KNOT_S = 0.04  # true poses closer than this are left out: their rounding would become velocity
+_MAX_TRUTH_GAP_S = 0.25  # over longer gaps the drift of the inertial data is no longer a smooth spline
+_MAX_IMU_GAP_S = 0.03  # over longer gaps the body may do anything
+_MIN_KNOTS = 8
+
+
+class MeasuredMotion:
+    """Motion over `[begin_s, end_s]`, in seconds since the first true pose that inertial data cover.
+
+    Attributes:
+        begin_s: always 0.
+        end_s: time of the last pose.
+        zero_ns: stamp of `begin_s`.
+        gyro_bias_rad_s: mean difference [3] between the gyroscope and the true turns.
+    """
+
+    def __init__(self, t_ns: NDArray[np.int64], gyro_rad_s: Array, accel_m_s2: Array, truth: Trajectory) -> None:
+        """Join inertial samples at times [N] (gyro and accel [N, 3], body frame) with the true poses of the body.
+
+        Raises DataError when fewer than eight true poses lie within the inertial data.
+        """
+        if len(t_ns) < 2 or len(truth) == 0:
+            raise DataError(f"motion needs inertial data and true poses, got {len(t_ns)} samples, {len(truth)} poses")
+        inside = (truth.t_ns >= t_ns[0]) & (truth.t_ns <= t_ns[-1])
+        chosen = _apart(truth.t_ns[inside], _KNOT_S)
+        stamps, poses = truth.t_ns[inside][chosen], truth.T_world_body[inside][chosen]
+        if len(stamps) < _MIN_KNOTS:
+            raise DataError(f"only {len(stamps)} true poses lie within the inertial data, {_MIN_KNOTS} are needed")
+        used = slice(int(np.searchsorted(t_ns, stamps[0], "right")) - 1, int(np.searchsorted(t_ns, stamps[-1])) + 1)
+        self.zero_ns = int(stamps[0])
+        self.begin_s, self.end_s = 0.0, float(stamps[-1] - stamps[0]) * 1e-9
+        imu_s, knots_s = _seconds(t_ns[used], self.zero_ns), _seconds(stamps, self.zero_ns)
+        self._gaps_s = np.vstack([_gaps(imu_s, _MAX_IMU_GAP_S), _gaps(knots_s, _MAX_TRUTH_GAP_S)])
+        self.gyro_bias_rad_s = np.zeros(3)
+        for _ in range(2):  # the second time without the bias, so that little is left to the spline
+            turned = _Attitude(imu_s, _integrate_gyro(imu_s, gyro_rad_s[used] - self.gyro_bias_rad_s))
+            drift = poses[:, :3, :3] @ turned.at(knots_s).transpose(0, 2, 1)
+            self.gyro_bias_rad_s = self.gyro_bias_rad_s + _mean_rate(knots_s, turned.at(knots_s), poses[:, :3, :3])
+        R = _Attitude(knots_s, drift).at(np.clip(imu_s, 0.0, self.end_s)) @ turned.at(imu_s)
+        self._attitude = _Attitude(imu_s, R)
+        acceleration = np.einsum("nij,nj->ni", R, accel_m_s2[used])
+        acceleration = acceleration - acceleration.mean(axis=0)
+        velocity, position = _integrate_twice(imu_s, acceleration)
+        self._sensed = make_interp_spline(imu_s, np.hstack([acceleration, gyro_rad_s[used] - self.gyro_bias_rad_s]), 1)
+        self._path = CubicHermiteSpline(imu_s, position, velocity)
+        self._drift = CubicSpline(knots_s, poses[:, :3, 3] - self._path(knots_s))
+
+    def at(self, t_s: Array) -> Motion:
+        """Return the motion at times [N] in seconds; times outside are held at the ends.
+
+        Rates and accelerations are what the IMU says, less mean bias and drift: they carry its noise.
+        """
+        t_s = np.clip(np.asarray(t_s, dtype=np.float64), self.begin_s, self.end_s)
+        T = np.zeros((len(t_s), 4, 4))
+        T[:, :3, :3], T[:, 3, 3] = self._attitude.at(t_s), 1.0
+        T[:, :3, 3] = self._path(t_s) + self._drift(t_s)
+        velocity = self._path(t_s, 1) + self._drift(t_s, 1)
+        sensed = self._sensed(t_s)
+        return Motion(T, velocity, sensed[:, :3] + self._drift(t_s, 2), sensed[:, 3:])
+
+    def covers(self, t_s: Array, margin_s: float = 0.0) -> NDArray[np.bool_]:
+        """Return at which times [N] the motion is known: not within `margin_s` of a gap in truth or inertial data."""
+        t_s = np.asarray(t_s, dtype=np.float64)
+        known = (t_s >= self.begin_s) & (t_s <= self.end_s)
+        for begin_s, end_s in self._gaps_s:
+            known &= (t_s <= begin_s - margin_s) | (t_s >= end_s + margin_s)
+        return np.asarray(known, dtype=np.bool_)
+
+
+class _Attitude:
+    """A smooth rotation through matrices [N, 3, 3] at times [N]: cubic in the quaternion, normalised."""
+
+    def __init__(self, t_s: Array, R: Array) -> None:
+        q = Rotation.from_matrix(R).as_quat()
+        flips = np.cumprod(np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0))
+        q[1:] *= flips[:, None]
+        self._q = CubicSpline(t_s, q)
+
+    def at(self, t_s: Array) -> Array:
+        """Return rotations [M, 3, 3] at times [M]."""
+        return np.asarray(Rotation.from_quat(self._q(t_s)).as_matrix())
+
+
+def _seconds(t_ns: NDArray[np.int64], zero_ns: int) -> Array:
+    return (t_ns - zero_ns).astype(np.float64) * 1e-9
+
+
+def _apart(t_ns: NDArray[np.int64], spacing_s: float) -> NDArray[np.int64]:
+    """Return indices of stamps that are at least a spacing apart (less the rounding of stamps)."""
+    chosen: list[int] = []
+    next_ns = -(1 << 62)
+    for i, stamp in enumerate(t_ns.tolist()):
+        if stamp >= next_ns:
+            chosen.append(i)
+            next_ns = stamp + round((spacing_s - 1e-4) * 1e9)
+    return np.array(chosen, dtype=np.int64)
+
+
+def _gaps(t_s: Array, longest_s: float) -> Array:
+    """Return begin and end [M, 2] of what is longer than `longest_s` between two of the times."""
+    wide = np.flatnonzero(np.diff(t_s) > longest_s)
+    return np.column_stack([t_s[wide], t_s[wide + 1]])
+
+
+@njit(cache=True, nogil=True)
+def _integrate_gyro(t_s: Array, gyro: Array) -> Array:
+    """Return rotations [N, 3, 3] from the first sample on; the mean rate of two samples turns between them."""
+    out = np.empty((len(t_s), 3, 3))
+    out[0] = np.eye(3)
+    for i in range(1, len(t_s)):
+        step = so3_exp(0.5 * (gyro[i - 1] + gyro[i]) * (t_s[i] - t_s[i - 1]))
+        out[i] = out[i - 1] @ step
+    return out
+
+
+def _integrate_twice(t_s: Array, acceleration: Array) -> tuple[Array, Array]:
+    """Return velocity and position [N, 3] of an acceleration that is linear between samples."""
+    h = np.diff(t_s)[:, None]
+    a, b = acceleration[:-1], acceleration[1:]
+    velocity = np.vstack([np.zeros(3), np.cumsum(0.5 * h * (a + b), axis=0)])
+    position = np.vstack([np.zeros(3), np.cumsum(h * velocity[:-1] + h * h * (2.0 * a + b) / 6.0, axis=0)])
+    return velocity, position
+
+
+def _mean_rate(t_s: Array, turned: Array, R: Array) -> Array:
+    """Return the mean rate [3] by which `turned` turns faster than `R` (both [N, 3, 3]) between the times."""
+    a = turned[:-1].transpose(0, 2, 1) @ turned[1:]
+    b = R[:-1].transpose(0, 2, 1) @ R[1:]
+    ahead = Rotation.from_matrix(b.transpose(0, 2, 1) @ a).as_rotvec()
+    return np.asarray(np.median(ahead / np.diff(t_s)[:, None], axis=0))
