@@ -1,0 +1,117 @@
+"""How states, measurements and unknowns lie in memory.
+
+A keyframe's state is a row of 21: rotation (row-major 9), position, velocity, gyro bias, accel bias. The unknowns are
+ordered velocity and biases of keyframe 0, 1, ..., then poses of keyframe 0, 1, ..., then calibration: elimination in
+this order keeps the factor sparse, and what has to be known with its covariance comes last. A keyframe's error is
+rotation (body side), position (world), velocity, gyro bias, accel bias, as in `NavState`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.geometry import so3_exp, so3_log
+from vislam.messages import Array
+
+STATE = 21
+CALIBRATION = 5  # time offset, rotation of the camera (3), readout
+Ints = NDArray[np.int64]
+
+
+class Views(NamedTuple):
+    """Observations [N] of landmarks [L], those of a landmark in a row and its host first."""
+
+    first: Ints  # [L + 1]
+    host: Ints  # [L] keyframe whose camera 0 holds bearing and inverse depth
+    keyframe: Ints  # [N]
+    camera: Ints  # [N] 0 or 1
+    xy: Array  # [N, 2] on z = 1
+    white: Array  # [N, 2, 2] turns an error on z = 1 into standard deviations
+    row: Array  # [N] of the image, -0.5 at the top to 0.5
+    inverse_depth: Array  # [N] 1/m, measured
+    depth_weight: Array  # [N] 1 / sigma; 0 where not measured
+
+
+class Links(NamedTuple):
+    """What ties keyframe k to k + 1, [M - 1] each, and what is known of keyframe k alone, [M]."""
+
+    inertial: NDArray[np.bool_]
+    dt: Array
+    dR: Array  # [., 3, 3]
+    dv: Array  # [., 3]
+    dp: Array  # [., 3]
+    by_bias: Array  # [., 9, 6] rotation, velocity, position by gyro bias and accel bias
+    information: Array  # [., 9, 9]
+    bias: Array  # [., 6] that was taken off
+    walk_information: Array  # [., 6]
+    guess: Array  # [., 4, 4] motion of the body
+    guess_weight: Array  # [., 2] 1 / sigma of rotation and of translation; 0: no such factor
+    velocity_weight: Array  # [.] 1 / sigma that velocity stays
+    rest_weight: Array  # [M] 1 / sigma that velocity is zero
+
+
+class Camera(NamedTuple):
+    """Geometry and timing of the cameras."""
+
+    T_body_cam: Array  # [4, 4] of camera 0
+    T_cam0_cams: Array  # [C, 4, 4]
+    rate: Array  # [M, 3] of the body at each keyframe, rad/s
+    applied_offset_s: Array  # [M] time offset that is already in the stamp
+    active: NDArray[np.bool_]  # [5] what is estimated
+    huber_k: float
+    rho_information: float  # of the prior of inverse depth
+
+
+class Prior(NamedTuple):
+    """Cost `b @ dx + dx @ H @ dx / 2` of calibration and the first keyframes, around where they were linearised."""
+
+    H: Array  # [5 + n * S, 5 + n * S], S = 15, or 6 without an IMU
+    b: Array
+    calibration: Array  # [5]
+
+
+@njit(cache=True, nogil=True)
+def retract(x: Array, d: Array) -> None:
+    """Move a state [21] by an error [15] (or [6]: its pose) in place."""
+    R = x[:9].copy().reshape(3, 3) @ so3_exp(d[:3].copy())
+    x[:9] = R.reshape(9)
+    x[9 : 6 + len(d)] += d[3:]
+
+
+@njit(cache=True, nogil=True)
+def difference(x: Array, x0: Array) -> Array:
+    """Return the error [15] that moves state x0 to x."""
+    out = np.empty(15)
+    out[:3] = so3_log(x0[:9].copy().reshape(3, 3).T @ x[:9].copy().reshape(3, 3))
+    out[3:] = x[9:] - x0[9:]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def positions(count: int, inertial: bool) -> Ints:
+    """Return where [count, 15] (or [count, 6]) each keyframe's error lies among the unknowns."""
+    size, start = (15, 9 * count) if inertial else (6, 0)
+    out = np.empty((count, size), dtype=np.int64)
+    for k in range(count):
+        for i in range(6):
+            out[k, i] = start + 6 * k + i
+        for i in range(6, size):
+            out[k, i] = 9 * k + i - 6
+    return out
+
+
+@njit(cache=True, nogil=True)
+def prior_positions(count: int, held: int, inertial: bool) -> Ints:
+    """Return where the prior's unknowns (calibration, then the first `held` keyframes) lie among all."""
+    where = positions(count, inertial)
+    size = where.shape[1]
+    out = np.empty(CALIBRATION + held * size, dtype=np.int64)
+    for i in range(CALIBRATION):
+        out[i] = (15 if inertial else 6) * count + i
+    for k in range(held):
+        out[CALIBRATION + k * size : CALIBRATION + (k + 1) * size] = where[k]
+    return out

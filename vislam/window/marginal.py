@@ -1,0 +1,119 @@
+"""What the window keeps of a keyframe that leaves: a quadratic prior on the states it was tied to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.messages import Array, NavState
+from vislam.window import inertial, visual
+from vislam.window.layout import CALIBRATION, Camera, Links, Prior, Views, positions, prior_positions
+from vislam.window.solver import add_prior
+
+_NOTHING = 1e-12  # relative to the largest: information below it is rounding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaving:
+    """Measurements that leave with keyframe 0."""
+
+    views: Views
+    points: Array  # [L, 3]
+
+
+def marginalise(
+    X: Array,
+    X_first: Array,
+    held: NDArray[np.bool_],
+    calibration: Array,
+    leaving: Leaving,
+    camera: Camera,
+    links: Links,
+    prior: Prior,
+    gravity_m_s2: float,
+    full: bool,
+) -> Prior:
+    """Return the prior [5 + (M - 1) * S] on calibration and the keyframes after the first.
+
+    States that the old prior holds keep their linearisation; the others are linearised at X, so the caller sets
+    `X_first` of every keyframe that the new prior touches to where it was, or to X. The views in `leaving`, the link
+    of keyframe 0 and its rest must not be used again.
+    """
+    count, size = len(X), 15 if full else 6
+    D = size * count + CALIBRATION
+    poses_at = 9 * count if full else 0
+    where = positions(count, full)
+    A, g = np.zeros((D, D)), np.zeros(D)
+    held_count = (len(prior.b) - CALIBRATION) // size
+    dx = inertial.prior_shift(X, X_first, calibration, prior.calibration, held_count, size)
+    add_prior(prior, dx, prior_positions(count, held_count, full), A, g)
+    inertial.linearise(X, X_first, held, links, gravity_m_s2, where, min(1, count - 1), 1, A, g)
+    L = len(leaving.points)
+    A_points, g_points, cross = np.empty((L, 3, 3)), np.empty((L, 3)), np.empty((L, 3, D - poses_at))
+    visual.linearise(
+        X, X_first, held, leaving.points, calibration, leaving.views, camera, poses_at, A, g, A_points, g_points, cross
+    )
+    visual.eliminate(np.empty((L, 3, 3)), A_points, g_points, cross, 0.0, poses_at, A, g)
+    A = np.triu(A) + np.triu(A, 1).T
+    gone = where[0]
+    kept = np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
+    gain = A[np.ix_(kept, gone)] @ _inverse(A[np.ix_(gone, gone)])
+    H = A[np.ix_(kept, kept)] - gain @ A[np.ix_(gone, kept)]
+    gradient = g[kept] - gain @ g[gone]
+    H = 0.5 * (H + H.T)
+    shift = np.concatenate([dx[:CALIBRATION], np.zeros(len(kept) - CALIBRATION)])
+    for k in range(1, held_count):
+        if held[k]:
+            shift[CALIBRATION + (k - 1) * size : CALIBRATION + k * size] = dx[
+                CALIBRATION + k * size : CALIBRATION + (k + 1) * size
+            ]
+    return Prior(np.ascontiguousarray(H), gradient - H @ shift, prior.calibration)
+
+
+def touched(prior: Prior, count: int, full: bool) -> NDArray[np.bool_]:
+    """Return which of `count` keyframes the prior says anything about."""
+    size = 15 if full else 6
+    diagonal = np.diag(prior.H)[CALIBRATION:].reshape(-1, size)
+    out = np.zeros(count, dtype=bool)
+    out[: len(diagonal)] = diagonal.max(axis=1) > 0.0
+    return out
+
+
+def first_prior(state: NavState, gauge_m: float, gauge_rad: float, calibration: Array, sigmas: Array) -> Prior:
+    """Return the prior on calibration and keyframe 0.
+
+    Position and yaw are a free choice and fixed to the gauge's sigmas; the rest of the covariance [15, 15] is taken as
+    it is, without its correlation to those.
+    """
+    P = state.covariance.copy()
+    up = state.T_world_body[2, :3]
+    level = np.eye(15)
+    level[:3, :3] -= np.outer(up, up)
+    level[3:6, 3:6] = 0.0
+    P = level @ P @ level.T
+    P[:3, :3] += gauge_rad**2 * np.outer(up, up)
+    P[3:6, 3:6] += gauge_m**2 * np.eye(3)
+    P += np.diag(np.repeat([1e-5, 0.0, 1e-4, 1e-6, 1e-5], 3) ** 2)  # nothing is known better: keeps it invertible
+    return _prior(np.linalg.inv(0.5 * (P + P.T)), calibration, sigmas)
+
+
+def first_pose_prior(gauge_m: float, gauge_rad: float, calibration: Array, sigmas: Array) -> Prior:
+    """Return the prior that fixes the pose of keyframe 0 where there is no IMU."""
+    return _prior(np.diag(np.repeat([gauge_rad**-2, gauge_m**-2], 3)), calibration, sigmas)
+
+
+def _prior(information: Array, calibration: Array, sigmas: Array) -> Prior:
+    H = np.zeros((CALIBRATION + len(information), CALIBRATION + len(information)))
+    H[:CALIBRATION, :CALIBRATION] = np.diag(np.where(sigmas > 0.0, 1.0 / np.maximum(sigmas, 1e-12) ** 2, 0.0))
+    H[CALIBRATION:, CALIBRATION:] = information
+    return Prior(H, np.zeros(len(H)), calibration.copy())
+
+
+def _inverse(A: Array) -> Array:
+    """Return the inverse of a positive semidefinite matrix, without the directions that nothing was known about."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+    values, vectors = np.linalg.eigh(A * np.outer(scale, scale))
+    good = values > _NOTHING * values[-1]
+    return (vectors[:, good] / values[good]) @ vectors[:, good].T * np.outer(scale, scale)

@@ -1,0 +1,163 @@
+"""What lies between keyframes: inertial spans made into links, with honest sigmas where data is missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vislam.config import WindowConfig
+from vislam.imu import ImuNoise, Preintegrated, preintegrate
+from vislam.messages import Array, ImuSpan
+from vislam.window.layout import Links
+
+_ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+_DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
+
+
+class LinkStore:
+    """Owns the links of the window, and the spans they came from so that they can be integrated again."""
+
+    def __init__(self, config: WindowConfig, noise: ImuNoise | None, gravity_m_s2: float) -> None:
+        """Start empty; without `noise` there is no IMU."""
+        self._config = config
+        self._noise = noise
+        self._white = None
+        if noise is not None:
+            self._white = replace(
+                noise,
+                gyro_noise_density=noise.gyro_noise_density * config.imu_inflation,
+                accel_noise_density=noise.accel_noise_density * config.imu_inflation,
+            )
+        self._gravity_m_s2 = gravity_m_s2
+        self._spans: list[ImuSpan | None] = []
+        size = config.keyframes + 2
+        self._links = Links(
+            inertial=np.zeros(size, dtype=np.bool_),
+            dt=np.zeros(size),
+            dR=np.tile(np.eye(3), (size, 1, 1)),
+            dv=np.zeros((size, 3)),
+            dp=np.zeros((size, 3)),
+            by_bias=np.zeros((size, 9, 6)),
+            information=np.zeros((size, 9, 9)),
+            bias=np.zeros((size, 6)),
+            walk_information=np.zeros((size, 6)),
+            guess=np.tile(np.eye(4), (size, 1, 1)),
+            guess_weight=np.zeros((size, 2)),
+            velocity_weight=np.zeros(size),
+            rest_weight=np.zeros(size),
+        )
+
+    def __len__(self) -> int:
+        """Return the number of links: one less than keyframes."""
+        return len(self._spans)
+
+    @property
+    def arrays(self) -> Links:
+        """The links [n] and rest weights [n + 1] as the kernels take them: views, valid until the next change."""
+        n = len(self._spans)
+        return Links(*(a[: n + 1] if name == "rest_weight" else a[:n] for name, a in self._links._asdict().items()))
+
+    def usable(self, span: ImuSpan | None) -> bool:
+        """Return whether a span can be integrated: there, and without too long an outage."""
+        if span is None or len(span.t_ns) < 2 or self._noise is None:
+            return False
+        return float(self._holes_s(span).sum()) <= self._config.imu_max_outage_s
+
+    def push(self, span: ImuSpan | None, dt_s: float, bias: Array, guess: Array, at_rest: bool) -> bool:
+        """Append the link to a new keyframe `dt_s` later; return whether it is inertial.
+
+        `guess` [4, 4] is the motion that is assumed, loosely, where there is no inertial data; `bias` [6] is taken off.
+        """
+        k, links, config = len(self._spans), self._links, self._config
+        inertial = self.usable(span)
+        self._spans.append(span if inertial else None)
+        links.inertial[k], links.dt[k] = inertial, dt_s
+        links.guess_weight[k], links.velocity_weight[k], links.rest_weight[k + 1] = 0.0, 0.0, 0.0
+        if self._noise is not None:
+            walk = np.repeat([self._noise.gyro_bias_walk, self._noise.accel_bias_walk], 3)
+            links.walk_information[k] = 1.0 / (np.maximum(walk, 1e-9) ** 2 * dt_s)
+        if inertial:
+            self.integrate(k, bias)
+        else:
+            links.guess[k] = guess
+            links.guess_weight[k, 0] = 1.0 / (np.deg2rad(config.lost_rate_sigma_deg_s) * dt_s)
+            links.guess_weight[k, 1] = 1.0 / (config.lost_speed_sigma_m_s * dt_s)
+            links.velocity_weight[k] = 1.0 / config.lost_speed_sigma_m_s
+        if at_rest:
+            links.guess[k] = np.eye(4)
+            links.guess_weight[k] = 1.0 / np.deg2rad(config.rest_sigma_deg), 1.0 / config.rest_sigma_m
+            links.rest_weight[k + 1] = 1.0 / config.rest_speed_sigma_m_s
+        return inertial
+
+    def integrate(self, k: int, bias: Array) -> None:
+        """Integrate link k at a bias [6]."""
+        span = self._spans[k]
+        assert span is not None
+        result = preintegrate(span, bias[:3], bias[3:], self._white)
+        links = self._links
+        links.dR[k], links.dv[k], links.dp[k], links.bias[k] = result.dR, result.dv_m_s, result.dp_m, bias
+        links.by_bias[k] = jacobian_by_bias(result)
+        links.information[k] = information(result, self._outage(span, result.dt_s))
+
+    def refresh(self, biases: Array) -> None:
+        """Integrate again where the biases [n + 1, 6] of the keyframes moved too far for first-order correction."""
+        n = len(self._spans)
+        moved = np.abs(biases[:n] - self._links.bias[:n])
+        far = (moved[:, :3].max(axis=1, initial=0.0) > self._config.reintegrate_gyro_rad_s) | (
+            moved[:, 3:].max(axis=1, initial=0.0) > self._config.reintegrate_accel_m_s2
+        )
+        for k in np.flatnonzero(far & self._links.inertial[:n]).tolist():
+            self.integrate(k, biases[k])
+
+    def pop_front(self) -> None:
+        """Forget the oldest link, and whether the oldest keyframe was at rest."""
+        del self._spans[0]
+        for array in self._links:
+            array[:-1] = array[1:].copy()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._spans.clear()
+        self._links.rest_weight[:] = 0.0
+
+    def _holes_s(self, span: ImuSpan) -> Array:
+        """Return the lengths [N - 1] of steps that are outages, 0 for the others."""
+        steps = np.diff(span.t_ns) * 1e-9
+        return np.where(steps > self._config.imu_max_gap_s, steps, 0.0)
+
+    def _outage(self, span: ImuSpan, duration_s: float) -> Array:
+        """Return the covariance [9, 9] that holes add: an unknown constant rate and force inside of each."""
+        out = np.zeros((9, 9))
+        holes = self._holes_s(span)
+        for i in np.flatnonzero(holes).tolist():
+            hole = float(holes[i])
+            after = duration_s - float(span.t_ns[i + 1] - span.t_ns[0]) * 1e-9
+            turned = self._config.outage_gyro_sigma_rad_s * hole
+            pushed = self._config.outage_accel_sigma_m_s2 * hole
+            by_push = np.zeros((9, 3))
+            by_push[_VELOCITY], by_push[_POSITION] = np.eye(3), np.eye(3) * (0.5 * hole + after)
+            out += pushed**2 * (by_push @ by_push.T)
+            # a wrong attitude turns gravity into acceleration from then on; taken in all directions, to be safe
+            leak = self._gravity_m_s2 * turned
+            out[_ROTATION, _ROTATION] += np.eye(3) * turned**2
+            out[_VELOCITY, _VELOCITY] += np.eye(3) * (leak * (0.5 * hole + after)) ** 2
+            out[_POSITION, _POSITION] += np.eye(3) * (0.5 * leak * (0.5 * hole + after) ** 2) ** 2
+        return out
+
+
+def jacobian_by_bias(span: Preintegrated) -> Array:
+    """Return d(rotation, velocity, position) by gyro and accel bias [9, 6]."""
+    out = np.zeros((9, 6))
+    out[_ROTATION, :3] = span.dR_dgyro
+    out[_VELOCITY, :3], out[_VELOCITY, 3:] = span.dv_dgyro, span.dv_daccel
+    out[_POSITION, :3], out[_POSITION, 3:] = span.dp_dgyro, span.dp_daccel
+    return out
+
+
+def information(span: Preintegrated, outage: Array | None = None) -> Array:
+    """Return the inverse [9, 9] of a span's covariance, with what an outage [9, 9] adds."""
+    P = span.covariance if outage is None else span.covariance + outage
+    scale = 1.0 / np.sqrt(np.diag(P) + _DAMP)
+    scaled = np.linalg.inv(P * np.outer(scale, scale) + 1e-9 * np.eye(9))
+    return 0.5 * (scaled + scaled.T) * np.outer(scale, scale)
