@@ -13,7 +13,16 @@ from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, Simulat
 from vislam.config import EkfConfig
 from vislam.ekf import Ekf, kernels
 from vislam.ekf.measurements import chi_square_limit, relative_motion, with_shared_error
-from vislam.geometry import quaternion_wxyz, se3_exp, so3_exp, so3_log, so3_right_jacobian, transform
+from vislam.geometry import (
+    quaternion_wxyz,
+    se3_exp,
+    skew,
+    so3_exp,
+    so3_left_jacobian,
+    so3_log,
+    so3_right_jacobian,
+    transform,
+)
 from vislam.imu import preintegrate
 from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
 from vislam.relative_motion import camera_displacement, direction_residual, metric_residual
@@ -58,6 +67,17 @@ def difference(y: Array, x: Array) -> Array:
     for at, rows in ((6, slice(0, 3)), (19, slice(15, 18))):
         d[rows] = so3_log(kernels.pose(x, 0, at)[:3, :3].T @ kernels.pose(y, 0, at)[:3, :3])
     return d
+
+
+def invariant(x: Array) -> Array:
+    """The matrix [21, 21] that turns the error of `NavState` at x into the right-invariant one (world axes)."""
+    T = np.eye(21)
+    for at_q, row, vectors in ((6, 0, ((0, 3), (3, 6))), (19, 15, ((16, 18),))):
+        R = kernels.pose(x, 0, at_q)[:3, :3]
+        T[row : row + 3, row : row + 3] = R
+        for at, error in vectors:
+            T[error : error + 3, row : row + 3] = skew(x[at : at + 3].copy()) @ R
+    return T
 
 
 def reference_step(x: Array, s0: Array, s1: Array, dt: float) -> Array:
@@ -176,7 +196,7 @@ def test_jacobians_of_direction(seed: int) -> None:
     np.testing.assert_allclose(axes.T @ c, 0.0, atol=1e-12)
 
 
-def test_correction_equals_the_textbook() -> None:
+def test_correction_is_the_textbook_s_in_the_invariant_error() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(21, 21)) * 0.1
     x, P = random_nominal(rng), root @ root.T
@@ -187,8 +207,45 @@ def test_correction_equals_the_textbook() -> None:
     assert nis == pytest.approx(residual @ np.linalg.inv(S) @ residual)
     y, P_after = x.copy(), P.copy()
     kernels.correct(y, P_after, K, H, noise, residual)
-    np.testing.assert_allclose(P_after, P - K @ S @ K.T, atol=1e-10)
-    np.testing.assert_allclose(difference(y, x), K @ residual, atol=1e-10)
+    before, after = invariant(x), invariant(y)
+    np.testing.assert_allclose(after @ P_after @ after.T, before @ (P - K @ S @ K.T) @ before.T, atol=1e-9)
+    xi = before @ K @ residual
+    for at_p, at_q, row in ((0, 6, 0), (16, 19, 15)):
+        turned = so3_exp(xi[row : row + 3])
+        expected = kernels.pose(x, at_p, at_q)
+        expected[:3, :3] = turned @ expected[:3, :3]
+        expected[:3, 3] = turned @ expected[:3, 3] + so3_left_jacobian(xi[row : row + 3]) @ xi[row + 3 : row + 6]
+        np.testing.assert_allclose(kernels.pose(y, at_p, at_q), expected, atol=1e-10)
+    velocity = so3_exp(xi[:3]) @ x[3:6] + so3_left_jacobian(xi[:3]) @ xi[6:9]
+    np.testing.assert_allclose(y[3:6], velocity, atol=1e-10)
+    np.testing.assert_allclose(y[10:16], x[10:16] + (K @ residual)[[12, 13, 14, 9, 10, 11]], atol=1e-12)
+
+
+def test_motions_tell_nothing_about_heading_and_place() -> None:
+    """However wrong the state was: the information about what cannot be seen is what it was at the start."""
+    rng = np.random.default_rng(8)
+    root = rng.normal(size=(21, 21))
+    x, P = random_nominal(rng), 0.1 * root @ root.T + 0.01 * np.eye(21)
+    unseen = np.zeros((21, 4))  # in the invariant error: turning about the vertical, shifting
+    unseen[[2, 17], 0] = 1.0
+    unseen[3:6, 1:] = unseen[18:21, 1:] = np.eye(3)
+
+    def information() -> Array:
+        T = invariant(x)
+        return unseen.T @ np.linalg.inv(T @ P @ T.T) @ unseen
+
+    start = information()
+    for i in range(30):
+        T = se3_exp(rng.normal(size=6) * 0.5)
+        unscaled = T.copy()
+        unscaled[:3, 3] /= np.linalg.norm(T[:3, 3])
+        vo = VoMeasurement(0, 0, unscaled if i % 2 else T, np.eye(6) * 1e-2, i % 2 == 0, Tracking.OK, 50)
+        m = relative_motion(x, P, vo, LEVER, 1.0)
+        _, K = kernels.innovation(P, m.H, m.noise, m.residual)
+        kernels.correct(x, P, K, m.H, m.noise, m.residual)
+    np.testing.assert_allclose(information(), start, rtol=1e-6, atol=1e-6 * np.abs(start).max())
+    seen = np.linalg.inv(P)
+    assert np.trace(seen) > 10 * np.trace(start)
 
 
 def test_clone_is_the_pose_itself() -> None:

@@ -11,6 +11,7 @@ from vislam.ekf import kernels
 from vislam.ekf.history import Event, Kind, Ledger
 from vislam.ekf.measurements import (
     LinearMeasurement,
+    absolute_pose,
     biases,
     chi_square_limit,
     relative_motion,
@@ -18,7 +19,7 @@ from vislam.ekf.measurements import (
     zero_velocity,
 )
 from vislam.imu import ImuNoise
-from vislam.messages import Array
+from vislam.messages import Array, VoMeasurement
 
 
 class Corrector:
@@ -44,10 +45,10 @@ class Corrector:
     def apply(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
         """Apply an event to x [23] and P [21, 21] in place, write its outcome into it, and return the new ledger."""
         event.was_reset, event.accepted, event.nis, event.reason = False, False, float("nan"), ""
+        event.degrees = 0
         if event.kind is Kind.KEYFRAME:
-            kernels.clone(x, P)
             event.outcome, event.accepted = "keyframes", True
-            return replace(ledger, clone_id=event.keyframe_id, shared=np.zeros((6, 6)))
+            return self._begin_keyframe(event, x, P, ledger)
         if event.kind is Kind.VO:
             return self._apply_vo(event, x, P, ledger)
         if event.kind is Kind.ZERO_VELOCITY:
@@ -59,6 +60,14 @@ class Corrector:
         self._correct(event, known, x, P, "bias", only=slice(9, 15))
         return ledger
 
+    def _begin_keyframe(self, event: Event, x: Array, P: Array, ledger: Ledger) -> Ledger:
+        if self._config.vision == "relative":
+            kernels.clone(x, P)
+            return replace(ledger, clone_id=event.keyframe_id, shared=np.zeros((6, 6)))
+        chained = ledger.T_odom_vo if ledger.vo_t_ns == event.t_ns else None  # vision was lost there: start over
+        T_odom_keyframe = kernels.pose(x, 0, 6) if chained is None else chained
+        return replace(ledger, clone_id=event.keyframe_id, T_odom_keyframe=T_odom_keyframe)
+
     def _apply_vo(self, event: Event, x: Array, P: Array, ledger: Ledger) -> Ledger:
         assert event.vo is not None
         if event.keyframe_id != ledger.clone_id:
@@ -67,6 +76,8 @@ class Corrector:
             event.reason = f"relative to keyframe {event.keyframe_id}, but the filter holds {have}"
             return ledger
         config = self._config
+        if config.vision == "accumulated":
+            return self._apply_accumulated(event, event.vo, x, P, ledger)
         measurement = relative_motion(x, P, event.vo, self._lever, config.vo_inflation)
         white, more, shared = with_shared_error(measurement, config.vo_shared_fraction, ledger.shared)
         widened = P.copy()
@@ -74,7 +85,26 @@ class Corrector:
         self._correct(event, white, x, widened, "vo")
         if event.accepted:
             P[:] = widened
-            return replace(ledger, shared=shared, rejects=0, last_vo_t_ns=event.t_ns)
+            ledger = replace(ledger, shared=shared)
+        return self._after_vo(event, P, ledger)
+
+    def _apply_accumulated(self, event: Event, vo: VoMeasurement, x: Array, P: Array, ledger: Ledger) -> Ledger:
+        """Chain the motion to the keyframe's pose, and take the sum for a measured pose in `odom`."""
+        if not vo.has_scale or vo.T_keyframe_body is None or ledger.T_odom_keyframe is None:
+            event.outcome = "vo_no_scale"
+            event.reason = "accumulated vision needs metric motion; use ekf.vision relative, a second camera or depth"
+            return ledger
+        config = self._config
+        T_odom_vo = ledger.T_odom_keyframe @ vo.T_keyframe_body
+        chained = absolute_pose(x, T_odom_vo, np.deg2rad(config.accumulated_sigma_deg), config.accumulated_sigma_m)
+        self._correct(event, chained, x, P, "vo")
+        return self._after_vo(event, P, replace(ledger, T_odom_vo=T_odom_vo, vo_t_ns=event.t_ns))
+
+    def _after_vo(self, event: Event, P: Array, ledger: Ledger) -> Ledger:
+        """Count rejections in a row; too many for too long widen the covariance."""
+        if event.accepted:
+            return replace(ledger, rejects=0, last_vo_t_ns=event.t_ns)
+        config = self._config
         since = event.t_ns if ledger.rejects == 0 else ledger.rejects_since_ns
         rejects = ledger.rejects + 1
         if rejects >= config.reset_rejects and event.t_ns - since >= config.reset_s * 1e9:
@@ -87,10 +117,14 @@ class Corrector:
     def _correct(
         self, event: Event, measurement: LinearMeasurement, x: Array, P: Array, name: str, only: slice | None = None
     ) -> None:
-        """Gate and apply; `only` lets the gain move just these error states (Schmidt-Kalman)."""
+        """Gate and apply; `only` lets the gain move just these error states (Schmidt-Kalman).
+
+        A continuous odom is the same idea: tilt that is learned metres away from the origin would swing the body about
+        it. With the gain of the clone's position at zero the past stays where it is, and P keeps the uncertainty of it.
+        """
         residual, H, noise = measurement.residual, measurement.H, measurement.noise
         nis, K = kernels.innovation(P, H, noise, residual)
-        event.nis = float(nis)
+        event.nis, event.degrees = float(nis), len(residual)
         limit = self._limits[len(residual)]
         if measurement.impossible:
             event.outcome, event.reason = f"{name}_opposed", measurement.impossible
@@ -102,5 +136,8 @@ class Corrector:
             masked = np.zeros_like(K)
             masked[only] = K[only]
             K = masked
+        elif event.vo is not None and event.vo.has_scale and self._config.odom == "continuous":
+            K[3:6] -= K[18:21]  # the body moves as much as its place against the clone is corrected
+            K[18:21] = 0.0
         kernels.correct(x, P, K, H, noise, residual)
         event.outcome, event.accepted = f"{name}_accepted", True

@@ -2,7 +2,13 @@
 
 The nominal state is that of Karpov et al. 2026, 16 numbers: position, velocity, quaternion, two biases; the error state
 has the 15 degrees of freedom behind them, plus 6 of the clone. Unlike there, visual odometry enters as relative motion:
-an accumulated visual pose taken as an absolute one makes the filter certain of its own drift.
+an accumulated visual pose taken as an absolute one makes the filter certain of its own drift. `vision = "accumulated"`
+does that all the same, for comparison: motions are chained from the pose of the filter at the start, and again from its
+pose after every loss of vision; where there is no observation the correction is skipped, as the paper has it.
+Corrections are those of an invariant filter, which heading and position need to stay consistent (`kernels.correct`).
+By default `odom` is continuous: a metric motion corrects where the body is against its keyframe, not where the keyframe
+is. `odom = "corrected"` lets all that is learned move the past too: the best estimate, in larger steps. Directions always
+do, for without scale the past is as long as what is learned later says.
 Measurements may come late and in any order: the filter goes back to their time and runs forward again, so the answer
 depends only on the set of measurements, not on when they came.
 """
@@ -16,7 +22,7 @@ import numpy as np
 from vislam.config import EkfConfig
 from vislam.ekf import kernels
 from vislam.ekf.corrector import Corrector
-from vislam.ekf.history import OUTCOMES, Checkpoint, Event, History, Kind, Ledger
+from vislam.ekf.history import OUTCOMES, Checkpoint, Event, History, Kind, Ledger, add_nis
 from vislam.ekf.measurements import why_unusable
 from vislam.geometry import interpolate, invert, quaternion_wxyz, skew
 from vislam.imu import ImuNoise, ImuSeries
@@ -73,6 +79,7 @@ class Ekf:
         self._applied = 0
         self._ledger = Ledger()
         self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *OUTCOMES), 0)
+        self._nis: dict[str, tuple[int, float, int]] = {}  # of events that the history has forgotten
 
     @property
     def initialised(self) -> bool:
@@ -83,6 +90,15 @@ class Ekf:
     def counters(self) -> dict[str, int]:
         """What came in and what became of it."""
         return {**self._counts, **{f"imu_{reason}": n for reason, n in self._series.refused.items()}}
+
+    @property
+    def nis_statistics(self) -> dict[str, tuple[int, float, int]]:
+        """Return count, sum of the normalised innovation squared and sum of its degrees of freedom, by measurement.
+
+        Of the measurements that were accepted, each as of the last time it was applied; what the gate refused is in
+        `counters`. The second over the third is 1 where the noise that the filter assumes is the true one.
+        """
+        return add_nis(self._nis, [] if self._history is None else self._history.events)
 
     @property
     def dead_reckoning_s(self) -> float:
@@ -110,6 +126,8 @@ class Ekf:
         self._P[:] = 0.0
         self._P[:15, :15] = 0.5 * (state.covariance + state.covariance.T)
         kernels.clone(x, self._P)
+        if self._config.vision == "accumulated":
+            self._P[15:] = self._P[:, 15:] = 0.0  # no clone: the 16 numbers of the paper
         self._t_ns = state.t_ns
         self._applied = 0
         self._ledger = Ledger(last_vo_t_ns=state.t_ns)
@@ -305,6 +323,9 @@ class Ekf:
         T_body = kernels.pose(self._x, 0, 6)
         T_body_keyframe = invert(vo.T_keyframe_body)
         T_keyframe = T_body @ T_body_keyframe
+        self._ledger = replace(self._ledger, clone_id=vo.keyframe_id, T_odom_keyframe=T_keyframe)
+        if self._config.vision == "accumulated":
+            return
         R_body = T_body[:3, :3]
         J = np.eye(6)
         J[:3, :3] = vo.T_keyframe_body[:3, :3]
@@ -320,7 +341,6 @@ class Ekf:
         P[:15, 15:] = P[15:, :15].T
         P[15:, 15:] = J @ P[0:6, 0:6] @ J.T + noise
         kernels.symmetrise(P)
-        self._ledger = replace(self._ledger, clone_id=vo.keyframe_id)
 
     def _snapshot(self) -> Checkpoint:
         return Checkpoint(self._t_ns, self._applied, self._x.copy(), self._P.copy(), self._ledger)
@@ -330,7 +350,7 @@ class Ekf:
         assert history is not None
         history.checkpoints.append(self._snapshot())
         if self._t_ns - history.checkpoints[0].t_ns > self._history_ns + 8 * self._checkpoint_ns:
-            history.forget_before(self._t_ns - self._history_ns)
+            self._nis = add_nis(self._nis, history.forget_before(self._t_ns - self._history_ns))
             self._series.forget_before(history.checkpoints[0].t_ns)
 
     def _restore(self, checkpoint: Checkpoint) -> None:

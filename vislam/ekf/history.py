@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -16,6 +17,7 @@ OUTCOMES = (  # every counter a measurement can end in, and what they cause
     "vo_gated",  # failed the chi-square gate
     "vo_opposed",  # moved against the direction seen
     "vo_no_keyframe",  # relative to a keyframe that is not the cloned one
+    "vo_no_scale",  # accumulated vision needs metric motion
     "vo_lost",
     "vo_invalid",
     "zero_velocity_accepted",
@@ -52,6 +54,7 @@ class Event:
     was_reset: bool = False
     accepted: bool = False
     nis: float = float("nan")
+    degrees: int = 0  # of freedom, of `nis`
     reason: str = "waits for an inertial sample as new"
 
 
@@ -64,6 +67,9 @@ class Ledger:
     rejects: int = 0  # in a row
     rejects_since_ns: int = 0
     last_vo_t_ns: int = 0
+    T_odom_keyframe: Array | None = None  # [4, 4] where accumulated vision has the keyframe
+    T_odom_vo: Array | None = None  # [4, 4] where it had the body last, and when
+    vo_t_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,13 +116,29 @@ class History:
         place = bisect_right(self.checkpoints, t_ns, key=_time)
         return self.checkpoints[place - 1] if place else None
 
-    def forget_before(self, t_ns: int) -> None:
-        """Drop what is not needed to go back to `t_ns` or later; one checkpoint always stays."""
+    @property
+    def events(self) -> list[Event]:
+        """Those not forgotten, in time order."""
+        return self._events
+
+    def forget_before(self, t_ns: int) -> list[Event]:
+        """Drop what is not needed to go back to `t_ns` or later and return the events of it; one checkpoint stays."""
         keep = max(bisect_right(self.checkpoints, t_ns, key=_time) - 1, 0)
         del self.checkpoints[:keep]
         drop = min(self.checkpoints[0].applied - self._forgotten, len(self._events))
-        del self._events[:drop]
+        forgotten, self._events = self._events[:drop], self._events[drop:]
         self._forgotten += drop
+        return forgotten
+
+
+def add_nis(sums: dict[str, tuple[int, float, int]], events: Iterable[Event]) -> dict[str, tuple[int, float, int]]:
+    """Return count, sum of NIS and sum of degrees of freedom by kind, with those of accepted events added."""
+    out = dict(sums)
+    for event in events:
+        if event.accepted and event.degrees:
+            count, nis, degrees = out.get(event.kind.value, (0, 0.0, 0))
+            out[event.kind.value] = count + 1, nis + event.nis, degrees + event.degrees
+    return out
 
 
 def _time(item: Event | Checkpoint) -> int:

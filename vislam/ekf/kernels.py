@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vislam.geometry import skew, so3_exp, so3_left_jacobian
 from vislam.messages import Array
 
 NOMINAL = 23
@@ -241,19 +242,39 @@ def predict_run(
 
 @njit(cache=True, nogil=True)
 def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Array) -> None:
-    """Apply a gain K [21, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain."""
+    """Apply a gain K [21, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain.
+
+    The correction is that of the right-invariant error (Barrau and Bonnabel, "The invariant extended Kalman filter as a
+    stable observer", IEEE TAC 2017): rotation, position and velocity move along the group SE_2(3), and P, though kept
+    in the error of `NavState`, is carried to the new state so that the invariant error keeps its covariance. What
+    vision and gravity cannot tell, heading and position, then stays untold however often the state is corrected.
+    """
     A = np.eye(ERRORS) - K @ H
-    P[:, :] = A @ P @ A.T + K @ noise @ K.T
-    symmetrise(P)
     d = K @ residual
+    G = np.eye(ERRORS)  # from the error about the old state to that about the new
+    _move(x, d, G, 6, 0, ((0, 3), (3, 6)))
+    _move(x, d, G, 19, 15, ((16, 18),))
     for i in range(3):
-        x[i] += d[3 + i]
-        x[3 + i] += d[6 + i]
         x[10 + i] += d[12 + i]
         x[13 + i] += d[9 + i]
-        x[16 + i] += d[18 + i]
-    turn(x, 6, d[0], d[1], d[2])
-    turn(x, 19, d[15], d[16], d[17])
+    A = G @ A
+    K = G @ K
+    P[:, :] = A @ P @ A.T + K @ noise @ K.T
+    symmetrise(P)
+
+
+@njit(cache=True, nogil=True)
+def _move(x: Array, d: Array, G: Array, at_q: int, row: int, vectors: tuple[tuple[int, int], ...]) -> None:
+    """Correct the rotation whose error is at `row`, and the vectors (place in x, place of error) that turn with it."""
+    turned = d[row : row + 3].copy()
+    R = pose(x, 0, at_q)[:3, :3].copy()
+    along = so3_left_jacobian(R @ turned)
+    G[row : row + 3, row : row + 3] = so3_exp(-turned)
+    for at_x, at_error in vectors:
+        moved = along @ d[at_error : at_error + 3].copy()
+        x[at_x : at_x + 3] += moved
+        G[at_error : at_error + 3, row : row + 3] = -skew(moved) @ R
+    turn(x, at_q, turned[0], turned[1], turned[2])
 
 
 @njit(cache=True, nogil=True)

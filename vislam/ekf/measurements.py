@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from vislam.ekf.kernels import ERRORS, pose
+from vislam.geometry import so3_left_jacobian_inverse, so3_log
 from vislam.messages import Array, VoMeasurement
 from vislam.relative_motion import direction_noise, direction_residual, metric_residual
 
@@ -73,6 +74,21 @@ def relative_motion(x: Array, P: Array, vo: VoMeasurement, lever_m: Array, infla
         noise = direction_noise(T, covariance, axes, float(np.sqrt(along * along + variance)))
     noise = noise + _FLOOR * np.eye(len(noise))
     return LinearMeasurement(residual, _spread(J_clone, J_body), noise, impossible)
+
+
+def absolute_pose(x: Array, T_odom_vo: Array, sigma_rad: float, sigma_m: float) -> LinearMeasurement:
+    """Return orientation and position of the body as a visual chain has them: z = [p_vo, theta_vo], R fixed.
+
+    The measurement of Karpov et al. 2026, section 4. Its true error grows and repeats itself from frame to frame, which
+    a fixed R of independent errors does not say.
+    """
+    residual, H = np.empty(6), np.zeros((6, ERRORS))
+    T_body = pose(x, 0, 6)
+    residual[:3] = so3_log(T_body[:3, :3].T @ T_odom_vo[:3, :3])
+    residual[3:] = T_odom_vo[:3, 3] - T_body[:3, 3]
+    H[:3, :3] = so3_left_jacobian_inverse(residual[:3])
+    H[3:, 3:6] = np.eye(3)
+    return LinearMeasurement(residual, H, np.diag(np.repeat([sigma_rad**2, sigma_m**2], 3)))
 
 
 def with_shared_error(
