@@ -77,6 +77,17 @@ def test_loose_odometry_between_loops_proves_nothing(world: World) -> None:
     assert park.group_of(true[2]) == []
 
 
+def test_travel_takes_better_variances_of_the_newest_motions() -> None:
+    travel, again = Travel(), Travel()
+    for k in range(1, 8):
+        travel.append(9.0 if k in (5, 6) else float(k), 0.1 * k, 1.0)
+        again.append(float(k), 0.5 if k == 5 else 0.1 * k, 1.0)
+    travel.amend(6, 6.0, 0.6)
+    travel.amend(5, 5.0, 0.5)
+    for i, j in ((0, 7), (4, 5), (5, 6), (6, 7), (0, 4)):
+        np.testing.assert_allclose(travel.between(i, j), again.between(i, j))
+
+
 def test_full_park_gives_up_its_oldest(world: World) -> None:
     park, travel = CarPark(GraphConfig(parked_max=2)), _travel(world)
     models = [_model(world.false_loop(n, n, 100 + n)) for n in range(3)]

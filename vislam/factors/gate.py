@@ -47,6 +47,13 @@ class Travel:
         self._m2.append(self._m2[-1] + variance_m2)
         self._distance_m.append(self._distance_m[-1] + distance_m)
 
+    def amend(self, k: int, variance_rad2: float, variance_m2: float) -> None:
+        """Replace the variances of the motion to keyframe k, one of the newest."""
+        for sums, variance in ((self._rad2, variance_rad2), (self._m2, variance_m2)):
+            delta = variance - (sums[k] - sums[k - 1])
+            for n in range(k, len(sums)):
+                sums[n] += delta
+
     def between(self, i: int, j: int) -> tuple[float, float, float]:
         """Return variance in rad^2 and m^2 per axis and the distance in m travelled between two keyframes."""
         rad2, distance = abs(self._rad2[j] - self._rad2[i]), abs(self._distance_m[j] - self._distance_m[i])

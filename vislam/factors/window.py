@@ -80,13 +80,18 @@ class WindowOdometry:
         edge = self._edges[k]
         assert edge is not None and self._newest is not None
         T = nearest_rigid(before.T_map_body @ edge.T_previous_body)
-        covariance = self._covariance(edge, vo_scale)
         named: dict[Label, gtsam.NonlinearFactor] = {("edge", k): self._edge_factor(edge, vo_scale)}
         if k in self._tilts:
             named["tilt", k] = self._tilt_factor(self._tilts[k])
-        variances = float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0
         note = self._newest.note if k == self._newest.id else ""
-        return Step([], Guess(T, before.velocity_map_m_s, before.bias), *variances, note=note, named=named)
+        guess = Guess(T, before.velocity_map_m_s, before.bias)
+        return Step([], guess, *self._variances(edge, vo_scale), note=note, named=named)
+
+    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
+        """Return older keyframes whose edge changed with the newest one, with its variances in rad^2 and m^2."""
+        assert self._newest is not None
+        older = [edge for edge in self._newest.edges if edge.to_id != self._newest.id]
+        return [(edge.to_id, *self._variances(edge, vo_scale)) for edge in older]
 
     def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         """See Odometry."""
@@ -102,6 +107,10 @@ class WindowOdometry:
     def reach_m(self, k: int) -> float:
         """See Odometry."""
         return SPEED_MAX_M_S * (self._t_ns[k] - self._t_ns[k - 1]) * 1e-9
+
+    def _variances(self, edge: EdgeRecord, vo_scale: float) -> tuple[float, float]:
+        covariance = self._covariance(edge, vo_scale)
+        return float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0
 
     def _covariance(self, edge: EdgeRecord, vo_scale: float) -> Array:
         config = self._config

@@ -109,6 +109,8 @@ class PoseGraph:
             step, note = self._estimator.extend()
             moved = invert(self._estimator.poses[-2]) @ self._estimator.poses[-1]
             self._travel.append(step.variance_rad2, step.variance_m2, float(np.linalg.norm(moved[:3, 3])))
+            for older, variance_rad2, variance_m2 in self._source.amended(self._estimator.vo_scale):
+                self._travel.amend(older, variance_rad2, variance_m2)
             notes = [step.note, note]
         self._keyframes.append(record)
         accepted, refused = self._close(edges, notes)

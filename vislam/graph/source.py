@@ -60,6 +60,9 @@ class Source(Protocol):
         Raises DataError, and changes nothing, on observations that cannot be used.
         """
 
+    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
+        """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
+
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
         """Return the state of keyframe k in map with its covariance, NaN where nobody can tell."""
 
@@ -88,6 +91,10 @@ class MotionSource:
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
         """See Source."""
         self._odometry.append(record)
+        return []
+
+    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
+        """See Source."""
         return []
 
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
@@ -146,6 +153,10 @@ class WindowSource:
             "rejected_tracks": update.rejected_tracks,
         }
         return [said]
+
+    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
+        """See Source."""
+        return self._odometry.amended(vo_scale)
 
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
         """See Source; the window's state carried to the keyframe's pose in map, whose covariance is the graph's."""

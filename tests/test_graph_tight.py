@@ -1,0 +1,348 @@
+"""The pose graph on top of a sliding window: what it takes from it, and what it does with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_window import FakeWindow
+from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
+from test_graph_faults import Failing
+
+from vislam.config import GraphConfig, WindowConfig
+from vislam.errors import DataError
+from vislam.factors.estimator import Estimator
+from vislam.factors.journal import KeyframeRecord, StartRecord, WindowRecord
+from vislam.factors.loop import LoopModel
+from vislam.factors.window import WindowOdometry
+from vislam.geometry import invert, so3_log
+from vislam.graph import PoseGraph
+from vislam.graph.source import in_map
+from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision
+from vislam.window.messages import WindowUpdate
+
+TIGHT = GraphConfig(
+    coupling="tight", window_inflation=1.0, window_floor_deg=0.0, window_floor_m=0.0, tilt_floor_deg=0.0
+)
+Spoil = Callable[[WindowUpdate], WindowUpdate]
+
+
+@pytest.fixture
+def world() -> World:
+    return World(26.0, seed=21)
+
+
+@pytest.fixture
+def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[PoseGraph, FakeWindow]]:
+    def build(world: World, imu: bool = True, config: GraphConfig = TIGHT, **kwargs: float):
+        window = FakeWindow(world, imu=imu, **kwargs)
+        monkeypatch.setattr("vislam.window.SlidingWindow", lambda *_: window, raising=False)
+        graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
+        graph.initialise(world.initial_state() if imu else None, None if imu else world.truth[0])
+        return graph, window
+
+    return build
+
+
+def feed(graph: PoseGraph, world: World, begin: int, end: int, loop_every: int = 0) -> list[GraphUpdate]:
+    updates = []
+    for k in range(begin, end):
+        edges = [world.loop(k, k - 100, k)] if loop_every and k > 102 and k % loop_every == 0 else []
+        updates.append(graph.add(world.packet(k), edges))
+    return updates
+
+
+def chain(window: FakeWindow, count: int, keyframes: int) -> np.ndarray:
+    T = [window.world.truth[0]]
+    for k in range(1, count):
+        T.append(T[-1] @ window.edge(k, settled=k < count - keyframes).T_from_to)
+    return np.stack(T)
+
+
+@pytest.mark.parametrize("imu", [True, False])
+def test_every_provisional_edge_makes_room_for_the_settled_one(world: World, make, imu: bool) -> None:
+    graph, window = make(world, imu)
+    feed(graph, world, 0, 80)
+    factors = graph._estimator._solver._isam.getFactorsUnsafe()
+    alive = [factors.at(n) for n in range(factors.size()) if factors.exists(n)]
+    tilts = sum(k % TIGHT.tilt_every == 0 for k in range(80 - window.keyframes)) if imu else 0
+    assert len(alive) == 1 + 79 + tilts
+    if not imu:  # without tilts and loops the graph is the chain of settled edges
+        settled = 80 - window.keyframes
+        np.testing.assert_allclose(graph.poses()[:settled], chain(window, 80, window.keyframes)[:settled], atol=1e-4)
+
+
+@pytest.mark.parametrize("imu", [True, False])
+def test_loops_correct_the_chain_and_reach_the_newest_keyframe(make, imu: bool) -> None:
+    world = World(26.0, seed=21, vo_sigma_rad=np.deg2rad(0.5), vo_sigma_m=0.012)
+    graph, window = make(world, imu)
+    feed(graph, world, 0, 115)
+    before = np.linalg.norm(graph.poses()[115 - 1, :3, 3] - world.truth[114, :3, 3])
+    update = graph.add(world.packet(115), [world.loop(1, 14, 115, 0.001, 0.002)])
+    assert update.accepted_loop_ids == (1,)
+    after = np.linalg.norm(graph.poses()[115, :3, 3] - world.truth[115, :3, 3])
+    assert after < 0.5 * before
+    updates = feed(graph, world, 116, world.count, loop_every=4)
+    graph.finish()
+    odometry = chain(window, world.count, window.keyframes)
+    print(f"odometry {_lap_error_m(odometry, world):.3f} m, graph {_lap_error_m(graph.poses(), world):.3f} m")
+    assert _lap_error_m(graph.poses(), world) < 0.2 * _lap_error_m(odometry, world)
+    assert all(u.note == "" for u in updates)
+
+
+def _lap_error_m(poses: np.ndarray, world: World) -> float:
+    """Error of where keyframes are relative to those one lap before, wherever the whole lies in the world."""
+    errors = [
+        (invert(poses[k - 100]) @ poses[k] - invert(world.truth[k - 100]) @ world.truth[k])[:3, 3]
+        for k in range(106, world.count)
+    ]
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def test_work_per_keyframe_is_bounded(world: World, make) -> None:
+    graph, _ = make(world, keyframes=12)
+    feed(graph, world, 0, 60)
+    records = [r for r in graph.journal if isinstance(r, WindowRecord)]
+    assert [r.id for r in records] == list(range(60))
+    for record in records[1:]:
+        assert len(record.edges) <= 2 + TIGHT.window_refresh_max  # the newest, the settled one, and what moved
+        assert sum(edge.settled for edge in record.edges) == (record.id >= 12)
+        assert len(record.tilts) <= 1
+    refreshed = sum(len(record.edges) - 2 for record in records[12:])
+    assert refreshed > 0
+
+
+def test_small_changes_of_provisional_edges_wait(world: World, make) -> None:
+    patient = replace(TIGHT, window_refresh_sigma=1e9)
+    graph, window = make(world, config=patient)
+    constant = window.edge
+    window.edge = lambda k, settled: replace(constant(k, True), settled=settled)  # never changes while it ages
+    feed(graph, world, 0, 40)
+    for record in graph.journal:
+        if isinstance(record, WindowRecord) and record.id > window.keyframes:
+            assert len(record.edges) == 2
+
+
+def test_tilts_level_the_map(world: World, make) -> None:
+    """A tilted first pose is levelled; without an IMU there is nothing to tell."""
+    graph, _ = make(world)
+    state = world.initial_state()
+    lean = np.eye(4)
+    lean[:3, :3] = world.truth[0, :3, :3] @ _rotation([0.008, -0.006, 0.0])
+    graph.initialise(replace(state, T_world_body=np.block([[lean[:3, :3], world.truth[0, :3, 3:]], [0, 0, 0, 1]])))
+    feed(graph, world, 0, 120)
+    error = [_tilt(graph.poses()[k], world.truth[k]) for k in range(0, 110)]
+    print(f"tilt {np.rad2deg(np.mean(error)):.3f} deg of {np.rad2deg(0.01):.3f}")
+    assert np.mean(error) < 0.004
+
+
+def _rotation(w: list[float]) -> np.ndarray:
+    from vislam.geometry import so3_exp
+
+    return so3_exp(np.array(w))
+
+
+def _tilt(T: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.arccos(np.clip(T[2, :3] @ truth[2, :3], -1.0, 1.0)))
+
+
+def test_states_live_in_map(world: World, make) -> None:
+    graph, _ = make(world)
+    updates = feed(graph, world, 0, world.count, loop_every=5)
+    newest = updates[-1].newest
+    assert newest is not None
+    states = graph.states()
+    np.testing.assert_array_equal(newest.T_world_body, graph.poses()[-1])
+    for k in (0, 40, 90, world.count - 1):
+        state = states[k]
+        np.testing.assert_array_equal(state.T_world_body, graph.poses()[k])
+        assert np.linalg.norm(state.velocity_world_m_s - world.velocity[k]) < 0.15  # local is turned by 30 degrees
+        assert np.all(np.linalg.eigvalsh(state.covariance) > -1e-12)
+        pose = graph._estimator.joint_covariance([(ord("x") << 56) | k])
+        np.testing.assert_allclose(state.covariance[:3, :3], pose[:3, :3], rtol=1e-9)
+    assert np.linalg.norm(newest.gyro_bias_rad_s - world.true_gyro_bias[-1]) < 0.01
+
+
+def test_state_in_map_keeps_what_the_window_says_about_velocity_given_the_pose() -> None:
+    """With the window's own pose covariance put back in, its joint covariance comes out, turned."""
+    rng = np.random.default_rng(4)
+    print("seed 4")
+    A = rng.normal(size=(15, 15)) * 0.1
+    world = World(2.0)
+    state = replace(world.initial_state(), covariance=A @ A.T)
+    same = in_map(state, state.T_world_body, state.covariance[:6, :6])
+    np.testing.assert_allclose(same.covariance, state.covariance, atol=1e-10)
+    tighter = in_map(state, state.T_world_body, state.covariance[:6, :6] * 0.1)
+    assert np.trace(tighter.covariance[6:9, 6:9]) < np.trace(state.covariance[6:9, 6:9])
+    assert np.linalg.eigvalsh(tighter.covariance)[0] > -1e-12
+    turned = in_map(state, world.truth[3], None)
+    R = world.truth[3, :3, :3] @ state.T_world_body[:3, :3].T
+    np.testing.assert_allclose(turned.velocity_world_m_s, R @ state.velocity_world_m_s)
+    np.testing.assert_allclose(turned.covariance[6:9, 6:9], R @ state.covariance[6:9, 6:9] @ R.T)
+
+
+def test_without_imu_states_are_poses(world: World, make) -> None:
+    graph, _ = make(world, imu=False)
+    updates = feed(graph, world, 0, 20)
+    assert updates[-1].newest is None
+    state = graph.states()[-1]
+    assert np.all(np.isnan(state.velocity_world_m_s))
+    assert np.all(np.isfinite(state.covariance[:6, :6])) and np.all(np.isnan(state.covariance[6:, 6:]))
+
+
+def test_odom_follows_map(world: World, make) -> None:
+    graph, _ = make(world)
+    for k in range(30):
+        T_odom_body = invert(world.truth[0]) @ world.truth[k]
+        update = graph.add(world.packet(k), T_odom_body=T_odom_body)
+        np.testing.assert_allclose(update.T_map_odom @ T_odom_body, graph.poses()[-1], atol=1e-9)
+
+
+def test_half_of_the_loops_false(world: World, make) -> None:
+    graph, _ = make(world)
+    rng = np.random.default_rng(5)
+    true = set()
+    for k in range(world.count):
+        edges = []
+        if k > 102 and k % 3 == 0:
+            edges = [world.loop(k, k - 100, k), world.false_loop(1000 + k, int(rng.integers(0, k - 20)), k)]
+            true.add(k)
+        graph.add(world.packet(k), edges)
+    accepted = {r.loop_id for r in graph.edge_reports() if r.decision is LoopDecision.ACCEPTED}
+    assert accepted == true
+
+
+def test_loops_that_contradict_the_window_teach_distrust(make) -> None:
+    world = World(50.0, seed=3, vo_sigma_rad=np.deg2rad(0.3), vo_sigma_m=0.008)
+    graph, window = make(world, imu=False, sigma_scale=4.0)
+    accepted = []
+    for k in range(world.count):
+        edges = [world.loop(k, k - 100, k)] if k > 102 and k % 5 == 0 else []
+        update = graph.add(world.packet(k), edges)
+        accepted += update.accepted_loop_ids
+    assert update.details is not None
+    print(f"vo_scale {update.details['vo_scale']:.1f}, {len(accepted)} accepted")
+    assert update.details["vo_scale"] > 2.0 and len(accepted) > 20
+    assert rmse_m(graph.poses(), world.truth) < 0.3 * rmse_m(chain(window, world.count, 6), world.truth)
+
+
+def test_the_journal_alone_rebuilds_the_graph(world: World, make) -> None:
+    graph, _ = make(world)
+    feed(graph, world, 0, 100)
+    odometry = WindowOdometry(TIGHT)
+    again: Estimator[LoopModel] = Estimator(TIGHT, odometry)
+    for record in graph.journal:
+        if isinstance(record, StartRecord):
+            odometry.begin(record)
+        elif isinstance(record, WindowRecord):
+            odometry.append(record)
+            again.begin() if record.id == 0 else again.extend()
+    np.testing.assert_array_equal(again.poses, graph.poses())
+    assert sum(isinstance(r, KeyframeRecord) for r in graph.journal) == 100
+
+
+@pytest.mark.parametrize(
+    ("failures", "solver"), [(1, "isam2-qr"), (2, "isam2-qr"), (3, "batch-lm")], ids=["qr", "qr from batch", "batch"]
+)
+def test_poisoned_update_is_survived(
+    world: World, make, monkeypatch: pytest.MonkeyPatch, failures: int, solver: str
+) -> None:
+    failing = Failing(monkeypatch)
+    graph, _ = make(world)
+    feed(graph, world, 0, 60)
+    before = graph.poses()
+    failing.armed = failures
+    update = graph.add(world.packet(60))
+    assert "gtsam failed" in update.note
+    assert update.details is not None and update.details["solver"] == solver
+    np.testing.assert_allclose(graph.poses()[:60], before, atol=5e-3)
+    assert all(u.note == "" for u in feed(graph, world, 61, 110, loop_every=4))
+    assert rmse_m(graph.poses(), world.truth[:110]) < 0.2
+    assert not failing.used_after_throw
+    factors = graph._estimator._whole(graph._estimator._values, graph._estimator.loops)[0]
+    assert np.isfinite(factors.error(graph._estimator._values))
+
+
+def test_poisoned_loop_is_given_up_and_the_window_goes_on(world: World, make, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = Failing(monkeypatch)
+    graph, _ = make(world)
+    feed(graph, world, 0, 110)
+    relative_covariance = graph.relative_covariance
+
+    def arm(i: int, j: int) -> np.ndarray:
+        failing.armed = 2
+        return relative_covariance(i, j)
+
+    monkeypatch.setattr(graph, "relative_covariance", arm)
+    update = graph.add(world.packet(110), [world.loop(7, 5, 105)])
+    assert 7 in update.rejected_loop_ids and "without the new loops" in update.note
+    monkeypatch.undo()
+    assert all(u.note == "" for u in feed(graph, world, 111, 120))
+
+
+def test_a_packet_that_the_window_refuses_changes_nothing(world: World, make, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, window = make(world)
+    feed(graph, world, 0, 20)
+    before, journal = graph.poses(), len(graph.journal)
+    good, add = world.packet(20), window.add
+
+    def refuse(packet: KeyframePacket, _: object = None) -> WindowUpdate:
+        raise DataError("keyframe 20: its observations hold NaN")
+
+    monkeypatch.setattr(window, "add", refuse)
+    with pytest.raises(DataError, match="observations"):
+        graph.add(good)
+    np.testing.assert_array_equal(graph.poses(), before)
+    assert len(graph.journal) == journal
+    monkeypatch.setattr(window, "add", add)
+    assert graph.add(good).note == ""
+
+
+def _with_edges(update: WindowUpdate, **changes: object) -> WindowUpdate:
+    return replace(update, odometry=tuple(replace(edge, **changes) for edge in update.odometry))
+
+
+SPOILED: dict[str, Spoil] = {
+    "NaN covariances": lambda u: _with_edges(u, covariance=np.full((6, 6), np.nan)),
+    "indefinite covariances": lambda u: _with_edges(u, covariance=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])),
+    "NaN motions": lambda u: _with_edges(u, T_from_to=np.full((4, 4), np.nan)),
+    "no edges": lambda u: replace(u, odometry=()),
+    "NaN tilts": lambda u: replace(u, tilts=tuple(replace(t, up_body=np.full(3, np.nan)) for t in u.tilts)),
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_a_window_that_gives_nonsense_is_bridged(world: World, make, monkeypatch, name: str) -> None:
+    graph, window = make(world)
+    feed(graph, world, 0, 40)
+    add = window.add
+    monkeypatch.setattr(window, "add", lambda packet, T=None: SPOILED[name](add(packet, T)))
+    update = feed(graph, world, 40, 42)[-1]
+    assert ("tilts" in name) or "no usable edge" in update.note
+    monkeypatch.setattr(window, "add", add)
+    updates = feed(graph, world, 42, 60)
+    assert updates[-1].note == ""
+    assert rmse_m(graph.poses(), world.truth[:60]) < 0.1
+
+
+def test_two_runs_give_the_same_bytes(make) -> None:
+    runs = []
+    for _ in range(2):
+        world = World(24.0, seed=9)
+        graph, _ = make(world)
+        feed(graph, world, 0, world.count, loop_every=4)
+        runs.append(graph.poses().tobytes() + graph.states()[-1].covariance.tobytes())
+    assert runs[0] == runs[1]
+
+
+def test_yaw_is_free_under_tilts(world: World, make) -> None:
+    """Loops may turn the map about the vertical: tilts must not resist."""
+    graph, _ = make(world, imu=True)
+    feed(graph, world, 0, 110)
+    covariance = graph.states()[-1].covariance
+    R = graph.poses()[-1, :3, :3]
+    world_axes = R @ covariance[:3, :3] @ R.T
+    assert np.sqrt(world_axes[2, 2]) > 1.5 * np.sqrt(max(world_axes[0, 0], world_axes[1, 1]))
+    assert np.linalg.norm(so3_log(np.ascontiguousarray(R.T @ world.truth[109, :3, :3]))) < 0.05
