@@ -1,0 +1,395 @@
+"""Compiled arithmetic of tracks: where a point is, what its pixels say about the poses they were seen from.
+
+One observation is a row [14]: direction x, y on z = 1; d(pixel)/d(x, y) [2, 2] by rows; the same six numbers for the
+right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read. NaN where not measured.
+Residuals are whitened: left pixels; right minus left pixels (matching left to right is better than following a corner
+over time, and both share the error of the corner); inverse depth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.geometry import skew, so3_exp
+from vislam.messages import Array
+
+COLUMNS = 14
+ROWS_MAX = 5  # of one observation
+_STEPS = 10
+_CONVERGED = 1e-4  # of the cost
+_FAR_RHO = 1e-3  # 1/m: no parallax tells such points from infinity
+_NEAR_RHO = 20.0  # 1/m
+_KERNEL = 3.0  # Cauchy, in standard deviations, while the point is found
+
+USED, FEW, PARALLAX, RANGE, GATED = 0, 1, 2, 3, 4
+
+
+@njit(cache=True, nogil=True)
+def observe(y: Array, seen: Array, sigmas: Array, R_cam1_cam0: Array, t_cam1_cam0: Array, r: Array, J: Array) -> int:
+    """Write the whitened residuals r [5] and d(prediction)/dy J [5, 3] of a point y [3] in cam0; return their number.
+
+    `sigmas` [3]: pixels, disparity in pixels, inverse depth in 1/m. 0 rows: the point is not in front of the camera.
+    """
+    if not y[2] > 1e-6:
+        return 0
+    z = 1.0 / y[2]
+    ex = seen[0] - y[0] * z
+    ey = seen[1] - y[1] * z
+    D = np.zeros((2, 3))
+    for i in range(2):
+        a, b = seen[2 + 2 * i], seen[3 + 2 * i]
+        r[i] = a * ex + b * ey
+        D[i, 0], D[i, 1], D[i, 2] = a * z, b * z, -(a * y[0] + b * y[1]) * z * z
+        for k in range(3):
+            J[i, k] = D[i, k] / sigmas[0]
+    rows = 2
+    if np.isfinite(seen[6]):
+        y1 = R_cam1_cam0 @ y + t_cam1_cam0
+        if not y1[2] > 1e-6:
+            return 0
+        z1 = 1.0 / y1[2]
+        ex, ey = seen[6] - y1[0] * z1, seen[7] - y1[1] * z1
+        for i in range(2):
+            a, b = seen[8 + 2 * i], seen[9 + 2 * i]
+            r[rows] = (a * ex + b * ey - r[i]) / sigmas[1]
+            d0, d1, d2 = a * z1, b * z1, -(a * y1[0] + b * y1[1]) * z1 * z1
+            for k in range(3):
+                right = d0 * R_cam1_cam0[0, k] + d1 * R_cam1_cam0[1, k] + d2 * R_cam1_cam0[2, k]
+                J[rows, k] = (right - D[i, k]) / sigmas[1]
+            rows += 1
+    if np.isfinite(seen[12]):
+        r[rows] = (seen[12] - z) / sigmas[2]
+        J[rows, 0], J[rows, 1], J[rows, 2] = 0.0, 0.0, -z * z / sigmas[2]
+        rows += 1
+    r[0] /= sigmas[0]
+    r[1] /= sigmas[0]
+    return rows
+
+
+@njit(cache=True, nogil=True)
+def camera_poses(
+    at: NDArray[np.int64],
+    seen: Array,
+    R: Array,
+    p: Array,
+    rate: Array,
+    velocity: Array,
+    R_body_cam: Array,
+    p_body_cam: Array,
+) -> tuple[Array, Array]:
+    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 14] made from the clones `at` [M].
+
+    Clones: R [C, 3, 3], p [C, 3], body rate [C, 3], world velocity [C, 3]; the last two carry the pose to the time at
+    which a rolling shutter read the row.
+    """
+    out_R = np.empty((len(at), 3, 3))
+    out_c = np.empty((len(at), 3))
+    for m in range(len(at)):
+        i = at[m]
+        R_world_body, centre = R[i].copy(), p[i].copy()
+        if seen[m, 13] != 0.0:
+            R_world_body = R_world_body @ so3_exp(rate[i] * seen[m, 13])
+            centre = centre + velocity[i] * seen[m, 13]
+        out_c[m] = centre + R_world_body @ p_body_cam
+        out_R[m] = (R_world_body @ R_body_cam).T
+    return out_R, out_c
+
+
+@njit(cache=True, nogil=True)
+def triangulate(
+    seen: Array,
+    R_cam: Array,
+    centres: Array,
+    sigmas: Array,
+    R_cam1_cam0: Array,
+    t_cam1_cam0: Array,
+) -> tuple[Array, float, float]:
+    """Return a point [3] in the world, its inverse depth in the first view and that one's sigma (1/m).
+
+    A linear start, then Levenberg-Marquardt on direction and inverse depth (Montiel et al., RSS 2006) with a Cauchy
+    kernel, since one bad pixel must not decide where a point is.
+    """
+    R_a = np.ascontiguousarray(R_cam[0].T)
+    state = np.array([seen[0, 0], seen[0, 1], _first_rho(seen, R_cam, centres, R_cam1_cam0, t_cam1_cam0)])
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    damping = 1e-3
+    cost, A, g = _normal(state, seen, R_cam, centres, R_a, sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+    for _ in range(_STEPS):
+        damped = A.copy()
+        for k in range(3):
+            damped[k, k] += damping * A[k, k] + 1e-12
+        trial = state + np.linalg.solve(damped, g)
+        trial[2] = min(max(trial[2], _FAR_RHO), _NEAR_RHO)
+        new_cost, new_A, new_g = _normal(trial, seen, R_cam, centres, R_a, sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+        if new_cost < cost:
+            done = cost - new_cost < _CONVERGED * (cost + 1e-3)
+            state, cost, A, g = trial, new_cost, new_A, new_g
+            damping *= 0.1
+            if done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+    point = centres[0] + R_a @ np.array([state[0], state[1], 1.0]) / state[2]
+    for k in range(3):
+        A[k, k] += 1e-12
+    variance = np.linalg.inv(A)[2, 2]
+    return point, state[2], np.sqrt(max(variance, 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _first_rho(seen: Array, R_cam: Array, centres: Array, R_cam1_cam0: Array, t_cam1_cam0: Array) -> float:
+    """Return an inverse depth in the first view: as measured, or where the rays meet best on the first one."""
+    total, weight = 0.0, 0.0
+    base = np.array([seen[0, 0], seen[0, 1], 1.0])
+    ray = R_cam[0].T @ base
+    for m in range(len(seen)):
+        if m == 0 and np.isfinite(seen[m, 12]):
+            return min(max(seen[m, 12], _FAR_RHO), _NEAR_RHO)
+        # (direction seen) x (rho (c0 - c) + ray) = 0 in camera m is linear in rho
+        a, b = R_cam[m] @ ray, R_cam[m] @ (centres[0] - centres[m])
+        d = np.array([seen[m, 0], seen[m, 1], 1.0])
+        u, w = np.cross(d, a), np.cross(d, b)
+        total -= u @ w
+        weight += w @ w
+        if np.isfinite(seen[m, 6]):
+            d = np.array([seen[m, 6], seen[m, 7], 1.0])
+            u, w = np.cross(d, R_cam1_cam0 @ a), np.cross(d, R_cam1_cam0 @ b + t_cam1_cam0)
+            total -= u @ w
+            weight += w @ w
+    rho = total / weight if weight > 1e-12 else 0.2
+    return min(max(rho, 0.02), _NEAR_RHO)
+
+
+@njit(cache=True, nogil=True)
+def _normal(
+    state: Array,
+    seen: Array,
+    R_cam: Array,
+    centres: Array,
+    R_a: Array,
+    sigmas: Array,
+    R_cam1_cam0: Array,
+    t_cam1_cam0: Array,
+    r: Array,
+    J: Array,
+) -> tuple[float, Array, Array]:
+    A = np.zeros((3, 3))
+    g = np.zeros(3)
+    cost = 0.0
+    ray = R_a @ np.array([state[0], state[1], 1.0])
+    offset = ray / state[2]
+    G = np.empty((3, 3))
+    for m in range(len(seen)):
+        y = R_cam[m] @ (offset + centres[0] - centres[m])
+        rows = observe(y, seen[m], sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+        if rows == 0:
+            cost += 100.0
+            continue
+        turned = R_cam[m] @ R_a
+        along = -(R_cam[m] @ offset) / state[2]
+        for i in range(3):
+            G[i, 0], G[i, 1], G[i, 2] = turned[i, 0] / state[2], turned[i, 1] / state[2], along[i]
+        squared = 0.0
+        for i in range(rows):
+            squared += r[i] * r[i]
+        scale = _KERNEL * _KERNEL
+        weight = 1.0 / (1.0 + squared / scale)
+        cost += scale * np.log1p(squared / scale)
+        JG = J[:rows] @ G
+        for i in range(rows):
+            for a in range(3):
+                g[a] += weight * JG[i, a] * r[i]
+                for b in range(3):
+                    A[a, b] += weight * JG[i, a] * JG[i, b]
+    return cost, A, g
+
+
+@njit(cache=True, nogil=True)
+def linearise(
+    point: Array,
+    at: NDArray[np.int64],
+    seen: Array,
+    R_cam: Array,
+    centres: Array,
+    sigmas: Array,
+    R_cam1_cam0: Array,
+    t_cam1_cam0: Array,
+    clones: int,
+) -> tuple[Array, Array, int]:
+    """Return A [rows, 3 + 6 C + 1] and H_f [rows, 3] of one point, and the rows; 0: it is behind a camera.
+
+    A holds the derivatives of the prediction by the extrinsic rotation (camera side) and by the clones (right-
+    invariant, rotation then position each), then the residual. H_f: by the point, in world axes.
+    """
+    width = 3 + 6 * clones + 1
+    A = np.zeros((ROWS_MAX * len(at), width))
+    H_f = np.zeros((ROWS_MAX * len(at), 3))
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    S = skew(point)
+    n = 0
+    for m in range(len(at)):
+        y = R_cam[m] @ (point - centres[m])
+        rows = observe(y, seen[m], sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+        if rows == 0:
+            return A, H_f, 0
+        by_point = J[:rows] @ R_cam[m]
+        by_turn = by_point @ S
+        by_mount = J[:rows] @ skew(y)
+        first = 3 + 6 * at[m]
+        for i in range(rows):
+            for k in range(3):
+                A[n + i, k] = by_mount[i, k]
+                A[n + i, first + k] = by_turn[i, k]
+                A[n + i, first + 3 + k] = -by_point[i, k]
+                H_f[n + i, k] = by_point[i, k]
+            A[n + i, width - 1] = r[i]
+        n += rows
+    return A[:n], H_f[:n], n
+
+
+@njit(cache=True, nogil=True)
+def project_out(A: Array, H_f: Array) -> None:
+    """Rotate the rows of A and H_f [rows, 3] in place so that only the first three of H_f are not zero.
+
+    Householder: the rows of A from the fourth on are its projection onto the left nullspace of H_f.
+    """
+    rows, width = A.shape
+    v = np.empty(rows)
+    for c in range(3):
+        norm = 0.0
+        for i in range(c, rows):
+            norm += H_f[i, c] * H_f[i, c]
+        norm = np.sqrt(norm)
+        if norm == 0.0:
+            continue
+        alpha = -norm if H_f[c, c] >= 0.0 else norm
+        size = 0.0
+        for i in range(c, rows):
+            v[i] = H_f[i, c] - (alpha if i == c else 0.0)
+            size += v[i] * v[i]
+        if size == 0.0:
+            continue
+        for j in range(c, 3):
+            dot = 0.0
+            for i in range(c, rows):
+                dot += v[i] * H_f[i, j]
+            dot *= 2.0 / size
+            for i in range(c, rows):
+                H_f[i, j] -= dot * v[i]
+        dots = np.zeros(width)
+        for i in range(c, rows):
+            for j in range(width):
+                dots[j] += v[i] * A[i, j]
+        for i in range(c, rows):
+            factor = 2.0 / size * v[i]
+            for j in range(width):
+                A[i, j] -= factor * dots[j]
+
+
+@njit(cache=True, nogil=True)
+def gate(H: Array, r: Array, P: Array) -> float:
+    """Return the normalised innovation squared of whitened rows; infinite where it cannot be computed."""
+    S = H @ P @ H.T
+    for i in range(len(r)):
+        S[i, i] += 1.0
+    nis = r @ np.linalg.solve(S, r)
+    return nis if np.isfinite(nis) and nis >= 0.0 else np.inf
+
+
+@njit(cache=True, nogil=True)
+def process(
+    starts: NDArray[np.int64],
+    at: NDArray[np.int64],
+    seen: Array,
+    R_cam: Array,
+    centres: Array,
+    sigmas: Array,
+    R_cam1_cam0: Array,
+    t_cam1_cam0: Array,
+    P: Array,
+    bounds: Array,
+    limits: Array,
+) -> tuple[NDArray[np.int64], Array, Array, Array, Array, Array, NDArray[np.int64]]:
+    """Find, linearise, project and gate every track.
+
+    Args:
+        starts: [F + 1] first observation of each track in what follows.
+        at: [M] clone of each observation.
+        seen: [M, 14] observations.
+        R_cam: [M, 3, 3] of the camera that saw it.
+        centres: [M, 3] of the camera that saw it.
+        sigmas: [3], see `observe`.
+        R_cam1_cam0: [3, 3] rotation into the right camera.
+        t_cam1_cam0: [3] origin of cam0 in the right camera.
+        P: [3 + 6 C, 3 + 6 C] covariance of extrinsic rotation and clones.
+        bounds: least inverse depth, greatest, greatest relative sigma of it, outlier in standard deviations, least
+            number of views.
+        limits: [d] chi-square limit of d degrees of freedom.
+
+    Returns:
+        Per track a status, its point [3], NIS, degrees of freedom and relative sigma of inverse depth [F, 3]; per track
+        the rows that fix the point: [3, 3 + 6 C + 1] as in `linearise`, and H_f [3, 3]; the projected rows of all used
+        tracks, stacked, and where those of each begin [F + 1].
+    """
+    count = len(starts) - 1
+    width = len(P) + 1
+    clones = (len(P) - 3) // 6
+    status = np.full(count, FEW)
+    points = np.zeros((count, 3))
+    tests = np.zeros((count, 3))
+    fixing = np.zeros((count, 3, width))
+    H_points = np.zeros((count, 3, 3))
+    stack = np.empty((ROWS_MAX * len(at), width))
+    begins = np.zeros(count + 1, dtype=np.int64)
+    n = 0
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    for f in range(count):
+        begins[f] = n
+        s, e = starts[f], starts[f + 1]
+        point, rho, sigma = triangulate(seen[s:e], R_cam[s:e], centres[s:e], sigmas, R_cam1_cam0, t_cam1_cam0)
+        keep = np.zeros(e - s, dtype=np.bool_)
+        for m in range(s, e):
+            y = R_cam[m] @ (point - centres[m])
+            rows = observe(y, seen[m], sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+            keep[m - s] = rows > 0 and r[0] * r[0] + r[1] * r[1] < bounds[3] * bounds[3]
+        chosen = np.flatnonzero(keep) + s
+        views = 0
+        for m in chosen:
+            views += 3 if np.isfinite(seen[m, 6]) or np.isfinite(seen[m, 12]) else 1
+        if len(chosen) < 2 or views < bounds[4]:
+            continue
+        tests[f, 2] = sigma / rho
+        if not tests[f, 2] < bounds[2]:
+            status[f] = PARALLAX
+            continue
+        if not bounds[0] < rho < bounds[1]:
+            status[f] = RANGE
+            continue
+        points[f] = point
+        A, H_f, rows = linearise(
+            point, at[chosen], seen[chosen], R_cam[chosen], centres[chosen], sigmas, R_cam1_cam0, t_cam1_cam0, clones
+        )
+        if rows < 4:
+            continue
+        project_out(A, H_f)
+        rest = np.ascontiguousarray(A[3:, : width - 1])
+        residual = np.ascontiguousarray(A[3:, width - 1])
+        tests[f, 1] = rows - 3
+        tests[f, 0] = gate(rest, residual, P)
+        if not tests[f, 0] <= limits[rows - 3]:
+            status[f] = GATED
+            continue
+        status[f] = USED
+        fixing[f] = A[:3]
+        H_points[f] = H_f[:3]
+        stack[n : n + rows - 3] = A[3:]
+        n += rows - 3
+    begins[count] = n
+    return status, points, tests, fixing, H_points, stack[:n], begins

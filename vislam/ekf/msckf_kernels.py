@@ -1,0 +1,193 @@
+"""Compiled inertial arithmetic of the tight filter: nominal motion, error transition and its noise, step by step.
+
+Nominal x [16]: position 0:3, velocity 3:6, quaternion wxyz 6:10, accel bias 10:13, gyro bias 13:16.
+Error [15]: rotation 0:3, position 3:6, velocity 6:9, gyro bias 9:12, accel bias 12:15, where the first three are
+right-invariant, in world axes: `R = Exp(e) R^`, `p = Exp(e) p^ + e_p`, `v = Exp(e) v^ + e_v`. In these coordinates
+what cannot be observed (yaw and position) is the same direction for every estimate, so the filter cannot gain
+information on it by moving its linearisation point: no first-estimates Jacobians are needed. Barrau and Bonnabel,
+"An EKF-SLAM algorithm with consistency properties", 2015; Wu et al., "An invariant-EKF VINS algorithm for improving
+consistency", IROS 2017.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.ekf.kernels import pose, turn
+from vislam.geometry import skew, so3_right_jacobian
+from vislam.messages import Array
+
+INERTIAL = 15
+_HOLE_STEP_S = 0.01
+
+
+@njit(cache=True, nogil=True)
+def step(
+    x: Array, Phi: Array, Q: Array, rate0: Array, rate1: Array, dt: float, gap_s: float, sigmas: Array, gravity: float
+) -> None:
+    """Move x [16] by one step and chain its error transition onto Phi and Q [15, 15], all in place.
+
+    Mid-point rule, as in `vislam.imu.preintegrate`; the transition is the exact derivative of that rule.
+
+    Args:
+        x: nominal state.
+        Phi: error transition since the last measurement.
+        Q: noise gathered since then.
+        rate0: sample [6] at the start of the step, gyro then accel.
+        rate1: sample [6] at its end.
+        dt: length of the step in s.
+        gap_s: length of the hole in the data that the step lies in, else 0.
+        sigmas: [6] gyro and accel noise densities, gyro and accel bias walks, then what mean rate and force may have
+            done unseen inside a hole (rad/s and m/s^2).
+        gravity: m/s^2.
+    """
+    turning = np.empty(3)
+    force = np.empty(3)
+    for i in range(3):
+        turning[i] = (0.5 * (rate0[i] + rate1[i]) - x[13 + i]) * dt
+        force[i] = 0.5 * (rate0[3 + i] + rate1[3 + i]) - x[10 + i]
+    turn(x, 6, 0.5 * turning[0], 0.5 * turning[1], 0.5 * turning[2])
+    middle = pose(x, 0, 6)
+    turn(x, 6, 0.5 * turning[0], 0.5 * turning[1], 0.5 * turning[2])
+    end = pose(x, 0, 6)
+    f = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            f[i] += middle[i, j] * force[j]
+    for i in range(3):
+        acceleration = f[i] - (gravity if i == 2 else 0.0)
+        x[i] += dt * x[3 + i] + 0.5 * dt * dt * acceleration
+        x[3 + i] += dt * acceleration
+    _chain(x, Phi, Q, turning, f, middle, end, dt, gravity, sigmas, gap_s)
+
+
+@njit(cache=True, nogil=True)
+def _chain(
+    x: Array,
+    Phi: Array,
+    Q: Array,
+    turning: Array,
+    f: Array,
+    middle: Array,
+    end: Array,
+    dt: float,
+    gravity: float,
+    sigmas: Array,
+    gap_s: float,
+) -> None:
+    """Phi = F Phi and Q = F Q F^T + noise; x is that at the end of the step, f the mean force in world axes."""
+    J_end = so3_right_jacobian(turning)
+    J_middle = so3_right_jacobian(0.5 * turning)
+    B = np.zeros((9, 3))  # rotation, position, velocity by gyro bias
+    M = np.zeros((3, 3))  # rotation at mid-step by gyro bias
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                B[i, j] -= dt * end[i, k] * J_end[k, j]
+                M[i, j] -= 0.5 * dt * middle[i, k] * J_middle[k, j]
+    S_f = skew(f)
+    S_p = skew(x[0:3])
+    S_v = skew(x[3:6])
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                B[3 + i, j] += S_p[i, k] * B[k, j] - 0.5 * dt * dt * S_f[i, k] * M[k, j]
+                B[6 + i, j] += S_v[i, k] * B[k, j] - dt * S_f[i, k] * M[k, j]
+    for j in range(INERTIAL):
+        _advance(Phi[:, j], B, middle, dt, gravity)
+    for j in range(INERTIAL):
+        _advance(Q[:, j], B, middle, dt, gravity)
+    for j in range(INERTIAL):
+        _advance(Q[j], B, middle, dt, gravity)
+    gyro = (sigmas[0] * sigmas[0] + sigmas[4] * sigmas[4] * gap_s) / dt
+    accel = (sigmas[1] * sigmas[1] + sigmas[5] * sigmas[5] * gap_s) * dt
+    for i in range(9):
+        for j in range(9):
+            Q[i, j] += gyro * (B[i, 0] * B[j, 0] + B[i, 1] * B[j, 1] + B[i, 2] * B[j, 2])
+    for i in range(3):
+        Q[3 + i, 3 + i] += 0.25 * dt * dt * accel
+        Q[3 + i, 6 + i] += 0.5 * dt * accel
+        Q[6 + i, 3 + i] += 0.5 * dt * accel
+        Q[6 + i, 6 + i] += accel
+        Q[9 + i, 9 + i] += sigmas[2] * sigmas[2] * dt
+        Q[12 + i, 12 + i] += sigmas[3] * sigmas[3] * dt
+
+
+@njit(cache=True, nogil=True)
+def _advance(e: Array, B: Array, middle: Array, dt: float, gravity: float) -> None:
+    """Replace e by F e, in place: position first, since it needs the others as they were."""
+    down_x = gravity * e[1]
+    down_y = -gravity * e[0]
+    for i in range(3):
+        push = 0.0
+        for k in range(3):
+            push -= dt * middle[i, k] * e[12 + k]
+        e[3 + i] += dt * e[6 + i] + 0.5 * dt * push
+        e[6 + i] += push
+        for k in range(3):
+            e[3 + i] += B[3 + i, k] * e[9 + k]
+            e[6 + i] += B[6 + i, k] * e[9 + k]
+    e[3] += 0.5 * dt * dt * down_x
+    e[4] += 0.5 * dt * dt * down_y
+    e[6] += dt * down_x
+    e[7] += dt * down_y
+    for i in range(3):
+        for k in range(3):
+            e[i] += B[i, k] * e[9 + k]
+
+
+@njit(cache=True, nogil=True)
+def run(
+    x: Array,
+    Phi: Array,
+    Q: Array,
+    t_ns: NDArray[np.int64],
+    samples: Array,
+    gaps_s: Array,
+    track: Array,
+    sigmas: Array,
+    gravity: float,
+) -> None:
+    """Step through samples [N, 6] at `t_ns` [N], the state being at the first; store x[:10] of each in `track`.
+
+    `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
+    """
+    track[0] = x[:10]
+    for k in range(1, len(t_ns)):
+        dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
+        if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
+            pieces = max(math.ceil(dt / _HOLE_STEP_S), 1)
+            change = samples[k] - samples[k - 1]
+            for j in range(pieces):
+                before = samples[k - 1] + (j / pieces) * change
+                after = samples[k - 1] + ((j + 1) / pieces) * change
+                step(x, Phi, Q, before, after, dt / pieces, gaps_s[k], sigmas, gravity)
+        else:
+            step(x, Phi, Q, samples[k - 1], samples[k], dt, 0.0, sigmas, gravity)
+        track[k] = x[:10]
+
+
+@njit(cache=True, nogil=True)
+def to_nav_error(x: Array) -> Array:
+    """Return M [15, 15] that turns the invariant error into that of `NavState`; to first order."""
+    T = pose(x, 0, 6)
+    M = np.eye(INERTIAL)
+    M[0:3, 0:3] = T[:3, :3].T
+    M[3:6, 0:3] = -skew(x[0:3])
+    M[6:9, 0:3] = -skew(x[3:6])
+    return M
+
+
+@njit(cache=True, nogil=True)
+def from_nav_error(x: Array) -> Array:
+    """Return the inverse of `to_nav_error`."""
+    T = pose(x, 0, 6)
+    M = np.eye(INERTIAL)
+    M[0:3, 0:3] = T[:3, :3]
+    M[3:6, 0:3] = skew(x[0:3]) @ np.ascontiguousarray(T[:3, :3])
+    M[6:9, 0:3] = skew(x[3:6]) @ np.ascontiguousarray(T[:3, :3])
+    return M

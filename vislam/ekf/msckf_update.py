@@ -1,0 +1,396 @@
+"""What a frame, a moment of rest and a known bias do to the tight filter. Settings only; the state comes and goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from vislam.config import EkfConfig
+from vislam.ekf import msckf_features as features
+from vislam.ekf.kernels import pose
+from vislam.ekf.msckf_kernels import from_nav_error
+from vislam.ekf.msckf_state import (
+    CLONES,
+    Window,
+    cloned,
+    compressed,
+    corrected,
+    moved,
+    with_points,
+    without_clone,
+    without_points,
+)
+from vislam.ekf.msckf_tracks import FrameTracks, image_motion_px, marked, ripe_tracks
+from vislam.geometry import invert, skew, so3_log
+from vislam.imu import ImuNoise
+from vislam.messages import Array
+
+if TYPE_CHECKING:  # the fast path must not load OpenCV
+    from vislam.camera import Rig
+
+_STATUS = {
+    features.USED: "tracks_used",
+    features.FEW: "tracks_few",
+    features.PARALLAX: "tracks_no_parallax",
+    features.RANGE: "tracks_range",
+    features.GATED: "tracks_gated",
+}
+_CONTRADICTED = 0.25  # of the tested tracks agree at most: the state is wrong, not the tracks
+_MIN_TESTED = 5
+
+
+@dataclass(slots=True, eq=False)
+class Outcome:
+    """What became of a measurement."""
+
+    accepted: bool = False
+    nis: float = float("nan")
+    reason: str = ""
+    counts: dict[str, int] = field(default_factory=dict)
+    statistics: dict[str, tuple[int, float, int]] = field(default_factory=dict)  # kind: number, sum of NIS, of degrees
+
+    def count(self, name: str, number: int = 1) -> None:
+        """Add to a counter."""
+        if number:
+            self.counts[name] = self.counts.get(name, 0) + number
+
+    def test(self, kind: str, number: int, nis: float, dof: int) -> None:
+        """Add tests to the statistics."""
+        old = self.statistics.get(kind, (0, 0.0, 0))
+        self.statistics[kind] = (old[0] + number, old[1] + nis, old[2] + dof)
+
+
+class Updater:
+    """Applies measurements: the same one on the same state gives the same answer, however often it is replayed."""
+
+    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+        """Take the settings and the rig."""
+        self._config = config
+        self._gravity = gravity_m_s2
+        self._p_body_cam = np.ascontiguousarray(rig.T_body_cams[0][:3, 3], dtype=np.float64)
+        T_cam1_cam0 = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
+        self._R_cam1_cam0 = np.ascontiguousarray(T_cam1_cam0[:3, :3])
+        self._t_cam1_cam0 = np.ascontiguousarray(T_cam1_cam0[:3, 3])
+        self._sigmas = np.array(
+            [config.tight_pixel_sigma_px, config.tight_stereo_sigma_px, config.tight_depth_sigma_rho]
+        )
+        self._bounds = np.array(
+            [
+                1.0 / config.tight_max_range_m,
+                1.0 / config.tight_min_range_m,
+                config.tight_max_depth_ratio,
+                config.tight_outlier_sigmas,
+                float(config.tight_min_observations),
+            ]
+        )
+        # one metric observation and another fix a point and leave something over
+        self._least = 2 if rig.is_stereo or rig.has_depth else config.tight_min_observations
+        most = features.ROWS_MAX * (config.tight_clones + 2)
+        self._limits = 2.0 * gammaincinv(0.5 * np.maximum(np.arange(most), 1), config.gate_probability)
+        per_sample = config.tight_imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
+        self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
+        self._reset_sigmas = np.repeat(
+            [
+                np.deg2rad(config.reset_rotation_deg),
+                config.reset_position_m,
+                config.reset_velocity_m_s,
+                config.reset_gyro_bias_rad_s,
+                config.reset_accel_bias_m_s2,
+            ],
+            3,
+        )
+
+    # -- a frame -----------------------------------------------------------------------------------------------------
+
+    def see(
+        self, window: Window, x: Array, gyro_rad_s: Array, ago_s: float, frame: FrameTracks
+    ) -> tuple[Window, Outcome]:
+        """Clone the pose for a frame and use the points it sees and the tracks that became ripe with it."""
+        out = Outcome()
+        R = np.ascontiguousarray(pose(x, 0, 6)[:3, :3])
+        window = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
+        leaving = self._leaving(window)
+        window, H_points, r_points = self._see_points(window, out)
+        window, H_tracks, r_tracks = self._use_tracks(window, leaving, out)
+        started = len(window.P) - H_points.shape[1]  # columns of points that came in with the tracks
+        H = np.vstack((np.pad(H_points, ((0, 0), (0, started))), H_tracks))
+        r = np.concatenate((r_points, r_tracks))
+        if len(r):
+            window, out.nis = corrected(window, x, H, r)
+            out.accepted = True
+            window = replace(window, last_vision_t_ns=frame.t_ns)
+        if leaving is not None:
+            window = without_clone(window, leaving)
+        window = self._watch(window, x, frame.t_ns, out)
+        out.count("vision_used" if out.accepted else "vision_idle")
+        out.reason = out.reason or ("" if out.accepted else "no track was ripe or passed its test")
+        return without_points(window, window.misses > self._config.tight_point_misses), out
+
+    def _leaving(self, window: Window) -> int | None:
+        """Return which clone goes: the oldest, unless the last but one is where the one before it was."""
+        count = len(window.frames)
+        if count <= self._config.tight_clones:
+            return None
+        kept, candidate = window.frames[-3], window.frames[-2]
+        still = image_motion_px(kept, candidate) < self._config.tight_still_px
+        if (still or window.rest_t_ns is not None) and candidate.t_ns != window.rest_t_ns:
+            return count - 2
+        oldest = 0 if window.frames[0].t_ns != window.rest_t_ns else 1
+        return oldest
+
+    def _see_points(self, window: Window, out: Outcome) -> tuple[Window, Array, Array]:
+        """Return the rows of the points of the state that the newest frame sees."""
+        newest = len(window.frames) - 1
+        frame = window.frames[newest]
+        row = np.searchsorted(frame.ids, window.point_ids)
+        row = np.minimum(row, max(len(frame.ids) - 1, 0))
+        found = frame.ids[row] == window.point_ids if len(frame.ids) else np.zeros(len(row), dtype=np.bool_)
+        R_cam, centres = self._cameras(
+            window, np.array([newest] * int(found.sum()), dtype=np.int64), frame.seen[row[found]]
+        )
+        H, r, tests = _point_rows(
+            np.flatnonzero(found),
+            window.points,
+            frame.seen[row[found]],
+            R_cam,
+            centres,
+            self._sigmas,
+            self._R_cam1_cam0,
+            self._t_cam1_cam0,
+            window.P,
+            len(window.frames),
+            self._limits,
+        )
+        good = tests[:, 1] > 0
+        misses = window.misses + 1
+        misses[np.flatnonzero(found)[good]] = 0
+        out.count("points_used", int(good.sum()))
+        out.count("points_gated", int((~good).sum()))
+        tested = tests[good]
+        out.test("points", len(tested), float(tested[:, 0].sum()), int(tested[:, 1].sum()))
+        frames = marked(window.frames, np.full(int(found.sum()), newest, dtype=np.int64), row[found])
+        return replace(window, misses=misses, frames=frames), H, r
+
+    def _use_tracks(self, window: Window, leaving: int | None, out: Outcome) -> tuple[Window, Array, Array]:
+        """Return the projected rows of the ripe tracks; the best of those still followed become points of the state."""
+        config = self._config
+        oldest = leaving if leaving is not None and leaving < len(window.frames) - 2 else None
+        ripe = ripe_tracks(window.frames, oldest, self._least, config.tight_max_tracks)
+        n = len(window.P)
+        if not len(ripe.ids):
+            return window, np.zeros((0, n)), np.zeros(0)
+        seen = np.concatenate([window.frames[i].seen[j][None] for i, j in zip(ripe.at, ripe.row, strict=True)])
+        R_cam, centres = self._cameras(window, ripe.at, seen)
+        visible = slice(16, window.first_point)
+        status, points, tests, fixing, H_points, stack, _ = features.process(
+            ripe.starts,
+            ripe.at,
+            seen,
+            R_cam,
+            centres,
+            self._sigmas,
+            self._R_cam1_cam0,
+            self._t_cam1_cam0,
+            np.ascontiguousarray(window.P[visible, visible]),
+            self._bounds,
+            self._limits,
+        )
+        window = replace(window, frames=marked(window.frames, ripe.at, ripe.row))
+        for code, name in _STATUS.items():
+            out.count(name, int((status == code).sum()))
+        used = status == features.USED
+        out.test("tracks", int(used.sum()), float(tests[used, 0].sum()), int(tests[used, 1].sum()))
+        H_stack, r_stack = compressed(stack[:, :-1], stack[:, -1])
+        window = self._keep_points(window, ripe.ids, used & ripe.alive, points, tests[:, 2], fixing, H_points, out)
+        H = np.zeros((len(r_stack), len(window.P)))
+        H[:, visible] = H_stack
+        return window, H, r_stack
+
+    def _keep_points(
+        self,
+        window: Window,
+        ids: NDArray[np.int64],
+        fit: NDArray[np.bool_],
+        points: Array,
+        ratios: Array,
+        fixing: Array,
+        H_points: Array,
+        out: Outcome,
+    ) -> Window:
+        free = self._config.tight_points - len(window.point_ids)
+        chosen = np.flatnonzero(fit)
+        chosen = chosen[np.argsort(ratios[chosen], kind="stable")][: max(free, 0)]
+        if not len(chosen):
+            return window
+        out.count("points_started", len(chosen))
+        return with_points(window, ids[chosen], points[chosen], fixing[chosen], H_points[chosen])
+
+    def _cameras(self, window: Window, at: NDArray[np.int64], seen: Array) -> tuple[Array, Array]:
+        return features.camera_poses(
+            at,
+            seen,
+            window.R,
+            window.p,
+            window.rate,
+            window.velocity,
+            np.ascontiguousarray(window.R_body_cam),
+            self._p_body_cam,
+        )
+
+    def _watch(self, window: Window, x: Array, t_ns: int, out: Outcome) -> Window:
+        """Inflate the covariance when frame after frame contradicts the state."""
+        config = self._config
+        good = out.counts.get("tracks_used", 0) + out.counts.get("points_used", 0)
+        bad = out.counts.get("tracks_gated", 0) + out.counts.get("points_gated", 0)
+        if good + bad < _MIN_TESTED:
+            return window
+        if good > _CONTRADICTED * (good + bad):
+            return replace(window, rejects=0)
+        since = t_ns if window.rejects == 0 else window.rejects_since_ns
+        rejects = window.rejects + 1
+        if rejects < config.reset_rejects or t_ns - since < config.reset_s * 1e9:
+            return replace(window, rejects=rejects, rejects_since_ns=since)
+        out.count("soft_resets")
+        out.reason = f"{rejects} frames in a row contradict the state, covariance inflated"
+        M = from_nav_error(x) * self._reset_sigmas
+        P = window.P.copy()
+        P[:15, :15] += M @ M.T
+        # points that no longer fit would only contradict again
+        fresh = replace(window, P=P, rejects=0)
+        return without_points(fresh, np.ones(len(window.point_ids), dtype=np.bool_))
+
+    # -- rest and biases ---------------------------------------------------------------------------------------------
+
+    def rest(self, window: Window, x: Array, gyro_rad_s: Array, t_ns: int) -> tuple[Window, Outcome]:
+        """Use that the body is at rest: no velocity, the gyro shows its bias, the pose is that where rest began."""
+        out = Outcome()
+        config = self._config
+        R = pose(x, 0, 6)[:3, :3]
+        H = np.zeros((6, len(window.P)))
+        H[:3, 6:9] = R.T / config.zero_velocity_sigma_m_s
+        H[3:, 9:12] = np.eye(3) / self._zero_rate_sigma
+        r = np.concatenate(
+            (-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / self._zero_rate_sigma)
+        )
+        if not self._passes("zero_velocity", window, H, r, out):
+            return replace(window, rest_t_ns=None), out
+        window, _ = corrected(window, x, H, r)
+        stamps = [frame.t_ns for frame in window.frames]
+        if window.rest_t_ns in stamps:
+            window = self._hold(window, x, stamps.index(window.rest_t_ns), out)
+        elif t_ns in stamps:
+            window = replace(window, rest_t_ns=t_ns)
+        return window, out
+
+    def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
+        config = self._config
+        sigmas = np.repeat([np.deg2rad(config.tight_rest_sigma_deg), config.tight_rest_sigma_m], 3)
+        T = pose(x, 0, 6)
+        H = np.zeros((6, len(window.P)))
+        at = CLONES + 6 * index
+        here = np.eye(6)
+        here[3:, :3] = -skew(window.p[index])
+        H[:, :6] = here / sigmas[:, None]
+        H[:, at : at + 6] = -here / sigmas[:, None]
+        turned = so3_log(window.R[index] @ np.ascontiguousarray(T[:3, :3].T))
+        r = np.concatenate((turned, window.p[index] - T[:3, 3])) / sigmas
+        if not self._passes("hold", window, H, r, out):
+            return replace(window, rest_t_ns=None)
+        return corrected(window, x, H, r)[0]
+
+    def _passes(self, kind: str, window: Window, H: Array, r: Array, out: Outcome) -> bool:
+        S = H @ window.P @ H.T + np.eye(len(r))
+        nis = float(r @ np.linalg.solve(S, r))
+        accepted = nis <= self._limits[len(r)]
+        out.count(f"{kind}_{'accepted' if accepted else 'gated'}")
+        if np.isnan(out.nis):
+            out.accepted, out.nis = accepted, nis
+        if accepted:
+            out.test(kind, 1, nis, len(r))
+        else:
+            out.reason = f"innovation {nis:.1f} of at most {self._limits[len(r)]:.1f}"
+        return accepted
+
+    def known_bias(self, window: Window, x: Array, bias: Array) -> tuple[Window, Outcome]:
+        """Take biases [12] (gyro, accel, their sigmas) found elsewhere; only the biases move (Schmidt-Kalman)."""
+        out = Outcome()
+        H = np.zeros((6, len(window.P)))
+        H[:, 9:15] = np.diag(1.0 / bias[6:])
+        r = np.concatenate((bias[:3] - x[13:16], bias[3:6] - x[10:13])) / bias[6:]
+        if not self._passes("bias", window, H, r, out):
+            return window, out
+        HP = H @ window.P
+        S = HP @ H.T + np.eye(6)
+        K = np.zeros((len(window.P), 6))
+        K[9:15] = np.linalg.solve(S, HP[:, 9:15]).T
+        KHP = K @ HP
+        P = window.P - KHP - KHP.T + K @ S @ K.T
+        return moved(replace(window, P=0.5 * (P + P.T)), x, K @ r), out
+
+
+@njit(cache=True, nogil=True)
+def _point_rows(
+    which: NDArray[np.int64],
+    points: Array,
+    seen: Array,
+    R_cam: Array,
+    centres: Array,
+    sigmas: Array,
+    R_cam1_cam0: Array,
+    t_cam1_cam0: Array,
+    P: Array,
+    clones: int,
+    limits: Array,
+) -> tuple[Array, Array, Array]:
+    """Return whitened rows H [m, n] and r [m] of points of the state seen from the newest clone, and tests [K, 2].
+
+    A test is NIS and degrees of freedom; the latter 0 where it failed.
+    """
+    n = len(P)
+    H = np.zeros((features.ROWS_MAX * len(which), n))
+    r_all = np.empty(features.ROWS_MAX * len(which))
+    tests = np.zeros((len(which), 2))
+    r = np.empty(features.ROWS_MAX)
+    J = np.empty((features.ROWS_MAX, 3))
+    clone = 19 + 6 * (clones - 1)
+    columns = np.empty(15, dtype=np.int64)
+    small = np.empty((15, 15))
+    m = 0
+    for k in range(len(which)):
+        f = points[which[k]]
+        y = R_cam[k] @ (f - centres[k])
+        rows = features.observe(y, seen[k], sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+        if rows == 0:
+            continue
+        by_point = J[:rows] @ R_cam[k]
+        by_turn = by_point @ skew(f)
+        h = np.zeros((rows, 15))
+        h[:, 0:3] = -by_turn
+        h[:, 3:6] = J[:rows] @ skew(y)
+        h[:, 6:9] = by_turn
+        h[:, 9:12] = -by_point
+        h[:, 12:15] = by_point
+        for i in range(3):
+            columns[i], columns[3 + i] = i, 16 + i
+            columns[6 + i], columns[9 + i] = clone + i, clone + 3 + i
+            columns[12 + i] = 19 + 6 * clones + 3 * which[k] + i
+        for i in range(15):
+            for j in range(15):
+                small[i, j] = P[columns[i], columns[j]]
+        residual = r[:rows].copy()
+        nis = features.gate(h, residual, small)
+        tests[k, 0] = nis
+        if not nis <= limits[rows]:
+            continue
+        tests[k, 1] = rows
+        for i in range(rows):
+            for j in range(15):
+                H[m + i, columns[j]] = h[i, j]
+            r_all[m + i] = residual[i]
+        m += rows
+    return H[:m], r_all[:m], tests
