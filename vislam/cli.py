@@ -137,7 +137,7 @@ def _run_source(source: str, settings: Config, out: Path, overwrite: bool, comma
 
 
 @contextmanager
-def _progress(name: str) -> Iterator[Callable[[int, int, str], None] | None]:
+def _progress(name: str, unit: str = "frames") -> Iterator[Callable[[int, int, str], None] | None]:
     """Show a progress bar on stderr when that is a terminal."""
     if not sys.stderr.isatty():
         yield None
@@ -145,7 +145,12 @@ def _progress(name: str) -> Iterator[Callable[[int, int, str], None] | None]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total} frames"), TimeRemainingColumn())
+    columns = (
+        TextColumn(name),
+        BarColumn(),
+        TextColumn(f"{{task.completed}}/{{task.total}} {unit}"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, note="")
         yield lambda done, total, note: bar.update(task, completed=done, total=total, note=note)
@@ -303,6 +308,17 @@ def _print_inspection(inspection: Inspection) -> None:
             console.print(f"        -> {finding.next_step}", soft_wrap=True, highlight=False, markup=False)
 
 
+def _compare(arguments: list[str]) -> int:
+    from vislam.experiment.compare import run_comparison
+    from vislam.options import CompareOptions
+
+    options = _parse(CompareOptions, arguments, "compare")
+    with _progress(options.plan.stem, "jobs") as progress:
+        answer = run_comparison(options, ["vislam", "compare", *arguments], progress)
+    print(json.dumps(answer.data) if options.json else "\n".join(answer.lines))
+    return answer.exit_code
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -317,6 +333,7 @@ _VERBS = {
     "run": _Verb(_run, "run the pipeline on a recording", "vislam run tum:PATH --out runs/desk"),
     "simulate": _Verb(_simulate, "record a simulated world", "vislam simulate corridor-loop --out recordings/corridor"),
     "eval": _Verb(_eval, "compare a trajectory with the truth", "vislam eval runs/desk"),
+    "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
     "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

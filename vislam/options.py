@@ -17,7 +17,8 @@ class RunOptions:
     """Options of `vislam run`."""
 
     source: Positional[str]
-    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD[,option=value], or a path, recognised by its contents"""
+    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD[,option=value], points:WORLD or
+    points:PATH[,option=value], or a path, recognised by its contents"""
     out: Path
     """Folder to make for everything that the run leaves"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
@@ -83,6 +84,38 @@ class EvalOptions:
     """Below this share of the reference's time the evaluation fails with exit code 4"""
     json: bool = False
     """Print JSON instead of the table"""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Options of `vislam compare`."""
+
+    plan: Positional[Path]
+    """TOML file that says what to compare on what; docs/experiments.md"""
+    out: Path | None = None
+    """Folder for report, tables and manifest; None: results/NAME of the plan"""
+    workers: int = 2
+    """Jobs at the same time on this machine; 1 for undisturbed timings"""
+    engine: Literal["local", "dask"] = "local"
+    """Processes of this machine, or the workers of a Dask cluster"""
+    scheduler: str | None = None
+    """Address of the Dask scheduler"""
+    store: Path = Path("results/results.db")
+    """Keeps every result by the hash of all it depends on; nothing in it runs again"""
+    cache: Path = Path("results/recordings")
+    """Keeps the recordings of simulated worlds"""
+    keep_runs: Path | None = None
+    """Keep the run folder of every job in here"""
+    retry_failed: bool = False
+    """Run the jobs again that failed before"""
+    verify: Path | None = None
+    """Run jobs of this comparison (folder or manifest) again: do the numbers come out? Exit code 4 if not"""
+    sample: int = 3
+    """How many jobs --verify runs; 0: all"""
+    dry_run: bool = False
+    """Only list the jobs and which of them are done"""
+    json: bool = False
+    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)

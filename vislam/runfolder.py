@@ -84,7 +84,7 @@ def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
         "data_sha256": fingerprint(Path(source.partition(":")[2] or source)),
         "command": command,
         "seed": config.seed,
-        "code_revision": _code_revision(),
+        "code_revision": code_revision(),
         "packages": {name: version for name in _PACKAGES if (version := _version(name))},
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
@@ -111,7 +111,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _code_revision() -> str | None:
+def code_revision() -> str | None:
     """Return the git revision of the code, with a hash of local changes; None outside a checkout."""
     root = Path(__file__).resolve().parent.parent
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,10 @@ _ANSWER_S = 20.0  # a scheduler that is there answers much sooner
 
 Spec = dict[str, Any]
 Result = dict[str, Any]
+Finished = Generator[tuple[Spec, Result], None, None]
 
 
-def run_locally(specs: Sequence[Spec], workers: int, cache: Path, keep: Path | None) -> Iterator[tuple[Spec, Result]]:
+def run_locally(specs: Sequence[Spec], workers: int, cache: Path, keep: Path | None) -> Finished:
     """Yield each job with its result as it is done, in any order; closing the iterator stops what still runs.
 
     The threads only wait: every job is a process of its own.
@@ -34,7 +35,7 @@ def run_locally(specs: Sequence[Spec], workers: int, cache: Path, keep: Path | N
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def run_on_dask(specs: Sequence[Spec], scheduler: str, cache: Path, keep: Path | None) -> Iterator[tuple[Spec, Result]]:
+def run_on_dask(specs: Sequence[Spec], scheduler: str, cache: Path, keep: Path | None) -> Finished:
     """Yield each job with its result as a Dask worker finishes it; Dask gives the jobs of a lost worker to others.
 
     Workers need this very version of vislam and the same paths to the recordings. A job that took several workers

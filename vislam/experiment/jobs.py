@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ class Job:
     sequence: str
     variant: tuple[tuple[str, Scalar], ...]  # (axis, value)
     estimator: str
+    estimator_index: int  # its place in the plan
     seed: int
     member: int  # 0: gravity as configured
     source: str
@@ -55,7 +56,7 @@ def expand(plan: Plan) -> list[Job]:
         source, settings = _conditions(plan, sequence, variant)
         if source not in identities:
             identities[source] = source_identity(source)
-        for estimator, seed in itertools.product(plan.estimators, plan.seeds):
+        for (index, estimator), seed in itertools.product(enumerate(plan.estimators), plan.seeds):
             where = f"plan '{plan.name}', sequence '{sequence.name}', estimator '{estimator.name}'"
             data = nested({**settings, **estimator.config, **_varied(plan, variant), "seed": seed}, where)
             resolved = from_data(data, where)
@@ -66,7 +67,8 @@ def expand(plan: Plan) -> list[Job]:
                 jobs.append(
                     Job(
                         sha256_of([identities[source], config, batch, environment()]),
-                        sequence.name, variant, estimator.name, seed, member, source, config, batch, plan.timeout_s,
+                        sequence.name, variant, estimator.name, index, seed, member,
+                        source, config, batch, plan.timeout_s,
                     )
                 )  # fmt: skip
     return jobs
@@ -84,6 +86,15 @@ def unique(jobs: list[Job]) -> Iterator[Job]:
         if job.key not in seen:
             seen.add(job.key)
             yield job
+
+
+def source_identities(jobs: Iterable[Job]) -> dict[str, str]:
+    """Return what every source holds, by sequence and condition."""
+    sources = {
+        " ".join([job.sequence, *(f"{axis}={value}" for axis, value in job.variant)]): job.source for job in jobs
+    }
+    held = {source: source_identity(source) for source in set(sources.values())}
+    return {name: held[source] for name, source in sources.items()}
 
 
 def _conditions(plan: Plan, sequence: Sequence, variant: tuple[tuple[str, Scalar], ...]) -> tuple[str, dict[str, Any]]:

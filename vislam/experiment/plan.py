@@ -13,8 +13,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from vislam.config import from_data
 from vislam.errors import UsageError
+from vislam.experiment.identity import is_world, split_source
 
 Scalar = bool | int | float | str
 Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.coupling": "tight"}
@@ -22,7 +22,6 @@ Output = Literal["ekf", "live", "graph", "batch"]
 
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?")
 _NAME = re.compile(r"[\w.+ -]{1,60}")
-_WITHOUT_PATH = ("sim",)  # kinds of source whose name is no file
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +110,10 @@ def _resolved(sequence: Sequence, where: str, folder: Path, variables: Mapping[s
         return variables[match[1]]
 
     source = _VARIABLE.sub(value, sequence.source)
-    kind, colon, rest = source.partition(":")
-    if not colon:
-        kind, rest = "", source
-    first, comma, options = rest.partition(",")
-    if kind not in _WITHOUT_PATH:
-        source = f"{kind}{colon}{folder / first}{comma}{options}"
-    return dataclasses.replace(sequence, source=source, name=sequence.name or Path(first).name)
+    scheme, name, options = split_source(source)
+    if not is_world(scheme, name):
+        source = f"{scheme}{folder / name}{options}"
+    return dataclasses.replace(sequence, source=source, name=sequence.name or Path(name).name)
 
 
 def _check(plan: Plan, where: str) -> None:
@@ -160,11 +156,6 @@ def nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
                 raise UsageError(f"{where}: '{section}' in '{dotted}' is a setting, not a section")
         node[name] = value
     return data
-
-
-def check_settings(settings: Mapping[str, Any], where: str) -> None:
-    """Raise UsageError when dotted settings are no valid configuration."""
-    from_data(nested(settings, where), where)
 
 
 def _refuse_unknown(data: Mapping[str, Any], cls: type, where: str, prefix: str = "") -> None:

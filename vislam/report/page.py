@@ -29,6 +29,7 @@ from vislam.report.html import (
 )
 from vislam.report.run_files import ESTIMATES, LoopRow, RunFiles, read_run
 from vislam.report.scene import Scene, build_scene
+from vislam.report.style import stylesheet
 from vislam.trajectory import write_text
 
 _SHOWN_LOOPS = 10  # rows that are always seen
@@ -60,12 +61,11 @@ def write_report(run: Path) -> Path:
             _manifest(files),
         )
     )
-    css = Path(__file__).with_name("style.css").read_text(encoding="utf-8")
     title = escape(f"vislam: {_name(files)}")
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{css}</style></head><body><main>{body}"
+        f"<title>{title}</title><style>{stylesheet()}</style></head><body><main>{body}"
         "<footer>Made by vislam from the files in this folder.</footer></main></body></html>\n"
     )
     path = run / "report.html"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -52,6 +53,11 @@ RC: dict[str, Any] = {
     "legend.handlelength": 1.6,
     "lines.solid_capstyle": "round",
 }
+
+
+def stylesheet() -> str:
+    """Return the style sheet of every page, to be embedded."""
+    return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
 
 
 def svg(figure: Figure, name: str) -> str:

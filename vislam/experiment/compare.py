@@ -1,0 +1,196 @@
+"""A comparison from plan to report: what is missing runs, all is kept, tables and pictures are written."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from vislam.errors import TrackingLostError, UsageError
+from vislam.experiment import engines
+from vislam.experiment.identity import environment
+from vislam.experiment.jobs import Job, expand, source_identities, unique
+from vislam.experiment.page import comparison_page
+from vislam.experiment.plan import Plan, load_plan
+from vislam.experiment.statistics import compare, groups
+from vislam.experiment.store import ResultStore
+from vislam.experiment.tables import latex, runs_csv, summary_csv, tests_csv
+from vislam.experiment.trials import Trial, trials
+from vislam.experiment.verify import read_manifest, verify
+from vislam.options import CompareOptions
+from vislam.runfolder import code_revision, storage, write_json
+from vislam.trajectory import write_text
+
+Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, a short note
+
+TESTED = ("ate_m", "rpe_5m_percent")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a comparison has to say."""
+
+    lines: list[str]
+    data: dict[str, Any] = field(default_factory=dict)
+    exit_code: int = 0  # 4: `verify` found numbers that do not come out again
+
+
+def run_comparison(options: CompareOptions, command: list[str], progress: Progress | None = None) -> Answer:
+    """Do what `vislam compare` was asked to.
+
+    Raises:
+        UsageError: the plan is wrong, Dask is missing, or code changed while jobs ran.
+        DataError, StorageError: recordings, store or output cannot be used.
+    """
+    _check(options)
+    plan = load_plan(options.plan)
+    jobs = expand(plan)
+    if options.verify is not None:
+        return _verify(options, plan, jobs, progress)
+    with ResultStore(options.store) as store:
+        if options.dry_run:
+            return _listing(jobs, store)
+        if options.retry_failed:
+            store.forget_failures(job.key for job in jobs)
+        new = run_missing(jobs, store, options, progress)
+        results = {job.key: result for job in unique(jobs) if (result := store.get(job.key)) is not None}
+    out = options.out or Path("results") / plan.name
+    return write_results(plan, options.plan.read_text(encoding="utf-8"), jobs, results, out, command, new)
+
+
+def run_missing(
+    jobs: Sequence[Job], store: ResultStore, options: CompareOptions, progress: Progress | None = None
+) -> int:
+    """Run the jobs that have no result yet and keep each as it comes; return how many ran.
+
+    An interrupt loses only what was running. Raises UsageError when a worker had other code or packages.
+    """
+    wanted = {job.key: job for job in unique(list(jobs))}
+    missing = [job for job in wanted.values() if store.status(job.key) is None]
+    done, mismatch = len(wanted) - len(missing), ""
+    if progress is not None:
+        progress(done, len(wanted), "")
+    added = 0
+    with closing(_engine(missing, options)) as finished:
+        for spec, result in finished:
+            if result["status"] == "mismatch":
+                mismatch = result["reason"]
+            elif result["status"] != "stopped":
+                added += store.add(spec["key"], wanted[spec["key"]].label, spec, result)
+            done += 1
+            if progress is not None:
+                progress(done, len(wanted), result["status"])
+    if mismatch:
+        raise UsageError(f"a worker has other code or packages than this process: {mismatch}; results so far are kept")
+    return added
+
+
+def write_results(
+    plan: Plan,
+    plan_text: str,
+    jobs: Sequence[Job],
+    results: dict[str, dict[str, Any]],
+    out: Path,
+    command: list[str],
+    new: int,
+) -> Answer:
+    """Write report.html, the tables and manifest.json into a folder. Raises StorageError."""
+    with storage(out):
+        out.mkdir(parents=True, exist_ok=True)
+    found = trials(plan, jobs, results)
+    grouped = groups(found)
+    tests = [comparison for metric in TESTED for comparison in compare(found, metric)]
+    manifest = _manifest(plan_text, jobs, found, command)
+    write_json(out / "manifest.json", manifest)
+    write_text(out / "runs.csv", runs_csv(plan, found))
+    write_text(out / "summary.csv", summary_csv(plan, grouped))
+    write_text(out / "tests.csv", tests_csv(tests))
+    write_text(out / "table.tex", latex(plan, grouped))
+    write_text(out / "report.html", comparison_page(plan, grouped, found, tests, manifest))
+    failed = [job for job in unique(list(jobs)) if results.get(job.key, {}).get("status") == "failed"]
+    lines = [f"{len(results)} results, {new} of them new, {len(failed)} failed"]
+    lines += [f"failed: {job.label}: {results[job.key]['reason'].splitlines()[0]}" for job in failed[:10]]
+    lines.append(f"report: {out / 'report.html'}")
+    return Answer(lines, {"out": str(out), "results": len(results), "new": new, "failed": len(failed)})
+
+
+def _check(options: CompareOptions) -> None:
+    if options.workers < 1 or options.sample < 0:
+        raise UsageError("--workers must be at least 1, --sample at least 0")
+    if (options.engine == "dask") != (options.scheduler is not None):
+        raise UsageError("--engine dask and --scheduler ADDRESS belong together, as tcp://127.0.0.1:8786")
+
+
+def _engine(jobs: Sequence[Job], options: CompareOptions) -> engines.Finished:
+    specs = [job.spec() for job in jobs]
+    cache, keep = options.cache.resolve(), None if options.keep_runs is None else options.keep_runs.resolve()
+    if not specs:
+        return
+    if options.scheduler is not None:
+        yield from engines.run_on_dask(specs, options.scheduler, cache, keep)
+    else:
+        yield from engines.run_locally(specs, options.workers, cache, keep)
+
+
+def _listing(jobs: Sequence[Job], store: ResultStore) -> Answer:
+    states = {job.key: store.status(job.key) or "to do" for job in unique(list(jobs))}
+    counts = Counter(states.values())
+    lines = [f"{states[job.key]:<7}{job.key[:12]}  {job.label}" for job in jobs]
+    lines.append(
+        f"{len(jobs)} jobs, {len(states)} different: " + ", ".join(f"{n} {what}" for what, n in counts.items())
+    )
+    listed = [{"key": job.key, "label": job.label, "state": states[job.key], "source": job.source} for job in jobs]
+    return Answer(lines, {"jobs": listed})
+
+
+def _manifest(plan_text: str, jobs: Sequence[Job], found: Sequence[Trial], command: list[str]) -> dict[str, Any]:
+    return {
+        "command": command,
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "code_revision": code_revision(),
+        "environment": environment(),
+        "plan_text": plan_text,
+        "sources": source_identities(jobs),
+        "results": [
+            {
+                "label": trial.job.label,
+                "unit": [trial.job.sequence, trial.job.variant, trial.job.estimator, trial.job.seed],
+                "output": trial.output,
+                "key": trial.job.key,
+                "failure": trial.failure,
+                "sha256": trial.sha256,
+                **trial.values,
+            }
+            for trial in found
+        ],
+    }
+
+
+def _verify(options: CompareOptions, plan: Plan, jobs: Sequence[Job], progress: Progress | None) -> Answer:
+    assert options.verify is not None
+    manifest = read_manifest(options.verify)
+
+    def rerun(chosen: Sequence[Job]) -> dict[str, dict[str, Any]]:
+        wanted = list(unique(list(chosen)))
+        results: dict[str, dict[str, Any]] = {}
+        with closing(_engine(wanted, options)) as finished:
+            for spec, result in finished:
+                if result["status"] in ("mismatch", "stopped"):
+                    raise UsageError(f"a job could not be run again: {result['reason']}")
+                results[spec["key"]] = result
+                if progress is not None:
+                    progress(len(results), len(wanted), result["status"])
+        return results
+
+    text = options.plan.read_text(encoding="utf-8")
+    verdicts, remarks = verify(plan, text, jobs, manifest, options.sample, rerun)
+    counts = Counter(verdict.outcome for verdict in verdicts)
+    lines = [f"remark: {remark}" for remark in remarks]
+    lines += [f"{v.outcome}: {v.label} {v.output}" + (f" ({v.detail})" if v.detail else "") for v in verdicts]
+    lines.append(f"{len(verdicts)} trajectories: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
+    data = {"verdicts": [asdict(verdict) for verdict in verdicts], "remarks": remarks}
+    return Answer(lines, data, TrackingLostError.exit_code if counts["differs"] else 0)
