@@ -11,6 +11,8 @@ from vislam.camera import Rig
 from vislam.errors import DataError
 from vislam.messages import Frame, Observations
 
+_DESCRIPTOR_BYTES = 32
+
 
 class Intake:
     """Refuses frames that do not fit the rig or do not advance in time, and seeds OpenCV's random numbers per frame."""
@@ -53,9 +55,14 @@ class Intake:
     def _usable(self, index: int, given: Observations) -> Observations:
         """Return the given tracks without those that cannot be used."""
         count = len(given.track_ids)
-        columns = {"pixels_px": (given.pixels_px, 2), "right_px": (given.right_px, 2), "depth_m": (given.depth_m, 0)}
-        for name, (values, width) in columns.items():
-            if values is not None and values.shape != ((count, width) if width else (count,)):
+        shapes = {
+            "pixels_px": (given.pixels_px, (count, 2)),
+            "right_px": (given.right_px, (count, 2)),
+            "depth_m": (given.depth_m, (count,)),
+            "descriptors": (given.descriptors, (count, _DESCRIPTOR_BYTES)),
+        }
+        for name, (values, shape) in shapes.items():
+            if values is not None and values.shape != shape:
                 raise DataError(f"frame {index}: {count} tracks came with {name} of shape {values.shape}")
         if len(np.unique(given.track_ids)) != count:
             raise DataError(f"frame {index}: a track id came twice; ids must be unique within a frame")
@@ -68,4 +75,5 @@ class Intake:
             given.pixels_px[good],
             None if given.right_px is None else given.right_px[good],
             None if given.depth_m is None else given.depth_m[good],
+            None if given.descriptors is None else given.descriptors[good],
         )

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.camera import Camera
 from vislam.config import FrontEndConfig
@@ -50,17 +51,21 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
 
 def make_keyframe(
     keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int,
-    measure_depth: Callable[[Array], Array] | None,
+    measure_depth: Callable[[Array, NDArray[np.int64] | None], Array] | None,
 ) -> Keyframe:  # fmt: skip
-    """Describe a frame for loop closing; `measure_depth` gives z-depths [N] in metres of raw pixels [N, 2].
+    """Describe a frame for loop closing.
 
-    A frame without images has nothing to describe.
+    `measure_depth` gives z-depths [N] in metres of raw pixels [N, 2] and the tracks [N] that they belong to, if any.
+    A frame that brings its tracks brings their descriptors too, or has nothing to recognise it by.
     """
-    if not frame.images:
-        none = None if measure_depth is None else np.empty((0, 3))
-        return Keyframe(keyframe_id, frame.t_ns, frame, np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8), none)
-    pixels, descriptors = describe(frame.images[0], features)
+    ids = None
+    if frame.tracks is None:
+        pixels, descriptors = describe(frame.images[0], features)
+    elif frame.tracks.descriptors is not None:
+        ids, pixels, descriptors = frame.tracks.track_ids, frame.tracks.pixels_px, frame.tracks.descriptors
+    else:
+        pixels, descriptors = np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
     points = None
     if measure_depth is not None:
-        points = transform_points(T_body_cam, camera.unproject(pixels) * measure_depth(pixels)[:, None])
+        points = transform_points(T_body_cam, camera.unproject(pixels) * measure_depth(pixels, ids)[:, None])
     return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points)

@@ -345,9 +345,9 @@ class MetricFrontEnd:
         return Observations(self._tracker.ids.copy(), pixels.copy(), reading.right_px, reading.depth_m)
 
     def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
-        def measure_depth(pixels: Array) -> Array:
+        def measure_depth(pixels: Array, ids: NDArray[np.int64] | None) -> Array:
             xy = self._camera.normalise(pixels)
-            return self._depth.measure(frame, pixels, xy, self._landmarks.expected_rho(xy)).depth_m
+            return self._depth.measure(frame, pixels, xy, self._landmarks.expected_rho(xy), ids).depth_m
 
         new_id = self._keyframe.id + 1 if self._keyframe is not None else 0
         features = self._config.described_features

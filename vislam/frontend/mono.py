@@ -29,6 +29,7 @@ _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second
 _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a translation
 _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
 _GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
+_BOTH_ENDS = 2.0**0.5
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
@@ -68,7 +69,7 @@ class MonoFrontEnd:
         self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
-        self._sigma_xy = config.track_sigma_px / self._camera.fx
+        self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
         self._keyframe: Keyframe | None = None
         self._keyframe_tracks = 0
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
@@ -82,6 +83,9 @@ class MonoFrontEnd:
     def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         frame, dt_s = self._intake.accept(frame)
+        # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy there as here
+        given = _BOTH_ENDS if frame.tracks is not None else 1.0
+        self._sigma_xy = given * self._config.track_sigma_px / self._camera.fx
         if self._keyframe is None:
             return self._start(frame, "")
         R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])

@@ -39,6 +39,7 @@ class LandmarkField:
         thinned = path_m[np.sort(np.unique(np.floor(path_m / 0.3).astype(np.int64), axis=0, return_index=True)[1])]
         clear = cKDTree(thinned).query(points, distance_upper_bound=_CLEARANCE_M)[0] > _CLEARANCE_M
         self.points_m: Array = np.ascontiguousarray(points[clear])
+        self.strength: Array = rng.random(len(self.points_m))  # [N] of the corners that the points are, 0 to 1
         self._anchor_of = np.repeat(np.arange(len(first)), each)[clear]
         self._starts = np.searchsorted(self._anchor_of, np.arange(len(first) + 1))
         self._tree = cKDTree(self._anchors)

@@ -22,6 +22,7 @@ from vislam.sim.spline import Motion
 
 Ids = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Descriptors = NDArray[np.uint8]
 
 _BORDER_PX = 8.0  # tracks begin at least this far inside the image
 _NEAR_M, _FAR_M = 0.4, 40.0  # z-depth within which a landmark can be followed
@@ -30,6 +31,9 @@ _SLIP_LIFE_S = 0.7  # how long a track that slipped goes on
 _SLIP_REACH_PX = 60.0  # Lucas-Kanade does not go astray much further
 _LONGEST_STEP_S = 0.3  # over a longer pause between frames nothing can be followed
 _ROW_STEPS = 2  # the row decides the time, the time moves the row
+_STRENGTH_NOISE = 0.3  # what light and view do to a corner's response, of the spread among corners
+_SIDES = 6  # a descriptor changes beyond about 60 degrees
+_BIT_ERRORS = 0.06  # of the 256 bits: 30 differ between two views of a landmark, as ORB has it
 _PERSON_M = 2.0  # away
 _PERSON_SWEEP_S = 7.0  # to the other side and back
 _NOBODY = -1
@@ -47,6 +51,7 @@ class TrackNoise:
     track_life_s: float
     readout_s: float
     moving_share: float
+    descriptors: bool
 
 
 class Moves(Protocol):
@@ -168,7 +173,9 @@ class SimulatedTracker:
         missing = round((1.0 - share) * wanted) - int((self.landmarks != _NOBODY).sum())
         if missing > 0:
             free, _ = self._candidates(t_s, person)
-            chosen = np.sort(self._rng.permutation(len(free))[:missing])
+            # as corner detectors do, mostly the same ones again, so that a place is recognised
+            strength = self._field.strength[free] + _STRENGTH_NOISE * self._rng.random(len(free))
+            chosen = np.sort(np.argsort(-strength)[:missing])
             self._append(free[chosen], np.zeros((len(chosen), 2)))
 
     def _begin_on_person(self, count: int, person: Array | None) -> None:
@@ -217,7 +224,19 @@ class SimulatedTracker:
             pixels[found],
             None if right is None else right[found],
             None if depth is None else depth[found],
+            self._describe(points_cam[found], self.landmarks[found]) if noise.descriptors else None,
         )
+
+    def _describe(self, points_cam: Array, landmarks: Ids) -> Descriptors:
+        """Return descriptors [N, 32]: alike for one landmark seen from about one side, with some wrong bits."""
+        T_world_body = self._motion.at(np.array([self._last_s or 0.0])).T_world_body[0]
+        back = -points_cam @ (T_world_body @ self._rig.T_body_cams[0])[:3, :3].T
+        side = np.arctan2(back[:, 1], back[:, 0]) / (2.0 * np.pi) + self._field.strength[landmarks]
+        key = landmarks * _SIDES + np.floor(side * _SIDES).astype(np.int64) % _SIDES
+        key[landmarks == _NOBODY] = self._rng.integers(1 << 40, 1 << 41, int((landmarks == _NOBODY).sum()))
+        words = scramble((key[:, None] * 4 + np.arange(4)).astype(np.uint64))
+        flipped = self._rng.random((len(key), 256), dtype=np.float32) < _BIT_ERRORS
+        return words.view(np.uint8) ^ np.packbits(flipped, axis=1)
 
     def _right(self, points_cam: Array, error: Array, jumps: Bools) -> Array | None:
         """Return pixels [N, 2] in the right camera: the same patch, so the left's error too, and that of the match."""
@@ -236,6 +255,14 @@ class SimulatedTracker:
         z, model = points_cam[:, 2], self._depth_noise
         z = z + self._rng.normal(0.0, 1.0, len(z)) * (model.floor_m + model.sigma_m_at_1m * z * z)
         return np.where(jumps | (z < model.min_m) | (z > model.max_m), np.nan, z)
+
+
+def scramble(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return numbers that look random and are the same for the same number (splitmix64; Steele et al. 2014)."""
+    x = numbers * np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
 
 
 def _within(pixels: Array, box: Array) -> Bools:

@@ -57,6 +57,7 @@ class PointOptions:
     dropout_share: _Share = 0.02  # of the tracks: not found in a frame, but in the next
     track_life_s: Annotated[float, Field(gt=0.05)] = 4.0  # mean, within the image
     distortion: bool = True  # of the lenses
+    descriptors: bool = True  # that recognise a landmark when it is seen again; without, no loops
     lost_share: _Share = 0.0  # of the frames: they never arrive
     outage_begin_s: _Seconds = 0.0  # frames without a single track ...
     outage_length_s: _Seconds = 0.0  # ... for so long ...
@@ -221,6 +222,7 @@ class PointRecording:
             tracks=options.tracks, pixel_sigma_px=options.pixel_sigma_px, stereo_sigma_px=options.stereo_sigma_px,
             outlier_share=options.outlier_share, dropout_share=options.dropout_share,
             track_life_s=options.track_life_s, readout_s=options.readout_s, moving_share=options.moving_share,
+            descriptors=options.descriptors,
         )  # fmt: skip
         return SimulatedTracker(self.true_rig, self.field, self.motion, noise, np.random.default_rng(self._track_seed))
 
@@ -299,4 +301,4 @@ def _in_window(t_s: float, begin_s: float, length_s: float, every_s: float) -> b
 
 def _nothing(rig: Rig) -> Observations:
     right, depth = np.empty((0, 2)) if rig.is_stereo else None, np.empty(0) if rig.has_depth else None
-    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)), right, depth)
+    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)), right, depth, np.empty((0, 32), dtype=np.uint8))
