@@ -163,6 +163,11 @@ class Front:
             counters["ekf"] = dict(self._ekf.counters)
         return counters
 
+    @property
+    def nis_statistics(self) -> dict[str, tuple[int, float, int]]:
+        """Innovations that the filter accepted, by measurement: count, sum of NIS, sum of degrees of freedom."""
+        return {} if self._ekf is None else self._ekf.nis_statistics
+
     def _span(self, from_t_ns: int | None, to_t_ns: int) -> ImuSpan | None:
         if not self._has_imu or from_t_ns is None:
             return None

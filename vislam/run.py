@@ -222,6 +222,7 @@ class Run:
             "accuracy": self._accuracy(final, truth),
             "timing_ms": self.slam.clock.summary_ms(),
             "counters": counters,
+            "nis": front.nis_statistics,
             "problems": dict(self.recording.problems),
             "loops": loops,
             "graph_revisions": self.log.revisions,

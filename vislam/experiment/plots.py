@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from vislam.experiment.measures import SEGMENTS_M
 from vislam.experiment.plan import Axis
@@ -20,7 +21,8 @@ from vislam.report.style import CODE, RC, svg
 _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", ":", "-.")
 _MAX_PANELS = 24  # more cannot be compared by eye; the tables hold all
-_WIDTH = 5.5
+_WIDTH = 11.2
+_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # 0.02 says more than 2 x 10^-2
 
 
 def errors_by_estimate(groups: Sequence[Group], metric: str = "ate_m") -> str:
@@ -38,6 +40,7 @@ def errors_by_estimate(groups: Sequence[Group], metric: str = "ate_m") -> str:
         axes.set_yticks(range(len(members)), [group.estimate for group in reversed(members)])
         axes.set_ylim(-0.6, len(members) - 0.4)
         axes.set_xscale("log")
+        _label_plainly(axes.xaxis)
         axes.set_title(name, loc="left", fontsize=9)
         axes.grid(axis="y", visible=False)
 
@@ -78,6 +81,7 @@ def over_axis(groups: Sequence[Group], axis: Axis, metric: str = "ate_m") -> str
         axes.set_title(name, loc="left", fontsize=9)
         axes.set_xlabel(axis.name)
         axes.set_yscale("log")
+        _label_plainly(axes.yaxis)
 
     return _panels(list(chosen), draw, 2.6, "", f"over-{metric}", BY_NAME[metric].title)
 
@@ -119,6 +123,7 @@ def over_segments(groups: Sequence[Group]) -> str:
         axes.set_xticks(SEGMENTS_M)
         axes.set_xlabel("segment [m]")
         axes.set_yscale("log")
+        _label_plainly(axes.yaxis)
 
     return _panels(list(chosen), draw, 2.4, "", "segments", "RPE [%]")
 
@@ -175,7 +180,7 @@ def _panels(
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     with mpl.rc_context(RC):
-        figure = Figure(figsize=(_WIDTH * columns, height * rows + 0.5), layout="constrained")
+        figure = Figure(figsize=(_WIDTH, height * rows + 0.5), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes, panel in zip(grid.flat, names, strict=False):
             draw(axes, panel)
@@ -192,6 +197,13 @@ def _panels(
         if labels:
             figure.legend(labels.values(), labels.keys(), loc="outside upper left", ncols=3)
         return svg(figure, f"compare-{name}")
+
+
+def _label_plainly(axis: Any) -> None:
+    """Label a logarithmic axis at 1, 2, 5 of each decade."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(_PLAIN)
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _color(output: str) -> str:
