@@ -313,6 +313,7 @@ def process(
     R_cam1_cam0: Array,
     t_cam1_cam0: Array,
     P: Array,
+    change: Array,
     bounds: Array,
     limits: Array,
 ) -> tuple[NDArray[np.int64], Array, Array, Array, Array, Array, NDArray[np.int64]]:
@@ -327,7 +328,8 @@ def process(
         sigmas: [3], see `observe`.
         R_cam1_cam0: [3, 3] rotation into the right camera.
         t_cam1_cam0: [3] origin of cam0 in the right camera.
-        P: [3 + 6 C, 3 + 6 C] covariance of extrinsic rotation and clones.
+        P: [3 + 6 C, 3 + 6 C] prior covariance of extrinsic rotation and clones.
+        change: [3 + 6 C] of those since the prior; residuals are brought back to it.
         bounds: least inverse depth, greatest, greatest relative sigma of it, outlier in standard deviations, least
             number of views.
         limits: [d] chi-square limit of d degrees of freedom.
@@ -380,6 +382,7 @@ def process(
             continue
         project_out(A, H_f)
         rest = np.ascontiguousarray(A[3:, : width - 1])
+        A[3:, width - 1] += rest @ change
         residual = np.ascontiguousarray(A[3:, width - 1])
         tests[f, 1] = rows - 3
         tests[f, 0] = gate(rest, residual, P)

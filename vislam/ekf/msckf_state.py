@@ -181,6 +181,27 @@ def with_points(window: Window, ids: NDArray[np.int64], points: Array, fixing: A
     )
 
 
+def depth_ratios(window: Window, points: Array, fixing: Array, H_points: Array) -> Array:
+    """Return the relative sigma [K] of the distance of points [K, 3] from the newest clone, poses included.
+
+    Arguments as in `with_points`.
+    """
+    newest = len(window.frames) - 1
+    visible = slice(16, window.first_point)
+    P = window.P[visible, visible]
+    at = 3 + 6 * newest
+    out = np.empty(len(points))
+    for k in range(len(points)):
+        ray = points[k] - window.p[newest]
+        distance = float(np.linalg.norm(ray))
+        across = np.linalg.solve(H_points[k].T, ray / distance)
+        row = -across @ fixing[k, :, :-1]
+        row[at : at + 3] += ray / distance @ skew(window.p[newest])
+        row[at + 3 : at + 6] -= ray / distance
+        out[k] = np.sqrt(max(float(row @ P @ row + across @ across), 0.0)) / distance
+    return out
+
+
 def compressed(H: Array, r: Array) -> tuple[Array, Array]:
     """Return at most as many rows as columns that say the same: QR of whitened rows [m, n]."""
     if len(r) <= H.shape[1]:
@@ -189,16 +210,22 @@ def compressed(H: Array, r: Array) -> tuple[Array, Array]:
     return R[: H.shape[1], :-1], R[: H.shape[1], -1]
 
 
-def corrected(window: Window, x: Array, H: Array, r: Array) -> tuple[Window, float]:
-    """Apply whitened rows H [m, n], r [m]: x moves in place, the window is returned with the NIS of the rows."""
-    HP = H @ window.P
+def gain_step(P: Array, H: Array, r: Array) -> tuple[Array, Array, float]:
+    """Return the change of the state [n] by whitened rows H [m, n], r [m], the covariance after it, and their NIS."""
+    HP = H @ P
     S = HP @ H.T
     S[np.diag_indices(len(r))] += 1.0
     L = np.linalg.cholesky(S)
     A = solve_triangular(L, HP, lower=True, check_finite=False)
     b = solve_triangular(L, r, lower=True, check_finite=False)
-    P = window.P - A.T @ A
-    return moved(replace(window, P=0.5 * (P + P.T)), x, A.T @ b), float(b @ b)
+    after = P - A.T @ A
+    return A.T @ b, 0.5 * (after + after.T), float(b @ b)
+
+
+def corrected(window: Window, x: Array, H: Array, r: Array) -> Window:
+    """Apply whitened rows H [m, n], r [m]: x moves in place."""
+    change, P, _ = gain_step(window.P, H, r)
+    return moved(replace(window, P=P), x, change)
 
 
 def moved(window: Window, x: Array, change: Array) -> Window:

@@ -20,6 +20,8 @@ from vislam.ekf.msckf_state import (
     cloned,
     compressed,
     corrected,
+    depth_ratios,
+    gain_step,
     moved,
     with_points,
     without_clone,
@@ -42,6 +44,9 @@ _STATUS = {
 }
 _CONTRADICTED = 0.25  # of the tested tracks agree at most: the state is wrong, not the tracks
 _MIN_TESTED = 5
+_SMALL_SHARE = 0.05  # of the window's extent
+_SHORT_M = 0.02
+_SMALL_RAD = 0.01
 
 
 @dataclass(slots=True, eq=False)
@@ -63,6 +68,22 @@ class Outcome:
         """Add tests to the statistics."""
         old = self.statistics.get(kind, (0, 0.0, 0))
         self.statistics[kind] = (old[0] + number, old[1] + nis, old[2] + dof)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """What a frame brings: whitened rows, the observations behind them, and tracks that may stay as points."""
+
+    H: Array  # [m, n]
+    r: Array  # [m] against the state before the frame
+    at: NDArray[np.int64]  # [M] clone of each observation used
+    row: NDArray[np.int64]  # [M]
+    misses: NDArray[np.int64]  # [S]
+    ids: NDArray[np.int64]  # [K], best known depth first
+    points: Array  # [K, 3]
+    ratios: Array  # [K]
+    fixing: Array  # [K, 3, 3 + 6 C + 1] see `with_points`
+    H_points: Array  # [K, 3, 3]
 
 
 class Updater:
@@ -110,20 +131,34 @@ class Updater:
     def see(
         self, window: Window, x: Array, gyro_rad_s: Array, ago_s: float, frame: FrameTracks
     ) -> tuple[Window, Outcome]:
-        """Clone the pose for a frame and use the points it sees and the tracks that became ripe with it."""
-        out = Outcome()
+        """Clone the pose for a frame and use the points it sees and the tracks that became ripe with it.
+
+        Iterated (Bell and Cathey, 1993): while velocity is badly known, poses in the window are wrong by as much as
+        they are apart, and one linear step would take the wrong parallax for knowledge.
+        """
         R = np.ascontiguousarray(pose(x, 0, 6)[:3, :3])
-        window = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
-        leaving = self._leaving(window)
-        window, H_points, r_points = self._see_points(window, out)
-        window, H_tracks, r_tracks = self._use_tracks(window, leaving, out)
-        started = len(window.P) - H_points.shape[1]  # columns of points that came in with the tracks
-        H = np.vstack((np.pad(H_points, ((0, 0), (0, started))), H_tracks))
-        r = np.concatenate((r_points, r_tracks))
-        if len(r):
-            window, out.nis = corrected(window, x, H, r)
-            out.accepted = True
+        prior = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
+        leaving = self._leaving(prior)
+        before = x.copy()
+        window, change, P = prior, np.zeros(len(prior.P)), prior.P
+        for _ in range(self._config.tight_iterations):
+            out = Outcome()
+            rows = self._rows(window, leaving, change, out)
+            if not len(rows.r):
+                x[:], window, P = before, prior, prior.P
+                break
+            step, P, out.nis = gain_step(prior.P, rows.H, rows.r)
+            x[:] = before
+            later = moved(prior, x, step)
+            rows.fixing[:, :, -1] -= rows.fixing[:, :, :-1] @ (step - change)[16 : prior.first_point]
+            done = _is_small(window, later, step - change)
+            window, change, out.accepted = later, step, True
+            if done:
+                break
+        window = replace(window, P=P, misses=rows.misses, frames=marked(prior.frames, rows.at, rows.row))
+        if out.accepted:
             window = replace(window, last_vision_t_ns=frame.t_ns)
+            window = self._keep_points(window, rows, out)
         if leaving is not None:
             window = without_clone(window, leaving)
         window = self._watch(window, x, frame.t_ns, out)
@@ -143,92 +178,111 @@ class Updater:
         oldest = 0 if window.frames[0].t_ns != window.rest_t_ns else 1
         return oldest
 
-    def _see_points(self, window: Window, out: Outcome) -> tuple[Window, Array, Array]:
-        """Return the rows of the points of the state that the newest frame sees."""
+    def _rows(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
+        """Return what the newest frame says of its points of the state, and the tracks that are ripe with it.
+
+        The window is where to linearise; its covariance is that before the frame, `change` [n] what lies between.
+        """
         newest = len(window.frames) - 1
         frame = window.frames[newest]
-        row = np.searchsorted(frame.ids, window.point_ids)
-        row = np.minimum(row, max(len(frame.ids) - 1, 0))
-        found = frame.ids[row] == window.point_ids if len(frame.ids) else np.zeros(len(row), dtype=np.bool_)
-        R_cam, centres = self._cameras(
-            window, np.array([newest] * int(found.sum()), dtype=np.int64), frame.seen[row[found]]
-        )
-        H, r, tests = _point_rows(
-            np.flatnonzero(found),
+        row = np.minimum(np.searchsorted(frame.ids, window.point_ids), len(frame.ids) - 1)
+        found = np.flatnonzero(frame.ids[row] == window.point_ids)
+        row = row[found]
+        at = np.full(len(found), newest, dtype=np.int64)
+        H_points, r_points, tests = _point_rows(
+            found,
             window.points,
-            frame.seen[row[found]],
-            R_cam,
-            centres,
+            frame.seen[row],
+            *self._cameras(window, at, frame.seen[row]),
             self._sigmas,
             self._R_cam1_cam0,
             self._t_cam1_cam0,
             window.P,
+            change,
             len(window.frames),
             self._limits,
         )
         good = tests[:, 1] > 0
         misses = window.misses + 1
-        misses[np.flatnonzero(found)[good]] = 0
+        misses[found[good]] = 0
         out.count("points_used", int(good.sum()))
         out.count("points_gated", int((~good).sum()))
-        tested = tests[good]
-        out.test("points", len(tested), float(tested[:, 0].sum()), int(tested[:, 1].sum()))
-        frames = marked(window.frames, np.full(int(found.sum()), newest, dtype=np.int64), row[found])
-        return replace(window, misses=misses, frames=frames), H, r
+        out.test("points", int(good.sum()), float(tests[good, 0].sum()), int(tests[good, 1].sum()))
+        unused = replace(window, frames=marked(window.frames, at, row))
+        tracks = self._use_tracks(unused, leaving, change, out)
+        return replace(
+            tracks,
+            H=np.vstack((H_points, tracks.H)),
+            r=np.concatenate((r_points, tracks.r)),
+            at=np.concatenate((at, tracks.at)),
+            row=np.concatenate((row, tracks.row)),
+            misses=misses,
+        )
 
-    def _use_tracks(self, window: Window, leaving: int | None, out: Outcome) -> tuple[Window, Array, Array]:
-        """Return the projected rows of the ripe tracks; the best of those still followed become points of the state."""
-        config = self._config
+    def _use_tracks(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
+        """Return the projected rows of the ripe tracks; those still followed may become points of the state."""
         oldest = leaving if leaving is not None and leaving < len(window.frames) - 2 else None
-        ripe = ripe_tracks(window.frames, oldest, self._least, config.tight_max_tracks)
-        n = len(window.P)
+        ripe = ripe_tracks(window.frames, oldest, self._least, self._config.tight_max_tracks)
+        n, visible = len(window.P), slice(16, window.first_point)
+        width = visible.stop - visible.start
         if not len(ripe.ids):
-            return window, np.zeros((0, n)), np.zeros(0)
+            nothing = np.zeros(0)
+            nobody = np.zeros(0, dtype=np.int64)
+            return _Rows(
+                np.zeros((0, n)), nothing, nobody, nobody, nobody, nobody, np.zeros((0, 3)), nothing,
+                np.zeros((0, 3, width + 1)), np.zeros((0, 3, 3)),
+            )  # fmt: skip
         seen = np.concatenate([window.frames[i].seen[j][None] for i, j in zip(ripe.at, ripe.row, strict=True)])
-        R_cam, centres = self._cameras(window, ripe.at, seen)
-        visible = slice(16, window.first_point)
         status, points, tests, fixing, H_points, stack, _ = features.process(
             ripe.starts,
             ripe.at,
             seen,
-            R_cam,
-            centres,
+            *self._cameras(window, ripe.at, seen),
             self._sigmas,
             self._R_cam1_cam0,
             self._t_cam1_cam0,
             np.ascontiguousarray(window.P[visible, visible]),
+            np.ascontiguousarray(change[visible]),
             self._bounds,
             self._limits,
         )
-        window = replace(window, frames=marked(window.frames, ripe.at, ripe.row))
         for code, name in _STATUS.items():
             out.count(name, int((status == code).sum()))
         used = status == features.USED
         out.test("tracks", int(used.sum()), float(tests[used, 0].sum()), int(tests[used, 1].sum()))
         H_stack, r_stack = compressed(stack[:, :-1], stack[:, -1])
-        window = self._keep_points(window, ripe.ids, used & ripe.alive, points, tests[:, 2], fixing, H_points, out)
-        H = np.zeros((len(r_stack), len(window.P)))
+        H = np.zeros((len(r_stack), n))
         H[:, visible] = H_stack
-        return window, H, r_stack
+        fit = np.flatnonzero(used & ripe.alive)
+        fit = fit[np.argsort(tests[fit, 2], kind="stable")]
+        return _Rows(
+            H,
+            r_stack,
+            ripe.at,
+            ripe.row,
+            window.misses,
+            ripe.ids[fit],
+            points[fit],
+            tests[fit, 2],
+            fixing[fit],
+            H_points[fit],
+        )
 
-    def _keep_points(
-        self,
-        window: Window,
-        ids: NDArray[np.int64],
-        fit: NDArray[np.bool_],
-        points: Array,
-        ratios: Array,
-        fixing: Array,
-        H_points: Array,
-        out: Outcome,
-    ) -> Window:
-        free = self._config.tight_points - len(window.point_ids)
-        chosen = np.flatnonzero(fit)
-        chosen = chosen[np.argsort(ratios[chosen], kind="stable")][: max(free, 0)]
-        if not len(chosen):
+    def _keep_points(self, window: Window, rows: _Rows, out: Outcome) -> Window:
+        """Take the tracks whose depth is known best into the state, as far as there is room.
+
+        How well the poses are known counts too: as long as scale is not, a point in the state would be linearised at
+        the wrong place for good.
+        """
+        free = max(self._config.tight_points - len(window.point_ids), 0)
+        if not len(rows.ids) or not free:
             return window
-        out.count("points_started", len(chosen))
-        return with_points(window, ids[chosen], points[chosen], fixing[chosen], H_points[chosen])
+        ratios = depth_ratios(window, rows.points, rows.fixing, rows.H_points)
+        fit = np.flatnonzero(ratios < self._config.tight_point_depth_ratio)[:free]
+        if not len(fit):
+            return window
+        out.count("points_started", len(fit))
+        return with_points(window, rows.ids[fit], rows.points[fit], rows.fixing[fit], rows.H_points[fit])
 
     def _cameras(self, window: Window, at: NDArray[np.int64], seen: Array) -> tuple[Array, Array]:
         return features.camera_poses(
@@ -279,7 +333,7 @@ class Updater:
         )
         if not self._passes("zero_velocity", window, H, r, out):
             return replace(window, rest_t_ns=None), out
-        window, _ = corrected(window, x, H, r)
+        window = corrected(window, x, H, r)
         stamps = [frame.t_ns for frame in window.frames]
         if window.rest_t_ns in stamps:
             window = self._hold(window, x, stamps.index(window.rest_t_ns), out)
@@ -301,7 +355,7 @@ class Updater:
         r = np.concatenate((turned, window.p[index] - T[:3, 3])) / sigmas
         if not self._passes("hold", window, H, r, out):
             return replace(window, rest_t_ns=None)
-        return corrected(window, x, H, r)[0]
+        return corrected(window, x, H, r)
 
     def _passes(self, kind: str, window: Window, H: Array, r: Array, out: Outcome) -> bool:
         S = H @ window.P @ H.T + np.eye(len(r))
@@ -333,6 +387,13 @@ class Updater:
         return moved(replace(window, P=0.5 * (P + P.T)), x, K @ r), out
 
 
+def _is_small(before: Window, after: Window, change: Array) -> bool:
+    """Whether a step changed so little of the window's shape that linearising again would change nothing."""
+    apart = np.abs(before.p - before.p[-1]).max()
+    moved_m = np.abs((after.p - after.p[-1]) - (before.p - before.p[-1])).max()
+    return bool(moved_m < _SMALL_SHARE * max(apart, _SHORT_M) and np.abs(change[:3]).max() < _SMALL_RAD)
+
+
 @njit(cache=True, nogil=True)
 def _point_rows(
     which: NDArray[np.int64],
@@ -344,6 +405,7 @@ def _point_rows(
     R_cam1_cam0: Array,
     t_cam1_cam0: Array,
     P: Array,
+    change: Array,
     clones: int,
     limits: Array,
 ) -> tuple[Array, Array, Array]:
@@ -383,6 +445,9 @@ def _point_rows(
             for j in range(15):
                 small[i, j] = P[columns[i], columns[j]]
         residual = r[:rows].copy()
+        for i in range(rows):
+            for j in range(15):
+                residual[i] += h[i, j] * change[columns[j]]
         nis = features.gate(h, residual, small)
         tests[k, 0] = nis
         if not nis <= limits[rows]:
