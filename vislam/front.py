@@ -10,7 +10,7 @@ import numpy as np
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
-from vislam.ekf import Ekf
+from vislam.ekf import Ekf, MsckfEkf, make_ekf
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.initialisation import Initialisation, Initialiser
@@ -78,12 +78,12 @@ class Front:
         self._config = config
         self._clock = clock
         self._has_imu = noise is not None
-        self._ekf: Ekf | None = None
+        self._ekf: Ekf | MsckfEkf | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu)
             self._rest = RestDetector(config.init, noise)
             self._initialiser = Initialiser(config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
-            self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
+            self._ekf = make_ekf(config.ekf, noise, config.imu.gravity_m_s2, rig)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
         self._last_frame_t_ns: int | None = None
         self._last_seen: Observations | None = None
@@ -243,7 +243,7 @@ class Front:
         self._T_odom_body = T_odom_body
         return T_odom_body, self._ekf.state_at(frame.t_ns)
 
-    def _correct(self, ekf: Ekf, t_ns: int, track: TrackResult, at_rest: bool) -> None:
+    def _correct(self, ekf: Ekf | MsckfEkf, t_ns: int, track: TrackResult, at_rest: bool) -> None:
         """Give the filter what was seen in a frame, in time or later."""
         ekf.update_vision(track.vo, track.observations)
         if at_rest:
