@@ -151,8 +151,10 @@ class EkfConfig:
 
     tight_clones: int = 11  # past poses that tracks tie together; half a second at 20 Hz
     tight_points: int = 25  # long tracks kept as points of the state; they stop the drift while little moves
+    tight_point_depth_ratio: float = 0.1  # sigma of its distance over it that such a point may have at first
     tight_point_misses: int = 1  # frames in a row that may not see such a point before it is dropped
     tight_max_tracks: int = 60  # used per frame; bounds its time
+    tight_iterations: int = 5  # of one update at most; more than one only while velocity is badly known
     tight_min_observations: int = 3  # of a track; two leave one equation
     tight_pixel_sigma_px: float = 1.0  # of a corner followed over many frames
     tight_stereo_sigma_px: float = 0.5  # right minus left pixel: matching, without the error of the corner
@@ -297,15 +299,16 @@ class GraphConfig:
 class BatchConfig:
     """Batch optimisation of a finished run: visual-inertial bundle adjustment over all keyframes."""
 
-    rounds: int = 4  # of optimising, then judging every track and loop anew; the last two change almost nothing
+    rounds: int = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
     iterations: int = 20  # most Levenberg-Marquardt steps of a round; converged earlier as a rule
     start_gate_px: float = 20.0  # first round: poses of the run may be off, only gross outliers leave
-    start_cauchy_px: float = 3.0  # scale of the kernel in that round
+    start_cauchy: float = 3.0  # standard deviations, scale of the kernel in that round
     huber_k: float = 2.0  # standard deviations, in later rounds
     gate_probability: float = 0.999  # chi-square of a pixel or depth that stays, in later rounds
     max_relative_sigma: float = 0.25  # of a landmark's distance by its own rays; farther ones lack parallax or depth
     max_observations: int = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
     min_seen: int = 12  # landmarks; a keyframe that sees fewer also gets the odometry of the run
+    vision_inflation: float = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
     pixel_sigma_min_px: float = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
     pixel_sigma_max_px: float = 3.0
     loop_probability: float = 0.9999  # a loop beyond this chi-square is refused by graduated non-convexity
