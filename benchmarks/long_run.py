@@ -1,0 +1,175 @@
+"""Does the graph's work grow with the length of a run? Time and memory of keyframe updates, printed and plotted.
+
+    .venv/bin/python benchmarks/long_run.py hour --coupling loose --minutes 60
+    .venv/bin/python benchmarks/long_run.py chain --kilometres 10 --step 1.0
+    .venv/bin/python benchmarks/long_run.py g2o sphere2500 M3500
+
+`hour` feeds a simulated hour of IMU, stereo tracks, odometry and loops through PoseGraph; `chain` an open-loop chain of
+odometry; `g2o` replays files in key order. Times are CPU time of this process. Plots go to results/long_run/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "soak")]
+
+import matplotlib  # noqa: E402
+import numpy as np  # noqa: E402
+import psutil  # noqa: E402
+
+matplotlib.use("Agg")
+
+from g2o_edges import BEST_CHI2, EdgeFile  # noqa: E402
+from graph_world import GRAVITY_M_S2, packet_of  # noqa: E402
+from lap_world import STEREO, LapWorld  # noqa: E402
+from matplotlib import pyplot as plt  # noqa: E402
+
+from vislam.config import GraphConfig, WindowConfig  # noqa: E402
+from vislam.factors.replay import EdgeGraph  # noqa: E402
+from vislam.geometry import se3_exp, transform  # noqa: E402
+from vislam.graph import PoseGraph  # noqa: E402
+from vislam.messages import Tracking, VoMeasurement  # noqa: E402
+
+RESULTS = ROOT / "results" / "long_run"
+
+
+@dataclass
+class Meter:
+    """CPU time and resident memory of each update."""
+
+    title: str
+    times_ms: list[float] = field(default_factory=list)
+    memory_mb: list[float] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    process: psutil.Process = field(default_factory=psutil.Process)
+
+    def start(self) -> None:
+        """Begin an update."""
+        self._began = time.process_time()
+
+    def stop(self, note: str = "") -> None:
+        """End it; `note` is what the graph had to say."""
+        self.times_ms.append((time.process_time() - self._began) * 1e3)
+        self.memory_mb.append(self.process.memory_info().rss / 2**20)
+        if note:
+            self.notes.append(f"{len(self.times_ms) - 1}: {note}")
+
+    def report(self) -> None:
+        """Print percentiles by quarters of the run, and plot all."""
+        times, memory = np.array(self.times_ms), np.array(self.memory_mb)
+        print(f"{self.title}: {len(times)} updates, {times.sum() / 1e3:.1f} s")
+        print("  part         p50 ms   p99 ms   max ms   MB at end")
+        parts = {f"quarter {n + 1}": rows for n, rows in enumerate(np.array_split(np.arange(len(times)), 4))}
+        for name, rows in (parts | {"all": np.arange(len(times))}).items():
+            part = times[rows]
+            p50, p99 = np.percentile(part, [50, 99])
+            print(f"  {name:11s} {p50:7.2f}  {p99:7.2f}  {part.max():7.1f}  {memory[rows[-1]]:7.0f}")
+        for note in self.notes[:10]:
+            print(f"  note at {note}")
+        print(f"  notes: {len(self.notes)}; plot: {self._plot(times, memory).relative_to(ROOT)}", flush=True)
+
+    def _plot(self, times: np.ndarray, memory: np.ndarray) -> Path:
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        figure, (upper, lower) = plt.subplots(2, 1, sharex=True, figsize=(9, 6))
+        upper.semilogy(times, ".", markersize=2)
+        upper.set_ylabel("CPU time of an update, ms")
+        upper.axhline(50.0, color="tab:red", linewidth=0.8)
+        upper.set_title(self.title)
+        lower.plot(memory)
+        lower.set_ylabel("resident memory, MB")
+        lower.set_xlabel("keyframe")
+        path = RESULTS / f"{self.title.replace(' ', '_').replace(',', '')}.png"
+        figure.savefig(path, dpi=120)
+        plt.close(figure)
+        return path
+
+
+def hour(coupling: str, minutes: float, loop_every: int, tracks: int) -> None:
+    """Feed minutes of a simulated run through PoseGraph."""
+    world = LapWorld(tracks=tracks, loop_every=loop_every)
+    config = GraphConfig(coupling="tight" if coupling == "tight" else "loose")
+    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, STEREO, WindowConfig())
+    graph.initialise(world.initial_state())
+    meter = Meter(f"{minutes:.0f} min {coupling}, loop every {loop_every}")
+    truth = []
+    for step in world.steps(round(minutes * 60 * world.keyframe_hz)):
+        meter.start()
+        update = graph.add(step.packet, step.edges)
+        meter.stop(update.note)
+        truth.append(step.truth)
+    meter.report()
+    error = graph.poses()[:, :3, 3] - np.stack(truth)[:, :3, 3]
+    print(f"  position rmse {np.sqrt(np.mean(np.sum(error**2, axis=1))):.3f} m, {update.details}")
+
+
+def chain(kilometres: float, step_m: float) -> None:
+    """Feed an open-loop chain through PoseGraph without an IMU: 1 mrad and 2 mm per step."""
+    rng = np.random.default_rng(3)
+    sigmas = np.repeat([0.001, 0.002], 3)
+    graph = PoseGraph(
+        GraphConfig(vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0), None, 9.81, STEREO, WindowConfig()
+    )
+    graph.initialise(None)
+    meter = Meter(f"{kilometres:g} km in steps of {step_m:g} m")
+    step = transform(np.eye(3), np.array([step_m, 0.0, 0.0]))
+    for k in range(round(kilometres * 1e3 / step_m)):
+        measured = step @ se3_exp(rng.normal(size=6) * sigmas)
+        vo = VoMeasurement(k * 10**9, max(k - 1, 0), measured, np.diag(sigmas**2), True, Tracking.OK, 100)
+        packet = packet_of(k, k * 10**9, vo)
+        meter.start()
+        meter.stop(graph.add(packet).note)
+    meter.report()
+
+
+def g2o(folder: Path, names: list[str]) -> None:
+    """Replay files in key order and say how far from the optimum they end."""
+    for name in names:
+        file, graph = EdgeFile(folder / f"{name}.g2o"), EdgeGraph(GraphConfig())
+        meter = Meter(f"{name} replay")
+        file.replay(graph, meter)
+        meter.report()
+        before = file.chi2(graph.poses)
+        how = graph.finish()
+        after = file.chi2(graph.poses)
+        best = BEST_CHI2[name] or file.optimum_from(graph.poses)
+        print(f"  chi2 {before:.6g}, after finish {after:.8g}, optimum {best:.8g}; {how}", flush=True)
+
+
+def main() -> None:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    verb = verbs.add_parser("hour")
+    verb.add_argument("--coupling", choices=["loose", "tight"], default="tight")
+    verb.add_argument("--minutes", type=float, default=60.0)
+    verb.add_argument("--loop-every", type=int, default=10, help="keyframes between loops; 0: none")
+    verb.add_argument("--tracks", type=int, default=80)
+    verb = verbs.add_parser("chain")
+    verb.add_argument("--kilometres", type=float, default=10.0)
+    verb.add_argument("--step", type=float, default=1.0, help="metres")
+    verb = verbs.add_parser("g2o")
+    verb.add_argument("names", nargs="*", default=list(BEST_CHI2))
+    verb.add_argument(
+        "--folder", type=Path, default=Path(os.environ.get("VISLAM_DATA", ROOT.parent / "shared/data")) / "g2o"
+    )
+    asked = parser.parse_args()
+    if asked.verb == "hour":
+        hour(asked.coupling, asked.minutes, asked.loop_every, asked.tracks)
+    elif asked.verb == "chain":
+        chain(asked.kilometres, asked.step)
+    else:
+        g2o(asked.folder, asked.names)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""An endless run around the same lap, made keyframe by keyframe so that an hour needs no more memory than a minute."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from graph_world import EUROC_NOISE, GRAVITY_M_S2, LAP_S, T_BODY_CAM0, _derivative, position, rotation
+from numpy.typing import NDArray
+
+from vislam.camera import Camera, Rig
+from vislam.geometry import invert, se3_exp, transform, transform_points
+from vislam.imu import ImuNoise
+from vislam.messages import (
+    Frame,
+    ImuSpan,
+    Keyframe,
+    KeyframePacket,
+    LoopEdge,
+    NavState,
+    Observations,
+    Tracking,
+    VoMeasurement,
+)
+
+Array = NDArray[np.float64]
+
+_IMU_HZ = 200
+_CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0)
+_T_BODY_CAM1 = T_BODY_CAM0 @ transform(np.eye(3), np.array([0.11, 0.0, 0.0]))
+STEREO = Rig((_CAMERA, _CAMERA), (T_BODY_CAM0, _T_BODY_CAM1))
+_ROOM_M = np.array([8.0, 7.0, 3.0])  # half extents of the walls that carry the landmarks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LapStep:
+    """One keyframe, the loops that end with it, and the truth."""
+
+    packet: KeyframePacket
+    edges: list[LoopEdge]
+    truth: Array  # [4, 4]
+
+
+class LapWorld:
+    """The motion of `graph_world`, forever: stereo tracks, odometry, IMU with walking biases, loops to old laps."""
+
+    def __init__(
+        self,
+        keyframe_hz: float = 2.0,
+        seed: int = 1,
+        tracks: int = 80,
+        loop_every: int = 10,
+        noise: ImuNoise = EUROC_NOISE,
+    ) -> None:
+        """Prepare one lap; a lap must hold a whole number of keyframes. `tracks` 0: no observations."""
+        print(f"lap world seed {seed}")
+        self.rng = np.random.default_rng(seed)
+        self.keyframe_hz, self.tracks, self.loop_every, self.noise = keyframe_hz, tracks, loop_every, noise
+        self.per_lap = round(LAP_S * keyframe_hz)
+        times = np.arange(self.per_lap) / keyframe_hz
+        R, p = rotation(times).as_matrix(), position(times)
+        self.truth = np.stack([transform(R[k], p[k]) for k in range(self.per_lap)])
+        self.velocity = _derivative(position, times, 1e-3)
+        self._make_imu()
+        self.vo_sigmas = np.repeat([np.deg2rad(0.15), 0.004], 3)
+        u = self.rng.uniform(-1.0, 1.0, (3000, 3))
+        axis = self.rng.integers(0, 3, 3000)
+        rows = np.arange(3000)
+        u[rows, axis] = np.sign(u[rows, axis])
+        self.landmarks = u * _ROOM_M
+        self.views = [[_seen(T @ T_cam, self.landmarks) for T_cam in STEREO.T_body_cams] for T in self.truth]
+
+    def _make_imu(self) -> None:
+        t, h = np.arange(round(LAP_S * _IMU_HZ) + 1) / _IMU_HZ, 1e-3
+        R = rotation(t)
+
+        def turned(s: float) -> Array:
+            return (R.inv() * rotation(t + s)).as_rotvec()
+
+        self.gyro = (8 * (turned(h) - turned(-h)) - (turned(2 * h) - turned(-2 * h))) / (12 * h)
+        acceleration = _derivative(lambda s: _derivative(position, s, 1e-3), t, 1e-3)
+        self.accel = R.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
+
+    def initial_state(self) -> NavState:
+        """The true state of keyframe 0 with biases unknown."""
+        sigmas = np.repeat([np.deg2rad(0.5), 1e-3, 0.05, 0.02, 0.15], 3)
+        return NavState(0, self.truth[0], self.velocity[0], np.zeros(3), np.zeros(3), np.diag(sigmas**2))
+
+    def steps(self, count: int) -> Iterator[LapStep]:
+        """Yield keyframes."""
+        bias = np.array([0.01, -0.015, 0.008, 0.08, -0.05, 0.06])
+        self._live: dict[int, int] = {}  # landmark to track
+        self._next_track = 0
+        for k in range(count):
+            t_ns = self.t_ns(k)
+            imu = None
+            if k:
+                imu, bias = self._span(k, bias)
+            packet = KeyframePacket(_keyframe(k, t_ns), self._vo(k), self._observe(k % self.per_lap), imu)
+            yield LapStep(packet, self._loops(k), self.truth[k % self.per_lap])
+
+    def t_ns(self, k: int) -> int:
+        """Stamp of keyframe k."""
+        return round(k / self.keyframe_hz * 1e9)
+
+    def _span(self, k: int, bias: Array) -> tuple[ImuSpan, Array]:
+        per = round(_IMU_HZ / self.keyframe_hz)
+        n = np.arange((k - 1) * per, k * per + 1)
+        at, noise, rng = n % (round(LAP_S * _IMU_HZ)), self.noise, self.rng
+        walk = np.repeat([noise.gyro_bias_walk, noise.accel_bias_walk], 3) / np.sqrt(_IMU_HZ)
+        white = np.repeat([noise.gyro_noise_density, noise.accel_noise_density], 3) * np.sqrt(_IMU_HZ)
+        biases = bias + np.cumsum(rng.normal(size=(len(n), 6)) * walk, axis=0)
+        values = np.hstack([self.gyro[at], self.accel[at]]) + biases + rng.normal(size=(len(n), 6)) * white
+        t_ns = np.round(n * (1e9 / _IMU_HZ)).astype(np.int64)
+        return ImuSpan(t_ns, values[:, :3].copy(), values[:, 3:].copy()), biases[-1]
+
+    def _vo(self, k: int) -> VoMeasurement:
+        covariance = np.diag(self.vo_sigmas**2)
+        if k == 0:
+            return VoMeasurement(0, 0, np.eye(4), covariance, True, Tracking.OK, 100)
+        T = invert(self.truth[(k - 1) % self.per_lap]) @ self.truth[k % self.per_lap]
+        T = T @ se3_exp(self.rng.normal(size=6) * self.vo_sigmas)
+        return VoMeasurement(self.t_ns(k), k - 1, T, covariance, True, Tracking.OK, 100)
+
+    def _loops(self, k: int) -> list[LoopEdge]:
+        """A loop to the same place of any earlier lap."""
+        laps = k // self.per_lap
+        if not self.loop_every or k % self.loop_every or laps < 1:
+            return []
+        old = k - self.per_lap * int(self.rng.integers(1, laps + 1))
+        sigmas = np.repeat([0.005, 0.02], 3)
+        T = se3_exp(self.rng.normal(size=6) * sigmas)
+        return [LoopEdge(k, old, k, T, np.diag(sigmas**2), True, 60, 0.5)]
+
+    def _observe(self, place: int) -> Observations:
+        left, right = self.views[place]
+        visible = np.flatnonzero(np.isfinite(left[:, 0]) & np.isfinite(right[:, 0]))
+        live = {i: self._live[i] for i in visible.tolist() if i in self._live}
+        for i in self.rng.permutation(visible).tolist():
+            if len(live) >= self.tracks:
+                break
+            if i not in live:
+                live[i] = self._next_track
+                self._next_track += 1
+        self._live = live
+        chosen = np.array(sorted(live), dtype=np.int64)
+        ids = np.array([live[i] for i in chosen.tolist()], dtype=np.int64)
+        noise = self.rng.normal(size=(2, len(chosen), 2)) * 1.0
+        return Observations(ids, left[chosen] + noise[0], right[chosen] + noise[1] * np.array([0.5, 1.0]))
+
+
+def _seen(T_world_cam: Array, points: Array) -> Array:
+    """Pixels [N, 2] of points, NaN where they are not seen."""
+    in_camera = transform_points(invert(T_world_cam), points)
+    pixels = _CAMERA.project(in_camera)
+    pixels[~_CAMERA.contains(pixels) | (in_camera[:, 2] < 0.3)] = np.nan
+    return pixels
+
+
+def _keyframe(k: int, t_ns: int) -> Keyframe:
+    return Keyframe(k, t_ns, Frame(t_ns, k, ()), np.zeros((0, 2)), np.zeros((0, 32), np.uint8), None)

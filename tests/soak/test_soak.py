@@ -1,0 +1,106 @@
+"""Runs as long as patience allows in every test run; the long ones are in benchmarks/long_run.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from g2o_edges import BEST_CHI2, EdgeFile
+from graph_world import GRAVITY_M_S2, RIG, packet_of
+from lap_world import STEREO, LapWorld
+
+from vislam.config import GraphConfig, WindowConfig
+from vislam.errors import DataError
+from vislam.factors.replay import Between, EdgeGraph
+from vislam.geometry import se3_exp, transform
+from vislam.graph import PoseGraph
+from vislam.messages import LoopEdge, Tracking, VoMeasurement
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["tinyGrid3D", "smallGrid3D", "MIT"])
+def test_pose_graph_files_reach_their_optimum(data_root: Path, name: str) -> None:
+    file = EdgeFile(data_root / "g2o" / f"{name}.g2o")
+    graph = EdgeGraph(GraphConfig())
+    notes = file.replay(graph)
+    print(notes)
+    graph.finish()
+    chi2 = file.chi2(graph.poses)
+    optimum = BEST_CHI2[name] or file.optimum_from(graph.poses)
+    assert chi2 < 1.001 * optimum
+    assert len(notes) <= 1  # a rebuild with QR, after which nothing fails again
+
+
+def test_edges_that_cannot_be_used_are_refused_before_anything_is_touched() -> None:
+    graph = EdgeGraph(GraphConfig())
+    step = transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    good = Between(0, 0, 1, step, np.eye(6) * 1e-4)
+    bad_loop = Between(7, 1, 0, np.full((4, 4), np.nan), np.eye(6))
+    for odometry, loops in (
+        (replace(good, to_id=2), []),
+        (replace(good, covariance=-np.eye(6)), []),
+        (good, [bad_loop]),
+        (good, [replace(good, id=7, to_id=5)]),
+    ):
+        with pytest.raises(DataError, match="edge"):
+            graph.add(odometry, loops)
+    assert len(graph.poses) == 1
+    assert graph.add(good, [replace(good, id=7, from_id=1, to_id=0, T_from_to=np.linalg.inv(step))]) == ""
+    np.testing.assert_allclose(graph.poses[1], step, atol=1e-6)
+
+
+@pytest.mark.parametrize("step_m", [1.0, 0.25])
+def test_open_loop_chain_as_far_as_gtsam_throws(step_m: float) -> None:
+    """Healthy chains on which iSAM2 with Cholesky throws, after about 370 m."""
+    rng = np.random.default_rng(3)
+    sigmas = np.repeat([0.001, 0.002], 3)
+    count = {1.0: 700, 0.25: 1500}[step_m]
+    covariance = np.diag(sigmas**2)
+    step = transform(np.eye(3), np.array([step_m, 0.0, 0.0]))
+    config = GraphConfig(vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
+    graph = PoseGraph(config, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph.initialise(None)
+    chain, notes = np.eye(4), []
+    for k in range(count):
+        t_ns = k * 10**9
+        measured = step @ se3_exp(rng.normal(size=6) * sigmas)
+        chain = chain @ measured if k else chain
+        vo = VoMeasurement(t_ns, max(k - 1, 0), measured, covariance, True, Tracking.OK, 100)
+        notes += [f"{k}: {note}"] if (note := graph.add(packet_of(k, t_ns, vo)).note) else []
+    print(notes)
+    assert len(notes) == 1 and "rebuilt with QR" in notes[0]
+    np.testing.assert_allclose(graph.poses()[-1], chain, atol=1e-3)
+    end = LoopEdge(0, 0, count - 1, np.linalg.matrix_power(step, count - 1), covariance, True, 50, 1.0)
+    vo = VoMeasurement(count * 10**9, count - 1, step, covariance, True, Tracking.OK, 100)
+    assert graph.add(packet_of(count, count * 10**9, vo), [end]).accepted_loop_ids == (0,)
+    assert np.linalg.norm(graph.poses()[count - 1, :3, 3] - [step_m * (count - 1), 0.0, 0.0]) < 0.1
+
+
+@pytest.mark.parametrize(("coupling", "minutes"), [("loose", 4.5), ("tight", 1.5)])
+def test_minutes_of_keyframes_with_loops(coupling: str, minutes: float) -> None:
+    """Loose is long enough for poses to be read back in parts."""
+    world = LapWorld(seed=5, tracks=40)
+    config = GraphConfig(coupling="tight" if coupling == "tight" else "loose")
+    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, STEREO, WindowConfig())
+    graph.initialise(world.initial_state())
+    count = round(minutes * 60.0 * world.keyframe_hz)
+    truth, most_read, seen = [], 0, {}
+    for step in world.steps(count):
+        update = graph.add(step.packet, step.edges)
+        truth.append(step.truth)
+        assert update.note == ""
+        assert update.newest is not None and np.all(np.isfinite(update.newest.covariance))
+        seen |= dict(zip(update.ids.tolist(), update.T_map_body, strict=True))
+        if not step.edges:
+            most_read = max(most_read, len(update.ids))
+    assert sorted(seen) == list(range(count))
+    assert most_read <= config.read_newest + config.read_block
+    published = np.stack([seen[k] for k in range(count)])
+    final = graph.finish()
+    error_m = np.linalg.norm((final.T_map_body - np.stack(truth))[:, :3, 3], axis=1)
+    lag_m = np.linalg.norm((published - final.T_map_body)[:, :3, 3], axis=1)
+    print(f"rmse {np.sqrt(np.mean(error_m**2)):.3f} m, published poses were {lag_m.max():.4f} m from the final ones")
+    assert np.sqrt(np.mean(error_m**2)) < 0.1
+    assert lag_m.max() < 0.1
