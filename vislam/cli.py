@@ -319,6 +319,32 @@ def _compare(arguments: list[str]) -> int:
     return answer.exit_code
 
 
+def _optimize(arguments: list[str]) -> int:
+    from vislam.optimize import optimize
+    from vislam.options import OptimizeOptions
+    from vislam.report import write_report
+
+    options = _parse(OptimizeOptions, arguments, "optimize")
+    entry = optimize(options.run, options.settings, options.out_name)
+    write_report(options.run)
+    if options.json:
+        print(json.dumps(entry))
+        return 0
+    loops = entry["loops"]
+    print(
+        f"{entry['keyframes']} keyframes, {entry['landmarks']} landmarks, {entry['observations']} observations "
+        f"({entry['rejected_observations']} refused), {loops['kept']} of {loops['offered']} loops; "
+        f"cost {entry['cost_before']:.6g} -> {entry['cost_after']:.6g} in {entry['iterations']} steps, "
+        f"{entry['wall_s']:.1f} s"
+    )
+    for warning in entry["warnings"]:
+        print(f"warning: {warning}")
+    if entry["accuracy"]:
+        _print_evaluation({f"{options.out_name} ({mode})": entry["accuracy"][mode] for mode in entry["accuracy"]})
+    print(f"trajectory: {options.run / f'trajectory_{options.out_name}.tum'}")
+    return 0
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -335,5 +361,6 @@ _VERBS = {
     "eval": _Verb(_eval, "compare a trajectory with the truth", "vislam eval runs/desk"),
     "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
     "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
+    "optimize": _Verb(_optimize, "estimate a run again in batch, from its factor log", "vislam optimize runs/desk"),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

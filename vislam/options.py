@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from vislam.config import Config
+from vislam.config import BatchConfig, Config
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,19 @@ class DoctorOptions:
     """Recording to examine, as for `run`"""
     json: bool = False
     """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """Options of `vislam optimize`."""
+
+    run: Positional[Path]
+    """Run folder, whether its run came to the end or not"""
+    settings: Annotated[BatchConfig, tyro.conf.arg(name="")] = field(default_factory=BatchConfig)
+    out_name: str = "batch"
+    """Names the files: trajectory_NAME.tum, states_NAME.csv"""
+    json: bool = False
+    """Print the entry of metrics.json instead of the summary"""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vislam.config import Config, dump
 from vislam.errors import StorageError, UsageError
+from vislam.factor_log import LoggedFrames
 from vislam.messages import Array, LoopCandidate, LoopDecision, NavState
 from vislam.slam import KeyframeStep, Step
 from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
@@ -29,8 +30,9 @@ _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "num
 _RUN_FILES = (
     "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "session.db", "session.db-wal",
     "session.db-shm", "run.rrd", "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum",
-    "trajectory_live.tum", "trajectory_graph.tum", "trajectory_truth.tum", "map/cloud.ply", "map/mesh.ply",
-    "map/octomap.bt", "map/grid.pgm", "map/grid.yaml", "map/picture_cloud.png", "map/picture_octree.png",
+    "trajectory_live.tum", "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
+    "map/cloud.ply", "map/mesh.ply", "map/octomap.bt", "map/grid.pgm", "map/grid.yaml", "map/picture_cloud.png",
+    "map/picture_octree.png",
 )  # fmt: skip
 _TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
 _LOOPS_HEADER = (
@@ -187,17 +189,8 @@ class RunLog:
 
         Frames whose motion since their keyframe is unknown are interpolated between those that are known.
         """
-        poses = dict(zip(ids, T_map_body, strict=True))
-        known = {self._keyframe_t_ns[i]: T for i, T in poses.items()}
-        for t_ns, keyframe_id, T in zip(self._t_ns, self._keyframe_ids, self._since_keyframe, strict=True):
-            if T is not None and keyframe_id in poses:
-                known[t_ns] = poses[keyframe_id] @ T
-        stamps = np.array(sorted(known), dtype=np.int64)
-        anchors = Trajectory(stamps, np.array([known[t] for t in stamps.tolist()]).reshape(-1, 4, 4))
-        if len(anchors) == 0:
-            return anchors
-        frames = np.array([t for t in self._t_ns if stamps[0] <= t <= stamps[-1]], dtype=np.int64)
-        return Trajectory(frames, anchors.at(frames))
+        frames = LoggedFrames(self.stamps_ns, np.array(self._keyframe_ids, dtype=np.int64), self._since_keyframe)
+        return frames.placed(self._keyframe_t_ns, dict(zip(ids, T_map_body, strict=True)))
 
     def odometry_trajectory(self) -> Trajectory:
         """Return the causal poses in odom: those of the filter, or of visual odometry without an IMU."""

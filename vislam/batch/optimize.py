@@ -6,7 +6,7 @@ rest and loop factors. Loops are chosen first, by graduated non-convexity; track
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from vislam.batch.adjust import L, Solution, VisualNoise, covariances, solve, visual_factors
 from vislam.batch.chain import Chain
 from vislam.batch.loops import Loops, LoopVerdict
+from vislam.batch.shutter import ReadoutSearch, camera_twists, readout_change_s, shear
 from vislam.batch.tracks import Mask, Tracks, collect, residuals, triangulate
 from vislam.config import BatchConfig, Config
 from vislam.errors import DataError
@@ -23,6 +24,7 @@ from vislam.factors.keys import B, V, X, nearest_rigid
 from vislam.messages import Array, NavState
 
 _MEDIAN_CHI2_2, _MEDIAN_CHI2_1 = 1.386, 0.455  # medians of chi-square with two degrees of freedom and with one
+_GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter, as in the front end
 _MIN_LANDMARK_SEEN = 2  # keyframes
 
 
@@ -41,6 +43,7 @@ class BatchResult:
     rejected_depths: int  # whose pixel stayed
     sigma_px: float  # noise of the tracks as the residuals show it
     depth_factor: float  # the same for depth, times what was assumed
+    readout_s: float  # of a rolling shutter; 0: global
     loops: list[LoopVerdict]
     tied_by_odometry: list[int]  # keyframes that saw too few landmarks
     note: str  # what was out of the ordinary
@@ -69,6 +72,10 @@ class _Batch:
         self._keep: Mask = np.zeros(len(self._tracks), dtype=bool)
         self._with_depth: Mask = np.isfinite(self._tracks.rho)
         self._sigma_px = config.frontend.track_sigma_px
+        self._readout_s = config.frontend.readout_s or 0.0
+        self._learns_readout = config.frontend.readout_s is None
+        self._readout = ReadoutSearch()
+        self._raw_xy = self._tracks.xy
         self._depth_factor = 1.0
         self._tied: list[int] = []
         self._graph = gtsam.NonlinearFactorGraph()
@@ -90,6 +97,7 @@ class _Batch:
             self._points = self._landmarks()
             if round_number > 0:
                 self._loops.drop_contradicted(self._poses())
+            self._undo_shutter()
             self._estimate_noise()
         if solution is None:
             raise DataError(f"batch.rounds is {config.rounds}; one at least is needed")
@@ -137,8 +145,12 @@ class _Batch:
     def _optimise(self, first: bool) -> Solution:
         tracks, config, keep = self._tracks, self._config, self._keep
         estimators = gtsam.noiseModel.mEstimator
-        kernel = estimators.Cauchy.Create(config.start_cauchy_px) if first else estimators.Huber.Create(config.huber_k)
-        noise = VisualNoise(self._sigma_px, self._depth_factor, kernel)
+        weaker = config.vision_inflation  # the kernel bends where it would without
+        cauchy, huber = (
+            estimators.Cauchy.Create(config.start_cauchy / weaker),
+            estimators.Huber.Create(config.huber_k / weaker),
+        )
+        noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, cauchy if first else huber)
         count = len(self._chain.records)
         seen = np.bincount(tracks.keyframe[keep], minlength=count)
         factors, self._tied = self._chain.factors(self._values, seen, config.min_seen)
@@ -168,6 +180,25 @@ class _Batch:
         for j in np.unique(self._tracks.point[self._keep]).tolist():
             points[j] = self._values.atPoint3(L(j))
         return points
+
+    @property
+    def _applied_readout_s(self) -> float:
+        return self._readout_s if not self._learns_readout or self._readout_s > _GLOBAL_S else 0.0
+
+    def _undo_shutter(self) -> None:
+        """Estimate the readout of a rolling shutter and bring what was seen to the instant of the middle row."""
+        tracks, poses = self._tracks, self._poses()
+        if not self._learns_readout and self._readout_s == 0.0:
+            return
+        t_ns = np.array([record.t_ns for record in self._chain.records], dtype=np.int64)
+        times = dict(enumerate(t_ns.tolist()))
+        twists = camera_twists(self._log.frames.placed(times, dict(enumerate(poses))), t_ns, self._T_body_cam0)
+        error = residuals(tracks, self._points, poses @ self._T_body_cam0)
+        if self._learns_readout:
+            left_s = readout_change_s(tracks, self._keep, error.xy, error.predicted_rho, twists)
+            self._readout_s = self._readout.next_s(self._readout_s, left_s)
+        xy = self._raw_xy - self._applied_readout_s * shear(tracks, error.predicted_rho, twists)
+        self._tracks = replace(tracks, xy=xy)
 
     def _estimate_noise(self) -> None:
         """Take the noise of pixels and depths from the medians of their residuals, three unknowns per point counted."""
@@ -200,6 +231,7 @@ class _Batch:
             rejected_depths=int((keep & usable & ~self._with_depth).sum()),
             sigma_px=self._sigma_px,
             depth_factor=self._depth_factor,
+            readout_s=self._applied_readout_s,
             loops=[self._loops.verdicts[i] for i in sorted(self._loops.verdicts)],
             tied_by_odometry=self._tied,
             note="; ".join(self._notes),

@@ -36,17 +36,11 @@ class Tracks:
     sigma_per_px: Array  # [N] sigma of xy for a noise of one pixel
     rho: Array  # [N] 1/m, NaN where depth was not measured
     sigma_rho: Array  # [N] 1/m
+    row: Array  # [N] image row from -0.5 (first) to 0.5 (last)
     points: int  # P
 
     def __len__(self) -> int:
         return len(self.keyframe)
-
-    def select(self, keep: Mask) -> Tracks:
-        """Return the observations [N] that `keep` marks, of the same points."""
-        return Tracks(
-            self.keyframe[keep], self.point[keep], self.xy[keep], self.sigma_per_px[keep],
-            self.rho[keep], self.sigma_rho[keep], self.points,
-        )  # fmt: skip
 
     def counts(self, keep: Mask | None = None) -> Ints:
         """Return how many observations each point has [P]."""
@@ -60,6 +54,7 @@ def collect(log: FactorLog, config: FrontEndConfig) -> Tracks:
     ids = np.concatenate([part.ids for part in parts])
     xy, sigma = np.concatenate([part.xy for part in parts]), np.concatenate([part.sigma_per_px for part in parts])
     rho, sigma_rho = np.concatenate([part.rho for part in parts]), np.concatenate([part.sigma_rho for part in parts])
+    row = np.concatenate([part.row for part in parts])
     _, first = np.unique(np.stack([keyframe, ids]), axis=1, return_index=True)  # a track has one place in a keyframe
     usable = np.zeros(len(ids), dtype=bool)
     usable[first] = True
@@ -69,8 +64,9 @@ def collect(log: FactorLog, config: FrontEndConfig) -> Tracks:
     _, point = np.unique(ids[usable], return_inverse=True)
     count = int(point.max()) + 1 if len(point) else 0
     return Tracks(
-        keyframe[usable], point.astype(np.int64), xy[usable], sigma[usable], rho[usable], sigma_rho[usable], count
-    )
+        keyframe[usable], point.astype(np.int64), xy[usable], sigma[usable], rho[usable], sigma_rho[usable],
+        row[usable], count,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +79,7 @@ class _Observed:
     sigma_per_px: Array
     rho: Array
     sigma_rho: Array
+    row: Array
 
 
 def _observed(index: int, seen: Observations, rig: Rig, config: FrontEndConfig) -> _Observed:
@@ -97,7 +94,8 @@ def _observed(index: int, seen: Observations, rig: Rig, config: FrontEndConfig) 
             rho = np.where(seen.depth_m > 0.0, 1.0 / seen.depth_m, np.nan)
         sigma_rho = np.where(np.isfinite(rho), config.depth_sigma_rho, np.nan)
     keyframe = np.full(n, index, dtype=np.int64)
-    return _Observed(keyframe, seen.track_ids.astype(np.int64), xy, _sigma_per_px(camera, xy), rho, sigma_rho)
+    row = np.clip(seen.pixels_px[:, 1] / max(camera.height - 1.0, 1.0), 0.0, 1.0) - 0.5
+    return _Observed(keyframe, seen.track_ids.astype(np.int64), xy, _sigma_per_px(camera, xy), rho, sigma_rho, row)
 
 
 def _sigma_per_px(camera: Camera, xy: Array) -> Array:
@@ -161,7 +159,8 @@ def triangulate(tracks: Tracks, keep: Mask, T_map_cam: Array, sigma_px: float) -
         A = across / (sigma * distance)[:, None, None] ** 2 + along * weight_along[:, None, None]
         information = _summed(A.reshape(-1, 9), p, tracks.points).reshape(-1, 3, 3)
         right = _summed(np.einsum("nij,nj->ni", A, target), p, tracks.points)
-        regular = information + _UNKNOWN_INFORMATION * np.eye(3)
+        floor = _UNKNOWN_INFORMATION + 1e-12 * np.trace(information, axis1=1, axis2=2)
+        regular = information + floor[:, None, None] * np.eye(3)
         points = np.asarray(np.linalg.solve(regular, right[:, :, None])[:, :, 0])
         distance = np.asarray(np.maximum(np.linalg.norm(points[p] - centre, axis=1), _MIN_Z_M))
     seen = np.maximum(np.bincount(p, None, tracks.points), 1)
@@ -179,10 +178,12 @@ def _summed(rows: Array, index: Ints, count: int) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """How far observations [N] are from their points: in pixels, and in inverse depth by its sigma (NaN: none)."""
+    """How far observations [N] are from where their points should be seen."""
 
-    px: Array  # [N] length, in units of one pixel; infinite behind the camera
-    rho: Array  # [N]
+    xy: Array  # [N, 2] predicted minus observed, on z = 1
+    px: Array  # [N] its length in units of one pixel; infinite behind the camera
+    rho: Array  # [N] inverse depth, predicted minus observed by its sigma; NaN where none was measured
+    predicted_rho: Array  # [N] 1/m
 
 
 def residuals(tracks: Tracks, points_m: Array, T_map_cam: Array) -> Residuals:
@@ -191,5 +192,6 @@ def residuals(tracks: Tracks, points_m: Array, T_map_cam: Array) -> Residuals:
     seen = np.einsum("nji,nj->ni", T[:, :3, :3], points_m[tracks.point] - T[:, :3, 3])
     ahead = seen[:, 2] > _MIN_Z_M
     z = np.where(ahead, seen[:, 2], 1.0)
-    error = np.linalg.norm(seen[:, :2] / z[:, None] - tracks.xy, axis=1) / tracks.sigma_per_px
-    return Residuals(np.where(ahead, error, np.inf), (1.0 / z - tracks.rho) / tracks.sigma_rho)
+    xy = seen[:, :2] / z[:, None] - tracks.xy
+    px = np.where(ahead, np.linalg.norm(xy, axis=1) / tracks.sigma_per_px, np.inf)
+    return Residuals(xy, px, (1.0 / z - tracks.rho) / tracks.sigma_rho, 1.0 / z)

@@ -1,0 +1,132 @@
+"""A finished run estimated again in batch, and what its folder gets of it: the library's side of `vislam optimize`."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.batch import BatchResult, optimize_run
+from vislam.batch.frames import place_frames
+from vislam.config import BatchConfig, Config, from_data
+from vislam.errors import DataError, UsageError, VislamError
+from vislam.factor_log import FactorLog
+from vislam.runfolder import write_json
+from vislam.session import Session
+from vislam.trajectory import Trajectory, evaluate, read_tum, write_states_csv, write_tum
+
+_TAKEN = ("ekf", "live", "graph", "truth")  # names of trajectories that the run itself wrote
+_SECTIONS = ("frontend", "graph", "imu")  # of the run's settings that batch goes by
+
+
+def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, Any]:
+    """Estimate a run folder anew and write trajectory_NAME.tum, states_NAME.csv and the entry in metrics.json.
+
+    Returns the entry: cost, what was used and refused, accuracy where the run has truth. Everything is computed before
+    anything is written. Raises UsageError for what is no run folder, DataError for one that cannot be used.
+    """
+    _check(run, name)
+    start = time.perf_counter()
+    log, settings = _read(run, config)
+    result = optimize_run(log, settings)
+    trajectory = place_frames(log, result.states, settings.imu.max_gap_s)
+    metrics = _metrics(run)
+    entry = _entry(result, log, trajectory)
+    accuracy = _accuracy(run, trajectory, log, entry["warnings"])
+    entry |= {"accuracy": accuracy, "wall_s": time.perf_counter() - start, "config": asdict(config)}
+    if accuracy:
+        metrics.setdefault("accuracy", {})[name] = accuracy["se3"]
+    metrics.setdefault("batch", {})[name] = entry
+    write_tum(trajectory, run / f"trajectory_{name}.tum")
+    write_states_csv(run / f"states_{name}.csv", range(len(result.states)), result.states)
+    write_json(run / "metrics.json", metrics)
+    return entry
+
+
+def _check(run: Path, name: str) -> None:
+    if run.suffix == ".g2o" or run.is_file():
+        raise UsageError(f"{run} is a file; optimize takes a run folder for now, pose graph files (g2o) come later")
+    if not run.is_dir():
+        raise DataError(f"{run} is no run folder; `vislam run SOURCE --out {run}` makes one")
+    if not re.fullmatch(r"[a-z0-9_]+", name) or name in _TAKEN:
+        raise UsageError(f"--out-name '{name}': small letters, digits and _ only, and none of {', '.join(_TAKEN)}")
+
+
+def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config]:
+    """Return the factor log and the settings; of those stored, the ones that this version knows."""
+    session = Session(run / "session.db")
+    try:
+        stored = session.info().get("config")
+        log = session.factor_log()
+    finally:
+        session.close()
+    data: dict[str, Any] = {"batch": asdict(config)}
+    for section in _SECTIONS:
+        known = {f.name for f in fields(getattr(Config(), section))}
+        values = stored.get(section) if isinstance(stored, dict) else None
+        if isinstance(values, dict):
+            data[section] = {key: value for key, value in values.items() if key in known}
+    return log, from_data(data, source=str(run / "session.db"))
+
+
+def _metrics(run: Path) -> dict[str, Any]:
+    """Return metrics.json of the run; a run that was killed has none."""
+    path = run / "metrics.json"
+    if not path.exists():
+        return {}
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        if not (isinstance(metrics, dict) and all(isinstance(metrics.get(k, {}), dict) for k in ("accuracy", "batch"))):
+            raise ValueError("it holds something else than metrics")
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be used: {error}; remove it, or run the recording again") from error
+    return metrics
+
+
+def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory) -> dict[str, Any]:
+    refused = [verdict for verdict in result.loops if verdict.in_run and not verdict.kept]
+    admitted = [verdict for verdict in result.loops if verdict.kept and not verdict.in_run]
+    warnings = [result.note] if result.note else []
+    for verdict in refused:
+        warnings.append(f"loop {verdict.from_id}-{verdict.to_id}, which the run had accepted: {verdict.reason}")
+    return {
+        "keyframes": len(log.keyframes),
+        "frames": len(trajectory),
+        "landmarks": result.landmarks,
+        "observations": result.observations,
+        "rejected_observations": result.rejected_observations,
+        "rejected_depths": result.rejected_depths,
+        "cost_before": result.cost_before,
+        "cost_after": result.cost_after,
+        "iterations": result.iterations,
+        "pixel_sigma_px": result.sigma_px,
+        "depth_sigma_factor": result.depth_factor,
+        "readout_s": result.readout_s,
+        "loops": {
+            "offered": len(result.loops),
+            "kept": sum(verdict.kept for verdict in result.loops),
+            "refused": [[v.from_id, v.to_id, v.reason] for v in refused],
+            "admitted": [[v.from_id, v.to_id, v.reason] for v in admitted],
+        },
+        "tied_by_odometry": result.tied_by_odometry,
+        "warnings": warnings,
+    }
+
+
+def _accuracy(run: Path, trajectory: Trajectory, log: FactorLog, warnings: list[str]) -> dict[str, Any]:
+    """Return the errors against the run's truth under both alignments; empty without truth."""
+    path = run / "trajectory_truth.tum"
+    if not path.is_file():
+        return {}
+    truth, stamps = read_tum(path), log.frames.t_ns
+    span = (int(np.min(stamps)), int(np.max(stamps))) if len(stamps) else None
+    try:
+        return {mode: evaluate(trajectory, truth, mode, span_ns=span) for mode in ("se3", "yaw")}
+    except VislamError as error:
+        warnings.append(f"accuracy: {error}")
+        return {}
