@@ -8,7 +8,7 @@ they arise, in its landmarks: they displace the keyframe.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -98,6 +98,7 @@ class Run:
     covariances: Array
     nis: dict[str, tuple[int, float, int]]
     counters: dict[str, int]
+    yaw: Array  # [K, 2] error about the vertical and its variance
 
     def nees(self, group: str) -> Array:
         """Return the normalised estimation error squared [K] of a group of `GROUPS`, or of "yaw"."""
@@ -107,8 +108,6 @@ class Run:
         rows = GROUPS[group]
         e, P = errors[:, rows], covariances[:, rows][:, :, rows]
         return np.einsum("ki,ki->k", e, np.linalg.solve(P, e[:, :, None])[:, :, 0])
-
-    yaw: Array = field(default_factory=lambda: np.empty((0, 2)))  # [K, 2] error about the vertical, its variance
 
 
 def drive(motion: str, seed: int, duration_s: float, noise: ImuNoise = IMU) -> Drive:
@@ -135,22 +134,48 @@ def drive(motion: str, seed: int, duration_s: float, noise: ImuNoise = IMU) -> D
     return Drive(t_ns, ideal + biases + rng.normal(size=(count, 6)) * white, truth, biases)
 
 
-def run(scenario: Scenario, config: EkfConfig, seed: int) -> Run:
-    """Run the filter once. The start is drawn from the covariance that the filter is given."""
+def soak(duration_s: float, config: EkfConfig, seed: int = 3) -> tuple[float, dict[str, int]]:
+    """Drive long, with vision late and lossy; return the smallest eigenvalue that P ever had, and the counters.
+
+    The eigenvalue is that of the correlations, so that units do not hide a negative one. P is checked to be symmetric
+    and finite 20 times a second.
+    """
+    scenario = Scenario("soak", "cart", delay_s=0.1, jitter_s=0.1, lost=0.05, duration_s=duration_s)
+    smallest = np.inf
+    for ekf, _, k in replay(scenario, config, seed):
+        if k % 10:
+            continue
+        P = ekf._P
+        assert np.isfinite(P).all()
+        assert np.array_equal(P, P.T)
+        sigmas = np.sqrt(np.diag(P))
+        smallest = min(smallest, float(np.linalg.eigvalsh(P / np.outer(sigmas, sigmas))[0]))
+    print(f"{duration_s:.0f} s: smallest eigenvalue of the correlations {smallest:.1e}")
+    return smallest, ekf.counters
+
+
+def replay(scenario: Scenario, config: EkfConfig, seed: int) -> Iterator[tuple[Ekf, Drive, int]]:
+    """Run the filter once and yield it after every sample k. The start is drawn from the covariance it is given."""
     way = drive(scenario.motion, seed, scenario.duration_s)
     rng = np.random.default_rng([seed, 1])
-    camera = None if scenario.metric else CAMERA
-    ekf = Ekf(config, IMU, GRAVITY_M_S2, camera)
+    ekf = Ekf(config, IMU, GRAVITY_M_S2, None if scenario.metric else CAMERA)
     ekf.initialise(start(way, scenario.start_sigmas, rng))
     deliveries = sorted(vision(scenario, way, rng), key=lambda delivery: delivery[0])
-    every = round(IMU.rate_hz)
-    errors, covariances, yaw, i = [], [], [], 0
+    i = 0
     for k in range(len(way.t_ns)):
         t_ns = int(way.t_ns[k])
         ekf.predict(ImuSample(t_ns, way.samples[k, :3], way.samples[k, 3:]))
         while i < len(deliveries) and deliveries[i][0] <= t_ns:
             deliver(ekf, *deliveries[i][1:])
             i += 1
+        yield ekf, way, k
+
+
+def run(scenario: Scenario, config: EkfConfig, seed: int) -> Run:
+    """Run the filter once and look at it every second."""
+    every = round(IMU.rate_hz)
+    errors, covariances, yaw = [], [], []
+    for ekf, way, k in replay(scenario, config, seed):
         if k and k % every == 0:
             state = ekf.state()
             error = way.error(k, state)
@@ -170,9 +195,7 @@ def start(way: Drive, sigmas: Array, rng: np.random.Generator) -> NavState:
     return NavState(int(way.t_ns[0]), T, way.truth[0, 3:6] - drawn[6:9], bias[:3], bias[3:], np.diag(sigmas**2))
 
 
-def vision(
-    scenario: Scenario, way: Drive, rng: np.random.Generator
-) -> Iterator[tuple[int, VoMeasurement | None, int | None]]:
+def vision(scenario: Scenario, way: Drive, rng: np.random.Generator) -> Iterator[tuple[int, VoMeasurement, int | None]]:
     """Yield what a front end makes of the frames: when it arrives, the motion, and the keyframe it begins (or None)."""
     root, camera = np.linalg.cholesky(COVARIANCE), None if scenario.metric else CAMERA
     step = round(IMU.rate_hz / scenario.camera_hz)
@@ -247,6 +270,13 @@ class Consistency:
 def honest(**changes: object) -> EkfConfig:
     """Return settings that know the simulated noise exactly: no inflation."""
     return EkfConfig(**{"imu_inflation": 1.0, "vo_inflation": 1.0, "vo_shared_fraction": SHARED, **changes})
+
+
+def shortened(scenario: Scenario, duration_s: float) -> Scenario:
+    """Return the scenario over a shorter time, an outage moved to its middle."""
+    begin, end = scenario.outage_s
+    outage_s = (0.5 * duration_s, 0.5 * duration_s + end - begin)
+    return replace(scenario, duration_s=duration_s, outage_s=outage_s if end > begin else (0.0, 0.0))
 
 
 def campaign(scenario: Scenario, runs: int, config: EkfConfig, first_seed: int = 5000) -> Consistency:

@@ -7,8 +7,8 @@ does that all the same, for comparison: motions are chained from the pose of the
 pose after every loss of vision; where there is no observation the correction is skipped, as the paper has it.
 Corrections are those of an invariant filter, which heading and position need to stay consistent (`kernels.correct`).
 By default `odom` is continuous: a metric motion corrects where the body is against its keyframe, not where the keyframe
-is. `odom = "corrected"` lets all that is learned move the past too: the best estimate, in larger steps. Directions always
-do, for without scale the past is as long as what is learned later says.
+is. With `odom = "corrected"` all that is learned moves the past too: the best estimate, in larger steps. Directions do
+so always, for without scale the past is as long as what is learned later says.
 Measurements may come late and in any order: the filter goes back to their time and runs forward again, so the answer
 depends only on the set of measurements, not on when they came.
 """
@@ -29,6 +29,7 @@ from vislam.imu import ImuNoise, ImuSeries
 from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 
 _NS = 1_000_000_000
+_MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 1e3, 1e4  # beyond every sensor: such numbers come from a broken transfer
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +79,7 @@ class Ekf:
         self._t_ns = 0
         self._applied = 0
         self._ledger = Ledger()
-        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *OUTCOMES), 0)
+        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", "imu_impossible", *OUTCOMES), 0)
         self._nis: dict[str, tuple[int, float, int]] = {}  # of events that the history has forgotten
 
     @property
@@ -114,17 +115,20 @@ class Ekf:
                 that follow can be used before there is a new keyframe. Without it the filter waits for `add_keyframe`.
 
         Raises:
-            ValueError: the state is not finite.
+            ValueError: the state is not finite, or its covariance not positive semidefinite.
         """
         parts = (state.T_world_body, state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2)
         if not all(np.isfinite(part).all() for part in (*parts, state.covariance)):
             raise ValueError(f"the filter cannot start from a state that is not finite (at {state.t_ns} ns)")
+        covariance = 0.5 * (state.covariance + state.covariance.T)
+        if np.linalg.eigvalsh(covariance)[0] < -1e-6 * np.trace(covariance):
+            raise ValueError(f"the filter cannot start from an indefinite covariance (at {state.t_ns} ns)")
         x = self._x
         x[0:3], x[3:6] = state.T_world_body[:3, 3], state.velocity_world_m_s
         x[6:10] = quaternion_wxyz(state.T_world_body[:3, :3].copy())
         x[10:13], x[13:16] = state.accel_bias_m_s2, state.gyro_bias_rad_s
         self._P[:] = 0.0
-        self._P[:15, :15] = 0.5 * (state.covariance + state.covariance.T)
+        self._P[:15, :15] = covariance
         kernels.clone(x, self._P)
         if self._config.vision == "accumulated":
             self._P[15:] = self._P[:, 15:] = 0.0  # no clone: the 16 numbers of the paper
@@ -138,8 +142,15 @@ class Ekf:
         self._run()
 
     def predict(self, sample: ImuSample) -> None:
-        """Take a sample and bring the state to its time. Not finite, duplicate or backward samples are counted only."""
+        """Take a sample and bring the state to its time.
+
+        Samples that are not finite, beyond any sensor, duplicate or backward are counted and change nothing.
+        """
         before = self._series.newest_t_ns
+        rate, force = max(map(abs, sample.gyro_rad_s.tolist())), max(map(abs, sample.accel_m_s2.tolist()))
+        if rate > _MAX_RATE_RAD_S or force > _MAX_FORCE_M_S2:
+            self._counts["imu_impossible"] += 1
+            return
         if not self._series.append(sample):
             return
         self._counts["imu_samples"] += 1
@@ -254,6 +265,9 @@ class Ekf:
         oldest = history.checkpoints[0].t_ns
         if event.t_ns < oldest:
             return self._refuse("too_late", f"{(oldest - event.t_ns) / _NS:.3f} s older than the history")
+        newest = max(self._series.newest_t_ns or oldest, self._t_ns)
+        if event.t_ns - newest > self._history_ns:
+            return self._refuse("too_early", f"{(event.t_ns - newest) / _NS:.3f} s ahead of the newest inertial sample")
         number = history.insert(event)
         if event.t_ns > self._t_ns:  # a sample as new has to come first
             return UpdateResult(False, event.nis, event.reason)

@@ -27,6 +27,7 @@ OUTCOMES = (  # every counter a measurement can end in, and what they cause
     "bias_invalid",
     "before_start",
     "too_late",
+    "too_early",
     "rewinds",
     "soft_resets",
 )

@@ -21,6 +21,7 @@ from vislam.messages import Array
 NOMINAL = 23
 ERRORS = 21
 _HOLE_STEP_S = 0.01
+_HOLE_STEPS = 2000  # at most: a clock that leaps by a year must not stop the filter for as long
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -230,7 +231,7 @@ def predict_run(
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
         pieces = 1
         if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
-            pieces = max(math.ceil(dt / _HOLE_STEP_S), 1)
+            pieces = min(max(math.ceil(dt / _HOLE_STEP_S), 1), _HOLE_STEPS)
         for j in range(pieces):
             before = samples[k - 1] + (j / pieces) * (samples[k] - samples[k - 1])
             after = samples[k - 1] + ((j + 1) / pieces) * (samples[k] - samples[k - 1])
