@@ -56,12 +56,11 @@ def expand(plan: Plan) -> list[Job]:
         source, settings = _conditions(plan, sequence, variant)
         if source not in identities:
             identities[source] = source_identity(source)
-        for (index, estimator), seed in itertools.product(enumerate(plan.estimators), plan.seeds):
+        for index, estimator in enumerate(plan.estimators):
             where = f"plan '{plan.name}', sequence '{sequence.name}', estimator '{estimator.name}'"
-            data = nested({**settings, **estimator.config, **_varied(plan, variant), "seed": seed}, where)
-            resolved = from_data(data, where)
-            for member in range(plan.members):
-                config = dump(resolved)
+            resolved = from_data(nested({**settings, **estimator.config, **_varied(plan, variant)}, where), where)
+            for seed, member in itertools.product(plan.seeds, range(plan.members)):
+                config = dump(resolved) | {"seed": seed}
                 config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
                 batch = "batch" in estimator.outputs
                 jobs.append(

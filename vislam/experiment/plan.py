@@ -134,6 +134,11 @@ def _check(plan: Plan, where: str) -> None:
         raise UsageError(f"{where}: '{plan.name}' is no name of a plan: letters, digits, and . _ + - or space")
     if plan.members < 1 or plan.timeout_s <= 0.0:
         raise UsageError(f"{where}: members must be at least 1 and timeout_s positive")
+    settings = [plan.config, *(s.config for s in plan.sequences), *(e.config for e in plan.estimators)]
+    if any("seed" in config for config in settings) or any(axis.setting == "seed" for axis in plan.axes):
+        raise UsageError(
+            f"{where}: seeds are a list of the plan itself, as seeds = [0, 1]; take 'seed' out of the settings"
+        )
     for axis in plan.axes:
         if bool(axis.setting) == bool(axis.option):
             raise UsageError(f"{where}: axis '{axis.name}' needs either a setting or an option to vary")
@@ -154,6 +159,8 @@ def nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
             node = node.setdefault(section, {})
             if not isinstance(node, dict):
                 raise UsageError(f"{where}: '{section}' in '{dotted}' is a setting, not a section")
+        if isinstance(node.get(name), dict):
+            raise UsageError(f"{where}: '{dotted}' is both a section and a setting")
         node[name] = value
     return data
 

@@ -1,0 +1,204 @@
+"""What jobs are judged by, against evo and against errors drawn from known covariances."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from vislam.errors import DataError
+from vislam.experiment.measures import alignment_of, nis_measures, output_measures, peak_memory_mb
+from vislam.experiment.recordings import TimedRecording
+from vislam.geometry import transform
+from vislam.messages import Frame, ImuSample, NavState
+from vislam.trajectory import Trajectory, write_tum
+from vislam.trajectory.consistency import anees, chi_square_mean
+
+RUN = {"has_imu": True, "mode": "stereo"}
+
+
+def walk(count=1200, seed=0):
+    """A walk of about 30 m with a smooth turn, at 20 Hz."""
+    t = np.arange(count) * 0.05
+    p = np.stack([4.0 * np.sin(0.13 * t), 3.0 * np.cos(0.11 * t), 0.3 * np.sin(0.5 * t)], axis=1)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("zyx", np.stack([0.3 * np.sin(0.2 * t), 0.1 * t, 0.0 * t], 1)).as_matrix()
+    poses[:, :3, 3] = p
+    return Trajectory((t * 1e9).astype(np.int64) + 10**18, poses)
+
+
+def drifting(truth, seed, scale=1.0):
+    rng = np.random.default_rng(seed)
+    poses = truth.T_world_body.copy()
+    poses[:, :3, 3] = scale * poses[:, :3, 3] + np.cumsum(rng.normal(0, 0.003, (len(truth), 3)), axis=0)
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0, 0.002, (len(truth), 3))).as_matrix()
+    return Trajectory(truth.t_ns, poses)
+
+
+def measured(tmp_path, estimate, truth, metrics=RUN):
+    write_tum(truth, tmp_path / "trajectory_truth.tum")
+    write_tum(estimate, tmp_path / "trajectory_graph.tum")
+    span = (int(truth.t_ns[0]), int(truth.t_ns[-1]))
+    return output_measures(tmp_path, ["graph"], metrics, span)["graph"]
+
+
+def test_segment_errors_are_those_of_evo(tmp_path):
+    from evo.core import metrics
+    from evo.core.trajectory import PosePath3D
+
+    truth = walk()
+    estimate = drifting(truth, 3)
+    ours = measured(tmp_path, estimate, truth)
+    paths = (PosePath3D(poses_se3=list(truth.T_world_body)), PosePath3D(poses_se3=list(estimate.T_world_body)))
+    for length in (1, 5, 10):
+        theirs = metrics.RPE(
+            metrics.PoseRelation.translation_part, delta=length, delta_unit=metrics.Unit.meters,
+            rel_delta_tol=0.1, all_pairs=True,
+        )  # fmt: skip
+        theirs.process_data(paths)
+        assert len(theirs.error) > 200
+        # evo divides by nothing: our percent is of the length that each segment really has
+        assert ours[f"rpe_{length}m_percent"] == pytest.approx(
+            100 * np.sqrt(np.mean(theirs.error**2)) / length, rel=0.03
+        )
+
+
+def test_alignment_takes_away_only_what_nobody_can_know(tmp_path):
+    truth = walk()
+    turned = transform(Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.array([5.0, -3.0, 2.0]))
+    moved = Trajectory(truth.t_ns, turned @ truth.T_world_body)
+    assert measured(tmp_path, moved, truth)["ate_m"] < 1e-6
+    tilted = transform(Rotation.from_euler("x", 5, degrees=True).as_matrix(), np.zeros(3))
+    leaning = Trajectory(truth.t_ns, tilted @ truth.T_world_body)
+    assert measured(tmp_path, leaning, truth)["ate_m"] > 0.1  # gravity was there to be used
+    assert measured(tmp_path, leaning, truth, {"has_imu": False, "mode": "rgbd"})["ate_m"] < 1e-6
+    larger = measured(tmp_path, drifting(truth, 1, scale=1.1), truth)
+    assert larger["scale_error"] == pytest.approx(1 / 1.1 - 1, abs=0.01)
+    assert larger["ate_m"] > 0.2
+    free = measured(tmp_path, drifting(truth, 1, scale=1.1), truth, {"has_imu": False, "mode": "mono"})
+    assert free["alignment"] == "sim3"
+    assert free["ate_m"] < 0.1
+    assert alignment_of({"has_imu": True, "mode": "mono"}) == "yaw"
+
+
+def test_what_cannot_be_judged_says_why(tmp_path):
+    truth = walk(100)
+    write_tum(truth, tmp_path / "trajectory_graph.tum")
+    no_truth = output_measures(tmp_path, ["graph"], RUN, None)["graph"]
+    assert "no truth" in no_truth["failure"]
+    write_tum(truth, tmp_path / "trajectory_truth.tum")
+    found = output_measures(tmp_path, ["graph", "ekf"], RUN, None)
+    assert "failure" not in found["graph"]
+    assert found["ekf"]["failure"] == "trajectory_ekf.tum cannot be read: No such file or directory"
+    half = Trajectory(truth.t_ns[:50], truth.T_world_body[:50])
+    assert measured(tmp_path, half, truth)["completeness"] == pytest.approx(0.5, abs=0.02)
+
+
+def states_of(truth, covariance, seed, world):
+    """States whose errors are drawn from their covariance, in a world of their own; the first one is exact."""
+    rng = np.random.default_rng(seed)
+    t = truth.t_ns[1:-1]
+    velocity = (truth.positions_m[2:] - truth.positions_m[:-2]) / 0.1
+    errors = rng.multivariate_normal(np.zeros(9), covariance[:9, :9], len(t))
+    errors[0] = 0.0
+    states = []
+    for t_ns, T, v, e in zip(t, truth.T_world_body[1:-1], velocity, errors, strict=True):
+        pose = world @ T
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(-e[:3]).as_matrix()
+        pose[:3, 3] -= e[3:6]
+        states.append(NavState(int(t_ns), pose, world[:3, :3] @ v - e[6:9], np.zeros(3), np.zeros(3), covariance))
+    return states
+
+
+def test_consistency_of_errors_drawn_from_their_covariance():
+    truth = walk(1500)
+    rng = np.random.default_rng(8)
+    A = rng.normal(0, 0.02, (9, 9))
+    covariance = np.eye(15)
+    covariance[:9, :9] = A @ A.T + 1e-4 * np.eye(9)
+    world = transform(Rotation.from_euler("z", 2.1).as_matrix(), np.array([3.0, -2.0, 1.0]))
+    found = anees(states_of(truth, covariance, 9, world), truth)
+    for name in ("rotation", "position", "velocity"):
+        assert found[name].count >= 1490
+        assert found[name].low < found[name].mean < found[name].high, name
+    optimistic = covariance / 4.0
+    states = [
+        NavState(s.t_ns, s.T_world_body, s.velocity_world_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, optimistic)
+        for s in states_of(truth, covariance, 9, world)
+    ]
+    assert all(value.mean == pytest.approx(4.0, rel=0.1) for value in anees(states, truth).values())
+
+
+def test_what_was_not_estimated_is_left_out_of_consistency():
+    truth = walk(200)
+    states = states_of(truth, np.eye(15) * 1e-4, 0, np.eye(4))
+    covariance = np.eye(15) * 1e-4
+    covariance[6:9] = covariance[:, 6:9] = np.nan
+    bare = [
+        NavState(s.t_ns, s.T_world_body, np.full(3, np.nan), s.gyro_bias_rad_s, s.accel_bias_m_s2, covariance)
+        for s in states
+    ]
+    assert set(anees(bare, truth)) == {"rotation", "position"}
+    singular = [
+        NavState(s.t_ns, s.T_world_body, s.velocity_world_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, np.zeros((15, 15)))
+        for s in states
+    ]
+    assert anees(singular, truth) == {}
+    with pytest.raises(DataError, match="needs 2 states"):
+        anees(states[:1], truth)
+
+
+@given(st.integers(1, 400), st.integers(1, 9), st.integers(0, 2**31))
+def test_chi_square_bounds_hold_95_percent(count, dof, seed):
+    found = chi_square_mean(1.0, count, dof)
+    inside = chi2.cdf(found.high * count * dof, count * dof) - chi2.cdf(found.low * count * dof, count * dof)
+    assert inside == pytest.approx(0.95)
+    assert found.mean == pytest.approx(1.0 / (count * dof))
+
+
+def test_nis_comes_by_measurement():
+    found = nis_measures({"vo": (100, 660.0, 600), "none": (0, 0.0, 0)})
+    assert list(found) == ["vo"]
+    assert found["vo"]["mean"] == pytest.approx(1.1)
+    assert (found["vo"]["count"], found["vo"]["low"] < 1.0 < found["vo"]["high"]) == (100, True)
+
+
+class Three:
+    """Three frames between samples."""
+
+    name, rig, imu_noise, frame_count = "three", None, None, 3
+
+    def __init__(self):
+        self.problems = {"odd": 1}
+
+    def truth(self):
+        return None
+
+    def events(self):
+        for i in range(4):
+            if i:
+                yield Frame(i * 100 - 50, i - 1, ())
+            yield ImuSample(i * 100, np.zeros(3), np.zeros(3))
+
+
+def test_time_per_frame_belongs_to_the_value_that_finished_it():
+    recording = TimedRecording(Three())
+    waiting = 0
+    for value in recording.events():
+        if isinstance(value, Frame):
+            waiting += 1
+        elif waiting:
+            waiting = 0
+            recording.frame_done(0, 0, "")
+    assert len(recording.latencies_s) == 3
+    assert all(latency >= 0.0 for latency in recording.latencies_s)
+    assert recording.span_ns == (50, 250)
+    assert recording.problems == {"odd": 1}
+
+
+def test_memory_is_that_of_this_process():
+    before = peak_memory_mb()
+    block = np.ones(2**25)  # 256 MB
+    assert peak_memory_mb() - before > 150.0
+    assert block.sum() == 2**25

@@ -1,0 +1,184 @@
+"""Plans and what they mean run by run."""
+
+from dataclasses import replace
+
+import pytest
+
+from vislam.errors import UsageError
+from vislam.experiment.identity import code_sha256, source_identity, split_source
+from vislam.experiment.jobs import JITTER, expand, unique, variants
+from vislam.experiment.plan import load_plan, plan_from_data
+from vislam.experiment.trials import estimates
+
+GOOD = """
+name = "small"
+seeds = [0, 3]
+members = 2
+config = {"frontend.max_tracks" = 50}
+
+[[sequences]]
+name = "laps"
+source = "points:laps"
+options = {duration_s = 6.0}
+
+[[sequences]]
+source = "euroc:$ROOT/drone"
+config = {"frontend.mode" = "mono"}
+
+[[estimators]]
+name = "loose"
+
+[[estimators]]
+name = "tight"
+config = {"graph.coupling" = "tight", "frontend.max_tracks" = 70}
+outputs = ["graph"]
+
+[[axes]]
+name = "delay"
+setting = "ekf.vision_delay_s"
+values = [0.0, 0.1]
+"""
+
+
+def load(tmp_path, text, **variables):
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    return load_plan(path, {"ROOT": str(tmp_path), **variables})
+
+
+def test_a_plan_is_the_product_of_its_parts(tmp_path):
+    plan = load(tmp_path, GOOD)
+    jobs = expand(plan)
+    assert len(jobs) == 2 * 2 * 2 * 2 * 2  # sequences, variants, estimators, seeds, members
+    assert len({job.key for job in jobs}) == len({job.label for job in jobs}) == len(jobs)
+    assert plan.sequences[1].source == f"euroc:{tmp_path}/drone"
+    assert [s.name for s in plan.sequences] == ["laps", "drone"]
+    assert {job.source for job in jobs} == {"points:laps,duration_s=6.0", f"euroc:{tmp_path}/drone"}
+    assert variants(plan) == [(("delay", 0.0),), (("delay", 0.1),)]
+    assert estimates(plan)[-2:] == [("loose", "graph"), ("tight", "graph")]
+
+
+def test_settings_of_estimator_win_over_sequence_over_plan(tmp_path):
+    jobs = {job.label: job for job in expand(load(tmp_path, GOOD))}
+    tight = jobs["drone delay=0.1 tight seed 3 member 1"].config
+    loose = jobs["laps delay=0.0 loose seed 0 member 0"].config
+    assert (tight["graph"]["coupling"], loose["graph"]["coupling"]) == ("tight", "loose")
+    assert (tight["frontend"]["max_tracks"], loose["frontend"]["max_tracks"]) == (70, 50)
+    assert (tight["frontend"]["mode"], loose["frontend"]["mode"]) == ("mono", "auto")
+    assert (tight["ekf"]["vision_delay_s"], loose["ekf"]["vision_delay_s"]) == (0.1, 0.0)
+    assert (tight["seed"], loose["seed"]) == (3, 0)
+    assert loose["map"]["enabled"] is False
+    assert loose["view"]["enabled"] is False
+
+
+def test_members_differ_in_gravity_alone_and_the_first_not_at_all(tmp_path):
+    first, second = expand(load(tmp_path, GOOD))[:2]
+    assert (first.member, second.member) == (0, 1)
+    assert first.config["imu"]["gravity_m_s2"] == 9.81
+    assert second.config["imu"]["gravity_m_s2"] == pytest.approx(9.81 * (1 + JITTER), rel=1e-15)
+    assert second.config["imu"]["gravity_m_s2"] != 9.81
+    second.config["imu"]["gravity_m_s2"] = 9.81
+    assert first.config == second.config
+
+
+def test_estimators_with_one_configuration_share_their_runs(tmp_path):
+    text = GOOD.replace('config = {"graph.coupling" = "tight", "frontend.max_tracks" = 70}\n', "")
+    jobs = expand(load(tmp_path, text))
+    assert len(list(unique(jobs))) == len(jobs) // 2
+
+
+def test_the_key_follows_data_options_and_configuration(tmp_path):
+    (tmp_path / "drone").mkdir()
+    table = tmp_path / "drone" / "imu.csv"
+    table.write_text("1,2,3\n")
+    plan = load(tmp_path, GOOD)
+    before = {job.label: job.key for job in expand(plan)}
+    assert before == {job.label: job.key for job in expand(plan)}
+    table.write_text("1,2,4\n")
+    after = {job.label: job.key for job in expand(plan)}
+    assert {label for label in before if before[label] != after[label]} == {la for la in before if "drone" in la}
+    longer = replace(plan, sequences=(replace(plan.sequences[0], options={"duration_s": 7.0}), plan.sequences[1]))
+    changed = {job.label: job.key for job in expand(longer)}
+    assert {label for label in after if changed[label] != after[label]} == {la for la in after if "laps" in la}
+
+
+def test_the_data_counts_and_not_where_they_lie(tmp_path):
+    for place in ("here", "there"):
+        (tmp_path / place / "drone").mkdir(parents=True)
+        (tmp_path / place / "drone" / "imu.csv").write_text("1,2,3\n")
+    here, there = (source_identity(f"points:euroc:{tmp_path}/{place}/drone,rig=mono") for place in ("here", "there"))
+    assert here == there
+    assert here.startswith("points:euroc:")
+    assert here.endswith(",rig=mono")
+    assert here != source_identity(f"points:euroc:{tmp_path}/here/drone,rig=stereo")
+    assert source_identity("sim:handheld-room,duration_s=3") == "sim:handheld-room,duration_s=3"
+    assert "missing" in source_identity("euroc:/no/such/folder")
+    assert split_source("/bare/path,with=option") == ("", "/bare/path", ",with=option")
+
+
+def test_code_that_only_shows_results_does_not_make_them_new(tmp_path):
+    for name in ("cli.py", "slam.py", "report/page.py", "experiment/worker.py", "experiment/page.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("a = 1\n")
+    before = code_sha256(tmp_path)
+    for name in ("cli.py", "report/page.py", "experiment/page.py"):
+        (tmp_path / name).write_text("a = 2\n")
+    assert code_sha256(tmp_path) == before
+    for name in ("slam.py", "experiment/worker.py"):
+        (tmp_path / name).write_text("a = 2\n")
+        assert code_sha256(tmp_path) != before
+        before = code_sha256(tmp_path)
+
+
+def test_relative_paths_begin_at_the_plan(tmp_path):
+    data = {"name": "p", "sequences": [{"source": "../drone"}], "estimators": [{"name": "e"}]}
+    plan = plan_from_data(data, "here", tmp_path / "plans", {})
+    assert plan.sequences[0].source == f"{tmp_path}/plans/../drone"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("seeds =", "seed ="), "no field 'seed'; there are: name, sequences"),
+        (("options =", "option ="), r"no field 'sequences\[0\]\.option'"),
+        (('source = "points:laps"\n', ""), "sequences.0.source: "),
+        (("members = 2", "members = 0"), "members must be at least 1"),
+        (("members = 2", 'members = "two"'), "members: .* got 'two'"),
+        (('outputs = ["graph"]', 'outputs = ["final"]'), "estimators.1.outputs.0: "),
+        (('outputs = ["graph"]', "outputs = []"), "estimator 'tight' needs outputs"),
+        (('name = "tight"', 'name = "loose"'), "two of kind estimator are called 'loose'"),
+        (("seeds = [0, 3]", "seeds = [3, 3]"), "two of kind seed"),
+        (("seeds = [0, 3]", "seeds = []"), "at least one seed"),
+        (("values = [0.0, 0.1]", "values = []"), "axis 'delay' needs values"),
+        (('setting = "ekf.vision_delay_s"\n', ""), "needs either a setting or an option"),
+        (('name = "small"', 'name = "../small"'), "is no name of a plan"),
+        (('"graph.coupling" = "tight"', "seed = 4"), "seeds are a list of the plan"),
+        (("$ROOT", "$NOWHERE"), "needs the environment variable NOWHERE"),
+        (('name = "small"', "name = "), "cannot be read"),
+    ],
+)
+def test_mistakes_in_a_plan_are_named(tmp_path, change, message):
+    assert change[0] in GOOD
+    with pytest.raises(UsageError, match=message):
+        load(tmp_path, GOOD.replace(*change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("ekf.vision_delay_s", "ekf.delay"), "no setting 'ekf.delay'"),
+        (('"graph.coupling" = "tight"', '"graph.coupling" = "firm"'), "graph.coupling: .* got 'firm'"),
+        (('"frontend.max_tracks" = 50', '"seed.x" = 50'), "seed: "),
+        (('"frontend.max_tracks" = 50', '"imu.enabled" = true, imu = 3'), "'imu' is both a section and a setting"),
+        (('"frontend.max_tracks" = 50', 'imu = 3, "imu.enabled" = true'), "'imu' in 'imu.enabled' is a setting"),
+    ],
+)
+def test_settings_are_checked_before_anything_runs(tmp_path, change, message):
+    assert change[0] in GOOD
+    with pytest.raises(UsageError, match=message):
+        expand(load(tmp_path, GOOD.replace(*change)))
+
+
+def test_a_missing_plan_is_one_line(tmp_path):
+    with pytest.raises(UsageError, match="cannot be read"):
+        load_plan(tmp_path / "none.toml")
