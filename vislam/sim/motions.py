@@ -59,8 +59,8 @@ def straight(_rng: np.random.Generator, duration_s: float) -> BodySpline:
 
 def laps(rng: np.random.Generator, duration_s: float) -> BodySpline:
     """Return a body carried by hand, lap after lap around a block of 12 x 7 m, for as long as is asked."""
-    path = rounded_path([(0.0, 0.0), (12.0, 0.0), (12.0, 7.0), (0.0, 7.0), (0.0, 0.0), (0.5, 0.0)], 1.5)
-    lap_m = path.length_m - 0.5  # the last half metre lies on the first
+    path = rounded_path([(4.0, 0.0), (12.0, 0.0), (12.0, 7.0), (0.0, 7.0), (0.0, 0.0), (4.0, 0.0)], 1.5)
+    lap_m = path.length_m
 
     def design(t: Array) -> tuple[Array, Array]:
         moving = smoothstep(t, _REST_S, _REST_S + _START_BLEND_S)
