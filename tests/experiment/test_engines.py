@@ -1,0 +1,178 @@
+"""Jobs in processes of their own: crashes, timeouts, interrupts, orphans, and a cluster that loses a worker."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+
+import psutil
+import pytest
+from tiny import write_plan
+
+from vislam.errors import UsageError
+from vislam.experiment.engines import run_locally, run_on_dask
+from vislam.experiment.isolated import run_isolated
+from vislam.experiment.jobs import expand
+from vislam.experiment.plan import load_plan
+from vislam.experiment.store import ResultStore
+
+PATIENCE_S = 240.0  # a busy machine is no failure; nothing waits so long otherwise
+
+
+@pytest.fixture
+def specs(tmp_path):
+    return [job.spec() for job in expand(load_plan(write_plan(tmp_path)))]
+
+
+def until(condition, what):
+    """Wait until a condition holds and return its value."""
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        if value := condition():
+            return value
+        time.sleep(0.02)
+    pytest.fail(f"waited in vain for {what}")
+
+
+def workers_of(process):
+    """The processes that `process` started for jobs."""
+    return [p for p in process.children(recursive=True) if "vislam.experiment.worker" in " ".join(p.cmdline())]
+
+
+def in_thread(function):
+    box = []
+    thread = threading.Thread(target=lambda: box.append(function()))
+    thread.start()
+    return thread, box
+
+
+def test_a_crash_and_a_timeout_are_results_with_reasons(specs, tmp_path):
+    crash = run_isolated({"key": "x", "timeout_s": PATIENCE_S}, str(tmp_path))
+    assert crash["status"] == "failed"
+    assert crash["reason"].startswith("crash: exit code 1; last said:")
+    assert "KeyError: 'environment'" in crash["reason"]
+    late = run_isolated({**specs[0], "timeout_s": 0.05}, str(tmp_path))
+    assert late == {"status": "failed", "reason": "timeout: not done after 0.05 s", "run": {}, "outputs": {}}
+    assert not workers_of(psutil.Process())
+
+
+def test_a_killed_job_says_by_what(specs, tmp_path):
+    thread, box = in_thread(lambda: run_isolated(specs[0], str(tmp_path)))
+    until(lambda: workers_of(psutil.Process()), "the job to start")[0].kill()
+    thread.join()
+    assert box[0]["reason"].startswith("crash: killed by SIGKILL")
+
+
+def test_an_error_of_the_pipeline_is_a_result(specs, tmp_path):
+    spec = json.loads(json.dumps(specs[0]))
+    spec["source"] = "points:laps,tracks=0,duration_s=3"
+    blind = run_isolated(spec, str(tmp_path))
+    assert blind["status"] == "failed"
+    assert blind["reason"].startswith("TrackingLostError: ")
+    assert blind["run"]["frames"] > 0  # what was measured on the way stays
+    spec["source"] = "points:/no/such/recording"
+    assert run_isolated(spec, str(tmp_path))["reason"].startswith("DataError: ")
+    spec["environment"] = {**spec["environment"], "code_sha256": "other"}
+    other = run_isolated(spec, str(tmp_path))
+    assert other["status"] == "mismatch"
+    assert "differs in code_sha256" in other["reason"]
+
+
+def test_closing_the_local_engine_stops_what_runs(specs, tmp_path):
+    done = []
+    with closing(run_locally(specs, 2, tmp_path, None)) as finished:
+        for spec, result in finished:
+            done.append((spec["key"], result["status"]))
+            break
+    assert [status for _, status in done] == ["ok"]
+    assert not workers_of(psutil.Process())
+
+
+def test_no_job_outlives_the_process_that_asked_for_it(specs, tmp_path):
+    request = tmp_path / "spec.json"
+    request.write_text(json.dumps(specs[0]))
+    code = (
+        "import json, sys; from vislam.experiment.isolated import run_isolated; "
+        "run_isolated(json.load(open(sys.argv[1])), sys.argv[2])"
+    )
+    asker = psutil.Popen([sys.executable, "-c", code, str(request), str(tmp_path)])
+    worker = until(lambda: workers_of(asker), "the job to start")[0]
+    asker.kill()
+    asker.wait()
+    until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE, "the orphan to end")
+
+
+def test_run_folders_are_kept_only_when_asked_for(specs, tmp_path):
+    kept = tmp_path / "kept"
+    result = run_isolated(specs[0], str(tmp_path), str(kept))
+    assert result["status"] == "ok"
+    assert (kept / specs[0]["key"][:24] / "trajectory_graph.tum").is_file()
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith("vislam-job-")]
+
+
+def start_dask_worker(address, name, folder):
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
+    options = ["--name", name, "--local-directory", str(folder), "--no-dashboard", "--host", "127.0.0.1"]
+    with (folder / f"{name}.txt").open("wb") as said:
+        return subprocess.Popen([*command, *options], stdout=said, stderr=said)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A real scheduler and two worker processes on loopback; yields its address and the workers by name."""
+    distributed = pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    with (tmp_path / "scheduler.txt").open("wb") as said:
+        scheduler = subprocess.Popen(
+            [*command, "--no-dashboard", "--scheduler-file", str(file)], stdout=said, stderr=said
+        )
+    processes = [scheduler]
+    try:
+        until(lambda: file.is_file() and file.stat().st_size > 0, "the scheduler")
+        address = json.loads(file.read_text())["address"]
+        workers = {name: start_dask_worker(address, name, tmp_path) for name in ("one", "two")}
+        processes += workers.values()
+        with distributed.Client(address, timeout=PATIENCE_S) as client:
+            client.wait_for_workers(2, timeout=PATIENCE_S)
+        yield address, workers
+    finally:
+        for process in processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+
+
+def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, cluster, tmp_path):
+    address, workers = cluster
+    finished = []
+    with ResultStore(tmp_path / "r.db") as store:
+        thread, _ = in_thread(lambda: finished.extend(run_on_dask(specs, address, tmp_path, None)))
+        victim = psutil.Process(workers["one"].pid)
+        job = until(lambda: workers_of(victim), "the worker to begin a job")[0]
+        until(lambda: workers_of(psutil.Process(workers["two"].pid)), "the other worker to begin a job")
+        os.kill(victim.pid, signal.SIGKILL)
+        until(lambda: not job.is_running() or job.status() == psutil.STATUS_ZOMBIE, "the killed worker's job to end")
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+        added = [store.add(spec["key"], "label", spec, result) for spec, result in finished]
+        assert all(added)
+        assert len(store) == len(specs) == len(finished)
+        assert {spec["key"] for spec, _ in finished} == {spec["key"] for spec in specs}
+        assert [result["status"] for _, result in finished] == ["ok"] * len(specs)
+    alone = run_isolated(specs[0], str(tmp_path))
+    for output, entry in next(result for spec, result in finished if spec is specs[0])["outputs"].items():
+        assert entry["sha256"] == alone["outputs"][output]["sha256"]  # where a job runs does not matter
+
+
+def test_a_cluster_that_is_not_there_is_one_line(specs, tmp_path, monkeypatch):
+    monkeypatch.setattr("vislam.experiment.engines._ANSWER_S", 0.5)
+    with pytest.raises(UsageError, match="no Dask scheduler answers at 'tcp://127.0.0.1:9'"):
+        list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UsageError, match=r"pip install 'vislam\[cluster\]'"):
+        list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))
