@@ -1,0 +1,226 @@
+"""Front ends on points that were followed elsewhere: the same odometry, without a single image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from vislam.config import FrontEndConfig
+from vislam.errors import DataError
+from vislam.frontend import TrackResult, make_frontend
+from vislam.frontend.intake import Intake
+from vislam.frontend.rgbd import ImageDepth
+from vislam.frontend.stereo import StereoDepth
+from vislam.frontend.tracker import Tracker, given_rows
+from vislam.geometry import invert, se3_log, so3_log
+from vislam.messages import Array, Frame, Observations, Tracking
+from vislam.sim import PointRecording, open_points
+
+CONFIG = FrontEndConfig()
+
+
+def driven(
+    recording: PointRecording, config: FrontEndConfig = CONFIG
+) -> Iterator[tuple[Frame, TrackResult, Array, Array | None]]:
+    """Yield frame, result, true pose of the body and that of the keyframe that the result refers to."""
+    frontend = make_frontend(config, recording.rig, 0)
+    T_true = recording.true_states(recording.frame_times_ns).T_world_body
+    keyframes: dict[int, Array] = {}
+    frames = (event for event in recording.events() if isinstance(event, Frame))
+    for frame, T in zip(frames, T_true, strict=True):
+        result = frontend.track(frame, None)
+        yield frame, result, T, keyframes.get(result.vo.keyframe_id)
+        if result.keyframe is not None:
+            keyframes[result.keyframe.id] = T
+
+
+@pytest.mark.parametrize("rig", ["stereo", "rgbd"])
+def test_metric_odometry_is_accurate_and_knows_how_much(rig: str) -> None:
+    errors, nees, tracking = [], [], []
+    for _, result, T_true, T_key in driven(open_points("handheld-room", seed=1, rig=rig, duration_s=15.0)):
+        tracking.append(result.vo.tracking)
+        if T_key is not None and result.vo.T_keyframe_body is not None:
+            error = se3_log(invert(invert(T_key) @ T_true) @ result.vo.T_keyframe_body)
+            errors.append(error)
+            nees.append(error @ np.linalg.solve(result.vo.covariance, error))
+    rms = np.sqrt(np.mean(np.array(errors) ** 2, axis=0))
+    print(f"seed 1, {rig}: {rms[:3] * 1e3} mrad, {rms[3:] * 1e3} mm, NEES {np.mean(nees):.1f} of 6")
+    assert len(errors) > 290 and tracking.count(Tracking.LOST) == 0
+    assert rms[:3].max() < 1.5e-3 and rms[3:].max() < 4e-3
+    assert 3.0 < np.mean(nees) < 15.0
+
+
+def test_mono_odometry_tells_turns_and_directions() -> None:
+    recording = open_points("laps", seed=1, rig="mono", duration_s=15.0)
+    lever = recording.true_rig.T_body_cams[0]
+    turns, directions = [], []
+    for _, result, T_true, T_key in driven(recording):
+        vo = result.vo
+        if T_key is None or vo.T_keyframe_body is None:
+            continue
+        R = (invert(T_key) @ T_true)[:3, :3].T @ vo.T_keyframe_body[:3, :3]
+        turns.append(np.linalg.norm(so3_log(np.ascontiguousarray(R))))
+        if vo.T_keyframe_body[:3, 3].any():
+            moved = T_key[:3, :3].T @ ((T_true @ lever)[:3, 3] - (T_key @ lever)[:3, 3])
+            cosine = moved @ vo.T_keyframe_body[:3, 3] / np.linalg.norm(moved)
+            directions.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    print(f"seed 1: {np.median(turns) * 1e3:.1f} mrad, {np.rad2deg(np.median(directions)):.1f} deg median")
+    assert len(turns) > 250 and np.median(turns) < 5e-3
+    assert len(directions) > 150 and np.median(directions) < np.deg2rad(4.0)
+
+
+def test_ids_and_pixels_are_those_that_were_given_and_outliers_do_not_come_back() -> None:
+    """What a keyframe drops is not taken up again under the same id, while it lasts."""
+    seen, last_kept, dropped = 0, set[int](), set[int]()
+    for frame, result, _, _ in driven(open_points("handheld-room", seed=3, duration_s=8.0, outlier_share=0.2)):
+        assert frame.tracks is not None
+        given = given_rows(frame.tracks, frame.tracks.pixels_px, result.observations.track_ids)
+        assert np.array_equal(given, result.observations.pixels_px)
+        seen += len(result.observations.track_ids)
+        if result.keyframe is not None:
+            kept, there = set(result.observations.track_ids.tolist()), set(frame.tracks.track_ids.tolist())
+            dropped = (dropped | (last_kept - kept)) & there
+            assert not dropped & kept
+            last_kept = kept
+            assert result.observations.right_px is not None
+            right = given_rows(frame.tracks, np.asarray(frame.tracks.right_px), result.observations.track_ids)
+            measured = np.isfinite(result.observations.right_px[:, 0])
+            assert measured.mean() > 0.5 and np.array_equal(result.observations.right_px[measured], right[measured])
+    assert seen > 5000
+
+
+def test_outage_is_lost_and_odometry_starts_again() -> None:
+    options = {"outage_begin_s": 4.0, "outage_length_s": 1.0}
+    results = list(driven(open_points("handheld-room", seed=1, duration_s=8.0, **options)))
+    tracking = [result.vo.tracking for _, result, _, _ in results]
+    assert all(state == Tracking.LOST for state in tracking[80:99])
+    assert tracking[110:].count(Tracking.OK) > 40 and Tracking.LOST not in tracking[5:79]
+    assert any("points were given" in result.reason for _, result, _, _ in results[80:100])
+    assert any(result.reason.startswith("restarted") for _, result, _, _ in results[95:105])
+
+
+def test_person_does_not_carry_the_odometry_away() -> None:
+    recording = open_points("handheld-room", seed=2, duration_s=10.0, moving_share=0.4, moving_begin_s=2.0)
+    errors = []
+    for _, result, T_true, T_key in driven(recording):
+        if T_key is not None and result.vo.T_keyframe_body is not None:
+            errors.append(np.linalg.norm((invert(invert(T_key) @ T_true) @ result.vo.T_keyframe_body)[:3, 3]))
+    print(f"seed 2: {np.median(errors) * 1e3:.1f} mm median, {np.quantile(errors, 0.95) * 1e3:.1f} mm at 95 %")
+    assert len(errors) > 180 and np.median(errors) < 5e-3 and np.quantile(errors, 0.95) < 0.02
+
+
+def test_keyframes_carry_what_recognises_them() -> None:
+    for rig in ("mono", "stereo", "rgbd"):
+        recording = open_points("handheld-room", seed=1, rig=rig, duration_s=2.0)
+        keyframe = next(result.keyframe for _, result, _, _ in driven(recording) if result.keyframe is not None)
+        tracks = keyframe.frame.tracks
+        assert tracks is not None and np.array_equal(keyframe.descriptors, tracks.descriptors)
+        assert np.array_equal(keyframe.keypoints_px, tracks.pixels_px)
+        if rig == "mono":
+            assert keyframe.points_body_m is None
+        else:
+            assert keyframe.points_body_m is not None and np.isfinite(keyframe.points_body_m[:, 0]).mean() > 0.5
+    plain = open_points("handheld-room", seed=1, duration_s=2.0, descriptors=False)
+    keyframe = next(result.keyframe for _, result, _, _ in driven(plain) if result.keyframe is not None)
+    assert keyframe.descriptors.shape == (0, 32) and keyframe.points_body_m is not None
+    assert len(keyframe.points_body_m) == 0
+
+
+# -- the door --------------------------------------------------------------------------------------------------------
+
+
+def first_frame() -> tuple[PointRecording, Frame]:
+    recording = open_points("still", duration_s=1.0)
+    return recording, next(event for event in recording.events() if isinstance(event, Frame))
+
+
+def test_points_that_cannot_be_are_left_out_and_counted() -> None:
+    recording, frame = first_frame()
+    assert frame.tracks is not None
+    pixels = frame.tracks.pixels_px.copy()
+    pixels[3], pixels[5], pixels[8] = [np.nan, 10.0], [-1.0, 10.0], [10.0, 480.0]
+    intake = Intake(recording.rig, 0)
+    accepted, dt_s = intake.accept(replace(frame, tracks=replace(frame.tracks, pixels_px=pixels)))
+    assert dt_s == 0.0 and accepted.tracks is not None and intake.refused_tracks == 3
+    left = np.delete(np.arange(len(pixels)), [3, 5, 8])
+    for name in ("track_ids", "pixels_px", "right_px", "descriptors"):
+        kept = getattr(accepted.tracks, name)
+        expected = (pixels if name == "pixels_px" else getattr(frame.tracks, name))[left]
+        assert np.array_equal(kept, expected, equal_nan=name == "right_px")
+
+
+def test_tracks_that_do_not_fit_together_are_refused() -> None:
+    recording, frame = first_frame()
+    tracks = frame.tracks
+    assert tracks is not None and tracks.right_px is not None
+    twice = tracks.track_ids.copy()
+    twice[4] = twice[7]
+    wrong = {
+        "a track id came twice": replace(tracks, track_ids=twice),
+        "pixels_px of shape": replace(tracks, pixels_px=tracks.pixels_px[:-1]),
+        "right_px of shape": replace(tracks, right_px=tracks.right_px[:, :1]),
+        "depth_m of shape": replace(tracks, depth_m=np.zeros((len(twice), 1))),
+        "descriptors of shape": replace(tracks, descriptors=np.zeros((len(twice), 16), dtype=np.uint8)),
+    }
+    for words, given in wrong.items():
+        with pytest.raises(DataError, match=words):
+            make_frontend(CONFIG, recording.rig, 0).track(replace(frame, tracks=given), None)
+    with pytest.raises(DataError, match="no image and no tracks"):
+        make_frontend(CONFIG, recording.rig, 0).track(replace(frame, tracks=None), None)
+
+
+# -- the parts -------------------------------------------------------------------------------------------------------
+
+
+def given(ids: list[int], pixels: Array) -> Frame:
+    tracks = Observations(np.array(ids, dtype=np.int64), pixels, pixels - [10.0, 0.0], np.full(len(ids), 2.0))
+    return Frame(0, 0, (), tracks=tracks)
+
+
+def test_tracker_follows_by_id_and_takes_no_more_than_it_may() -> None:
+    rng = np.random.default_rng(0)
+    tracker = Tracker(replace(CONFIG, max_tracks=5, max_misses=1))
+    pixels = rng.uniform(20.0, 400.0, (7, 2))
+    assert tracker.begin(given([2, 3, 5, 7, 11, 13, 17], pixels), np.zeros(0, dtype=np.bool_), np.empty((0, 2))) == 5
+    assert tracker.ids.tolist() == [2, 3, 5, 7, 11]
+    found = tracker.follow(given([11, 3, 99], pixels[:3] + 1.0), pixels[:5])
+    assert np.array_equal(np.isfinite(found[:, 0]), [False, True, False, False, True])
+    assert np.array_equal(found[1], pixels[1] + 1.0) and np.array_equal(found[4], pixels[0] + 1.0)
+    good = np.isfinite(found[:, 0])
+    assert tracker.judge(good).all() and tracker.judge(good).tolist() == good.tolist()
+    assert tracker.ids.tolist() == [3, 11]
+    again = given([2, 3, 11, 19], pixels[:4])  # 2 was missed too often: its id is spent
+    assert tracker.begin(again, np.ones(2, dtype=np.bool_), pixels[:2]) == 1 and tracker.ids.tolist() == [3, 11, 19]
+    tracker.forget()
+    assert tracker.begin(again, np.zeros(0, dtype=np.bool_), np.empty((0, 2))) == 4
+
+
+def test_depth_sensors_read_what_was_given() -> None:
+    recording, frame = first_frame()
+    tracks = frame.tracks
+    assert tracks is not None and tracks.right_px is not None
+    stereo, ids = StereoDepth(recording.rig, CONFIG), tracks.track_ids[::-1].copy()
+    pixels = given_rows(tracks, tracks.pixels_px, ids)
+    xy = recording.rig.cameras[0].normalise(pixels)
+    reading = stereo.measure(frame, pixels, xy, np.full(len(xy), np.nan), ids)
+    assert stereo.available(frame) and reading.right_px is not None
+    known = np.isfinite(reading.rho)
+    assert known.mean() > 0.5 and np.array_equal(reading.right_px[known], tracks.right_px[::-1][known])
+    assert np.isnan(stereo.measure(frame, pixels, xy, np.full(len(xy), np.nan)).rho).all()
+    flat = given([1, 2, 3], np.full((3, 2), 50.0))
+    assert flat.tracks is not None
+    depths = replace(flat, tracks=replace(flat.tracks, depth_m=np.array([2.0, 20.0, np.nan])))
+    image = ImageDepth(CONFIG)
+    rho = image.measure(depths, np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3), np.array([2, 1, 4])).rho
+    assert image.available(depths) and np.array_equal(np.isfinite(rho), [False, True, False]) and rho[1] == 0.5
+
+
+def test_keyframes_follow_each_other_while_moving() -> None:
+    new = [result for _, result, _, _ in driven(open_points("laps", duration_s=9.0)) if result.keyframe is not None]
+    stamps = [result.keyframe.t_ns for result in new if result.keyframe is not None]
+    assert len(new) > 8 and new[0].reason == "first keyframe"
+    assert all(b - a <= 2_100_000_000 for a, b in pairwise(stamps))
