@@ -14,7 +14,7 @@ from vislam.messages import Array
 from vislam.window.layout import Ints, Links, difference
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def imu_error(a: Array, b: Array, links: Links, k: int, gravity_m_s2: float, J: Array) -> Array:
     """Return the error [9] (rotation, velocity, position) between states [21], and its derivative in J [9, 30].
 
@@ -58,7 +58,7 @@ def imu_error(a: Array, b: Array, links: Links, k: int, gravity_m_s2: float, J: 
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def guess_error(a: Array, b: Array, guess: Array, J: Array) -> Array:
     """Return the error [6] of the motion between two states against a guess [4, 4], and J [6, 12] by both poses."""
     Ra, Rb = a[:9].copy().reshape(3, 3), b[:9].copy().reshape(3, 3)
@@ -77,7 +77,7 @@ def guess_error(a: Array, b: Array, guess: Array, J: Array) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _scatter(J: Array, information: Array, r: Array, at: Ints, A: Array, g: Array) -> None:
     weighted = J.T.copy() @ information
     H, b = weighted @ J, weighted @ r
@@ -88,7 +88,7 @@ def _scatter(J: Array, information: Array, r: Array, at: Ints, A: Array, g: Arra
                 A[at[i], at[j]] += H[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _diagonal(at_a: int, at_b: int, weight: float, error: float, A: Array, g: Array) -> None:
     """Add the square of `weight * (b - a)` whose value is `error`; at_a < 0: of b alone."""
     A[at_b, at_b] += weight
@@ -99,7 +99,7 @@ def _diagonal(at_a: int, at_b: int, weight: float, error: float, A: Array, g: Ar
         g[at_a] -= weight * error
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
     """Return half the squared error of all links and of rest."""
     J9, J6 = np.empty((9, 30)), np.empty((6, 12))
@@ -120,7 +120,7 @@ def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
     return 0.5 * total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def linearise(
     X: Array,
     X_first: Array,
@@ -168,7 +168,7 @@ def linearise(
                 _diagonal(-1, where[k, 6 + i], links.rest_weight[k] ** 2, X[k, 12 + i], A, g)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def prior_shift(X: Array, X_first: Array, calibration: Array, calibration_first: Array, held: int, size: int) -> Array:
     """Return how far [5 + held * size] the states are from where the prior was linearised."""
     out = np.empty(5 + held * size)

@@ -11,7 +11,7 @@ from numba import njit
 from vislam.messages import Array
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def factorise(A: Array) -> bool:
     """Replace the upper triangle of A [D, D] by its Cholesky factor; False where A is not positive definite."""
     n = len(A)
@@ -32,7 +32,7 @@ def factorise(A: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(U: Array, rhs: Array) -> Array:
     """Return x with `U.T @ U @ x == rhs` for an upper factor [D, D] and a vector [D]."""
     n = len(U)
@@ -53,7 +53,7 @@ def solve(U: Array, rhs: Array) -> Array:
     return y
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def trailing_covariance(U: Array, start: int) -> Array:
     """Return the covariance [D - start, D - start] of the unknowns that were eliminated last."""
     n = len(U) - start
@@ -72,7 +72,7 @@ def trailing_covariance(U: Array, start: int) -> Array:
     return inverse @ inverse.T
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def columns_of_covariance(U: Array, columns: np.ndarray) -> Array:
     """Return columns [D, N] of the inverse of `U.T @ U`."""
     out = np.empty((len(columns), len(U)))

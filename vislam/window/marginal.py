@@ -96,7 +96,8 @@ def first_prior(state: NavState, gauge_m: float, gauge_rad: float, calibration: 
     P[:3, :3] += gauge_rad**2 * np.outer(up, up)
     P[3:6, 3:6] += gauge_m**2 * np.eye(3)
     P += np.diag(np.repeat([1e-5, 0.0, 1e-4, 1e-6, 1e-5], 3) ** 2)  # nothing is known better: keeps it invertible
-    return _prior(np.linalg.inv(0.5 * (P + P.T)), calibration, sigmas)
+    information: Array = np.linalg.inv(0.5 * (P + P.T)).astype(np.float64)
+    return _prior(information, calibration, sigmas)
 
 
 def first_pose_prior(gauge_m: float, gauge_rad: float, calibration: Array, sigmas: Array) -> Prior:

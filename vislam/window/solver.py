@@ -36,12 +36,12 @@ class Solution(NamedTuple):
     ok: bool  # False: the system stayed indefinite, or something is not finite
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _prior_cost(prior: Prior, dx: Array) -> float:
-    return prior.b @ dx + 0.5 * (dx @ (prior.H @ dx))
+    return float(prior.b @ dx + 0.5 * (dx @ (prior.H @ dx)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_prior(prior: Prior, dx: Array, where: np.ndarray, A: Array, g: Array) -> None:
     """Add the prior at shift `dx` to the upper triangle of the normal equations A, g."""
     gradient = prior.b + prior.H @ dx
@@ -55,7 +55,7 @@ def add_prior(prior: Prior, dx: Array, where: np.ndarray, A: Array, g: Array) ->
                 out[where[j]] += row[j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def move_calibration(calibration: Array, step: Array, active: np.ndarray) -> Array:
     """Return the calibration [5] after a step [5]; what is not estimated stays."""
     out = calibration.copy()
@@ -68,8 +68,8 @@ def move_calibration(calibration: Array, step: Array, active: np.ndarray) -> Arr
     return out
 
 
-@njit(cache=True, nogil=True)
-def optimise(
+@njit(cache=True, nogil=True, error_model="numpy")
+def optimise(  # noqa: PLR0912, PLR0915 (compiled as one, so that the loop never leaves machine code)
     X: Array,
     X_first: Array,
     held: np.ndarray,
@@ -92,7 +92,10 @@ def optimise(
         held: which they are [M]. Give none held to have the prior without fixing derivatives (batch).
         points: start of the landmarks [L, 3].
         calibration: start [5].
-        views, camera, links, prior: the measurements.
+        views: observations.
+        camera: geometry and timing.
+        links: between keyframes.
+        prior: on calibration and the first keyframes.
         gravity_m_s2: along -z.
         full: with velocities and biases, else poses alone.
         max_iterations: of Gauss-Newton.
@@ -172,5 +175,5 @@ def optimise(
         S[:] = A
         s[:] = g
         ok = _eliminate(inverses, A_points, g_points, cross, 0.0, poses_at, S, s) and _factorise(S)
-    ok = ok and np.isfinite(X).all() and np.isfinite(now)
+    ok = ok and bool(np.isfinite(X).all()) and bool(np.isfinite(now))
     return Solution(X, points, calibration, S, squares, now, iterations, ok)

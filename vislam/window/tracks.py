@@ -139,7 +139,7 @@ class TrackTable:
             known = np.isfinite(seen.depth_m) & (seen.depth_m > 0.0)
             values[known, 7] = 1.0 / seen.depth_m[known]
             values[known, 8] = 1.0 / self._config.depth_sigma_rho
-        return values, np.isfinite(values).all(axis=1)
+        return values, np.asarray(np.isfinite(values).all(axis=1))
 
 
 def check_observations(seen: Observations, where: str) -> None:
@@ -153,9 +153,7 @@ def check_observations(seen: Observations, where: str) -> None:
     if len(np.unique(seen.track_ids)) != count:
         raise DataError(f"{where}: a track is seen twice in one frame; track ids must be unique")
     if seen.right_px is not None and seen.right_px.shape != (count, 2):
-        raise DataError(
-            f"{where}: right pixels of shape {seen.right_px.shape} for {count} tracks; use NaN for no match"
-        )
+        raise DataError(f"{where}: right pixels {seen.right_px.shape} for {count} tracks; use NaN for no match")
     if seen.depth_m is not None and seen.depth_m.shape != (count,):
         raise DataError(f"{where}: depths of shape {seen.depth_m.shape} for {count} tracks; use NaN where unknown")
 

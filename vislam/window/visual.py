@@ -16,87 +16,105 @@ from vislam.geometry import so3_exp
 from vislam.messages import Array
 from vislam.window.layout import CALIBRATION, Camera, Views
 
-Rig = tuple[Camera, Array]  # with the corrected rotation [3, 3] of camera 0 on the body
 COLUMNS = 20  # of an error: host pose 6, pose 6, calibration 5, landmark 3
 _MIN_Z = 0.02  # relative to the host's depth: nearer is beside or behind the camera
 _BEHIND_COST = 50.0  # of a view that the landmark lies behind; constant, so that it neither pulls nor stops a step
 
+# Rows of the scratch space [_ROWS, 3] in which a view is computed: small arrays of their own would cost more than the
+# arithmetic. Rotations take three rows. A landmark is carried through the frames scaled by its inverse depth.
+_BODY_CAM, _CAMS = 0, 4  # rotation and position of camera 0 on the body; the same for each camera in camera 0
+_HOST, _SEEN = 12, 16  # rotation and position of host and keyframe when the rows were read
+_TURN_HOST, _TURN_SEEN = 20, 23  # rotation since the stamp
+_RATE_HOST, _RATE_SEEN, _V_HOST, _V_SEEN = 26, 27, 28, 29
+_BEARING, _F_HOST, _F_WORLD, _F_SEEN, _Q, _F_CAM, _GAP, _FREE = 30, 31, 32, 33, 34, 35, 36, 37
+_BY_CAM, _BY_Q, _BY_SEEN, _BY_WORLD, _BY_HOST, _BY_BEARING = 38, 39, 40, 41, 42, 43  # rows of a derivative
+_ROWS = 44
 
-@njit(cache=True, nogil=True, inline="always")
-def _product(A: Array, B: Array, out: Array) -> None:
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rotate(w: Array, matrix: int, vector: int, out: int) -> None:
+    for i in range(3):
+        w[out, i] = w[matrix + i, 0] * w[vector, 0] + w[matrix + i, 1] * w[vector, 1] + w[matrix + i, 2] * w[vector, 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rotate_back(w: Array, matrix: int, vector: int, out: int) -> None:
+    for i in range(3):
+        w[out, i] = w[matrix, i] * w[vector, 0] + w[matrix + 1, i] * w[vector, 1] + w[matrix + 2, i] * w[vector, 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cross(w: Array, a: int, b: int, out: int) -> None:
+    w[out, 0] = w[a, 1] * w[b, 2] - w[a, 2] * w[b, 1]
+    w[out, 1] = w[a, 2] * w[b, 0] - w[a, 0] * w[b, 2]
+    w[out, 2] = w[a, 0] * w[b, 1] - w[a, 1] * w[b, 0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scratch(camera: Camera, calibration: Array) -> Array:
+    """Return scratch space with the cameras' geometry in it."""
+    w = np.zeros((_ROWS, 3))
+    w[_BODY_CAM : _BODY_CAM + 3] = camera.T_body_cam[:3, :3].copy() @ so3_exp(calibration[1:4].copy())
+    w[_BODY_CAM + 3] = camera.T_body_cam[:3, 3]
+    for c in range(len(camera.T_cam0_cams)):
+        w[_CAMS + 4 * c : _CAMS + 4 * c + 3] = camera.T_cam0_cams[c, :3, :3]
+        w[_CAMS + 4 * c + 3] = camera.T_cam0_cams[c, :3, 3]
+    return w
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place(X: Array, k: int, rates: Array, dt: float, w: Array, at: int, turn: int, rate: int, velocity: int) -> None:
+    """Put the pose `dt` after the stamp of keyframe k into the scratch space, and the turn since.
+
+    The turn is Rodrigues' series, good to 1e-8 rad at 0.1 rad.
+    """
+    for i in range(3):
+        w[rate, i], w[velocity, i] = rates[k, i], X[k, 12 + i]
+        w[at + 3, i] = X[k, 9 + i] + dt * X[k, 12 + i]
+    a, b, c = dt * rates[k, 0], dt * rates[k, 1], dt * rates[k, 2]
+    square = a * a + b * b + c * c
+    first, second = 1.0 - square / 6.0 * (1.0 - square / 20.0), 0.5 - square / 24.0
+    w[turn, 0], w[turn + 1, 1] = 1.0 - second * (b * b + c * c), 1.0 - second * (a * a + c * c)
+    w[turn + 2, 2] = 1.0 - second * (a * a + b * b)
+    w[turn, 1], w[turn + 1, 0] = second * a * b - first * c, second * a * b + first * c
+    w[turn, 2], w[turn + 2, 0] = second * a * c + first * b, second * a * c - first * b
+    w[turn + 1, 2], w[turn + 2, 1] = second * b * c - first * a, second * b * c + first * a
     for i in range(3):
         for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+            w[at + i, j] = (
+                X[k, 3 * i] * w[turn, j] + X[k, 3 * i + 1] * w[turn + 1, j] + X[k, 3 * i + 2] * w[turn + 2, j]
+            )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _apply(A: Array, v: Array, out: Array) -> None:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place_host(X: Array, host: int, camera: Camera, dt: float, point: Array, w: Array) -> None:
+    """Put the host and the landmark in its body frame and in the world into the scratch space."""
+    _place(X, host, camera.rate, dt, w, _HOST, _TURN_HOST, _RATE_HOST, _V_HOST)
+    w[_BEARING, 0], w[_BEARING, 1], w[_BEARING, 2] = point[0], point[1], 1.0
+    _rotate(w, _BODY_CAM, _BEARING, _F_HOST)
     for i in range(3):
-        out[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
+        w[_F_HOST, i] += point[2] * w[_BODY_CAM + 3, i]
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _apply_transposed(A: Array, v: Array, out: Array) -> None:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _chain(X: Array, seen: int, camera: Camera, dt: float, rho: float, cam: int, w: Array) -> None:
+    """Carry a landmark from its host, already in the scratch space, into a camera; every step stays there."""
+    at = _CAMS + 4 * cam
+    _place(X, seen, camera.rate, dt, w, _SEEN, _TURN_SEEN, _RATE_SEEN, _V_SEEN)
+    _rotate(w, _HOST, _F_HOST, _F_WORLD)
     for i in range(3):
-        out[i] = A[0, i] * v[0] + A[1, i] * v[1] + A[2, i] * v[2]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _cross(a: Array, b: Array, out: Array) -> None:
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
-
-
-@njit(cache=True, nogil=True)
-def _place(x: Array, rate: Array, dt: float, pose: Array, turn: Array) -> None:
-    """Fill the pose [4, 3] (rotation, then position) `dt` after a state's stamp, and the turn [3, 3] since."""
-    for i in range(3):
-        for j in range(3):
-            pose[i, j] = x[3 * i + j]
-        pose[3, i] = x[9 + i] + dt * x[12 + i]
-    if dt != 0.0:
-        turn[:] = so3_exp(dt * rate)
-        R = x[:9].reshape(3, 3)
-        _product(R, turn, pose)
-
-
-# Rows of the scratch space [_ROWS, 3] in which a view is computed: poses (4 rows) and turns (3) of host and keyframe,
-# the landmark in the frames that it passes, and room for rows of derivatives.
-_HOST, _TURN_HOST, _SEEN, _TURN_SEEN = 0, 4, 7, 11
-_F_HOST, _F_WORLD, _F_SEEN, _Q, _F_CAM, _GAP, _FREE, _ROWS = 14, 15, 16, 17, 18, 19, 20, 29
-
-
-@njit(cache=True, nogil=True)
-def _chain(
-    X: Array, host: int, seen: int, dt_host: float, dt_seen: float, point: Array, rig: Rig, cam: int, w: Array
-) -> None:
-    """Carry a landmark from its host into a camera, scaled by its inverse depth; leaves every step in `w`."""
-    camera, R_body_cam = rig
-    _place(X[host], camera.rate[host], dt_host, w[_HOST : _HOST + 4], w[_TURN_HOST : _TURN_HOST + 3])
-    _place(X[seen], camera.rate[seen], dt_seen, w[_SEEN : _SEEN + 4], w[_TURN_SEEN : _TURN_SEEN + 3])
-    rho = point[2]
-    free = w[_FREE]
-    free[0], free[1], free[2] = point[0], point[1], 1.0
-    _apply(R_body_cam, free, w[_F_HOST])
-    T = camera.T_body_cam
-    for i in range(3):
-        w[_F_HOST, i] += rho * T[i, 3]
         w[_GAP, i] = w[_HOST + 3, i] - w[_SEEN + 3, i]
-    _apply(w[_HOST : _HOST + 3], w[_F_HOST], w[_F_WORLD])
-    for i in range(3):
         w[_F_WORLD, i] += rho * w[_GAP, i]
-    _apply_transposed(w[_SEEN : _SEEN + 3], w[_F_WORLD], w[_F_SEEN])
+    _rotate_back(w, _SEEN, _F_WORLD, _F_SEEN)
     for i in range(3):
-        free[i] = w[_F_SEEN, i] - rho * T[i, 3]
-    _apply_transposed(R_body_cam, free, w[_Q])
-    T1 = camera.T_cam0_cams[cam]
+        w[_FREE, i] = w[_F_SEEN, i] - rho * w[_BODY_CAM + 3, i]
+    _rotate_back(w, _BODY_CAM, _FREE, _Q)
     for i in range(3):
-        free[i] = w[_Q, i] - rho * T1[i, 3]
-    _apply_transposed(T1, free, w[_F_CAM])
+        w[_FREE, i] = w[_Q, i] - rho * w[at + 3, i]
+    _rotate_back(w, at, _FREE, _F_CAM)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _residual(w: Array, views: Views, n: int, rho: float, out: Array) -> bool:
     """Whitened error [3] of view n: two of the pixel, one of inverse depth; False behind the camera."""
     z = w[_F_CAM, 2]
@@ -104,14 +122,13 @@ def _residual(w: Array, views: Views, n: int, rho: float, out: Array) -> bool:
         return False
     ex = w[_F_CAM, 0] / z - views.xy[n, 0]
     ey = w[_F_CAM, 1] / z - views.xy[n, 1]
-    W = views.white[n]
-    out[0] = W[0, 0] * ex + W[0, 1] * ey
-    out[1] = W[1, 0] * ex + W[1, 1] * ey
+    out[0] = views.white[n, 0, 0] * ex + views.white[n, 0, 1] * ey
+    out[1] = views.white[n, 1, 0] * ex + views.white[n, 1, 1] * ey
     out[2] = views.depth_weight[n] * (rho / z - views.inverse_depth[n])
     return True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _robust(s: float, k: float) -> tuple[float, float]:
     """Return Huber's weight and twice its cost for a squared error."""
     if s <= k * k:
@@ -120,29 +137,26 @@ def _robust(s: float, k: float) -> tuple[float, float]:
     return k / root, 2.0 * k * root - k * k
 
 
-@njit(cache=True, nogil=True)
-def _shifts(views: Views, camera: Camera, calibration: Array, n: int, host_view: int, host: int) -> tuple[float, float]:
-    """Return the times from the stamps of host and keyframe to what was read."""
-    dt_host = calibration[0] - camera.applied_offset_s[host] + views.row[host_view] * calibration[4]
-    seen = views.keyframe[n]
-    if seen == host:
-        return dt_host, dt_host
-    return dt_host, calibration[0] - camera.applied_offset_s[seen] + views.row[n] * calibration[4]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shift(views: Views, camera: Camera, calibration: Array, n: int, k: int) -> float:
+    """Return the time from keyframe k's stamp to when view n's row was read."""
+    return calibration[0] - camera.applied_offset_s[k] + views.row[n] * calibration[4]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Camera, squares: Array) -> float:
     """Return half the robust cost of all views; `squares` [N, 2] gets the squared errors of pixel and depth."""
-    w = np.zeros((_ROWS, 3))
-    r = np.empty(3)
-    rig = (camera, camera.T_body_cam[:3, :3].copy() @ so3_exp(calibration[1:4].copy()))
+    w, r = _scratch(camera, calibration), np.empty(3)
     total = 0.0
     for p in range(len(points)):
-        host = views.host[p]
+        host, own = views.host[p], views.first[p]
+        dt_host = _shift(views, camera, calibration, own, host)
+        _place_host(X, host, camera, dt_host, points[p], w)
         total += camera.rho_information * points[p, 2] * points[p, 2]
-        for n in range(views.first[p], views.first[p + 1]):
-            dt_host, dt = _shifts(views, camera, calibration, n, views.first[p], host)
-            _chain(X, host, views.keyframe[n], dt_host, dt, points[p], rig, views.camera[n], w)
+        for n in range(own, views.first[p + 1]):
+            seen = views.keyframe[n]
+            dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
+            _chain(X, seen, camera, dt, points[p, 2], views.camera[n], w)
             if not _residual(w, views, n, points[p, 2], r):
                 total += _BEHIND_COST
                 squares[n, 0], squares[n, 1] = 1e6, 0.0
@@ -152,72 +166,71 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
     return 0.5 * total
 
 
-@njit(cache=True, nogil=True)
-def _derivative(
-    w: Array, views: Views, n: int, host_view: int, rho: float, rig: Rig, X: Array, host: int, J: Array
-) -> None:
-    """Fill J [3, 20], the derivative of view n's whitened error, from the chain in `w`."""
-    camera, R_body_cam = rig
-    seen, cam = views.keyframe[n], views.camera[n]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _derivative(w: Array, views: Views, n: int, own: int, rho: float, same: bool, J: Array) -> None:
+    """Fill J [3, 20], the derivative of view n's whitened error, from the chain in the scratch space.
+
+    A row of the derivative is carried back through the frames, as the landmark was carried forth.
+    """
+    at = _CAMS + 4 * views.camera[n]
     z = w[_F_CAM, 2]
     x, y = w[_F_CAM, 0] / z, w[_F_CAM, 1] / z
-    W = views.white[n]
-    T, T1 = camera.T_body_cam, camera.T_cam0_cams[cam]
-    R_host, R_seen = w[_HOST : _HOST + 3], w[_SEEN : _SEEN + 3]
-    lever, row = w[_FREE + 1], w[_FREE + 2]
-    in_q, in_seen, in_world = w[_FREE + 3], w[_FREE + 4], w[_FREE + 5]
-    in_host, in_cam, bearing = w[_FREE + 6], w[_FREE + 7], w[_FREE + 8]
-    for i in range(3):
-        lever[i] = w[_F_HOST, i] - rho * T[i, 3]
-    _apply_transposed(R_body_cam, lever, bearing)  # [a, b, 1] again
     depth_weight = views.depth_weight[n]
     for k in range(3):
-        out = J[k]
         if k == 2 and depth_weight == 0.0:
-            out[:] = 0.0
+            for i in range(COLUMNS):
+                J[k, i] = 0.0
             continue
         if k < 2:
-            in_cam[0], in_cam[1] = W[k, 0] / z, W[k, 1] / z
-            in_cam[2] = -(W[k, 0] * x + W[k, 1] * y) / z
+            w[_BY_CAM, 0], w[_BY_CAM, 1] = views.white[n, k, 0] / z, views.white[n, k, 1] / z
+            w[_BY_CAM, 2] = -(w[_BY_CAM, 0] * x + w[_BY_CAM, 1] * y)
         else:
-            in_cam[0], in_cam[1], in_cam[2] = 0.0, 0.0, -depth_weight * rho / (z * z)
-        # the row of the derivative by what each step of the chain produced
-        _apply(T1, in_cam, in_q)
-        _apply(R_body_cam, in_q, in_seen)
-        _apply(R_seen, in_seen, in_world)
-        _apply_transposed(R_host, in_world, in_host)
-        _cross(w[_F_HOST], in_host, row)
-        _apply(w[_TURN_HOST : _TURN_HOST + 3], row, out[0:3])
-        _cross(in_seen, w[_F_SEEN], row)
-        _apply(w[_TURN_SEEN : _TURN_SEEN + 3], row, out[6:9])
-        by_time_host, by_time = 0.0, 0.0
-        _cross(camera.rate[host], w[_F_HOST], row)
+            w[_BY_CAM, 0], w[_BY_CAM, 1], w[_BY_CAM, 2] = 0.0, 0.0, -depth_weight * rho / (z * z)
+        _rotate(w, at, _BY_CAM, _BY_Q)
+        _rotate(w, _BODY_CAM, _BY_Q, _BY_SEEN)
+        _rotate(w, _SEEN, _BY_SEEN, _BY_WORLD)
+        _rotate_back(w, _HOST, _BY_WORLD, _BY_HOST)
+        _rotate_back(w, _BODY_CAM, _BY_HOST, _BY_BEARING)
+        by_rho, by_time_host, by_time = 0.0, 0.0, 0.0
         for i in range(3):
-            out[3 + i] = rho * in_world[i]
-            out[9 + i] = -rho * in_world[i]
-            by_time_host += in_host[i] * row[i] + rho * in_world[i] * X[host, 12 + i]
-        _cross(camera.rate[seen], w[_F_SEEN], row)
+            by_rho += (w[_BY_HOST, i] - w[_BY_SEEN, i]) * w[_BODY_CAM + 3, i]
+            by_rho += w[_BY_WORLD, i] * w[_GAP, i] - w[_BY_Q, i] * w[at + 3, i]
+        J[k, 17], J[k, 18], J[k, 19] = w[_BY_BEARING, 0], w[_BY_BEARING, 1], by_rho
+        if k == 2:
+            J[k, 19] += depth_weight / z
+        if same:  # moving the body moves landmark and camera alike
+            for i in range(17):
+                J[k, i] = 0.0
+            continue
+        _cross(w, _F_HOST, _BY_HOST, _FREE)  # by a turn of the host at the time of reading
         for i in range(3):
-            by_time -= in_seen[i] * row[i] + rho * in_world[i] * X[seen, 12 + i]
-        out[12] = by_time_host + by_time
-        out[16] = by_time_host * views.row[host_view] + by_time * views.row[n]
-        _apply_transposed(R_body_cam, in_host, row)  # by [a, b, 1]
-        out[17], out[18] = row[0], row[1]
-        _cross(bearing, row, out[13:16])
-        _cross(in_q, w[_Q], row)
-        by_rho = 0.0
+            by_time_host -= w[_FREE, i] * -w[_RATE_HOST, i] - rho * w[_BY_WORLD, i] * w[_V_HOST, i]
+            J[k, i] = (
+                w[_TURN_HOST + i, 0] * w[_FREE, 0]
+                + w[_TURN_HOST + i, 1] * w[_FREE, 1]
+                + w[_TURN_HOST + i, 2] * w[_FREE, 2]
+            )
+            J[k, 3 + i] = rho * w[_BY_WORLD, i]
+        _cross(w, _BY_SEEN, _F_SEEN, _FREE)
         for i in range(3):
-            out[13 + i] += row[i]
-            by_rho += (in_host[i] - in_seen[i]) * T[i, 3] + in_world[i] * w[_GAP, i] - in_q[i] * T1[i, 3]
-        out[19] = by_rho + (depth_weight / z if k == 2 else 0.0)
-        for i in range(CALIBRATION):
-            if not camera.active[i]:
-                out[12 + i] = 0.0
-        if seen == host:  # moving the body moves landmark and camera alike
-            out[:17] = 0.0
+            by_time += w[_FREE, i] * w[_RATE_SEEN, i] - rho * w[_BY_WORLD, i] * w[_V_SEEN, i]
+            J[k, 6 + i] = (
+                w[_TURN_SEEN + i, 0] * w[_FREE, 0]
+                + w[_TURN_SEEN + i, 1] * w[_FREE, 1]
+                + w[_TURN_SEEN + i, 2] * w[_FREE, 2]
+            )
+            J[k, 9 + i] = -rho * w[_BY_WORLD, i]
+        J[k, 12] = by_time_host + by_time
+        J[k, 16] = by_time_host * views.row[own] + by_time * views.row[n]
+        _cross(w, _BEARING, _BY_BEARING, _FREE)
+        for i in range(3):
+            J[k, 13 + i] = w[_FREE, i]
+        _cross(w, _BY_Q, _Q, _FREE)
+        for i in range(3):
+            J[k, 13 + i] += w[_FREE, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def linearise(
     X: Array,
     X_first: Array,
@@ -244,77 +257,98 @@ def linearise(
         views: observations.
         camera: geometry and timing.
         poses_at: where the poses begin among the unknowns; calibration follows them.
-        A: [D, D], g: [D]; added to.
-        A_points: [L, 3, 3], g_points: [L, 3], cross: [L, 3, D - poses_at]; overwritten.
+        A: [D, D], added to.
+        g: [D], added to.
+        A_points: the landmarks' own blocks [L, 3, 3], overwritten.
+        g_points: their gradients [L, 3], overwritten.
+        cross: landmarks by poses and calibration [L, 3, D - poses_at], overwritten.
     """
-    w = np.zeros((_ROWS, 3))
-    r, J, waste = np.empty(3), np.empty((3, COLUMNS)), np.empty(3)
-    rig = (camera, camera.T_body_cam[:3, :3].copy() @ so3_exp(calibration[1:4].copy()))
-    calibration_at = 6 * len(X)
+    w, r, J, waste = _scratch(camera, calibration), np.empty(3), np.empty((3, COLUMNS)), np.empty(3)
     X_by = X.copy()
     for k in range(len(X)):
         if held[k]:
             X_by[k] = X_first[k]
-    where = np.empty(17, dtype=np.int64)
-    for i in range(CALIBRATION):
-        where[12 + i] = calibration_at + i
-    some_calibration = camera.active.any()
-    width = 17 if some_calibration else 12
     cross[:] = 0.0
     for p in range(len(points)):
-        host = views.host[p]
-        H, b, W = A_points[p], g_points[p], cross[p]
-        H[:] = 0.0
-        b[:] = 0.0
-        H[2, 2] = camera.rho_information
-        b[2] = camera.rho_information * points[p, 2]
-        for n in range(views.first[p], views.first[p + 1]):
+        host, own, rho = views.host[p], views.first[p], points[p, 2]
+        A_points[p] = 0.0
+        g_points[p] = 0.0
+        A_points[p, 2, 2] = camera.rho_information
+        g_points[p, 2] = camera.rho_information * rho
+        dt_host = _shift(views, camera, calibration, own, host)
+        for n in range(own, views.first[p + 1]):
             seen = views.keyframe[n]
-            dt_host, dt = _shifts(views, camera, calibration, n, views.first[p], host)
-            _chain(X, host, seen, dt_host, dt, points[p], rig, views.camera[n], w)
-            if not _residual(w, views, n, points[p, 2], r):
+            dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
+            _place_host(X, host, camera, dt_host, points[p], w)
+            _chain(X, seen, camera, dt, rho, views.camera[n], w)
+            if not _residual(w, views, n, rho, r):
                 continue
             if held[host] or held[seen]:
-                _chain(X_by, host, seen, dt_host, dt, points[p], rig, views.camera[n], w)
-                if not _residual(w, views, n, points[p, 2], waste):
+                _place_host(X_by, host, camera, dt_host, points[p], w)
+                _chain(X_by, seen, camera, dt, rho, views.camera[n], w)
+                if not _residual(w, views, n, rho, waste):
                     continue
-            _derivative(w, views, n, views.first[p], points[p, 2], rig, X_by, host, J)
-            weight = np.sqrt(_robust(r[0] * r[0] + r[1] * r[1], camera.huber_k)[0])
-            rows = 2
-            for k in range(2):
-                r[k] *= weight
-                for i in range(COLUMNS):
-                    J[k, i] *= weight
-            if views.depth_weight[n] > 0.0:
-                rows = 3
-                weight = np.sqrt(_robust(r[2] * r[2], camera.huber_k)[0])
-                r[2] *= weight
-                for i in range(COLUMNS):
-                    J[2, i] *= weight
+            _derivative(w, views, n, own, rho, seen == host, J)
+            rows = 3 if views.depth_weight[n] > 0.0 else 2
+            _weigh(J, r, rows, camera.huber_k)
             for k in range(rows):
-                row = J[k]
                 for i in range(3):
-                    b[i] += row[17 + i] * r[k]
+                    g_points[p, i] += J[k, 17 + i] * r[k]
                     for j in range(3):
-                        H[i, j] += row[17 + i] * row[17 + j]
-            if seen == host:
-                continue
-            for i in range(6):
-                where[i], where[6 + i] = 6 * host + i, 6 * seen + i
+                        A_points[p, i, j] += J[k, 17 + i] * J[k, 17 + j]
+            if seen != host:
+                _accumulate(J, r, rows, host, seen, len(X), camera.active, poses_at, p, A, g, cross)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(J: Array, r: Array, rows: int, huber_k: float) -> None:
+    """Apply the robust weights of pixel and depth to an error and its derivative."""
+    pixel = np.sqrt(_robust(r[0] * r[0] + r[1] * r[1], huber_k)[0])
+    for k in range(rows):
+        weight = pixel if k < 2 else np.sqrt(_robust(r[2] * r[2], huber_k)[0])
+        if weight != 1.0:
+            r[k] *= weight
+            for i in range(COLUMNS):
+                J[k, i] *= weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _accumulate(
+    J: Array,
+    r: Array,
+    rows: int,
+    host: int,
+    seen: int,
+    count: int,
+    active: Array,
+    poses_at: int,
+    p: int,
+    A: Array,
+    g: Array,
+    cross: Array,
+) -> None:
+    """Add one view of landmark p to the normal equations of poses and calibration."""
+    blocks = (6 * host, 6 * seen, 6 * count)  # ascending, for the host is the first to see it
+    for i in range(CALIBRATION):
+        if not active[i]:
             for k in range(rows):
-                row = J[k]
-                for i in range(width):
-                    at = where[i]
-                    value = row[i]
-                    g[poses_at + at] += value * r[k]
-                    for j in range(3):
-                        W[j, at] += row[17 + j] * value
-                    out = A[poses_at + at]
-                    for j in range(i, width):
-                        out[poses_at + where[j]] += value * row[j]
+                J[k, 12 + i] = 0.0
+    for a in range(3):
+        for i in range(6 if a < 2 else CALIBRATION):
+            column, at = 6 * a + i, blocks[a] + i
+            for k in range(rows):
+                value = J[k, column]
+                g[poses_at + at] += value * r[k]
+                for j in range(3):
+                    cross[p, j, at] += J[k, 17 + j] * value
+                for b in range(a, 3):
+                    start = i if b == a else 0
+                    first = poses_at + blocks[b]
+                    for j in range(start, 6 if b < 2 else CALIBRATION):
+                        A[poses_at + at, first + j] += value * J[k, 6 * b + j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def eliminate(
     points_at: Array, A_points: Array, g_points: Array, cross: Array, damping: float, poses_at: int, A: Array, g: Array
 ) -> bool:
@@ -360,7 +394,7 @@ def eliminate(
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def follow(points: Array, points_at: Array, g_points: Array, cross: Array, step: Array, out: Array) -> None:
     """Move the landmarks [L, 3] to where the step [D - poses_at] of poses and calibration wants them, into `out`."""
     b = np.empty(3)
@@ -377,7 +411,7 @@ def follow(points: Array, points_at: Array, g_points: Array, cross: Array, step:
             )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def start(
     X: Array, calibration: Array, views: Views, camera: Camera, wanted: Array, rho_start: float, points: Array
 ) -> None:
@@ -385,48 +419,53 @@ def start(
 
     Once through the linear equation for the inverse depth, then three Gauss-Newton steps with the poses fixed.
     """
-    w = np.zeros((_ROWS, 3))
-    at_infinity, J, r = np.empty(3), np.empty((3, COLUMNS)), np.empty(3)
-    rig = (camera, camera.T_body_cam[:3, :3].copy() @ so3_exp(calibration[1:4].copy()))
+    w, r, J = _scratch(camera, calibration), np.empty(3), np.empty((3, COLUMNS))
     for p in range(len(points)):
         if not wanted[p]:
             continue
         point, host, own = points[p], views.host[p], views.first[p]
         point[:2] = views.xy[own]
+        dt_host = _shift(views, camera, calibration, own, host)
         numerator, denominator = 1e2 * rho_start, 1e2
         for n in range(own, views.first[p + 1]):
-            dt_host, dt = _shifts(views, camera, calibration, n, own, host)
+            seen, cam = views.keyframe[n], views.camera[n]
+            dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
             point[2] = 0.0
-            _chain(X, host, views.keyframe[n], dt_host, dt, point, rig, views.camera[n], w)
-            at_infinity[:] = w[_F_CAM]
+            _place_host(X, host, camera, dt_host, point, w)
+            _chain(X, seen, camera, dt, 0.0, cam, w)
+            far_x, far_y, far_z = w[_F_CAM, 0], w[_F_CAM, 1], w[_F_CAM, 2]
             point[2] = 1.0
-            _chain(X, host, views.keyframe[n], dt_host, dt, point, rig, views.camera[n], w)
+            _place_host(X, host, camera, dt_host, point, w)
+            _chain(X, seen, camera, dt, 1.0, cam, w)
+            by_z = w[_F_CAM, 2] - far_z
             weight = views.white[n, 0, 0] ** 2
             for i in range(2):
-                a = (w[_F_CAM, i] - at_infinity[i]) - views.xy[n, i] * (w[_F_CAM, 2] - at_infinity[2])
-                b = at_infinity[i] - views.xy[n, i] * at_infinity[2]
-                numerator -= weight * a * b
+                far = far_x if i == 0 else far_y
+                a = (w[_F_CAM, i] - far) - views.xy[n, i] * by_z
+                numerator -= weight * a * (far - views.xy[n, i] * far_z)
                 denominator += weight * a * a
             if views.depth_weight[n] > 0.0:
-                a = 1.0 - views.inverse_depth[n] * (w[_F_CAM, 2] - at_infinity[2])
-                numerator += views.depth_weight[n] ** 2 * a * views.inverse_depth[n] * at_infinity[2]
+                a = 1.0 - views.inverse_depth[n] * by_z
+                numerator += views.depth_weight[n] ** 2 * a * views.inverse_depth[n] * far_z
                 denominator += views.depth_weight[n] ** 2 * a * a
         point[2] = min(max(numerator / denominator, 1e-3), 5.0)
         for _ in range(3):
             H, b = np.eye(3) * camera.rho_information, point * camera.rho_information
+            _place_host(X, host, camera, dt_host, point, w)
             for n in range(own, views.first[p + 1]):
-                dt_host, dt = _shifts(views, camera, calibration, n, own, host)
-                _chain(X, host, views.keyframe[n], dt_host, dt, point, rig, views.camera[n], w)
+                seen = views.keyframe[n]
+                dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
+                _chain(X, seen, camera, dt, point[2], views.camera[n], w)
                 if not _residual(w, views, n, point[2], r):
                     continue
-                _derivative(w, views, n, own, point[2], rig, X, host, J)
-                weight = _robust(r[0] * r[0] + r[1] * r[1], camera.huber_k)[0]
-                for k in range(3):
-                    scale = weight if k < 2 else _robust(r[2] * r[2], camera.huber_k)[0]
+                _derivative(w, views, n, own, point[2], seen == host, J)
+                rows = 3 if views.depth_weight[n] > 0.0 else 2
+                _weigh(J, r, rows, camera.huber_k)
+                for k in range(rows):
                     for i in range(3):
-                        b[i] += scale * J[k, 17 + i] * r[k]
+                        b[i] += J[k, 17 + i] * r[k]
                         for j in range(3):
-                            H[i, j] += scale * J[k, 17 + i] * J[k, 17 + j]
+                            H[i, j] += J[k, 17 + i] * J[k, 17 + j]
             step = np.linalg.solve(H, b)
             point[:2] -= step[:2]
             point[2] = min(max(point[2] - step[2], -0.1), 10.0)

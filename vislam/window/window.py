@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from vislam.camera import Rig
@@ -64,6 +65,7 @@ class SlidingWindow:
         self._full = False
         self._tracks = TrackTable(config, rig)
         self._links = LinkStore(config, noise, gravity_m_s2)
+        self._last_edges: list[WindowEdge] = []
         self._start: NavState | None = None
         self._T_start: Array | None = None
         self._initialised = False
@@ -151,7 +153,7 @@ class SlidingWindow:
         self._calibration = np.zeros(CALIBRATION)
         self._prior: Prior | None = None
         self._speed_sigma_m_s = 0.0
-        self._last_edges: list[WindowEdge] = []
+        self._last_edges = []
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
 
@@ -191,7 +193,7 @@ class SlidingWindow:
         self._t_ns = np.append(self._t_ns, packet.keyframe.t_ns)
         self._X = np.vstack([self._X, x])
         self._X_first = np.vstack([self._X_first, x])
-        self._held = np.append(self._held, False)
+        self._held = np.append(self._held, first)  # the first prior is linearised there
         self._gyro = np.vstack([self._gyro, gyro])
         self._applied = np.append(self._applied, packet.time_offset_s)
         self._T_odom.append(None if T_odom_body is None else T_odom_body.copy())
@@ -219,7 +221,6 @@ class SlidingWindow:
             T = self._T_start
             self._prior = first_pose_prior(config.gauge_sigma_m, config.gauge_sigma_rad, self._calibration, sigmas)
         x[:9], x[9:12] = T[:3, :3].ravel(), T[:3, 3]
-        self._held[:] = True
         return x
 
     def _predicted(self, packet: KeyframePacket, T_odom_body: Array | None) -> Array:
@@ -263,7 +264,7 @@ class SlidingWindow:
 
     # ---- the solution
 
-    def _active(self) -> Array:
+    def _active(self) -> NDArray[np.bool_]:
         config = self._config
         return np.array(
             [

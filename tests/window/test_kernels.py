@@ -1,0 +1,180 @@
+"""The kernels against numbers: derivatives by differences, factorisation and covariance against numpy."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from inertial_world import EUROC_NOISE, GRAVITY_M_S2, Motion
+from landmark_world import RGBD, STEREO, World, start_state
+
+from vislam.config import WindowConfig
+from vislam.messages import Array
+from vislam.window import inertial, linear, visual
+from vislam.window.layout import CALIBRATION, Camera, Links, Views, positions, retract
+from vislam.window.spans import LinkStore
+from vislam.window.tracks import TrackTable
+
+
+class Scene(NamedTuple):
+    X: Array
+    points: Array
+    calibration: Array
+    views: Views
+    camera: Camera
+    links: Links
+
+
+def make_scene(rig, seed: int) -> Scene:
+    """Five keyframes off the truth, everything on: rolling shutter, time offset, extrinsic rotation, right or depth."""
+    world = World(Motion.random(seed), rig, seed, duration_s=1.2, tracks=12)
+    packets, truths = world.packets()
+    rng = np.random.default_rng(seed)
+    config = WindowConfig()
+    tracks, links = TrackTable(config, rig), LinkStore(config, EUROC_NOISE, GRAVITY_M_S2)
+    X = []
+    for packet, truth in zip(packets, truths, strict=True):
+        state = start_state(truth, packet.keyframe.t_ns, rng)
+        T = state.T_world_body
+        X.append(
+            np.concatenate(
+                [T[:3, :3].ravel(), T[:3, 3], state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2]
+            )
+        )
+        tracks.add(packet.keyframe.id, packet.observations)
+        if packet.imu is not None:
+            links.push(packet.imu, 0.2, X[-2][15:] + 1e-3, np.eye(4), at_rest=len(X) == 3)
+    count = len(X)
+    camera = Camera(
+        T_body_cam=rig.T_body_cams[0],
+        T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams]),
+        rate=rng.normal(size=(count, 3)),
+        applied_offset_s=rng.normal(size=count) * 1e-3,
+        active=np.ones(CALIBRATION, dtype=np.bool_),
+        huber_k=1.5,
+        rho_information=0.01,
+    )
+    selection = tracks.select(np.arange(count))
+    calibration = np.array([0.008, 0.01, -0.02, 0.015, 0.012])
+    points = np.zeros((len(selection.slots), 3))
+    visual.start(np.array(X), calibration, selection.views, camera, np.ones(len(points), dtype=np.bool_), 0.2, points)
+    return Scene(np.array(X), points, calibration, selection.views, camera, links.arrays)
+
+
+def normal_equations(scene: Scene) -> tuple[Array, Array, Array, Array]:
+    count = len(scene.X)
+    D = 15 * count + CALIBRATION
+    L = len(scene.points)
+    A, g = np.zeros((D, D)), np.zeros(D)
+    A_points, g_points, cross = np.empty((L, 3, 3)), np.empty((L, 3)), np.empty((L, 3, 6 * count + CALIBRATION))
+    held = np.zeros(count, dtype=np.bool_)
+    visual.linearise(
+        scene.X, scene.X, held, scene.points, scene.calibration, scene.views, scene.camera, 9 * count,
+        A, g, A_points, g_points, cross,
+    )  # fmt: skip
+    return A, g, A_points, g_points
+
+
+def views_cost(scene: Scene, X: Array, points: Array, calibration: Array) -> float:
+    squares = np.zeros((len(scene.views.xy), 2))
+    return visual.cost(X, points, calibration, scene.views, scene.camera, squares)
+
+
+@pytest.mark.parametrize("rig", [STEREO, RGBD], ids=["stereo", "rgbd"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
+    scene = make_scene(rig, seed)
+    _, g, _, g_points = normal_equations(scene)
+    where = positions(len(scene.X), True)
+    step = 1e-6
+    for k in range(len(scene.X)):
+        for i in range(6):
+            costs = []
+            for sign in (1.0, -1.0):
+                X, d = scene.X.copy(), np.zeros(15)
+                d[i] = sign * step
+                retract(X[k], d)
+                costs.append(views_cost(scene, X, scene.points, scene.calibration))
+            assert g[where[k, i]] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=1e-4, abs=1e-1)
+    for p in (0, len(scene.points) // 2):
+        for i in range(3):
+            points = np.repeat(scene.points[None], 2, axis=0)
+            points[0, p, i] += step
+            points[1, p, i] -= step
+            costs = [views_cost(scene, scene.X, q, scene.calibration) for q in points]
+            assert g_points[p, i] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=1e-4, abs=1e-1)
+    for i in (0, 4):
+        calibrations = np.repeat(scene.calibration[None], 2, axis=0)
+        calibrations[0, i] += step
+        calibrations[1, i] -= step
+        costs = [views_cost(scene, scene.X, scene.points, c) for c in calibrations]
+        assert g[-CALIBRATION + i] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=1e-3, abs=1.0)
+
+
+def test_gradient_by_extrinsic_rotation() -> None:
+    scene = make_scene(STEREO, 3)
+    scene = scene._replace(calibration=np.array([0.008, 0.0, 0.0, 0.0, 0.012]))  # where its tangent is its difference
+    _, g, _, _ = normal_equations(scene)
+    for i in range(1, 4):
+        costs = []
+        for sign in (1e-6, -1e-6):
+            c = scene.calibration.copy()
+            c[i] = sign
+            costs.append(views_cost(scene, scene.X, scene.points, c))
+        assert g[-CALIBRATION + i] == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-3, abs=1.0)
+
+
+def test_gradient_of_links_is_that_of_their_cost() -> None:
+    scene = make_scene(STEREO, 4)
+    count = len(scene.X)
+    D = 15 * count + CALIBRATION
+    A, g = np.zeros((D, D)), np.zeros(D)
+    where = positions(count, True)
+    held = np.zeros(count, dtype=np.bool_)
+    inertial.linearise(scene.X, scene.X, held, scene.links, GRAVITY_M_S2, where, count - 1, count, A, g)
+    for k in range(count):
+        for i in range(15):
+            step = 1e-6
+            costs = []
+            for sign in (1.0, -1.0):
+                X, d = scene.X.copy(), np.zeros(15)
+                d[i] = sign * step
+                retract(X[k], d)
+                costs.append(inertial.cost(X, scene.links, GRAVITY_M_S2))
+            assert g[where[k, i]] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=2e-3, abs=10.0), (k, i)
+
+
+def test_factorisation_solution_and_covariance_agree_with_numpy() -> None:
+    rng = np.random.default_rng(5)
+    half = rng.normal(size=(40, 30))
+    half[:, ::3] *= half[:, ::3] > 0.5  # some zeros to skip
+    A = half.T @ half + 0.1 * np.eye(30)
+    U = A.copy()
+    assert linear.factorise(U)
+    np.testing.assert_allclose(np.triu(U).T @ np.triu(U), A, atol=1e-10)
+    b = rng.normal(size=30)
+    np.testing.assert_allclose(linear.solve(U, b), np.linalg.solve(A, b), rtol=1e-8)
+    inverse = np.linalg.inv(A)
+    np.testing.assert_allclose(linear.trailing_covariance(U, 12), inverse[12:, 12:], rtol=1e-6, atol=1e-9)
+    columns = np.array([3, 17])
+    np.testing.assert_allclose(linear.columns_of_covariance(U, columns), inverse[:, columns], rtol=1e-6, atol=1e-9)
+    A[4, 4] = -1.0
+    assert not linear.factorise(A)
+
+
+def test_landmarks_are_found_at_their_depth() -> None:
+    world = World(Motion.random(6), STEREO, 6, duration_s=1.0, sigma_px=1e-3, tracks=30)
+    packets, truths = world.packets()
+    tracks = TrackTable(WindowConfig(), STEREO)
+    for packet in packets:
+        tracks.add(packet.keyframe.id, packet.observations)
+    X = np.array([np.concatenate([T[:3, :3].ravel(), T[:3, 3], v, b]) for T, v, b in truths])
+    selection = tracks.select(np.arange(len(X)))
+    scene = make_scene(STEREO, 6)
+    camera = scene.camera._replace(
+        rate=np.zeros((len(X), 3)), applied_offset_s=np.zeros(len(X)), T_cam0_cams=scene.camera.T_cam0_cams
+    )
+    points = np.zeros((len(selection.slots), 3))
+    visual.start(X, np.zeros(5), selection.views, camera, np.ones(len(points), dtype=np.bool_), 0.2, points)
+    squares = np.zeros((len(selection.rows), 2))
+    visual.cost(X, points, np.zeros(5), selection.views, camera, squares)
+    assert np.sqrt(squares[:, 0]).max() < 0.02  # standard deviations of 1 px, so px

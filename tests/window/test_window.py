@@ -1,0 +1,242 @@
+"""The sliding window on simulated packets: accuracy, consistency, faults, and that work stays bounded."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, state_error
+from landmark_world import MONO, RGBD, STEREO, World, packet, start_state
+
+from vislam.camera import Rig
+from vislam.config import WindowConfig
+from vislam.errors import DataError, UsageError
+from vislam.geometry import invert, se3_log
+from vislam.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
+from vislam.window import SlidingWindow, WindowUpdate
+
+HONEST = replace(WindowConfig(), imu_inflation=1.0, keyframes=8)  # the simulated sensor has no vibration
+
+
+def run(
+    world: World, config: WindowConfig = HONEST, seed: int = 0
+) -> tuple[list[WindowUpdate], list[tuple[Array, Array, Array]], SlidingWindow]:
+    packets, truths = world.packets()
+    window = SlidingWindow(config, world.rig, world.noise, GRAVITY_M_S2)
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
+    return [window.add(p) for p in packets], truths, window
+
+
+def position_rmse(updates: list[WindowUpdate], truths: list[tuple[Array, Array, Array]]) -> float:
+    errors = [u.T_local_body[-1][:3, 3] - T[:3, 3] for u, (T, _, _) in zip(updates, truths, strict=True)]
+    return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+
+
+def path_m(truths: list[tuple[Array, Array, Array]]) -> float:
+    return float(sum(np.linalg.norm(b[0][:3, 3] - a[0][:3, 3]) for a, b in zip(truths, truths[1:], strict=False)))
+
+
+@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
+def test_drift_is_small_against_distance(rig: Rig) -> None:
+    updates, truths, _ = run(World(Motion.random(0), rig, 0, duration_s=12.0))
+    assert position_rmse(updates, truths) < 0.005 * path_m(truths)
+    assert all(u.note == "" for u in updates)
+    if rig is MONO:
+        assert 0.0 < updates[-1].scale_sigma < 0.02
+    else:
+        assert updates[-1].scale_sigma == 0.0
+
+
+def test_error_of_the_newest_state_fits_its_covariance() -> None:
+    """NEES over runs: within the band that a correct filter leaves once in a thousand, pose, velocity and biases."""
+    dof, total, count = 15, 0.0, 0
+    for seed in range(6):
+        updates, truths, _ = run(World(Motion.random(seed), MONO, seed, duration_s=5.0, tracks=50), seed=seed)
+        error = state_error(truths[-1], updates[-1].newest)
+        total += float(error @ np.linalg.solve(updates[-1].newest.covariance, error))
+        count += 1
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([0.0005, 0.9995], dof * count)
+    print(f"NEES of {count} runs: {total / (dof * count):.2f} per degree of freedom")
+    assert low < total < high
+
+
+def test_edges_are_settled_once_and_fit_the_truth() -> None:
+    updates, truths, _ = run(World(Motion.random(2), MONO, 2, duration_s=6.0, tracks=50))
+    settled = [e for u in updates for e in u.odometry if e.settled]
+    assert [(e.from_id, e.to_id) for e in settled] == [(k, k + 1) for k in range(len(updates) - HONEST.keyframes)]
+    squares = []
+    for e in settled:
+        T_true = invert(truths[e.from_id][0]) @ truths[e.to_id][0]
+        xi = se3_log(invert(e.T_from_to) @ T_true)
+        squares.append(xi @ np.linalg.solve(e.covariance, xi))
+    assert 2.0 < np.mean(squares) < 12.0  # six degrees of freedom, neighbours correlated
+    for u in updates:
+        provisional = [e for e in u.odometry if not e.settled]
+        assert [e.from_id for e in provisional] == list(u.ids[:-1])
+    tilts = [t for u in updates for t in u.tilts]
+    assert [t.id for t in tilts] == [e.from_id for e in settled] == [i for u in updates for i, _ in u.states]
+    errors = [np.arccos(min(1.0, float(t.up_body @ truths[t.id][0][2, :3]))) / t.sigma_rad for t in tilts]
+    assert np.sqrt(np.mean(np.square(errors))) < 2.5
+
+
+def test_time_offset_and_extrinsic_rotation_are_found() -> None:
+    correction = np.deg2rad([0.4, -0.3, 0.35])
+    world = World(
+        Motion.random(3, 1.2), STEREO, 3, duration_s=10.0, time_offset_s=0.03, R_cam_correction=correction, tracks=60
+    )
+    updates, _, _ = run(world)
+    found = updates[-1].calibration
+    assert abs(found.time_offset_s - 0.03) < 0.002
+    assert abs(found.time_offset_s - 0.03) < 5.0 * found.time_offset_sigma_s + 2e-4
+    assert np.abs(found.R_cam_correction - correction).max() < np.deg2rad(0.1)
+
+
+def test_calibration_that_is_switched_off_stays() -> None:
+    config = replace(HONEST, estimate_time_offset=False, estimate_rotation=False)
+    updates, _, _ = run(World(Motion.random(3), MONO, 3, duration_s=3.0), config)
+    found = updates[-1].calibration
+    assert found.time_offset_s == 0.0 and found.time_offset_sigma_s == 0.0
+    assert not found.R_cam_correction.any() and not found.R_cam_sigma.any()
+
+
+def test_known_rolling_shutter_is_accounted_for() -> None:
+    world = World(Motion.random(4, 1.2), STEREO, 4, duration_s=3.0, readout_s=0.03, tracks=50, sigma_px=0.5)
+    aware, truths, _ = run(world, replace(HONEST, readout_s=0.03, sigma_px=0.5, right_sigma_px=0.5))
+    blind, _, _ = run(world, replace(HONEST, sigma_px=0.5, right_sigma_px=0.5))
+    assert position_rmse(aware, truths) < 0.5 * position_rmse(blind, truths)
+
+
+def test_outliers_are_taken_out() -> None:
+    world = World(Motion.random(5), MONO, 5, duration_s=8.0, outliers=0.05)
+    updates, truths, _ = run(world)
+    assert position_rmse(updates, truths) < 0.01 * path_m(truths)
+    assert sum(u.rejected_tracks for u in updates) > 0
+
+
+def test_without_an_imu_stereo_is_bundle_adjustment() -> None:
+    world = World(Motion.random(6, 0.7), STEREO, 6, duration_s=6.0, keyframe_hz=8.0)
+    packets, truths = world.packets()
+    window = SlidingWindow(HONEST, STEREO, None, GRAVITY_M_S2)
+    window.initialise(None, truths[0][0])
+    updates = [window.add(replace(p, imu=None)) for p in packets]
+    assert position_rmse(updates, truths) < 0.01 * path_m(truths)
+    assert updates[-1].newest is None and not any(u.tilts for u in updates)
+
+
+def test_ten_minutes_at_rest_do_not_drift() -> None:
+    """Keyframes every 2 s; the sensor sees the same landmarks all the time."""
+    still = Motion(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)))
+    noise = replace(EUROC_NOISE, rate_hz=50.0)
+    world = World(still, MONO, 7, duration_s=600.0, keyframe_hz=0.5, tracks=40, noise=noise, rest_until_s=1e9)
+    updates, truths, _ = run(world)
+    T = invert(truths[-1][0]) @ updates[-1].T_local_body[-1]
+    first = invert(truths[10][0]) @ updates[10].T_local_body[-1]
+    drift = se3_log(invert(first) @ T)
+    assert np.linalg.norm(drift[3:]) < 0.005 and np.linalg.norm(drift[:3]) < np.deg2rad(0.2)
+    assert abs(updates[-1].calibration.time_offset_s) < 0.002
+
+
+def test_inertial_data_bridges_lost_vision_and_vision_bridges_lost_inertial_data() -> None:
+    world = World(Motion.random(8), STEREO, 8, duration_s=8.0, tracks=60)
+    packets, truths = world.packets()
+    nothing = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    for k in range(18, 22):
+        packets[k] = replace(packets[k], observations=nothing)
+    packets[28] = replace(packets[28], imu=None)
+    hole = packets[32].imu
+    inside = (np.arange(len(hole.t_ns)) < 5) | (np.arange(len(hole.t_ns)) > 33)
+    packets[32] = replace(
+        packets[32], imu=ImuSpan(hole.t_ns[inside], hole.gyro_rad_s[inside], hole.accel_m_s2[inside])
+    )
+    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, GRAVITY_M_S2)
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(8)))
+    updates = [window.add(p) for p in packets]
+    assert all(u.note == "" for u in updates)
+    assert position_rmse(updates, truths) < 0.01 * path_m(truths)
+    sigma = [float(np.sqrt(np.trace(u.newest.covariance[6:9, 6:9]))) for u in updates]
+    assert sigma[21] > 1.5 * sigma[17]  # without vision, velocity is known less well
+
+
+def bad_packets(good: KeyframePacket) -> list[tuple[str, KeyframePacket]]:
+    nan_pixels = good.observations.pixels_px.copy()
+    nan_pixels[3, 0] = np.nan
+    nan_gyro = good.imu.gyro_rad_s.copy()
+    nan_gyro[2] = np.inf
+    twice = good.observations.track_ids.copy()
+    twice[1] = twice[0]
+    return [
+        ("not finite", replace(good, observations=replace(good.observations, pixels_px=nan_pixels))),
+        ("twice", replace(good, observations=replace(good.observations, track_ids=twice))),
+        ("not finite", replace(good, imu=replace(good.imu, gyro_rad_s=nan_gyro))),
+        ("covers", replace(good, imu=replace(good.imu, t_ns=good.imu.t_ns + 1))),
+        ("back in time", replace(good, imu=replace(good.imu, t_ns=good.imu.t_ns[::-1].copy()))),
+        ("follow", replace(good, keyframe=replace(good.keyframe, t_ns=T0_NS))),
+        ("time offset", replace(good, time_offset_s=float("nan"))),
+    ]
+
+
+def test_bad_input_is_refused_before_anything_is_touched() -> None:
+    world = World(Motion.random(9), MONO, 9, duration_s=3.0, tracks=40)
+    clean, truths, _ = run(world)
+    packets, _ = world.packets()
+    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, GRAVITY_M_S2)
+    with pytest.raises(UsageError, match="initialise"):
+        window.add(packets[0])
+    start = start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1000))
+    with pytest.raises(DataError, match="finite"):
+        window.initialise(replace(start, velocity_world_m_s=np.full(3, np.nan)))
+    window.initialise(start)
+    for k, good in enumerate(packets):
+        if k == 9:
+            for words, bad in bad_packets(good):
+                with pytest.raises(DataError, match=words):
+                    window.add(bad)
+        update = window.add(good)
+    np.testing.assert_array_equal(update.T_local_body, clean[-1].T_local_body)  # and two runs agree to the last bit
+
+
+def test_a_window_without_solution_restarts_and_goes_on() -> None:
+    world = World(Motion.random(10), MONO, 10, duration_s=6.0, tracks=40)
+    packets, truths = world.packets()
+    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, GRAVITY_M_S2)
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(0)))
+    seen: list[tuple[int, int]] = []
+    for k, p in enumerate(packets):
+        if k == 14:  # a force that no arithmetic survives
+            p = replace(p, imu=replace(p.imu, accel_m_s2=np.full_like(p.imu.accel_m_s2, 1e200)))
+        update = window.add(p)
+        seen += [(e.from_id, e.to_id) for e in update.odometry if e.settled]
+        if k == 14:
+            assert "restarted" in update.note and list(update.ids) == [14]
+        else:
+            assert update.note == ""
+    assert seen == sorted(set(seen)) and seen[-1][1] > 14
+    assert np.isfinite(update.T_local_body).all()
+
+
+def test_memory_and_work_stay_bounded() -> None:
+    world = World(Motion.random(11), MONO, 11, duration_s=30.0, tracks=40)
+    _, _, window = run(world)
+    packets, _ = world.packets()
+    most = 40 * (HONEST.keyframes + 1)
+    assert len(window._tracks) <= most
+    assert len(window._tracks.host) <= most
+    assert len(window._X) == HONEST.keyframes and len(window._prior.b) == 5 + 15 * HONEST.keyframes - 15 + 15
+
+
+def test_one_camera_alone_is_refused() -> None:
+    with pytest.raises(UsageError, match="scale"):
+        SlidingWindow(HONEST, MONO, None, GRAVITY_M_S2)
+    with pytest.raises(UsageError, match="at least 3"):
+        SlidingWindow(replace(HONEST, keyframes=2), STEREO, None, GRAVITY_M_S2)
+
+
+def test_an_empty_frame_is_no_error() -> None:
+    window = SlidingWindow(HONEST, STEREO, None, GRAVITY_M_S2)
+    window.initialise(None, np.eye(4))
+    nothing = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    for k in range(12):
+        update = window.add(packet(k, T0_NS + k * NS // 10, nothing, None))
+    np.testing.assert_allclose(update.T_local_body[-1], np.eye(4), atol=1e-9)
+    assert isinstance(update.newest, NavState | None)
