@@ -68,6 +68,25 @@ def test_two_comparisons_may_share_the_file(tmp_path):
         assert len(one) == 2
 
 
+def _open(path):
+    with ResultStore(path) as store:
+        store.add(f"k{os.getpid()}", "x", {}, RESULT)
+
+
+def test_comparisons_may_make_the_file_at_the_same_time(tmp_path):
+    context = multiprocessing.get_context("fork")
+    for i in range(5):
+        path = tmp_path / f"{i}.db"
+        processes = [context.Process(target=_open, args=(path,)) for _ in range(4)]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join()
+        assert [process.exitcode for process in processes] == [0] * 4
+        with ResultStore(path) as store:
+            assert len(store) == 4
+
+
 def test_other_files_are_refused(tmp_path):
     garbage = tmp_path / "garbage.db"
     garbage.write_bytes(b"this is not a database at all" * 100)

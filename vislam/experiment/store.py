@@ -36,9 +36,9 @@ class ResultStore:
         with self._storage():
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None)
+            self._prepare()
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")  # a power cut may cost the last results, never the file
-            self._prepare()
 
     def __enter__(self) -> Self:
         return self
@@ -81,13 +81,16 @@ class ResultStore:
             return self._db.total_changes - before
 
     def _prepare(self) -> None:
+        self._db.execute("BEGIN IMMEDIATE")  # another comparison may be making the same file
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if version == _SCHEMA_VERSION:
-            return
-        if version != 0 or self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+        is_new = version == 0 and not self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+        if is_new:
+            self._db.execute(_SCHEMA)
+            self._db.execute(f"PRAGMA user_version={_SCHEMA_VERSION}")
+        self._db.execute("COMMIT")
+        if not is_new and version != _SCHEMA_VERSION:
             self._db.close()
             raise DataError(f"{self._path} holds no results of this version ({version}); give another --store")
-        self._db.executescript(f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version={_SCHEMA_VERSION}; COMMIT;")
 
     @contextmanager
     def _storage(self) -> Iterator[None]:
