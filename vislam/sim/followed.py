@@ -74,6 +74,8 @@ class SimulatedTracker:
         self._depth_noise = DepthNoise()
         self._next_id = 0
         self._last_s: float | None = None
+        self._T_world_cam: Array = np.eye(4)  # at that time
+        self._visible: tuple[Ids, Array] | None = None  # landmarks that could be seen then, and where; when asked for
         self._ids: Ids = np.empty(0, dtype=np.int64)
         self.landmarks: Ids = np.empty(0, dtype=np.int64)  # [N] whose image each track follows; -1: the person's
         self.slipped: Bools = np.empty(0, dtype=np.bool_)  # [N] no longer on the landmark it began with
@@ -86,15 +88,16 @@ class SimulatedTracker:
         next call, for `track_ids_all`.
         """
         dt_s = 0.0 if self._last_s is None else t_s - self._last_s
-        self._last_s = t_s
+        self._last_s, self._visible = t_s, None
+        self._T_world_cam = self._motion.at(np.array([t_s])).T_world_body[0] @ self._rig.T_body_cams[0]
         if dt_s > _LONGEST_STEP_S:
             self._keep(np.zeros(len(self._ids), dtype=np.bool_))
         person = self._person_px(t_s) if moving and self._noise.moving_share > 0.0 else None
         ideal, points_cam = self._look(t_s, person)
         alive = self._survive(ideal, points_cam[:, 2], dt_s, person)
         self._keep(alive)
-        self._slip(t_s)
-        self._begin(t_s, person)
+        self._slip()
+        self._begin(person)
         return self._observe(*self._look(t_s, person))
 
     @property
@@ -108,19 +111,23 @@ class SimulatedTracker:
         """Return ideal pixels [N, 2] of the tracks, NaN where none can be, and their points [N, 3] in the camera."""
         of_person = self.landmarks == _NOBODY
         points = self._field.points_m[np.where(of_person, 0, self.landmarks)]
-        pixels, points_cam = self._project(points, t_s, self._noise.readout_s)
+        pixels, points_cam = self._rolling(points, t_s)
         if of_person.any():
             middle = np.full(2, np.nan) if person is None else person[0]
             pixels[of_person] = middle + self._on_person[of_person]
             points_cam[of_person] = _PERSON_M * self._rig.cameras[0].unproject(pixels[of_person])
         return pixels, points_cam
 
-    def _project(self, points: Array, t_s: float, readout_s: float = 0.0) -> tuple[Array, Array]:
-        """Return raw pixels [N, 2] of world points [N, 3], and the points in the camera as its row saw them."""
-        camera, T_body_cam = self._rig.cameras[0], self._rig.T_body_cams[0]
-        T = self._motion.at(np.array([t_s])).T_world_body[0] @ T_body_cam
+    def _project(self, points: Array) -> tuple[Array, Array]:
+        """Return raw pixels [N, 2] of world points [N, 3] at the frame's instant, and the points in the camera."""
+        T = self._T_world_cam
         points_cam = (points - T[:3, 3]) @ T[:3, :3]
-        pixels = camera.project(points_cam)
+        return self._rig.cameras[0].project(points_cam), points_cam
+
+    def _rolling(self, points: Array, t_s: float) -> tuple[Array, Array]:
+        """Return what `_project` does, each point at the time of the row that sees it."""
+        camera, T_body_cam, readout_s = self._rig.cameras[0], self._rig.T_body_cams[0], self._noise.readout_s
+        pixels, points_cam = self._project(points)
         if readout_s > 0.0:
             for _ in range(_ROW_STEPS):
                 rows = np.clip(np.nan_to_num(pixels[:, 1]), 0.0, camera.height - 1.0)
@@ -148,23 +155,23 @@ class SimulatedTracker:
             alive &= (self.landmarks == _NOBODY) | ~_within(ideal, person)
         return alive
 
-    def _slip(self, t_s: float) -> None:
+    def _slip(self) -> None:
         """Let as many tracks go astray as the share of outliers asks for."""
         missing = self._noise.outlier_share * _SLIP_SHARE * len(self._ids) - self.slipped.sum()
         count = int(np.floor(missing + self._rng.random())) if missing > 0.0 else 0
         good = np.flatnonzero(~self.slipped & (self.landmarks != _NOBODY))
         if count == 0 or len(good) == 0:
             return
-        free, pixels = self._candidates(t_s, None)
+        free, pixels = self._candidates()
         astray = self._rng.choice(good, size=min(count, len(good)), replace=False)
-        here = self._project(self._field.points_m[self.landmarks[astray]], t_s)[0]
+        here = self._project(self._field.points_m[self.landmarks[astray]])[0]
         for track, pixel in zip(astray, here, strict=True):
             within = np.flatnonzero(np.linalg.norm(pixels - pixel, axis=1) < _SLIP_REACH_PX)
             if len(within):
                 self.landmarks[track] = free[self._rng.choice(within)]
                 self.slipped[track] = True
 
-    def _begin(self, t_s: float, person: Array | None) -> None:
+    def _begin(self, person: Array | None) -> None:
         """Fill up to the wanted number of tracks: on the person in proportion to its part of the image."""
         wanted = self._noise.tracks
         on_person = int((self.landmarks == _NOBODY).sum())
@@ -172,7 +179,9 @@ class SimulatedTracker:
         self._begin_on_person(round(share * wanted) - on_person, person)
         missing = round((1.0 - share) * wanted) - int((self.landmarks != _NOBODY).sum())
         if missing > 0:
-            free, _ = self._candidates(t_s, person)
+            free, pixels = self._candidates()
+            if person is not None:
+                free = free[~_within(pixels, person)]
             # as corner detectors do, mostly the same ones again, so that a place is recognised
             strength = self._field.strength[free] + _STRENGTH_NOISE * self._rng.random(len(free))
             chosen = np.sort(np.argsort(-strength)[:missing])
@@ -183,18 +192,19 @@ class SimulatedTracker:
             places = (2.0 * self._rng.random((count, 2)) - 1.0) * np.maximum(person[1] - _BORDER_PX, 0.0)
             self._append(np.full(count, _NOBODY), places)
 
-    def _candidates(self, t_s: float, person: Array | None) -> tuple[Ids, Array]:
+    def _candidates(self) -> tuple[Ids, Array]:
         """Return landmarks [M] that could be seen and are not followed, and about where [M, 2] (no rolling shutter)."""
-        T = self._motion.at(np.array([t_s])).T_world_body[0] @ self._rig.T_body_cams[0]
-        near = self._surroundings.at(T[:3, 3])
-        depth = (self._field.points_m[near] - T[:3, 3]) @ T[:3, 2]
-        near = near[(depth > _NEAR_M) & (depth < _FAR_M)]
-        near = near[~np.isin(near, self.landmarks)]
-        pixels = self._project(self._field.points_m[near], t_s)[0]
-        good = self._rig.cameras[0].contains(pixels, _BORDER_PX)
-        if person is not None:
-            good &= ~_within(pixels, person)
-        return near[good], pixels[good]
+        if self._visible is None:
+            T, points = self._T_world_cam, self._field.points_m
+            near = self._surroundings.at(T[:3, 3])
+            depth = (points[near] - T[:3, 3]) @ T[:3, 2]
+            near = near[(depth > _NEAR_M) & (depth < _FAR_M)]
+            pixels = self._project(points[near])[0]
+            good = self._rig.cameras[0].contains(pixels, _BORDER_PX)
+            self._visible = near[good], pixels[good]
+        landmarks, pixels = self._visible
+        free = ~np.isin(landmarks, self.landmarks)
+        return landmarks[free], pixels[free]
 
     def _append(self, landmarks: Ids, on_person: Array) -> None:
         count = len(landmarks)
@@ -229,8 +239,7 @@ class SimulatedTracker:
 
     def _describe(self, points_cam: Array, landmarks: Ids) -> Descriptors:
         """Return descriptors [N, 32]: alike for one landmark seen from about one side, with some wrong bits."""
-        T_world_body = self._motion.at(np.array([self._last_s or 0.0])).T_world_body[0]
-        back = -points_cam @ (T_world_body @ self._rig.T_body_cams[0])[:3, :3].T
+        back = -points_cam @ self._T_world_cam[:3, :3].T
         side = np.arctan2(back[:, 1], back[:, 0]) / (2.0 * np.pi) + self._field.strength[landmarks]
         key = landmarks * _SIDES + np.floor(side * _SIDES).astype(np.int64) % _SIDES
         key[landmarks == _NOBODY] = self._rng.integers(1 << 40, 1 << 41, int((landmarks == _NOBODY).sum()))
