@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.geometry import invert
 from vislam.messages import Array, Observations
+from vislam.sim.disturbance import PERSON_M, person_box
 from vislam.sim.field import LandmarkField, Surroundings
 from vislam.sim.sensors import DepthNoise
 from vislam.sim.spline import Motion
@@ -34,8 +35,6 @@ _ROW_STEPS = 2  # the row decides the time, the time moves the row
 _STRENGTH_NOISE = 0.3  # what light and view do to a corner's response, of the spread among corners
 _SIDES = 6  # a descriptor changes beyond about 60 degrees
 _BIT_ERRORS = 0.06  # of the 256 bits: 30 differ between two views of a landmark, as ORB has it
-_PERSON_M = 2.0  # away
-_PERSON_SWEEP_S = 7.0  # to the other side and back
 _NOBODY = -1
 
 
@@ -92,7 +91,8 @@ class SimulatedTracker:
         self._T_world_cam = self._motion.at(np.array([t_s])).T_world_body[0] @ self._rig.T_body_cams[0]
         if dt_s > _LONGEST_STEP_S:
             self._keep(np.zeros(len(self._ids), dtype=np.bool_))
-        person = self._person_px(t_s) if moving and self._noise.moving_share > 0.0 else None
+        share = self._noise.moving_share
+        person = person_box(self._rig.cameras[0], share, t_s) if moving and share > 0.0 else None
         ideal, points_cam = self._look(t_s, person)
         alive = self._survive(ideal, points_cam[:, 2], dt_s, person)
         self._keep(alive)
@@ -115,7 +115,7 @@ class SimulatedTracker:
         if of_person.any():
             middle = np.full(2, np.nan) if person is None else person[0]
             pixels[of_person] = middle + self._on_person[of_person]
-            points_cam[of_person] = _PERSON_M * self._rig.cameras[0].unproject(pixels[of_person])
+            points_cam[of_person] = PERSON_M * self._rig.cameras[0].unproject(pixels[of_person])
         return pixels, points_cam
 
     def _project(self, points: Array) -> tuple[Array, Array]:
@@ -136,13 +136,6 @@ class SimulatedTracker:
                 points_cam = np.einsum("nji,nj->ni", T_rows[:, :3, :3], points - T_rows[:, :3, 3])
                 pixels = camera.project(points_cam)
         return pixels, points_cam
-
-    def _person_px(self, t_s: float) -> Array:
-        """Return middle and half size [2, 2] in pixels of the part of the image that the person fills."""
-        camera = self._rig.cameras[0]
-        half = np.array([0.5 * self._noise.moving_share * camera.width, 0.5 * camera.height])
-        swing = (0.5 * camera.width - half[0]) * np.sin(2.0 * np.pi * t_s / _PERSON_SWEEP_S)
-        return np.array([[0.5 * camera.width + swing, 0.5 * camera.height], half])
 
     # -- the life of tracks ------------------------------------------------------------------------------------------
 

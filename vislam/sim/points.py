@@ -20,6 +20,7 @@ from vislam.camera import Camera, Rig
 from vislam.errors import DataError, UsageError
 from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImuSample, Observations
+from vislam.sim.disturbance import in_window
 from vislam.sim.field import LandmarkField
 from vislam.sim.followed import Moves, SimulatedTracker, TrackNoise
 from vislam.sim.inertial import InertialSource, RecordedImu, SimulatedImu
@@ -232,11 +233,11 @@ class PointRecording:
         zero_s = self._begin_s + _MARGIN_S
         for index, (t_s, t_ns) in enumerate(zip(self._frame_s.tolist(), stamps, strict=True)):
             since_s = t_s - zero_s
-            if _in_window(since_s, options.outage_begin_s, options.outage_length_s, options.outage_every_s):
+            if in_window(since_s, options.outage_begin_s, options.outage_length_s, options.outage_every_s):
                 tracks = _nothing(self.true_rig)
             else:
                 length_s = np.inf if options.moving_length_s is None else options.moving_length_s
-                tracks = tracker.see(t_s, _in_window(since_s, options.moving_begin_s, length_s, 0.0))
+                tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, length_s))
             yield Frame(t_ns, index, (), tracks=tracks)
 
     # -- truth -------------------------------------------------------------------------------------------------------
@@ -290,13 +291,6 @@ def _steps(begin_s: float, end_s: float, step_s: float) -> Array:
 def _parts(t_s: Array) -> Iterator[Array]:
     for begin in range(0, max(len(t_s), 1), _AT_ONCE):
         yield t_s[begin : begin + _AT_ONCE]
-
-
-def _in_window(t_s: float, begin_s: float, length_s: float, every_s: float) -> bool:
-    after_s = t_s - begin_s
-    if every_s > 0.0 and after_s >= 0.0:
-        after_s %= every_s
-    return 0.0 <= after_s < length_s
 
 
 def _nothing(rig: Rig) -> Observations:

@@ -19,6 +19,7 @@ from vislam.errors import UsageError
 from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
 from vislam.sim.bake import bake
+from vislam.sim.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.render import Renderer
 from vislam.sim.scene import Scene
 from vislam.sim.sensors import CONSUMER_IMU, DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
@@ -49,6 +50,14 @@ class SimOptions:
     imu_noise: bool = True  # white noise and biases
     mag_hz: Annotated[float, Field(ge=0.0, le=200.0)] = 50.0  # 0: no magnetometer
     mag_sigma_ut: Annotated[float, Field(ge=0.0)] = 0.4
+    blank_begin_s: Annotated[float, Field(ge=0.0)] = 0.0  # a view without any texture, since the first frame ...
+    blank_length_s: Annotated[float, Field(ge=0.0)] = 0.0  # ... for so long ...
+    blank_every_s: Annotated[float, Field(ge=0.0)] = 0.0  # ... and again after so long; 0: once
+    light_every_s: Annotated[float, Field(ge=0.0)] = 0.0  # the light goes off and on again every so often; 0: never
+    light_stops: Annotated[float, Field(ge=0.0, le=6.0)] = 2.0  # how much darker it is then, in powers of two
+    moving_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the image: filled by a person walking to and fro
+    moving_begin_s: Annotated[float, Field(ge=0.0)] = 0.0
+    moving_length_s: Annotated[float, Field(ge=0.0)] | None = None  # None: to the end
     gravity_m_s2: float = 9.81
     world_seed: int = 0  # of the place: its textures and where things stand; `seed` is that of motion and sensors
     workers: Annotated[int, Field(ge=1, le=16)] = 1  # threads that render ahead
@@ -130,6 +139,16 @@ class Simulation:
         return [Renderer(camera) for camera in self.rig.cameras]
 
     @cached_property
+    def _disturbance(self) -> Disturbance:
+        o = self.options
+        length_s = np.inf if o.moving_length_s is None else o.moving_length_s
+        chosen = DisturbanceOptions(
+            o.blank_begin_s, o.blank_length_s, o.blank_every_s, o.light_every_s, o.light_stops, o.moving_share,
+            o.moving_begin_s, length_s,
+        )  # fmt: skip
+        return Disturbance(self.rig, chosen, np.random.SeedSequence(self.options.world_seed, spawn_key=(7,)))
+
+    @cached_property
     def _imager(self) -> Imager:
         camera = self.rig.cameras[0]
         return Imager(camera.width, camera.height, self.options.image_noise)
@@ -179,7 +198,9 @@ class Simulation:
         for camera, renderer in enumerate(self._renderers):
             rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(1, camera, index)))
             light, exact = self._see(renderer, self.rig.T_body_cams[camera], t_s)
-            picture = self._imager.sense(light, float(self._gains[index]), rng)
+            light, exact = self._disturbance.spoil(camera, t_s - float(self._frame_s[0]), light, exact)
+            gain = float(self._gains[index]) * self._disturbance.gain(t_s - float(self._frame_s[0]))
+            picture = self._imager.sense(light, gain, rng)
             images.append(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             if camera == 0:
                 color = picture
