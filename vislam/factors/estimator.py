@@ -43,7 +43,8 @@ L = TypeVar("L", bound=Loop)
 class Estimator(Generic[L]):
     """Owns the solver and the last good estimate; `poses` is never older than one failed attempt.
 
-    On long runs a keyframe reads back the newest poses and, in turn, a block of the older ones; loops read all.
+    On long runs a keyframe reads back the newest poses and, in turn, a block of the older ones; loops that moved the
+    estimate read all.
     """
 
     def __init__(self, config: GraphConfig, odometry: Odometry) -> None:
@@ -76,6 +77,16 @@ class Estimator(Generic[L]):
     def solver_name(self) -> str:
         """Return which solver is at work."""
         return self._solver.name
+
+    @property
+    def is_long(self) -> bool:
+        """Return whether there are too many keyframes to look at all of them with each."""
+        return self._count > self._config.read_newest + self._config.read_block and not self._solver.reads_all
+
+    def look_at(self, ids: list[int]) -> None:
+        """Read back some poses now, where a long run may not have for a while."""
+        if self.is_long and ids:
+            self._read_back(np.unique(np.array(ids, dtype=np.int64)))
 
     def state(self, k: int) -> Guess:
         """Return the estimated state of keyframe k."""
@@ -116,11 +127,12 @@ class Estimator(Generic[L]):
         """Multiply the sigma of visual odometry; past factors follow with the next `close` in batch."""
         self.vo_scale *= factor
 
-    def close(self, fresh: list[L], batch: bool) -> str:
+    def close(self, fresh: list[L], batch: bool, gentle: bool = False) -> str:
         """Take loops: first without a kernel, so that the estimate reaches them, then under the Cauchy kernel.
 
         A kernel from the start would leave a single loop after a long drift in the flat tail. `batch` starts from a
-        batch solution, for corrections too large for incremental steps. Returns what went wrong.
+        batch solution, for corrections too large for incremental steps. `gentle` takes one step under the kernel, for
+        loops that fit already, so that work stays small on long runs. Returns what went wrong.
         """
         if batch:
             try:
@@ -129,6 +141,11 @@ class Estimator(Generic[L]):
                 return self._recover(self._values, fresh, error)
             return ""
         try:
+            if gentle:
+                slots = self._solver.update(_graph([edge.factor(robust=True) for edge in fresh]), gtsam.Values(), [])
+                self._take_some()
+                self._enter(fresh, slots)
+                return ""
             plain = self._solver.update(_graph([edge.factor(robust=False) for edge in fresh]), gtsam.Values(), [])
             self._solver.iterate(self._config.loop_iterations)
             robust = _graph([edge.factor(robust=True) for edge in fresh])
@@ -137,9 +154,12 @@ class Estimator(Generic[L]):
             self._take()
         except FAILURES as error:
             return self._recover(self._values, fresh, error)
+        self._enter(fresh, slots)
+        return ""
+
+    def _enter(self, fresh: list[L], slots: list[int]) -> None:
         for edge, slot in zip(fresh, slots, strict=True):
             self.loops[edge.id], self._slots["loop", edge.id] = edge, slot
-        return ""
 
     def drop(self, edges: list[L]) -> str:
         """Take loops out again; return what went wrong."""
@@ -232,18 +252,20 @@ class Estimator(Generic[L]):
     def _take_some(self) -> None:
         """Read back the newest poses and the next block of older ones: all of them while they are few."""
         config, count = self._config, self._count
-        if count <= config.read_newest + config.read_block or self._solver.reads_all:
+        if not self.is_long:
             self._take()
             return
         newest = np.arange(count - config.read_newest, count)
         begin = self._next_old if self._next_old < newest[0] else 0
         end = min(begin + config.read_block, int(newest[0]))
-        ids = np.concatenate([np.arange(begin, end), newest])
+        self._read_back(np.concatenate([np.arange(begin, end), newest]))
+        self._next_old = end
+
+    def _read_back(self, ids: NDArray[np.int64]) -> None:
         keys = [X(k) for k in ids.tolist()]
         if self.has_imu:
             keys += [key for k in ids.tolist() for key in (V(k), B(k))]
         self._adopt(self._solver.estimate(keys), ids)
-        self._next_old = end
 
     def _adopt(self, values: gtsam.Values, ids: NDArray[np.int64]) -> None:
         """Adopt an estimate of keyframes; RuntimeError when it is not complete, not finite or diverged."""

@@ -22,6 +22,7 @@ from vislam.imu import ImuNoise
 from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
+_FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
 _COLLAPSED = 0.1  # weight below which an older loop counts as torn by newer ones
 
 
@@ -59,6 +60,7 @@ class PoseGraph:
         self._published: Array = np.zeros((0, 4, 4))
         self._T_map_odom: Array = np.eye(4)
         self._revision = 0
+        self._last_closed = 0  # newest keyframe that a loop ties to older ones
 
     @property
     def ids(self) -> NDArray[np.int64]:
@@ -167,6 +169,7 @@ class PoseGraph:
         passed: list[LoopModel] = []
         parked: list[LoopModel] = []
         touched: list[int] = []
+        self._estimator.look_at([k for e in edges for k in (e.from_id, e.to_id) if 0 <= k < len(self._keyframes)])
         for edge in edges:
             model = self._admit(edge)
             touched.append(edge.id)
@@ -206,9 +209,16 @@ class PoseGraph:
         return LoopModel(record, self._config, self._lever_m)
 
     def _gate(self, model: LoopModel) -> bool:
-        """Test an edge against the current estimate and note the chi-square."""
+        """Test an edge against the current estimate and note the chi-square.
+
+        A joint marginal takes as long as the run is long: there, a loop that passes with less is inside with it too.
+        """
         record = model.record
-        chi2 = model.chi2(*self._ends(model), self.relative_covariance(record.from_id, record.to_id))
+        chi2 = np.inf
+        if self._estimator.is_long:
+            chi2 = model.chi2(*self._ends(model), self._least_covariance(record.to_id))
+        if chi2 > model.threshold:
+            chi2 = model.chi2(*self._ends(model), self.relative_covariance(record.from_id, record.to_id))
         inside = bool(chi2 <= model.threshold)
         decision = LoopDecision.ACCEPTED if inside else LoopDecision.PARKED
         reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
@@ -217,13 +227,24 @@ class PoseGraph:
         )  # fmt: skip
         return inside
 
+    def _least_covariance(self, k: int) -> Array:
+        """Return what the relative pose of keyframe k and an old one is uncertain by at least: odometry since a loop.
+
+        With an IMU in the graph nothing is said: the motion is known better than odometry alone knows it.
+        """
+        if self._estimator.has_imu or self._last_closed > k:
+            return np.zeros((6, 6))
+        return self._travel.relative_covariance(self._last_closed, k)
+
     def _report(self, model: LoopModel, decision: LoopDecision, reason: str) -> None:
         old = self._reports[model.record.id]
         self._reports[model.record.id] = replace(old, decision=decision, reason=f"{old.reason}; {reason}")
 
     def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> list[LoopModel]:
         """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
-        notes.append(self._estimator.close(fresh, batch=promoted or any(self._is_far(m) for m in fresh)))
+        far = promoted or any(self._is_far(m) for m in fresh)
+        fits = not far and all(m.weight(*self._ends(m)) >= _FITS for m in fresh)
+        notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._estimator.is_long))
         contradicted = []
         for model in fresh:
             if model.record.id not in self._estimator.loops:
@@ -236,6 +257,7 @@ class PoseGraph:
                 self._report(model, decision, f"contradicted by the graph, weight {weight:.3f}")
             else:
                 self._report(model, LoopDecision.ACCEPTED, reason)
+                self._last_closed = max(self._last_closed, model.record.to_id)
         if contradicted:
             notes.append(self._estimator.drop(contradicted))
         return contradicted
