@@ -116,7 +116,9 @@ class InitConfig:
     time_offset: bool = True  # estimate what the camera's clock is off from the IMU's, and correct its stamps
     time_offset_s: float = 0.0  # what is known before: added to the camera's stamps from the first frame on
     time_offset_sigma_s: float = 0.015  # of that; drivers that stamp on arrival are off by up to 30 ms
-    max_time_offset_sigma_s: float = 0.005  # a metric start waits for this, up to its window: 1 m/s makes it 5 mm
+    time_offset_settled_s: float = 0.0005  # sigma at which the estimate is final
+    time_offset_min_s: float = 0.001  # smaller corrections are not worth a step in time
+    max_time_offset_sigma_s: float = 0.003  # worse is not applied; a metric start waits for it, but no longer than its window
 
 
 @dataclass(frozen=True, slots=True)

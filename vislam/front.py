@@ -13,6 +13,7 @@ from vislam.config import Config
 from vislam.ekf import Ekf, MsckfEkf, make_ekf
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
+from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
 from vislam.geometry import invert, level_rotation, transform
 from vislam.imu import ImuBuffer, ImuNoise, RestDetector, subtract_bias
@@ -61,6 +62,9 @@ class Front:
 
     Without an IMU, `odom` is the chain of visual odometry. With one, it is the filter's frame, gravity-aligned, and
     keyframes wait for it; visual odometry before that lives in its own frame `vo`.
+
+    Everything that leaves is stamped in the IMU's time: what the camera's clock is off is added to its frames. What
+    left before that was known keeps the camera's own time.
     """
 
     def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock) -> None:
@@ -72,17 +76,22 @@ class Front:
                 "allows it, or record an IMU"
             )
         self.initialisation: Initialisation | None = None
+        self._refused: Initialisation | None = None  # the newest answer without a state
         self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
         self.last_refusal = "no frame yet"  # why there is no first state
         self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0}
         self._config = config
         self._clock = clock
         self._has_imu = noise is not None
+        self.camera_clock = CameraClock(config.init)
         self._ekf: Ekf | MsckfEkf | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu)
             self._rest = RestDetector(config.init, noise)
-            self._initialiser = Initialiser(config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0])
+            self._initialiser = Initialiser(
+                config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
+                config.frontend.track_sigma_px,
+            )  # fmt: skip
             self._ekf = make_ekf(config.ekf, noise, config.imu.gravity_m_s2, rig)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
         self._last_frame_t_ns: int | None = None
@@ -112,13 +121,17 @@ class Front:
             return True
         newest = self._buffer.newest_t_ns
         waited_s = (newest_frame_t_ns - frame_t_ns) * 1e-9
-        return (newest is not None and newest > frame_t_ns) or waited_s > self._config.imu.max_wait_s
+        return (
+            newest is not None and newest > frame_t_ns + self.camera_clock.applied_ns
+        ) or waited_s > self._config.imu.max_wait_s
 
     def process(self, frame: Frame) -> FrontStep:
         """Track one frame, update the filter with it, and hand over keyframes that are ready."""
+        frame = self.camera_clock.in_imu_time(frame)
         span = self._span(self._last_frame_t_ns, frame.t_ns)
         with self._clock.measure("track"):
             track = self.frontend.track(frame, *self._without_bias(span))
+            track = replace(track, vo=self.camera_clock.loosened(track.vo, span, self._state()))
         still_image = self._is_still(track.observations)
         at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
@@ -134,6 +147,7 @@ class Front:
             T_keyframe_body = np.eye(4)
         self._last_frame_t_ns = frame.t_ns
         self._last_seen = track.observations
+        self._follow_clock(track.vo)
         return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready)
 
     def feed_back(self, update: GraphUpdate) -> None:
@@ -159,6 +173,8 @@ class Front:
         counters = {"front": dict(self.counters)}
         if self._has_imu:
             counters["imu"] = dict(self._buffer.counters)
+            counters["initialisation refused"] = dict(self._initialiser.refusals)
+            counters["camera clock"] = {"changes": self.camera_clock.changes}
         if self._ekf is not None:
             counters["ekf"] = dict(self._ekf.counters)
         return counters
@@ -181,8 +197,37 @@ class Front:
         if span is None or self._ekf is None or not self._ekf.initialised:
             return span, np.inf
         state = self._ekf.state()
-        sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max()))
+        sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max())) + self.camera_clock.gyro_sigma_rad_s(span)
         return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2), sigma_rad_s
+
+    def _state(self) -> NavState | None:
+        return self._ekf.state() if self._ekf is not None and self._ekf.initialised else None
+
+    def _follow_clock(self, vo: VoMeasurement) -> None:
+        """Learn the camera's time offset; what waits for gravity is stamped anew, what left stays as it was."""
+        if not self._has_imu:
+            return
+        refused, self._refused = self._refused, None
+        if refused is not None and np.isfinite(refused.time_offset_sigma_s):
+            self._shift(self.camera_clock.tell(refused.time_offset_s, refused.time_offset_sigma_s))
+        else:
+            self._shift(self.camera_clock.follow(vo, self._buffer))
+
+    def _shift(self, shift_ns: int) -> None:
+        """Bring what waits for gravity to the time that a change of the camera's offset gives it."""
+        if shift_ns == 0 or self.initialisation is not None or self._last_frame_t_ns is None:
+            return
+        self._initialiser.restamp(shift_ns, self._buffer.span)
+        self._last_frame_t_ns += shift_ns
+        self._keyframe_t_ns += shift_ns
+        self.camera_clock.took_keyframe()
+        before_ns: int | None = None
+        for i, waiting in enumerate(self._waiting):
+            packet = restamped(waiting.packet, shift_ns)
+            t_ns = packet.keyframe.t_ns
+            imu = None if before_ns is None or waiting.packet.imu is None else self._buffer.span(before_ns, t_ns)
+            self._waiting[i] = replace(waiting, packet=replace(packet, imu=imu))
+            before_ns = t_ns
 
     def _is_still(self, seen: Observations) -> bool:
         flow_px = median_flow_px(self._last_seen, seen)
@@ -198,8 +243,10 @@ class Front:
         """Look for the first gravity-aligned state; once found, start the filter and release what waited."""
         if self._ekf is None or self.initialisation is not None:
             return []
-        found = self._initialiser.add(span, track.vo, still_image)
+        self._initialiser.time_offset_sigma_s = self.camera_clock.sigma_s
+        found = self._initialiser.add(span, track.vo, still_image, track.observations)
         self.last_refusal = found.reason
+        self._refused = found if found.first is None else None
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
         self.initialisation = found
@@ -272,7 +319,10 @@ class Front:
         if self._has_imu and self._keyframe_id >= 0:
             imu = self._buffer.span(self._keyframe_t_ns, keyframe.t_ns)
         at_rest = self._rested_since_keyframe and self._keyframe_id >= 0
-        packet = KeyframePacket(keyframe, track.vo, track.observations, imu, self._mag, at_rest)
+        packet = KeyframePacket(
+            keyframe, track.vo, track.observations, imu, self._mag, at_rest, self.camera_clock.applied_s
+        )
+        self.camera_clock.took_keyframe()
         self._keyframe_id, self._keyframe_t_ns = keyframe.id, keyframe.t_ns
         self._rested_since_keyframe, self._mag = True, None
         self._T_vo_keyframe = self._T_vo_body.copy()
@@ -297,6 +347,17 @@ class Front:
         released = self._release(self._T_upright)
         self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
         return released
+
+
+def restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
+    """Return the packet `shift_ns` later in the IMU's time; its inertial data have to be cut anew."""
+    keyframe, t_ns = packet.keyframe, packet.keyframe.t_ns + shift_ns
+    return replace(
+        packet,
+        keyframe=replace(keyframe, t_ns=t_ns, frame=replace(keyframe.frame, t_ns=t_ns)),
+        vo=replace(packet.vo, t_ns=packet.vo.t_ns + shift_ns),
+        time_offset_s=packet.time_offset_s + shift_ns * 1e-9,
+    )
 
 
 def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:

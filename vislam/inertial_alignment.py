@@ -156,6 +156,13 @@ def solve_linear(window: Window) -> LinearSolution:
     )
 
 
+def excitation(window: Window) -> float:
+    """Return the rms change of specific force over the window in m/s^2, in fixed axes: what scale is seen by."""
+    pieces = [preintegrate(span) for span in window.spans]
+    force = np.array([R @ piece.dv_m_s / piece.dt_s for R, piece in zip(window.rotations[:-1], pieces, strict=True)])
+    return float(np.sqrt(np.mean(np.sum((force - force.mean(axis=0)) ** 2, axis=1))))
+
+
 def _displacements(window: Window, positions: Array) -> Array:
     """Return the camera's displacement [M, 3] of every motion in body axes of its first node."""
     R = window.rotations
@@ -219,20 +226,20 @@ def refine(window: Window, start: LinearSolution) -> Alignment:
         numpy.linalg.LinAlgError: the motion does not determine it, or the iteration does not settle.
     """
     nodes = len(window.rotations)
-    R_world_visual = _up_to_z(start.gravity_m_s2, window.rotations[0])
+    R_world_visual = up_to_z(start.gravity_m_s2, window.rotations[0])
     T = np.tile(np.eye(4), (nodes, 1, 1))
     T[:, :3, :3] = R_world_visual @ window.rotations
     T[:, :3, 3] = (start.positions_m - start.positions_m[0]) @ R_world_visual.T
     v = start.velocities_m_s @ R_world_visual.T
     gyro_bias, accel_bias = start.gyro_bias_rad_s.copy(), start.accel_bias_m_s2.copy()
     pieces = [preintegrate(span, gyro_bias, accel_bias, window.noise) for span in window.spans]
-    weights = [_inverse(piece.covariance + _FLOOR * np.eye(9)) for piece in pieces]
+    weights = [inverse(piece.covariance + _FLOOR * np.eye(9)) for piece in pieces]
     cost = np.inf
     for _ in range(_ROUNDS):
-        system = _NormalEquations(nodes)
-        _add_priors(system, window, T[0], gyro_bias, accel_bias)
+        system = NormalEquations(9 * nodes + 6)
+        add_priors(system, window, T[0], gyro_bias, accel_bias)
         for i, (piece, weight) in enumerate(zip(pieces, weights, strict=True)):
-            _add_inertial(system, i, piece, weight, (T, v, gyro_bias, accel_bias), window.gravity_m_s2)
+            add_inertial(system, i, piece, weight, (T, v, gyro_bias, accel_bias), window.gravity_m_s2)
         _add_visual(system, window, T)
         step = np.linalg.solve(system.H, system.g)
         d = step[: 9 * nodes].reshape(nodes, 9)
@@ -254,21 +261,22 @@ def refine(window: Window, start: LinearSolution) -> Alignment:
     return Alignment(T, v, gyro_bias, accel_bias, half.T @ half, float(ratio))
 
 
-def _inverse(covariance: Array) -> Array:
+def inverse(covariance: Array) -> Array:
+    """Return the inverse of a matrix, typed."""
     return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
 
-def _up_to_z(gravity: Array, R_visual_body: Array) -> Array:
+def up_to_z(gravity: Array, R_visual_body: Array) -> Array:
     """Return R_world_visual that puts gravity down and gives the first body zero heading."""
     up_body = -(R_visual_body.T @ gravity)
     return level_rotation(up_body) @ R_visual_body.T
 
 
-class _NormalEquations:
-    """Sums `J^T W J` and `J^T W r` over the nodes' errors [9 each] and the biases [6]."""
+class NormalEquations:
+    """Sums `J^T W J` and `J^T W r`: first the nodes' errors [9 each], last the biases [6]."""
 
-    def __init__(self, nodes: int) -> None:
-        size = 9 * nodes + 6
+    def __init__(self, size: int) -> None:
+        """Start from zero over `size` unknowns."""
         self.H = np.zeros((size, size))
         self.g = np.zeros(size)
         self.cost = 0.0
@@ -283,7 +291,8 @@ class _NormalEquations:
         self.rows += len(residual)
 
 
-def _add_priors(system: _NormalEquations, window: Window, T_first: Array, gyro_bias: Array, accel_bias: Array) -> None:
+def add_priors(system: NormalEquations, window: Window, T_first: Array, gyro_bias: Array, accel_bias: Array) -> None:
+    """Fix what is chosen, first position and heading, and add what is known of the biases [3]."""
     size = len(system.g)
     heading = T_first[2:3, :3]  # body-side rotation about the world's z
     system.add(range(3), np.zeros(1), heading, np.eye(1) / _GAUGE**2)
@@ -292,8 +301,8 @@ def _add_priors(system: _NormalEquations, window: Window, T_first: Array, gyro_b
     system.add(range(size - 6, size), -np.concatenate([gyro_bias, accel_bias]), np.eye(6), np.diag(1.0 / sigmas**2))
 
 
-def _add_inertial(
-    system: _NormalEquations,
+def add_inertial(
+    system: NormalEquations,
     i: int,
     piece: Preintegrated,
     weight: Array,
@@ -324,7 +333,7 @@ def _add_inertial(
     system.add(columns, residual, J, weight)
 
 
-def _add_visual(system: _NormalEquations, window: Window, T: Array) -> None:
+def _add_visual(system: NormalEquations, window: Window, T: Array) -> None:
     for motion in window.motions:
         T_a, T_b = T[motion.a], T[motion.b]
         columns = [*range(9 * motion.a, 9 * motion.a + 6), *range(9 * motion.b, 9 * motion.b + 6)]

@@ -218,6 +218,8 @@ class Run:
                 "status": "none" if found is None else str(found.status),
                 "reason": front.last_refusal if found is None else found.reason,
                 "t_s": None if found is None or found.last is None else (found.last.t_ns - int(stamps[0])) * 1e-9,
+                "scale_sigma": None if found is None else found.scale_sigma,
+                "excitation_m_s2": None if found is None else found.excitation_m_s2,
             },
             "accuracy": self._accuracy(final, truth),
             "timing_ms": self.slam.clock.summary_ms(),

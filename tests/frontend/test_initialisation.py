@@ -25,7 +25,6 @@ from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
 
 QUIET = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
 HONEST = InitConfig(imu_inflation=1.0)
-CAMERA = transform(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, -0.05, 0.2]))
 GYRO_BIAS, ACCEL_BIAS = np.array([0.08, -0.05, 0.03]), np.array([0.1, -0.05, 0.08])
 
 
@@ -39,12 +38,11 @@ class Feed:
         self.stamps, self.motions = stamps, motions
 
     @staticmethod
-    def moving(seed: int, duration_s: float = 3.0, camera: Array | None = None, vigour: float = 1.0) -> Feed:
-        motion, rng = Motion.random(seed, vigour), np.random.default_rng(seed)
+    def moving(seed: int, duration_s: float = 3.0) -> Feed:
+        motion, rng = Motion.random(seed), np.random.default_rng(seed)
         samples, _ = motion.samples(duration_s, 200.0, QUIET, rng, GYRO_BIAS, ACCEL_BIAS)
         stamps = [T0_NS + 50_000_000 * k + 1_000_000 for k in range(int(duration_s * 20) - 1)]
-        vision = SimulatedVision(T_body_camera=camera)
-        return Feed(samples, stamps, vision.motions([motion.pose((t - T0_NS) / NS) for t in stamps], stamps, rng))
+        return Feed(samples, stamps, SimulatedVision().motions([motion.pose((t - T0_NS) / NS) for t in stamps], stamps, rng))
 
     @staticmethod
     def still(duration_s: float = 2.0, gravity: float = GRAVITY_M_S2) -> Feed:
@@ -75,8 +73,8 @@ class Feed:
 RESTING = transform(so3_exp(np.array([0.3, -0.4, 0.0])), np.zeros(3))
 
 
-def initialiser(config: InitConfig = HONEST, camera: Array | None = None, noise: ImuNoise = QUIET) -> Initialiser:
-    return Initialiser(config, noise, GRAVITY_M_S2, np.eye(4) if camera is None else camera)
+def initialiser(config: InitConfig = HONEST, noise: ImuNoise = QUIET) -> Initialiser:
+    return Initialiser(config, noise, GRAVITY_M_S2, np.eye(4))
 
 
 def tilt_rad(state: NavState, T_true: Array) -> float:
@@ -137,10 +135,9 @@ def test_uniform_motion_is_not_rest() -> None:
     assert answer.status == "moving"
 
 
-def chi2_of(answer: Initialisation, motion: Motion, which: str, metric: bool = True) -> float:
+def chi2_of(answer: Initialisation, motion: Motion, which: str) -> float:
     state = getattr(answer, which)
-    origin = T0_NS + 1_000_000 if metric else answer.t_ns[0]
-    T, v = in_odom(motion, origin, state.t_ns)
+    T, v = in_odom(motion, T0_NS + 1_000_000, state.t_ns)
     error = state_error((T, v, np.concatenate([GYRO_BIAS, ACCEL_BIAS])), state)
     # Heading and position are chosen at the first frame; their tiny sigmas there are not under test.
     P = state.covariance + np.diag(np.repeat([0.0, 1e-6, 0.0, 0.0, 0.0], 3)) + 1e-6 * np.eye(15)
@@ -185,55 +182,6 @@ def test_answer_fits_the_visual_chain() -> None:
     assert np.linalg.norm(chained[:3, 3] - answer.last.T_world_body[:3, 3]) < 0.02
     assert np.linalg.norm(so3_log(chained[:3, :3].T @ answer.last.T_world_body[:3, :3])) < np.deg2rad(1.0)
     np.testing.assert_array_equal(answer.T_odom_body[-1], answer.last.T_world_body)
-
-
-def test_in_motion_without_scale() -> None:
-    errors, nees = [], []
-    for seed in range(12):
-        answer, reasons = Feed.moving(seed, 6.0, CAMERA).run(initialiser(camera=CAMERA))
-        if answer.last is None or answer.first is None:
-            continue
-        assert reasons
-        motion = Motion.random(seed)
-        start, end = (motion.pose((t - T0_NS) / NS) for t in (answer.first.t_ns, answer.last.t_ns))
-        moved = invert(answer.first.T_world_body) @ answer.last.T_world_body
-        errors.append(
-            np.linalg.norm(moved[:3, 3] - (invert(start) @ end)[:3, 3]) / np.linalg.norm((invert(start) @ end)[:3, 3])
-        )
-        nees.append(chi2_of(answer, motion, "last", metric=False))
-    print(f"{len(errors)} of 12, displacement {np.round(errors, 3)}, NEES {np.mean(nees):.1f}")
-    assert len(errors) >= 10
-    assert np.median(errors) < 0.1
-    assert np.max(errors) < 0.4
-    assert np.mean(nees) < 22.0
-
-
-def test_without_scale_straight_uniform_motion_is_never_answered() -> None:
-    """Constant velocity, no turning: scale is unobservable; whatever the window, there must be no answer."""
-    rng = np.random.default_rng(0)
-    white = np.repeat([QUIET.gyro_noise_density, QUIET.accel_noise_density], 3) * np.sqrt(200.0)
-    samples = []
-    for k in range(1601):
-        value = np.array([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2]) + rng.normal(size=6) * white
-        samples.append(ImuSample(T0_NS + 5_000_000 * k, value[:3], value[3:]))
-    stamps = [T0_NS + 50_000_000 * k + 1_000_000 for k in range(155)]
-    poses = [transform(np.eye(3), np.array([0.5 * (t - T0_NS) / NS, 0.0, 0.0])) for t in stamps]
-    motions = SimulatedVision(T_body_camera=CAMERA).motions(poses, stamps, rng)
-    answer, reasons = Feed(samples, stamps, motions).run(initialiser(camera=CAMERA))
-    assert answer.first is None
-    assert any("scale known to" in reason or "does not determine" in reason for reason in reasons)
-
-
-def test_no_parallax_is_named() -> None:
-    feed = Feed.moving(2, 3.0, CAMERA)
-    turned = []
-    for vo in feed.motions:
-        assert vo.T_keyframe_body is not None
-        turned.append(replace(vo, T_keyframe_body=transform(vo.T_keyframe_body[:3, :3], np.zeros(3))))
-    feed.motions = turned
-    answer, reasons = feed.run(initialiser(camera=CAMERA))
-    assert answer.first is None
-    assert "parallax in 0 of 8" in reasons[-1]
 
 
 def test_wrong_unit_of_the_accelerometer_fails() -> None:

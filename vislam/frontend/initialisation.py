@@ -1,4 +1,4 @@
-"""The first gravity-aligned state: from rest, or in motion by aligning visual odometry with inertial data.
+"""The first gravity-aligned state: from rest, or in motion by aligning what the camera saw with inertial data.
 
 Fed with one entry per frame, it answers "waiting" and why until it is sure; a wrong start costs a whole run, a late one
 a second.
@@ -6,22 +6,49 @@ a second.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vislam.camera import Camera
 from vislam.config import InitConfig
-from vislam.geometry import invert, level_rotation, se3_adjoint, skew, transform
+from vislam.frontend.initialisation_bundle import (
+    Bundle,
+    InertialPath,
+    Start,
+    Tracks,
+    inertial_path,
+    median_parallax,
+    refine_tracks,
+    solve_start,
+)
+from vislam.frontend.initialisation_rest import rest_accel_bias, rest_covariance
+from vislam.frontend.initialisation_window import Entry, FrameWindow, gather_tracks, metric_motions
+from vislam.geometry import level_rotation, transform
 from vislam.imu import ImuNoise, RestDetector, join
-from vislam.inertial_alignment import Alignment, LinearSolution, VisualMotion, Window, refine, solve_linear
-from vislam.messages import Array, ImuSpan, NavState, Tracking, VoMeasurement
+from vislam.inertial_alignment import Alignment, VisualMotion, Window, excitation, refine, solve_linear
+from vislam.messages import Array, ImuSpan, NavState, Observations, Tracking, VoMeasurement
 
 _NS = 1_000_000_000
-_CHOSEN = 1e-3  # sigma, rad and m, of heading and position where odom is defined to be zero
-_REST_SIGMA_M_S = 0.02  # a body at rest still sways
-_CORRELATED_S = 0.05  # vibration at rest averages out over samples this far apart
 _AGREE_SIGMAS = 3.0
+_MAX_BEHIND = 0.2  # of the points; more of them behind the camera, and the linear solution is no solution
+_MAX_OUTLIERS = 0.3  # of the observations
+_MAX_BIAS_SIGMAS = 3.5  # of the accelerometer's bias
+_SAME_SCALE = 0.05  # two attempts agree within this and their sigmas
+_FOREIGN_OFFSET_S = 0.002  # a time offset found in the window that is larger than this is applied before the start
+
+
+class Phase(StrEnum):
+    """Where the search for the first state stands."""
+
+    EMPTY = "empty"  # nothing seen, or vision or inertial data just broke off
+    COLLECTING = "collecting"  # in motion, too little seen to try
+    RESTING = "resting"  # at rest, not yet for long enough
+    MOVING = "moving"  # in motion, solving now and then
+    FOUND = "found"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,25 +67,35 @@ class Initialisation:
     T_odom_vo: Array | None = None  # [4, 4]
     t_ns: tuple[int, ...] = ()  # of the frames in the window that were solved for
     T_odom_body: Array | None = None  # [N, 4, 4] at these times
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Entry:
-    """A frame in the window."""
-
-    span: ImuSpan | None  # since the entry before; None for the very first
-    vo: VoMeasurement
-    T_vo_body: Array
-    keyframe: int  # number of the frame that is its keyframe
-    number: int
-    still: bool  # image and IMU
+    cause: str = ""  # of a refusal, in a word: what it is counted under
+    scale_sigma: float = 0.0  # relative, of lengths in the window; 0 where vision is metric or nothing has moved yet
+    excitation_m_s2: float = 0.0  # rms change of acceleration in the window; near zero scale cannot be seen
+    time_offset_s: float = 0.0  # of the camera's clock beyond what was applied, as this window has it
+    time_offset_sigma_s: float = float("inf")
 
 
 class Initialiser:
-    """Owns a window of the last frames. Losing vision or inertial data empties it."""
+    """Owns a window of the last frames and decides. Losing vision or inertial data empties it.
 
-    def __init__(self, config: InitConfig, noise: ImuNoise, gravity_m_s2: float, T_body_cam0: Array) -> None:
-        """Start empty; `T_body_cam0` [4, 4] is only needed for one camera without scale."""
+    Attributes:
+        phase: where the search stands.
+        refusals: how often it was refused, by cause.
+        time_offset_sigma_s: how well the camera's clock is known; the owner keeps it up to date.
+    """
+
+    def __init__(
+        self,
+        config: InitConfig,
+        noise: ImuNoise,
+        gravity_m_s2: float,
+        T_body_cam0: Array,
+        camera: Camera | None = None,
+        track_sigma_px: float = 1.0,
+    ) -> None:
+        """Start empty; `T_body_cam0` [4, 4], camera and the noise of tracks are needed only without scale."""
+        self.phase = Phase.EMPTY
+        self.refusals: dict[str, int] = {}
+        self.time_offset_sigma_s = 0.0
         self._config = config
         self._noise = replace(
             noise,
@@ -66,240 +103,285 @@ class Initialiser:
             accel_noise_density=noise.accel_noise_density * config.imu_inflation,
         )
         self._gravity = float(gravity_m_s2)
-        self._lever = T_body_cam0[:3, 3].copy()
+        self._T_body_cam = T_body_cam0
+        self._camera = camera
+        self._track_sigma_px = track_sigma_px
         self._rest = RestDetector(config, noise)
-        self._entries: list[_Entry] = []
-        self._count = 0
-        self._T_vo_keyframe = np.eye(4)
-        self._keyframe_id: int | None = None
-        self._keyframe_number = 0
-        self._T_vo_body = np.eye(4)
+        self._window = FrameWindow()
         self._next_attempt_ns = 0
+        self._before: Lengths | None = None  # the attempt before
         self._last = Initialisation("waiting", "no frame yet")
 
-    def add(self, span: ImuSpan | None, vo: VoMeasurement, at_rest_by_image: bool) -> Initialisation:
+    def add(
+        self,
+        span: ImuSpan | None,
+        vo: VoMeasurement,
+        at_rest_by_image: bool,
+        observations: Observations | None = None,
+    ) -> Initialisation:
         """Take one frame and answer.
 
         Args:
             span: inertial data since the frame before, no bias taken off; None for the first frame or across a hole.
             vo: visual motion at the frame.
             at_rest_by_image: the image hardly moved since the frame before (below `config.still_px`).
+            observations: the tracks in the frame; without scale they are what a moving start is made of.
         """
         still_by_imu = self._rest.add(span)
-        follows = span is not None and bool(self._entries) and int(span.t_ns[0]) == self._entries[-1].vo.t_ns
+        entries = self._window.entries
+        follows = span is not None and bool(entries) and int(span.t_ns[0]) == entries[-1].t_ns
         if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None:
-            return self._restart("vision is lost")
-        if self._entries and not follows:
-            self._restart("inertial data has a hole")
-        self._append(span if follows else None, vo, vo.T_keyframe_body, at_rest_by_image and follows)
-        self._trim(vo.t_ns)
-        if still_by_imu and at_rest_by_image:
-            found = self._from_rest()
-        elif vo.t_ns >= self._next_attempt_ns:
-            found = self._from_motion()
-            self._next_attempt_ns = vo.t_ns + round(self._config.attempt_s * _NS)
-        else:
-            return self._last
+            return self._restart("vision", "vision is lost")
+        if entries and not follows:
+            self._restart("inertial data", "inertial data has a hole")
+        self._window.append(span if follows else None, vo, observations, at_rest_by_image and follows)
+        self._window.trim(self._config.window_s if vo.has_scale else self._config.mono_window_s)
+        self.phase = self._next_phase(vo, still_by_imu and at_rest_by_image)
+        match self.phase:
+            case Phase.RESTING:
+                found = self._from_rest()
+            case Phase.MOVING if vo.t_ns >= self._next_attempt_ns:
+                found = self._from_motion()
+                self._next_attempt_ns = vo.t_ns + round(self._config.attempt_s * _NS)
+            case Phase.COLLECTING:
+                found = self._refuse("duration", self._needed(vo))
+            case _:
+                return self._last
+        if found.first is not None:
+            self.phase = Phase.FOUND
         self._last = found if found.first is None else Initialisation("waiting", "already found")
         return found
 
-    def _restart(self, reason: str) -> Initialisation:
-        self._entries = []
+    def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
+        """Shift the times of all frames seen, because the camera's clock turned out to be off by `shift_ns`.
+
+        `cut` gives the inertial data between two times, as `ImuBuffer.span`.
+        """
+        self._rest.clear()
+        self._before = None
+        if not self._window.restamp(shift_ns, cut):
+            self._restart("inertial data", "inertial data does not reach back to the first frames")
+        self._next_attempt_ns += shift_ns if self._next_attempt_ns else 0
+
+    def _next_phase(self, vo: VoMeasurement, still: bool) -> Phase:
+        if still:
+            return Phase.RESTING
+        need_s = self._config.window_min_s if vo.has_scale else self._config.mono_window_min_s
+        return Phase.COLLECTING if self._window.seen_s < need_s else Phase.MOVING
+
+    def _needed(self, vo: VoMeasurement) -> str:
+        need_s = self._config.window_min_s if vo.has_scale else self._config.mono_window_min_s
+        return f"{self._window.seen_s:.2f} s of motion seen, {need_s:.2f} s needed"
+
+    def _restart(self, cause: str, reason: str) -> Initialisation:
+        self._window.clear()
         self._rest.clear()
         self._next_attempt_ns = 0
-        self._last = Initialisation("waiting", reason)
+        self._before = None
+        self.phase = Phase.EMPTY
+        self._last = self._refuse(cause, reason)
         return self._last
 
-    def _append(self, span: ImuSpan | None, vo: VoMeasurement, T_keyframe_body: Array, still: bool) -> None:
-        """Chain the motion to a pose in the visual frame. After a loss the chain goes on from the last good pose."""
-        number = self._count
-        if vo.keyframe_id != self._keyframe_id:  # the frame before became the keyframe
-            self._T_vo_keyframe = self._T_vo_body
-            self._keyframe_number = number if self._keyframe_id is None else number - 1  # the first is its own
-            self._keyframe_id = vo.keyframe_id
-        self._T_vo_body = self._T_vo_keyframe @ T_keyframe_body
-        self._entries.append(_Entry(span, vo, self._T_vo_body.copy(), self._keyframe_number, number, still))
-        self._count += 1
+    def _refuse(self, cause: str, reason: str, status: str = "waiting") -> Initialisation:
+        self.refusals[cause] = self.refusals.get(cause, 0) + 1
+        return Initialisation(status, reason, cause=cause)
 
-    def _trim(self, now_ns: int) -> None:
-        """Drop what is older than the window; without scale it has to begin at a keyframe, which can be older."""
-        metric = self._entries[-1].vo.has_scale
-        oldest_ns = now_ns - round((self._config.window_s if metric else self._config.mono_window_s) * _NS)
-        keep = 0
-        for i, entry in enumerate(self._entries):
-            if entry.vo.t_ns > oldest_ns:
-                break
-            if metric or self._is_keyframe(i):
-                keep = i
-        del self._entries[:keep]
-
-    def _is_keyframe(self, i: int) -> bool:
-        number = self._entries[i].number
-        return i + 1 < len(self._entries) and self._entries[i + 1].keyframe == number
-
-    def _waiting(self, reason: str) -> Initialisation:
-        return Initialisation("waiting", reason)
+    # -- at rest -----------------------------------------------------------------------------------------------------
 
     def _from_rest(self) -> Initialisation:
         """Gravity and gyro bias from the means over the frames at rest."""
-        start = len(self._entries) - 1
-        while start > 0 and self._entries[start].still:
+        entries = self._window.entries
+        start = len(entries) - 1
+        while start > 0 and entries[start].still:
             start -= 1
-        entries = self._entries[start:]
+        entries = entries[start:]
         spans = [entry.span for entry in entries[1:] if entry.span is not None]
-        rested_s = (entries[-1].vo.t_ns - entries[0].vo.t_ns) / _NS
+        rested_s = (entries[-1].t_ns - entries[0].t_ns) / _NS
         if not spans or rested_s < self._config.rest_s:
-            return self._waiting(f"at rest for {rested_s:.2f} s of {self._config.rest_s:.2f} s")
+            return self._refuse("duration", f"at rest for {rested_s:.2f} s of {self._config.rest_s:.2f} s needed")
         span = join(spans)
         gyro, force = span.gyro_rad_s.mean(axis=0), span.accel_m_s2.mean(axis=0)
-        excess = float(np.linalg.norm(force)) - self._gravity
-        if abs(excess) > self._config.gravity_tolerance_m_s2:
-            return Initialisation("failed", self._contradiction(excess + self._gravity))
-        up_vo = entries[-1].T_vo_body[:3, :3] @ force
-        T_odom_vo = transform(level_rotation(up_vo), np.zeros(3))
+        norm = float(np.linalg.norm(force))
+        if abs(norm - self._gravity) > self._config.gravity_tolerance_m_s2:
+            return self._contradiction(norm)
+        T_odom_vo = transform(level_rotation(entries[-1].T_vo_body[:3, :3] @ force), np.zeros(3))
         poses = np.array([T_odom_vo @ entry.T_vo_body for entry in entries])
-        covariance = self._rest_covariance(span, poses[-1][:3, :3])
-        up_body = force / np.linalg.norm(force)
-        prior, measured = self._config.accel_bias_sigma_m_s2**2, self._rest_variance(span.accel_m_s2, rested_s)
-        accel_bias = up_body * (excess * prior / (prior + measured))
+        covariance = rest_covariance(span, poses[-1][:3, :3], self._gravity, self._config, self._noise)
+        accel_bias = rest_accel_bias(span, self._gravity, self._config)
         first, last = (
-            NavState(entry.vo.t_ns, pose, np.zeros(3), gyro, accel_bias, covariance)
+            NavState(entry.t_ns, pose, np.zeros(3), gyro, accel_bias, covariance)
             for entry, pose in ((entries[0], poses[0]), (entries[-1], poses[-1]))
         )
-        times = tuple(entry.vo.t_ns for entry in entries)
+        times = tuple(entry.t_ns for entry in entries)
         return Initialisation("static", f"at rest for {rested_s:.2f} s", first, last, T_odom_vo, times, poses)
 
-    def _rest_variance(self, values: Array, rested_s: float) -> float:
-        """Return the variance of the mean of one axis, given that vibration is correlated for a while."""
-        return float(values.var(axis=0).max()) / max(rested_s / _CORRELATED_S, 1.0)
-
-    def _rest_covariance(self, span: ImuSpan, R: Array) -> Array:
-        """Return the covariance [15, 15] of a state at rest: tilt and accelerometer bias cannot be told apart."""
-        rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
-        sigma_gyro = np.sqrt(self._rest_variance(span.gyro_rad_s, rested_s)) + self._noise.gyro_noise_density
-        sigma_force = np.sqrt(self._rest_variance(span.accel_m_s2, rested_s)) + self._noise.accel_noise_density
-        information = np.zeros((6, 6))  # rotation, accel bias
-        heading = R[2]  # rotation about the vertical, on the body side
-        information[:3, :3] = np.outer(heading, heading) / _CHOSEN**2 + np.eye(3)  # and tilt within 1 rad
-        information[3:, 3:] = np.eye(3) / self._config.accel_bias_sigma_m_s2**2
-        J = np.hstack([skew(R.T @ np.array([0.0, 0.0, self._gravity])), np.eye(3)])
-        information += J.T @ J / sigma_force**2
-        both = np.linalg.inv(information)
-        covariance = np.diag(np.repeat([0.0, _CHOSEN**2, _REST_SIGMA_M_S**2, sigma_gyro**2, 0.0], 3))
-        covariance[:3, :3], covariance[:3, 12:] = both[:3, :3], both[:3, 3:]
-        covariance[12:, :3], covariance[12:, 12:] = both[3:, :3], both[3:, 3:]
-        return covariance
+    # -- in motion ---------------------------------------------------------------------------------------------------
 
     def _from_motion(self) -> Initialisation:
         """Gravity, velocity, biases and scale from the window, if it says enough about them."""
-        config, entries = self._config, self._entries
-        metric = entries[-1].vo.has_scale
-        seen_s = (entries[-1].vo.t_ns - entries[0].vo.t_ns) / _NS
-        need_s = config.window_min_s if metric else config.mono_window_min_s
-        if seen_s < need_s:
-            return self._waiting(f"{seen_s:.2f} s of motion seen, {need_s:.2f} s needed")
-        chosen = self._choose_nodes()
-        window = self._window(chosen)
-        if not metric:
-            directions = sum(motion.has_direction for motion in window.motions)
-            if directions < config.min_directions:
-                return self._waiting(f"parallax in {directions} of {config.min_directions} motions needed")
+        metric = self._window.entries[-1].vo.has_scale
         try:
-            linear = solve_linear(window)
-            refusal = self._gravity_refusal(linear)
-            if refusal is not None:
-                return refusal
-            aligned = refine(window, linear)
+            return self._from_metric_motion() if metric else self._from_tracks()
         except np.linalg.LinAlgError:
-            return self._waiting("the motion does not determine gravity and velocity yet; accelerate or turn")
-        refusal = self._quality_refusal(aligned, metric)
-        return refusal if refusal is not None else self._moving(chosen, aligned, metric)
+            return self._refuse("geometry", "the motion does not determine gravity and velocity yet; accelerate, turn")
 
-    def _choose_nodes(self) -> list[_Entry]:
-        """Return the entries that become unknowns: keyframes, the ends, and others at a spacing."""
-        entries, config = self._entries, self._config
-        seen_ns = entries[-1].vo.t_ns - entries[0].vo.t_ns
-        spacing_ns = max(round(config.node_spacing_s * _NS), seen_ns // config.max_nodes)
-        chosen, last_ns = [], -(1 << 62)
-        for i, entry in enumerate(entries):
-            at_end = i == len(entries) - 1
-            if at_end or self._is_keyframe(i) or entry.vo.t_ns - last_ns >= spacing_ns - spacing_ns // 16:
-                chosen.append(entry)
-                last_ns = entry.vo.t_ns
-        return chosen
+    def _from_metric_motion(self) -> Initialisation:
+        """Align metric visual odometry with inertial data."""
+        config = self._config
+        sigma_s = self.time_offset_sigma_s
+        if sigma_s > config.max_time_offset_sigma_s and self._window.seen_s < 0.95 * config.window_s:
+            limit_ms = 1e3 * config.max_time_offset_sigma_s
+            return self._refuse("time offset", f"camera clock known to {1e3 * sigma_s:.1f} ms of {limit_ms:.1f}; turn")
+        chosen = self._window.choose_nodes(config.node_spacing_s, config.max_nodes)
+        window = self._inertial_window(chosen, metric_motions(chosen, config.vo_inflation))
+        linear = solve_linear(window)
+        norm = float(np.linalg.norm(linear.gravity_m_s2))
+        refusal = self._gravity_refusal(norm, linear.gravity_norm_sigma_m_s2)
+        if refusal is not None:
+            return refusal
+        aligned = refine(window, linear)
+        refusal = self._quality_refusal(aligned)
+        return refusal or self._moving(chosen, aligned, metric=True, excitation_m_s2=excitation(window))
 
-    def _window(self, chosen: list[_Entry]) -> Window:
-        first = self._entries[0].number
-        spans = []
-        for a, b in pairwise(chosen):
-            between = self._entries[a.number - first + 1 : b.number - first + 1]
-            spans.append(join([entry.span for entry in between if entry.span is not None]))
+    def _from_tracks(self) -> Initialisation:
+        """Structure from motion with inertial data: scale is unknown to the camera."""
+        config, camera = self._config, self._camera
+        if camera is None:
+            return self._refuse("calibration", "without scale a moving start needs the camera's calibration")
+        chosen = self._window.choose_nodes(config.node_spacing_s, config.mono_max_nodes)
+        tracks = gather_tracks(chosen, camera, self._T_body_cam, self._track_sigma_px, config.max_points)
+        window = self._inertial_window(chosen, [])
+        path = inertial_path(window)
+        refusal = self._sight_refusal(tracks, path, camera.fx)
+        if refusal is not None:
+            return refusal
+        start = solve_start(window, path, tracks)
+        if start.behind > _MAX_BEHIND:
+            reason = f"{start.behind:.0%} of the points behind the camera: too little acceleration, or wrong extrinsics"
+            return self._refuse("geometry", reason)
+        try:
+            bundle = refine_tracks(window, tracks, path, start, self.time_offset_sigma_s)
+        except np.linalg.LinAlgError:
+            return self._start_refusal(start) or self._refuse(
+                "geometry", "the motion does not settle; accelerate, turn"
+            )
+        before, self._before = self._before, Lengths([entry.t_ns for entry in chosen], bundle.aligned)
+        refusal = (
+            self._start_refusal(start)
+            or self._bundle_refusal(bundle)
+            or self._quality_refusal(bundle.aligned, bundle.aligned.scale_sigma())
+            or self._repetition_refusal(before, self._before)
+        )
+        if refusal is not None:
+            return refusal
+        found = self._moving(chosen, bundle.aligned, metric=False, excitation_m_s2=path.excitation_m_s2)
+        return replace(found, time_offset_s=bundle.offset_s, time_offset_sigma_s=bundle.offset_sigma_s)
+
+    def _inertial_window(self, chosen: list[Entry], motions: list[VisualMotion]) -> Window:
         return Window(
-            spans=spans,
-            motions=self._motions(chosen),
+            spans=self._window.spans(chosen),
+            motions=motions,
             rotations=np.array([entry.T_vo_body[:3, :3] for entry in chosen]),
             noise=self._noise,
             gravity_m_s2=self._gravity,
-            lever_m=self._lever,
+            lever_m=self._T_body_cam[:3, 3].copy(),
             gyro_bias_sigma_rad_s=self._config.gyro_bias_sigma_rad_s,
             accel_bias_sigma_m_s2=self._config.accel_bias_sigma_m_s2,
         )
 
-    def _motions(self, chosen: list[_Entry]) -> list[VisualMotion]:
-        """Return the visual motions among the nodes; if a keyframe is older than the window, from its first frame."""
-        inflation = self._config.vo_inflation**2
-        place = {entry.number: i for i, entry in enumerate(chosen)}
-        start = chosen[0]
-        motions = []
-        for i, entry in enumerate(chosen[1:], start=1):
-            T, covariance = entry.vo.T_keyframe_body, entry.vo.covariance
-            assert T is not None and start.vo.T_keyframe_body is not None
-            a = place.get(entry.keyframe)
-            if a is None and entry.vo.has_scale and entry.keyframe == start.keyframe:
-                a = 0
-                T = invert(start.vo.T_keyframe_body) @ T
-                turned = se3_adjoint(invert(T))
-                covariance = covariance + turned @ start.vo.covariance @ turned.T
-            if a is not None and a != i:
-                motions.append(VisualMotion(a, i, T, inflation * covariance, entry.vo.has_scale))
-        return motions
+    # -- refusals ----------------------------------------------------------------------------------------------------
 
-    def _contradiction(self, norm: float) -> str:
-        return (
+    def _contradiction(self, norm: float) -> Initialisation:
+        reason = (
             f"gravity norm {norm:.2f} m/s2, expected {self._gravity:.2f}: check the accelerometer's unit and "
             "calibration and the camera-IMU extrinsics"
         )
+        return self._refuse("gravity", reason, "failed")
 
-    def _gravity_refusal(self, linear: LinearSolution) -> Initialisation | None:
-        norm, sigma = float(np.linalg.norm(linear.gravity_m_s2)), linear.gravity_norm_sigma_m_s2
+    def _gravity_refusal(self, norm: float, sigma: float) -> Initialisation | None:
         allowed = self._config.gravity_tolerance_m_s2
         if sigma > 2.0 * allowed:
-            return self._waiting(f"gravity norm {norm:.1f} +- {sigma:.1f} m/s2: too little acceleration or turning")
+            reason = f"gravity norm {norm:.1f} +- {sigma:.1f} m/s2: too little acceleration or turning"
+            return self._refuse("gravity", reason)
         if abs(norm - self._gravity) > allowed + _AGREE_SIGMAS * sigma:
-            return Initialisation("failed", self._contradiction(norm))
+            return self._contradiction(norm)
         return None
 
-    def _quality_refusal(self, aligned: Alignment, metric: bool) -> Initialisation | None:
+    def _sight_refusal(self, tracks: Tracks, path: InertialPath, fx: float) -> Initialisation | None:
+        """Refuse a window in which there is too little to see."""
+        config = self._config
+        if tracks.points < config.min_points:
+            return self._refuse("points", f"{tracks.points} points of {config.min_points} needed followed long enough")
+        parallax_px = median_parallax(tracks, path.rotations) * fx
+        if parallax_px < config.min_parallax_px:
+            return self._refuse("parallax", f"parallax {parallax_px:.0f} px of {config.min_parallax_px:.0f} needed")
+        if path.excitation_m_s2 < config.min_excitation_m_s2:
+            return self._refuse(
+                "excitation",
+                f"acceleration changes by {path.excitation_m_s2:.2f} m/s2 of {config.min_excitation_m_s2:.2f} needed: "
+                "scale cannot be seen in uniform motion, speed up, brake or turn",
+            )
+        return None
+
+    def _start_refusal(self, start: Start) -> Initialisation | None:
+        """Refuse where the linear solution, gravity left free, is far from what gravity can be."""
+        norm, sigma = start.free_norm_m_s2, start.free_norm_sigma_m_s2
+        allowed = self._config.gravity_tolerance_m_s2
+        # in a short window this norm errs by more than its sigma says: twice the room
+        if abs(norm - self._gravity) > 2.0 * (allowed + _AGREE_SIGMAS * sigma):
+            return self._contradiction(norm)
+        return None
+
+    def _bundle_refusal(self, bundle: Bundle) -> Initialisation | None:
+        bias = float(np.linalg.norm(bundle.aligned.accel_bias_m_s2))
+        limit = _MAX_BIAS_SIGMAS * self._config.accel_bias_sigma_m_s2
+        if bias > limit:  # a motion that is not understood hides in it
+            reason = f"accelerometer bias {bias:.2f} m/s2 of {limit:.2f}: check its calibration, move with acceleration"
+            return self._refuse("accel bias", reason)
+        if bundle.outliers > _MAX_OUTLIERS:
+            reason = f"{bundle.outliers:.0%} of the sightings contradict the inertial data"
+            return self._refuse("disagreement", reason, "failed")
+        sigma_s = bundle.offset_sigma_s
+        if abs(bundle.offset_s) > max(_FOREIGN_OFFSET_S, _AGREE_SIGMAS * sigma_s):
+            reason = f"camera clock found off by {1e3 * bundle.offset_s:.1f} +- {1e3 * sigma_s:.1f} ms"
+            refusal = self._refuse("time offset", reason)
+            return replace(refusal, time_offset_s=bundle.offset_s, time_offset_sigma_s=sigma_s)
+        return None
+
+    def _repetition_refusal(self, before: Lengths | None, now: Lengths) -> Initialisation | None:
+        """Refuse what the attempt before does not confirm: a wrong minimum does not come twice at the same scale."""
+        if before is None:
+            return self._refuse("confirmation", "one more look needed to confirm the scale")
+        ratio, sigma = now.ratio(before)
+        if abs(ratio - 1.0) > _SAME_SCALE + _AGREE_SIGMAS * sigma:
+            return self._refuse("confirmation", f"scale differs from the attempt before by {abs(ratio - 1.0):.0%}")
+        return None
+
+    def _quality_refusal(self, aligned: Alignment, scale_sigma: float = 0.0) -> Initialisation | None:
         config = self._config
         if aligned.residual_ratio > config.max_residual_ratio:
             reason = f"vision and IMU disagree: chi2 {aligned.residual_ratio:.1f} of {config.max_residual_ratio:.1f}"
-            return Initialisation("failed", f"{reason} per degree of freedom; check time stamps and extrinsics")
+            advice = "per degree of freedom; check time stamps and extrinsics"
+            return self._refuse("disagreement", f"{reason} {advice}", "failed")
         P = aligned.state_covariance(-1 + len(aligned.T_world_body))
         R = aligned.T_world_body[-1, :3, :3]
         tilt = np.rad2deg(np.sqrt(np.linalg.eigvalsh((R @ P[:3, :3] @ R.T)[:2, :2])[-1]))
         velocity = np.sqrt(np.linalg.eigvalsh(P[6:9, 6:9])[-1])
         gyro = np.sqrt(np.linalg.eigvalsh(P[9:12, 9:12])[-1])
         for name, value, limit, unit in (
-            ("scale", 0.0 if metric else aligned.scale_sigma() * 100.0, config.max_scale_sigma * 100.0, "%"),
+            ("scale", scale_sigma * 100.0, config.max_scale_sigma * 100.0, "%"),
             ("tilt", tilt, config.max_tilt_sigma_deg, "deg"),
             ("velocity", velocity, config.max_velocity_sigma_m_s, "m/s"),
             ("gyro bias", gyro, config.max_gyro_bias_sigma_rad_s, "rad/s"),
         ):
             if not value <= limit:
-                return self._waiting(f"{name} known to {value:.3g} {unit}, {limit:.3g} needed; accelerate or turn")
+                reason = f"{name} sigma {value:.3g} {unit} of {limit:.3g} needed: move with more acceleration, or turn"
+                return self._refuse(name, reason)
         return None
 
-    def _moving(self, chosen: list[_Entry], aligned: Alignment, metric: bool) -> Initialisation:
+    # -- the answer --------------------------------------------------------------------------------------------------
+
+    def _moving(self, chosen: list[Entry], aligned: Alignment, metric: bool, excitation_m_s2: float) -> Initialisation:
         """Express the solution in odom."""
         up_vo = chosen[0].T_vo_body[:3, :3] @ aligned.T_world_body[0, 2, :3]
         T_odom_vo = transform(level_rotation(up_vo), np.zeros(3))
@@ -311,7 +393,7 @@ class Initialiser:
         inflation = max(aligned.residual_ratio, 1.0)  # what the model does not explain makes the answer less certain
         first, last = (
             NavState(
-                t_ns=chosen[i].vo.t_ns,
+                t_ns=chosen[i].t_ns,
                 T_world_body=poses[i],
                 velocity_world_m_s=turn[:3, :3] @ aligned.velocities_m_s[i],
                 gyro_bias_rad_s=aligned.gyro_bias_rad_s,
@@ -321,8 +403,36 @@ class Initialiser:
             for i in (0, len(chosen) - 1)
         )
         reason = f"{len(chosen)} frames over {(last.t_ns - first.t_ns) / _NS:.2f} s, chi2 {aligned.residual_ratio:.2f}"
-        times = tuple(entry.vo.t_ns for entry in chosen)
-        return Initialisation("moving", reason, first, last, T_odom_vo, times, poses)
+        scale_sigma = 0.0 if metric else aligned.scale_sigma() * float(np.sqrt(inflation))
+        if not metric:
+            reason = f"{reason}, scale sigma {100.0 * scale_sigma:.1f} %"
+        return Initialisation(
+            "moving", reason, first, last, T_odom_vo, tuple(entry.t_ns for entry in chosen), poses,
+            scale_sigma=scale_sigma, excitation_m_s2=excitation_m_s2,
+        )  # fmt: skip
+
+
+class Lengths:
+    """Distances from the first node of a solution, to compare the scale of two solutions that overlap in time."""
+
+    def __init__(self, t_ns: list[int], aligned: Alignment) -> None:
+        """Take the times of the nodes and their solution."""
+        self._t_ns = np.array(t_ns, dtype=np.int64)
+        self._positions = aligned.T_world_body[:, :3, 3]
+        self.sigma = aligned.scale_sigma()
+
+    def ratio(self, before: Lengths) -> tuple[float, float]:
+        """Return the scale relative to that of `before`, and the sigma of that; without overlap zero."""
+        common = before._t_ns[(before._t_ns >= self._t_ns[0]) & (before._t_ns <= self._t_ns[-1])]
+        if len(common) < 2:
+            return 0.0, 0.0
+        now, then = self._from_first(common), before._from_first(common)
+        return float(now @ then / max(float(then @ then), 1e-12)), min(before.sigma, 0.3)
+
+    def _from_first(self, t_ns: NDArray[np.int64]) -> Array:
+        t_s, at_s = (self._t_ns - self._t_ns[0]) / _NS, (t_ns - self._t_ns[0]) / _NS
+        at = np.column_stack([np.interp(at_s, t_s, self._positions[:, i]) for i in range(3)])
+        return np.asarray(np.linalg.norm(at - at[0], axis=1))
 
 
 def _turn(covariance: Array, R: Array) -> Array:

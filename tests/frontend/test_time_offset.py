@@ -1,0 +1,97 @@
+"""The camera's time offset from rotations: found, with an honest sigma, from either side; applied only when it counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from inertial_world import T0_NS
+from point_world import Start
+
+from vislam.config import ImuConfig, InitConfig
+from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.time_offset import TimeOffset
+from vislam.geometry import so3_exp, transform
+from vislam.imu import ImuBuffer
+from vislam.messages import Frame, VoMeasurement
+
+
+def estimate(start: Start, config: InitConfig, motions: list[VoMeasurement] | None = None) -> TimeOffset:
+    found = TimeOffset(config)
+    for k, (vo, _, _) in enumerate(start.frames):
+        found.add(vo.t_ns, vo if motions is None else motions[k])
+        wanted = found.wanted_ns()
+        if wanted is not None and k % 5 == 0:
+            span = start.buffer.span(max(wanted[0], T0_NS), min(wanted[1], vo.t_ns + 5_000_000))
+            assert span is not None
+            found.solve(span)
+    return found
+
+
+@pytest.mark.parametrize("offset_s", [0.03, -0.03, 0.0])
+def test_offset_comes_back_honestly(offset_s: float) -> None:
+    errors, sigmas = [], []
+    for seed in range(8):
+        found = estimate(Start("moving", seed, offset_s=offset_s, duration_s=5.0), InitConfig()).estimate
+        errors.append(found.offset_s - offset_s)
+        sigmas.append(found.sigma_s)
+    ratio = np.array(errors) / np.array(sigmas)
+    print(f"errors {np.round(1e3 * np.array(errors), 2)} ms, sigmas {np.round(1e3 * np.array(sigmas), 2)} ms")
+    assert np.sqrt(np.mean(np.square(errors))) < 2e-3
+    assert 0.2 < np.sqrt(np.mean(ratio**2)) < 1.6
+    assert np.abs(ratio).max() < 3.5
+
+
+def test_misaligned_axes_come_back() -> None:
+    start, turn = Start("moving", 3, duration_s=5.0), np.array([0.01, -0.006, 0.008])
+    R = transform(so3_exp(turn), np.zeros(3))
+    motions = [replace(vo, T_keyframe_body=R @ vo.T_keyframe_body @ R.T) for vo, _, _ in start.frames]
+    found = estimate(start, InitConfig(), motions).estimate
+    print(found.R_correction, found.R_correction_sigma)
+    np.testing.assert_array_less(np.abs(found.R_correction - turn), 4.0 * found.R_correction_sigma)
+    assert found.R_correction_sigma.max() < 0.01
+    np.testing.assert_allclose(found.gyro_bias_rad_s, start.gyro_bias, atol=5e-3)
+
+
+def test_without_turning_nothing_is_claimed() -> None:
+    config = InitConfig()
+    found = estimate(Start("uniform", 0, offset_s=0.02), config).estimate
+    assert found.sigma_s > 0.8 * config.time_offset_sigma_s
+    assert abs(found.offset_s) < config.time_offset_sigma_s
+
+
+def test_switched_off_nothing_is_estimated() -> None:
+    found = estimate(Start("moving", 0, offset_s=0.02), InitConfig(time_offset=False, time_offset_s=0.004))
+    assert found.estimate.offset_s == 0.004
+    assert found.sigma_s == 0.0
+
+
+def follow(start: Start, config: InitConfig) -> tuple[CameraClock, list[int]]:
+    """Let a clock see a whole start; inertial data come as they would, to just behind the frame."""
+    clock, buffer, stamps = CameraClock(config), ImuBuffer(ImuConfig()), []
+    samples = iter(start.samples)
+    for k, (vo, _, _) in enumerate(start.frames):
+        frame = clock.in_imu_time(Frame(vo.t_ns, k, ()))
+        while buffer.newest_t_ns is None or buffer.newest_t_ns <= frame.t_ns:
+            buffer.add(next(samples))
+        stamps.append(frame.t_ns)
+        clock.follow(replace(vo, t_ns=frame.t_ns), buffer)
+    return clock, stamps
+
+
+@pytest.mark.parametrize(("offset_s", "frame_ns"), [(0.03, 50_000_000), (-0.03, 50_000_000), (-0.03, 20_000_000)])
+def test_time_advances_while_the_clock_is_corrected(offset_s: float, frame_ns: int) -> None:
+    start = Start("moving", 1, offset_s=offset_s, frame_ns=frame_ns, duration_s=5.0)
+    clock, stamps = follow(start, InitConfig())
+    print(f"{offset_s}: applied {1e3 * clock.applied_s:.2f} ms in {clock.changes} steps")
+    assert np.diff(stamps).min() > 0
+    assert abs(clock.applied_s - offset_s) < 2e-3
+    assert clock.changes > 0
+
+
+def test_a_good_clock_is_left_alone() -> None:
+    for seed in range(6):
+        clock, stamps = follow(Start("moving", seed, duration_s=5.0), InitConfig())
+        assert clock.changes == 0, seed
+        assert stamps == [vo.t_ns for vo, _, _ in Start("moving", seed, duration_s=5.0).frames]

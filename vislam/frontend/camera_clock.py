@@ -1,0 +1,121 @@
+"""The camera's clock: what is added to its stamps, so that everything behind it lives in the IMU's time.
+
+The offset that is applied follows the estimate only where that is significant, changes from one frame to the next, and
+never so far that time would not advance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vislam.config import InitConfig
+from vislam.frontend.time_offset import TimeOffset, TimeOffsetEstimate
+from vislam.imu import ImuBuffer
+from vislam.messages import Frame, ImuSpan, NavState, VoMeasurement
+
+_NS = 1_000_000_000
+_EVERY_FRAMES = 5  # between estimates: they change slowly, and each costs a millisecond
+_SIGNIFICANT = 3.0  # sigmas of the estimate
+_WIDER = 3.0  # sigmas of the offset by which the gyroscope's word on rotation is widened
+_MOST_BACK = 0.5  # of a frame interval, by which stamps may step back at once
+_FASTEST_M_S = 1.0  # assumed where nothing tells the speed
+
+
+class CameraClock:
+    """Owns the offset that is applied and the estimator behind it.
+
+    Attributes:
+        applied_ns: what is added to the camera's stamps now.
+        changes: how often that was changed.
+    """
+
+    def __init__(self, config: InitConfig) -> None:
+        """Start from the configured offset."""
+        self._config = config
+        self._offset = TimeOffset(config)
+        self.applied_ns = round(config.time_offset_s * _NS)
+        self.changes = 0
+        self._keyframe_ns = self.applied_ns  # applied when the newest keyframe was stamped
+        self._frames = 0
+        self._last_t_ns: int | None = None  # of the frame before, by the camera
+        self._interval_ns = 0
+
+    @property
+    def estimate(self) -> TimeOffsetEstimate:
+        """Offset, gyro bias and misalignment of the axes as rotations tell them."""
+        return self._offset.estimate
+
+    @property
+    def applied_s(self) -> float:
+        """What is added to the camera's stamps now."""
+        return self.applied_ns / _NS
+
+    @property
+    def sigma_s(self) -> float:
+        """How far the applied offset may be off."""
+        return self._offset.sigma_s
+
+    def in_imu_time(self, frame: Frame) -> Frame:
+        """Return the frame with its stamp in the IMU's time."""
+        if self._last_t_ns is not None:
+            self._interval_ns = frame.t_ns - self._last_t_ns
+        self._last_t_ns = frame.t_ns
+        return replace(frame, t_ns=frame.t_ns + self.applied_ns) if self.applied_ns else frame
+
+    def took_keyframe(self) -> None:
+        """Take note that the newest frame became a keyframe."""
+        self._keyframe_ns = self.applied_ns
+
+    def gyro_sigma_rad_s(self, span: ImuSpan) -> float:
+        """Return the sigma of a mean rate over a span for want of the exact time: it grows with the change of rate."""
+        change = float(np.linalg.norm(span.gyro_rad_s[-1] - span.gyro_rad_s[0]))
+        return _WIDER * self.sigma_s * change / ((int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS)
+
+    def loosened(self, vo: VoMeasurement, span: ImuSpan | None, state: NavState | None) -> VoMeasurement:
+        """Return a motion with the noise that comes of two stamps made with different offsets; usually as it is."""
+        shift_s = abs(self.applied_ns - self._keyframe_ns) / _NS
+        if shift_s == 0.0 or vo.T_keyframe_body is None:
+            return vo
+        rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
+        speed = _FASTEST_M_S if state is None else float(np.linalg.norm(state.velocity_world_m_s))
+        along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way says nothing then
+        extra = np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
+        return replace(vo, covariance=vo.covariance + extra)
+
+    def follow(self, vo: VoMeasurement, buffer: ImuBuffer) -> int:
+        """Learn from the newest frame's motion and return by how many ns the applied offset changes from now on.
+
+        Args:
+            vo: its motion, stamped in the IMU's time.
+            buffer: the inertial data around it.
+        """
+        self._offset.add(vo.t_ns - self.applied_ns, vo)
+        self._frames += 1
+        wanted = self._offset.wanted_ns()
+        oldest_ns, newest_ns = buffer.oldest_t_ns, buffer.newest_t_ns
+        if oldest_ns is None or newest_ns is None or wanted is None or self._frames % _EVERY_FRAMES:
+            return 0
+        span = buffer.span(max(wanted[0], oldest_ns), min(wanted[1], newest_ns))
+        if span is None:
+            return 0
+        self._offset.solve(span)
+        return self._change()
+
+    def tell(self, further_s: float, sigma_s: float) -> int:
+        """Take an offset beyond what is applied, found by other means; return the change as `follow` does."""
+        self._offset.tell(self.applied_s + further_s, sigma_s)
+        return self._change()
+
+    def _change(self) -> int:
+        found, config = self._offset.estimate, self._config
+        target_ns = round(found.offset_s * _NS)
+        shift_ns = target_ns - self.applied_ns
+        needed_s = max(_SIGNIFICANT * found.sigma_s, config.time_offset_min_s)
+        if found.sigma_s > config.max_time_offset_sigma_s or abs(shift_ns) < needed_s * _NS:
+            return 0
+        shift_ns = max(shift_ns, -round(_MOST_BACK * self._interval_ns))
+        self.applied_ns += shift_ns
+        self.changes += 1
+        return shift_ns

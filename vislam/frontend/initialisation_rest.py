@@ -1,0 +1,50 @@
+"""The first state from rest: gravity and gyro bias are the means of what the IMU says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.config import InitConfig
+from vislam.geometry import skew
+from vislam.imu import ImuNoise
+from vislam.messages import Array, ImuSpan
+
+_NS = 1_000_000_000
+_CHOSEN = 1e-3  # sigma, rad and m, of heading and position where odom is defined to be zero
+_REST_SIGMA_M_S = 0.02  # a body at rest still sways
+_CORRELATED_S = 0.05  # vibration at rest averages out over samples this far apart
+
+
+def rest_variance(values: Array, rested_s: float) -> float:
+    """Return the variance of the mean of one axis of `values` [N, 3]; vibration is correlated for a while."""
+    return float(values.var(axis=0).max()) / max(rested_s / _CORRELATED_S, 1.0)
+
+
+def rest_accel_bias(span: ImuSpan, gravity_m_s2: float, config: InitConfig) -> Array:
+    """Return the accelerometer bias [3]: only its part along gravity shows at rest."""
+    rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
+    force = span.accel_m_s2.mean(axis=0)
+    norm = float(np.linalg.norm(force))
+    prior, measured = config.accel_bias_sigma_m_s2**2, rest_variance(span.accel_m_s2, rested_s)
+    return np.asarray(force / norm * ((norm - gravity_m_s2) * prior / (prior + measured)))
+
+
+def rest_covariance(span: ImuSpan, R: Array, gravity_m_s2: float, config: InitConfig, noise: ImuNoise) -> Array:
+    """Return the covariance [15, 15] of a state at rest with attitude R [3, 3].
+
+    Tilt and accelerometer bias cannot be told apart; their correlation says so.
+    """
+    rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
+    sigma_gyro = np.sqrt(rest_variance(span.gyro_rad_s, rested_s)) + noise.gyro_noise_density
+    sigma_force = np.sqrt(rest_variance(span.accel_m_s2, rested_s)) + noise.accel_noise_density
+    information = np.zeros((6, 6))  # rotation, accel bias
+    heading = R[2]  # rotation about the vertical, on the body side
+    information[:3, :3] = np.outer(heading, heading) / _CHOSEN**2 + np.eye(3)  # and tilt within 1 rad
+    information[3:, 3:] = np.eye(3) / config.accel_bias_sigma_m_s2**2
+    J = np.hstack([skew(R.T @ np.array([0.0, 0.0, gravity_m_s2])), np.eye(3)])
+    information += J.T @ J / sigma_force**2
+    both = np.linalg.inv(information)
+    covariance = np.diag(np.repeat([0.0, _CHOSEN**2, _REST_SIGMA_M_S**2, sigma_gyro**2, 0.0], 3))
+    covariance[:3, :3], covariance[:3, 12:] = both[:3, :3], both[:3, 3:]
+    covariance[12:, :3], covariance[12:, 12:] = both[3:, :3], both[3:, 3:]
+    return covariance

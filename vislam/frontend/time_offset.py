@@ -1,0 +1,212 @@
+"""How far the camera's clock is off from the IMU's, from rotations alone.
+
+A camera whose stamps are late or early sees the rotations that the gyroscope measures shifted in time. Rotation between
+a keyframe and a frame, by vision and by gyroscope, is compared over a sliding window; the difference is linear in time
+offset, gyro bias and a small misalignment of the axes, for which one least-squares problem is solved, integrated anew
+around every solution. Neither gravity nor scale is needed. The idea is that of Li and Mourikis, "Online temporal
+calibration for camera-IMU systems", IJRR 2014, and of the rotation part of Kalibr (Furgale et al., IROS 2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.config import InitConfig
+from vislam.geometry import so3_exp, so3_log
+from vislam.messages import Array, ImuSpan, Tracking, VoMeasurement
+
+_NS = 1_000_000_000
+_WINDOW_S = 10.0  # of frames that are looked at: longer than a hand takes to turn this way and that
+_SLACK_S = 0.1  # more inertial data than the frames span, so that they can be shifted
+_MIN_FRAMES = 15  # fewer are no statistics
+_SIGMA_RAD = 1e-3  # nominal, of a visual rotation; residuals tell the real one
+_MIN_RATIO = 0.05  # of real to nominal variance: better than 0.2 mrad nobody is
+_GYRO_BIAS_SIGMA = 0.5  # rad/s, prior: wide enough for any
+_TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
+_CAUCHY = 3.0  # standard deviations
+_ROUNDS = 5
+_UNKNOWNS = 7  # offset, gyro bias, misalignment
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeOffsetEstimate:
+    """What is to be added to the camera's own stamps to get the IMU's time, and what came with it."""
+
+    offset_s: float
+    sigma_s: float
+    gyro_bias_rad_s: Array  # [3]
+    R_correction: Array  # [3] rotation vector, body axes: vision's body axes are those of the IMU turned by it
+    R_correction_sigma: Array  # [3] rad
+    frames: int
+
+
+class TimeOffset:
+    """Owns the visual rotations of the last seconds and estimates the offset from them.
+
+    Attributes:
+        estimate: the newest one; its sigma is the configured one until there is something to see.
+        settled: the offset is known so well that nothing more is taken in.
+    """
+
+    def __init__(self, config: InitConfig) -> None:
+        """Start from the configured offset."""
+        self._config = config
+        none = np.zeros(3)
+        self.estimate = TimeOffsetEstimate(
+            config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, _TURN_SIGMA), 0
+        )
+        self.settled = not config.time_offset
+        self._t_ns: list[int] = []  # of the frames, by the camera
+        self._keyframe_ns: list[int] = []
+        self._rotations: list[Array] = []  # [3, 3] of the body since the keyframe, by vision
+        self._last_t_ns: int | None = None
+        self._keyframe_id: int | None = None
+        self._keyframe_t_ns = 0
+
+    @property
+    def sigma_s(self) -> float:
+        """How well the offset is known; zero when it is not estimated but given."""
+        return self.estimate.sigma_s if self._config.time_offset else 0.0
+
+    def add(self, camera_t_ns: int, vo: VoMeasurement) -> None:
+        """Take the rotation of one frame since its keyframe.
+
+        Args:
+            camera_t_ns: the frame's time by the camera's own clock.
+            vo: its motion, in which rotation must come from the image: not held by a gyroscope prior.
+        """
+        if self.settled:
+            return
+        if vo.keyframe_id != self._keyframe_id:  # the frame before became the keyframe
+            self._keyframe_id = vo.keyframe_id
+            self._keyframe_t_ns = camera_t_ns if self._last_t_ns is None else self._last_t_ns
+        self._last_t_ns = camera_t_ns
+        if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None or camera_t_ns <= self._keyframe_t_ns:
+            return
+        self._t_ns.append(camera_t_ns)
+        self._keyframe_ns.append(self._keyframe_t_ns)
+        self._rotations.append(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]))
+        old = 0
+        while self._keyframe_ns[old] < camera_t_ns - round(_WINDOW_S * _NS):
+            old += 1
+        del self._t_ns[:old], self._keyframe_ns[:old], self._rotations[:old]
+
+    def wanted_ns(self) -> tuple[int, int] | None:
+        """Return the interval of inertial data that `solve` can use; None while there is nothing to solve."""
+        if self.settled or len(self._t_ns) < _MIN_FRAMES:
+            return None
+        reach = round((abs(self.estimate.offset_s) + _SLACK_S) * _NS)
+        return self._keyframe_ns[0] - reach, self._t_ns[-1] + reach
+
+    def solve(self, span: ImuSpan) -> TimeOffsetEstimate:
+        """Estimate from the frames that `span` covers, no bias taken off; keep the old estimate if that fails."""
+        problem = self._problem(span)
+        x = np.concatenate([[self.estimate.offset_s], self.estimate.gyro_bias_rad_s, self.estimate.R_correction])
+        sigmas = np.repeat([self._config.time_offset_sigma_s, _GYRO_BIAS_SIGMA, _TURN_SIGMA], [1, 3, 3])
+        mean = np.zeros(_UNKNOWNS)
+        mean[0] = self._config.time_offset_s
+        scale, H, used = 1.0, np.eye(_UNKNOWNS), 0
+        for _ in range(_ROUNDS):
+            H, g, squares, used = _normal_equations(*problem, x, scale)
+            if used < _MIN_FRAMES:
+                return self.estimate
+            H += np.diag(1.0 / sigmas**2)
+            step = np.linalg.solve(H, g + (mean - x) / sigmas**2)
+            x = x + step
+            x[0] = float(np.clip(x[0], *(self._config.time_offset_s + _SLACK_S * np.array([-0.9, 0.9]))))
+            scale = float(np.sqrt(max(np.median(squares[:used]) / 0.79, _MIN_RATIO)))  # 0.79: chi2 of 3, over 3
+        deviations = np.sqrt(np.diag(np.linalg.inv(H)))
+        if not np.isfinite(x).all():
+            return self.estimate
+        sigma_s = min(float(deviations[0]), self._config.time_offset_sigma_s)
+        self.estimate = TimeOffsetEstimate(float(x[0]), sigma_s, x[1:4].copy(), x[4:].copy(), deviations[4:], used)
+        self.settled = sigma_s < self._config.time_offset_settled_s
+        return self.estimate
+
+    def tell(self, offset_s: float, sigma_s: float) -> None:
+        """Take an offset that was found by other means, with its sigma."""
+        if not self.settled and sigma_s < self.estimate.sigma_s:
+            e = self.estimate
+            self.estimate = TimeOffsetEstimate(
+                offset_s, sigma_s, e.gyro_bias_rad_s, e.R_correction, e.R_correction_sigma, e.frames
+            )
+
+    def _problem(self, span: ImuSpan) -> tuple[Array, Array, Array, Array, Array]:
+        """Return times in seconds after the span's begin (samples, keyframes, frames), rates and visual rotations."""
+        begin = int(span.t_ns[0])
+        times = [(np.asarray(t, dtype=np.int64) - begin) / _NS for t in (span.t_ns, self._keyframe_ns, self._t_ns)]
+        return times[0], np.ascontiguousarray(span.gyro_rad_s), times[1], times[2], np.array(self._rotations)
+
+
+@njit(cache=True, nogil=True)
+def _integrate(t_s: Array, gyro: Array, bias: Array) -> tuple[Array, Array]:
+    """Return the attitude [N, 3, 3] since the first sample, and its integral over time [N, 3, 3]."""
+    R, total = np.zeros((len(t_s), 3, 3)), np.zeros((len(t_s), 3, 3))
+    R[0] = np.eye(3)
+    for k in range(len(t_s) - 1):
+        dt = t_s[k + 1] - t_s[k]
+        R[k + 1] = R[k] @ so3_exp((0.5 * (gyro[k] + gyro[k + 1]) - bias) * dt)
+        total[k + 1] = total[k] + (0.5 * dt) * (R[k] + R[k + 1])
+    return R, total
+
+
+@njit(cache=True, nogil=True)
+def _at(t: float, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array) -> tuple[Array, Array, Array]:
+    """Return attitude, its integral and rate at a time inside the samples."""
+    k = min(max(np.searchsorted(t_s, t) - 1, 0), len(t_s) - 2)
+    h = t - t_s[k]
+    rate = gyro[k] + (gyro[k + 1] - gyro[k]) * (h / (t_s[k + 1] - t_s[k]))
+    turned = R[k] @ so3_exp((0.5 * (gyro[k] + rate) - bias) * h)
+    return turned, total[k] + (0.5 * h) * (R[k] + turned), rate - bias
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(
+    t_s: Array, gyro: Array, keyframe_s: Array, frame_s: Array, rotations: Array, x: Array, scale: float
+) -> tuple[Array, Array, Array, int]:
+    """Sum up the frames that the samples cover; what all frames of a keyframe have in common is eliminated.
+
+    Returns:
+        H [7, 7], g [7], the squared residuals per axis in nominal sigmas, and how many frames were used.
+    """
+    offset, bias, turn = x[0], x[1:4].copy(), so3_exp(x[4:7].copy())
+    R, total = _integrate(t_s, gyro, bias)
+    H, g = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS)
+    squares, used = np.zeros(len(frame_s)), 0
+    weight0 = 1.0 / (_SIGMA_RAD * scale) ** 2
+    shared_weight, link, head = weight0, np.zeros((_UNKNOWNS, 3)), np.zeros(3)
+    J = np.zeros((3, _UNKNOWNS))
+    for i in range(len(frame_s)):
+        if i > 0 and keyframe_s[i] != keyframe_s[i - 1]:
+            H -= link @ link.T / shared_weight
+            g -= link @ head / shared_weight
+            shared_weight, link, head = weight0, np.zeros((_UNKNOWNS, 3)), np.zeros(3)
+        begin, end = keyframe_s[i] + offset, frame_s[i] + offset
+        if begin < t_s[0] or end > t_s[-1]:
+            continue
+        R_a, total_a, rate_a = _at(begin, t_s, gyro, bias, R, total)
+        R_b, total_b, rate_b = _at(end, t_s, gyro, bias, R, total)
+        R_a_b = R_a.T @ R_b
+        seen = turn @ R_a_b @ turn.T
+        error = so3_log(rotations[i] @ seen.T)
+        J[:, 0] = turn @ (R_a_b @ rate_b - rate_a)
+        J[:, 1:4] = -(turn @ R_a.T @ (total_b - total_a))
+        J[:, 4:7] = np.eye(3) - seen
+        square = np.sum(error * error) / (3.0 * _SIGMA_RAD**2)
+        squares[used] = square
+        used += 1
+        weight = weight0 / (1.0 + square / (_CAUCHY * scale) ** 2)
+        H += weight * (J.T @ J)
+        g += weight * (J.T @ error)
+        link += weight * J.T
+        head += weight * error
+        shared_weight += weight
+    H -= link @ link.T / shared_weight
+    g -= link @ head / shared_weight
+    return H, g, squares, used
