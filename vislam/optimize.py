@@ -71,7 +71,10 @@ def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config]:
         values = stored.get(section) if isinstance(stored, dict) else None
         if isinstance(values, dict):
             data[section] = {key: value for key, value in values.items() if key in known}
-    return log, from_data(data, source=str(run / "session.db"))
+    try:
+        return log, from_data(data, source=str(run / "session.db"))
+    except UsageError as error:
+        raise DataError(f"{error}; the settings stored with the run are damaged, run the recording again") from error
 
 
 def _metrics(run: Path) -> dict[str, Any]:

@@ -18,9 +18,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera, Rig
+from vislam.camera import Rig
 from vislam.errors import DataError, StorageError
-from vislam.factor_log import FactorLog, LoggedEdge, LoggedFrames, LoggedKeyframe
+from vislam.factor_log import (
+    FactorLog,
+    LoggedEdge,
+    LoggedFrames,
+    LoggedKeyframe,
+    rig_data,
+    rig_from,
+    state_data,
+    state_from,
+)
 from vislam.imu import ImuNoise
 from vislam.messages import (
     Array,
@@ -103,7 +112,7 @@ class SessionWriter:
         self.path = path
         self._frames: list[tuple[int, int, bytes | None]] = []
         self._begun = False
-        sensors = {"rig": _rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
+        sensors = {"rig": rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
         entries = {**info, **sensors, "gravity_m_s2": gravity_m_s2}
         with _storage(path):
             self._db = sqlite3.connect(path, isolation_level=None)
@@ -148,7 +157,7 @@ class SessionWriter:
         packet_row = _packet_row(packet, update.newest)
         with _storage(self.path), self._transaction():
             if not self._begun:
-                data = json.dumps(None if first_state is None else _state_data(first_state))
+                data = json.dumps(None if first_state is None else state_data(first_state))
                 self._db.execute("INSERT INTO info VALUES (?, ?)", ("first_state", data))
             self._db.execute("INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?, ?)", row)
             self._db.execute(f"INSERT INTO packets VALUES ({', '.join('?' * len(packet_row))})", packet_row)
@@ -166,11 +175,12 @@ class SessionWriter:
             self._move(update)
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and close it."""
+        """Fold the write-ahead log into the file, which is then all there is, and close it."""
         with _storage(self.path):
             with self._transaction():
                 self._write_frames()
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            self._db.execute("PRAGMA journal_mode=DELETE")  # so that readers leave no files beside it
             self._db.close()
 
     def _move(self, update: GraphUpdate) -> None:
@@ -254,10 +264,10 @@ class Session:
         try:
             noise, first = info["imu_noise"], info.get("first_state")
             return FactorLog(
-                rig=_rig(info["rig"]),
+                rig=rig_from(info["rig"]),
                 noise=None if noise is None else ImuNoise(**noise),
                 gravity_m_s2=float(info["gravity_m_s2"]),
-                first_state=None if first is None else _state(first),
+                first_state=None if first is None else state_from(first),
                 keyframes=self._logged_keyframes(),
                 edges=list(self._edges()),
                 frames=self._logged_frames(),
@@ -354,36 +364,6 @@ def _packet_row(packet: KeyframePacket, newest: NavState | None) -> tuple[Any, .
         None if imu is None else _to_bytes(imu.t_ns, "<i8"), None if imu is None else _to_bytes(imu.gyro_rad_s, "<f8"),
         None if imu is None else _to_bytes(imu.accel_m_s2, "<f8"), None if mag is None else mag.t_ns,
         None if mag is None else _to_bytes(mag.field_ut, "<f8"), int(packet.at_rest), packet.time_offset_s, state,
-    )  # fmt: skip
-
-
-def _rig_data(rig: Rig) -> dict[str, Any]:
-    """Return a rig as plain data; JSON keeps every bit of a float."""
-    return {
-        "cameras": [asdict(camera) for camera in rig.cameras],
-        "T_body_cams": [T.tolist() for T in rig.T_body_cams],
-        "has_depth": rig.has_depth,
-    }
-
-
-def _rig(data: dict[str, Any]) -> Rig:
-    cameras = [Camera(**{**entry, "coefficients": tuple(entry["coefficients"])}) for entry in data["cameras"]]
-    poses = tuple(np.array(T, dtype=np.float64).reshape(4, 4) for T in data["T_body_cams"])
-    return Rig(tuple(cameras), poses, bool(data["has_depth"]))
-
-
-def _state_data(state: NavState) -> dict[str, Any]:
-    data = {name: getattr(state, name) for name in NavState.__slots__}
-    return {name: value.tolist() if isinstance(value, np.ndarray) else int(value) for name, value in data.items()}
-
-
-def _state(data: dict[str, Any]) -> NavState:
-    def numbers(name: str, *shape: int) -> Array:
-        return np.array(data[name], dtype=np.float64).reshape(shape)
-
-    return NavState(
-        int(data["t_ns"]), numbers("T_world_body", 4, 4), numbers("velocity_world_m_s", 3),
-        numbers("gyro_bias_rad_s", 3), numbers("accel_bias_m_s2", 3), numbers("covariance", 15, 15),
     )  # fmt: skip
 
 
