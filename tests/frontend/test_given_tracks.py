@@ -13,6 +13,7 @@ from vislam.config import FrontEndConfig
 from vislam.errors import DataError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.intake import Intake
+from vislam.frontend.metric import MetricFrontEnd
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
 from vislam.frontend.tracker import Tracker, given_rows
@@ -101,6 +102,17 @@ def test_outage_is_lost_and_odometry_starts_again() -> None:
     assert tracking[110:].count(Tracking.OK) > 40 and Tracking.LOST not in tracking[5:79]
     assert any("points were given" in result.reason for _, result, _, _ in results[80:100])
     assert any(result.reason.startswith("restarted") for _, result, _, _ in results[95:105])
+
+
+def test_rolling_shutter_is_found_from_given_tracks() -> None:
+    recording = open_points("handheld-room", seed=1, readout_s=0.02, duration_s=8.0)
+    frontend = make_frontend(CONFIG, recording.rig, 0)
+    assert isinstance(frontend, MetricFrontEnd)
+    for event in recording.events():
+        if isinstance(event, Frame):
+            frontend.track(event, None)
+    print(f"seed 1: {frontend._shutter.readout_s * 1e3:.1f} of 20 ms")
+    assert frontend._shutter.readout_s == pytest.approx(0.02, abs=0.003)
 
 
 def test_person_does_not_carry_the_odometry_away() -> None:
