@@ -1,14 +1,18 @@
 """Plans and what they mean run by run."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from vislam.errors import UsageError
-from vislam.experiment.identity import code_sha256, source_identity, split_source
+from vislam.experiment.identity import code_sha256, is_world, source_identity, split_source
 from vislam.experiment.jobs import JITTER, expand, unique, variants
 from vislam.experiment.plan import load_plan, plan_from_data
 from vislam.experiment.trials import estimates
+from vislam.sources import open_source
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 GOOD = """
 name = "small"
@@ -87,6 +91,12 @@ def test_estimators_with_one_configuration_share_their_runs(tmp_path):
     assert len(list(unique(jobs))) == len(jobs) // 2
 
 
+def test_an_estimator_may_be_kept_from_sequences_that_it_cannot_be_run_on(tmp_path):
+    jobs = expand(load(tmp_path, GOOD.replace('outputs = ["graph"]', 'sequences = ["laps"]')))
+    assert {job.sequence for job in jobs if job.estimator == "tight"} == {"laps"}
+    assert {job.sequence for job in jobs if job.estimator == "loose"} == {"laps", "drone"}
+
+
 def test_the_key_follows_data_options_and_configuration(tmp_path):
     (tmp_path / "drone").mkdir()
     table = tmp_path / "drone" / "imu.csv"
@@ -147,6 +157,7 @@ def test_relative_paths_begin_at_the_plan(tmp_path):
         (('outputs = ["graph"]', 'outputs = ["final"]'), "estimators.1.outputs.0: "),
         (('outputs = ["graph"]', "outputs = []"), "estimator 'tight' needs outputs"),
         (('name = "tight"', 'name = "loose"'), "two of kind estimator are called 'loose'"),
+        (('outputs = ["graph"]', 'sequences = ["lap"]'), "estimator 'tight': no sequence 'lap' in laps, drone"),
         (("seeds = [0, 3]", "seeds = [3, 3]"), "two of kind seed"),
         (("seeds = [0, 3]", "seeds = []"), "at least one seed"),
         (("values = [0.0, 0.1]", "values = []"), "axis 'delay' needs values"),
@@ -182,3 +193,18 @@ def test_settings_are_checked_before_anything_runs(tmp_path, change, message):
 def test_a_missing_plan_is_one_line(tmp_path):
     with pytest.raises(UsageError, match="cannot be read"):
         load_plan(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "experiments").glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_plans_are_valid(path):
+    plan = load_plan(path, {"VISLAM_DATA": "/data"})
+    jobs = expand(plan)
+    assert plan.name == path.stem
+    assert plan.members >= 6
+    assert len({job.label for job in jobs}) == len(jobs) > 0
+    for source in {job.source for job in jobs}:
+        scheme, name, options = split_source(source)
+        if is_world(scheme, name):
+            open_source(source, 0)
+        elif scheme.startswith("points:"):  # the data are absent here: its options are tried on a world
+            open_source(f"points:laps{options}", 0)

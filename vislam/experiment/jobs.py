@@ -57,6 +57,8 @@ def expand(plan: Plan) -> list[Job]:
         if source not in identities:
             identities[source] = source_identity(source)
         for index, estimator in enumerate(plan.estimators):
+            if estimator.sequences and sequence.name not in estimator.sequences:
+                continue
             where = f"plan '{plan.name}', sequence '{sequence.name}', estimator '{estimator.name}'"
             resolved = from_data(nested({**settings, **estimator.config, **_varied(plan, variant)}, where), where)
             for seed, member in itertools.product(plan.seeds, range(plan.members)):

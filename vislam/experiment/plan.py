@@ -21,7 +21,7 @@ Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.co
 Output = Literal["ekf", "live", "graph", "batch"]
 
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?")
-_NAME = re.compile(r"[\w.+ -]{1,60}")
+_NAME = re.compile(r"[\w.,+ \[\]%-]{1,60}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,7 @@ class Estimator:
     name: str
     config: Settings = field(default_factory=dict)
     outputs: tuple[Output, ...] = ("ekf", "live", "graph")  # filter and graph as they went, graph in the end
+    sequences: tuple[str, ...] = ()  # names of those that it can be run on; empty: all
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +130,9 @@ def _check(plan: Plan, where: str) -> None:
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise UsageError(f"{where}: two of kind {what} are called '{twice[0]}'; give each its own name")
         if what != "seed" and (odd := [name for name in names if not _NAME.fullmatch(name)]):
-            raise UsageError(f"{where}: '{odd[0]}' is no name of a {what}: letters, digits, and . _ + - or space")
+            raise UsageError(f"{where}: '{odd[0]}' is no name of a {what}: letters, digits, space and . , _ + - % [ ]")
     if not _NAME.fullmatch(plan.name) or "/" in plan.name:
-        raise UsageError(f"{where}: '{plan.name}' is no name of a plan: letters, digits, and . _ + - or space")
+        raise UsageError(f"{where}: '{plan.name}' is no name of a plan: letters, digits, space and . , _ + - % [ ]")
     if plan.members < 1 or plan.timeout_s <= 0.0:
         raise UsageError(f"{where}: members must be at least 1 and timeout_s positive")
     settings = [plan.config, *(s.config for s in plan.sequences), *(e.config for e in plan.estimators)]
@@ -144,9 +145,16 @@ def _check(plan: Plan, where: str) -> None:
             raise UsageError(f"{where}: axis '{axis.name}' needs either a setting or an option to vary")
         if not axis.values or len(set(map(repr, axis.values))) != len(axis.values):
             raise UsageError(f"{where}: axis '{axis.name}' needs values, each one once")
+    _check_estimators(plan, where)
+
+
+def _check_estimators(plan: Plan, where: str) -> None:
+    known = [sequence.name for sequence in plan.sequences]
     for estimator in plan.estimators:
         if not estimator.outputs or len(set(estimator.outputs)) != len(estimator.outputs):
             raise UsageError(f"{where}: estimator '{estimator.name}' needs outputs, each one once")
+        if unknown := sorted(set(estimator.sequences) - set(known)):
+            raise UsageError(f"{where}: estimator '{estimator.name}': no sequence '{unknown[0]}' in {', '.join(known)}")
 
 
 def nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:

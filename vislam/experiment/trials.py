@@ -107,6 +107,8 @@ def _trial(job: Job, output: str, result: dict[str, Any]) -> Trial:
     for name, value in ratios.items():
         if isinstance(value, dict):
             values[name], bounds[name] = value["mean"], (value["low"], value["high"])
+    if output == "batch" and "batch_failure" in result:
+        entry = {"failure": result["batch_failure"]}
     failure = result["reason"] if result["status"] != "ok" else entry.get("failure", "" if entry else "no trajectory")
     if not failure and values.get("completeness", 0.0) < _MIN_COMPLETE:
         failure = f"covers {values.get('completeness', 0.0):.0%} of the recording"
