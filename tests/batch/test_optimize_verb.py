@@ -125,6 +125,17 @@ def test_a_damaged_run_is_refused_and_stays_as_it_was(folder, statement, message
     assert digests(folder) == before
 
 
+def test_a_failed_optimisation_leaves_the_folder_as_it_was(folder, monkeypatch, capsys):
+    def fail(*_):
+        raise DataError("the run cannot be optimised: for this test")
+
+    monkeypatch.setattr("vislam.batch.optimize.solve", fail)
+    before = digests(folder)
+    assert run_verb(["optimize", str(folder)]) == 3
+    assert "cannot be optimised" in capsys.readouterr().err
+    assert digests(folder) == before
+
+
 def test_damaged_metrics_and_truth_are_refused_before_anything_is_written(folder):
     (folder / "metrics.json").write_text("[1, 2")
     with pytest.raises(DataError, match=r"metrics\.json"):
