@@ -21,6 +21,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +44,15 @@ MIN_VIEWS = 4  # before a peer's explicit landmark is triangulated
 
 
 def world(seed: int, args: argparse.Namespace) -> World:
+    """Return the world of a seed."""
     return World(Motion.random(seed), MONO, seed, duration_s=args.seconds, tracks=args.tracks)
 
 
 def run_ours(packets: list[KeyframePacket], start: NavState, keyframes: int) -> tuple[Array, list[float]]:
     """Return positions [N, 3] as they were when each keyframe was the newest, and seconds of CPU for each."""
-    window = SlidingWindow(replace(WindowConfig(), imu_inflation=1.0, keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2)
+    window = SlidingWindow(
+        replace(WindowConfig(), imu_inflation=1.0, keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2
+    )
     window.initialise(start)
     positions, times = [], []
     for packet in packets:
@@ -61,6 +65,8 @@ def run_ours(packets: list[KeyframePacket], start: NavState, keyframes: int) -> 
 
 @dataclass
 class Track:
+    """What a peer knows of a track."""
+
     views: list[tuple[int, Array]] = field(default_factory=list)  # keyframe, pixel
     slot: int = -1  # of its factor in the smoother
     in_graph: bool = False  # its landmark is a variable
@@ -119,7 +125,10 @@ class Peer:
             pim = g.PreintegratedCombinedMeasurementsG(self.params, self.bias)
             span = packet.imu
             dt = np.diff(span.t_ns) * 1e-9
-            accel, gyro = 0.5 * (span.accel_m_s2[1:] + span.accel_m_s2[:-1]), 0.5 * (span.gyro_rad_s[1:] + span.gyro_rad_s[:-1])
+            accel, gyro = (
+                0.5 * (span.accel_m_s2[1:] + span.accel_m_s2[:-1]),
+                0.5 * (span.gyro_rad_s[1:] + span.gyro_rad_s[:-1]),
+            )
             for i in range(len(dt)):
                 pim.integrateMeasurement(accel[i], gyro[i], dt[i])
             before = (g.symbol(c, k - 1) for c in "xvb")
@@ -170,7 +179,9 @@ class Peer:
                 continue
             if track.views[-1][0] < self.k or len(track.views) < 2:
                 continue
-            factor = g.SmartProjectionPoseFactorCal3_S2(self.pixel, self.calibration, self.T_body_cam, self.smart_params)
+            factor = g.SmartProjectionPoseFactorCal3_S2(
+                self.pixel, self.calibration, self.T_body_cam, self.smart_params
+            )
             for k, pixel in track.views:
                 factor.add(pixel, g.symbol("x", k))
             if track.slot >= 0:
@@ -222,6 +233,7 @@ class Peer:
 
 
 def run_peer(packets: list[KeyframePacket], start: NavState, keyframes: int, smart: bool) -> tuple[Array, list[float]]:
+    """Return positions and times of a peer, as `run_ours` does."""
     peer = Peer(start, keyframes, smart)
     positions, times = [], []
     for packet in packets:
@@ -248,12 +260,20 @@ def worker(args: argparse.Namespace) -> None:
 
 
 def compare(args: argparse.Namespace) -> None:
+    """Print one row per seed and estimator."""
     print(f"{args.seconds:.0f} s, {args.tracks} tracks, {args.keyframes} keyframes; CPU ms per keyframe, position in m")
     print(f"{'seed':>4} {'estimator':>10} {'median':>8} {'p99':>8} {'rmse':>8}")
     for seed in range(args.seeds):
         for estimator in ("ours", "smart", "landmarks"):
             command = [sys.executable, __file__, "worker", "--estimator", estimator, "--seed", str(seed)]
-            command += ["--seconds", str(args.seconds), "--tracks", str(args.tracks), "--keyframes", str(args.keyframes)]
+            command += [
+                "--seconds",
+                str(args.seconds),
+                "--tracks",
+                str(args.tracks),
+                "--keyframes",
+                str(args.keyframes),
+            ]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode != 0:
                 lines = done.stderr.strip().splitlines()
@@ -265,6 +285,7 @@ def compare(args: argparse.Namespace) -> None:
 
 
 def nees(args: argparse.Namespace) -> None:
+    """Print the consistency of the newest state over many runs."""
     from scipy.stats import chi2
 
     names = ("rotation", "position", "velocity", "gyro bias", "accel bias")
@@ -281,7 +302,7 @@ def nees(args: argparse.Namespace) -> None:
             part = slice(3 * i, 3 * i + 3)
             sums[i] += error[part] @ np.linalg.solve(P[part, part], error[part])
         sums[5] += error @ np.linalg.solve(P, error)
-        path = sum(np.linalg.norm(b[0][:3, 3] - a[0][:3, 3]) for a, b in zip(truths, truths[1:], strict=False))
+        path = sum(np.linalg.norm(b[0][:3, 3] - a[0][:3, 3]) for a, b in pairwise(truths))
         drift.append(float(np.linalg.norm(error[3:6]) / path))
     for label, total, dof in zip((*names, "all"), sums, (3, 3, 3, 3, 3, 15), strict=True):
         low, high = chi2.ppf([0.025, 0.975], dof * args.runs) / (dof * args.runs)
@@ -290,6 +311,7 @@ def nees(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
+    """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", choices=("compare", "nees", "worker"), default="compare")
     parser.add_argument("--seconds", type=float, default=20.0)

@@ -21,11 +21,12 @@ from vislam.window import visual
 from vislam.window.layout import CALIBRATION, STATE, Camera, Links, Prior
 from vislam.window.linear import columns_of_covariance
 from vislam.window.posterior import pose, scale_sigma
-from vislam.window.solver import optimise
+from vislam.window.solver import Problem, optimise
 from vislam.window.spans import information, jacobian_by_bias
 from vislam.window.tracks import TrackTable
 
 _RHO_START = 0.2  # 1/m
+_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,10 +101,13 @@ def solve(
     points = np.zeros((len(selection.slots), 3))
     fresh = np.ones(len(points), dtype=np.bool_)
     visual.start(X, calibration, selection.views, camera, fresh, _RHO_START, points)
+    held = np.zeros(count, dtype=np.bool_)
+    links, gauge = _links(problem, noise), _gauge(problem, config)
     solution = optimise(
-        X, X.copy(), np.zeros(count, dtype=np.bool_), points, calibration, selection.views, camera,
-        _links(problem, noise), _gauge(problem, config), gravity_m_s2, True, max_iterations, 1e-6,
-    )  # fmt: skip
+        Problem(X, X.copy(), held, points, calibration, selection.views, camera, links, gauge, gravity_m_s2, True),
+        max_iterations,
+        _TOLERANCE,
+    )
     poses_at = 9 * count
     index = np.concatenate([np.arange(poses_at, poses_at + 6 * count), np.arange(9), np.arange(poses_at - 9, poses_at)])
     joint = columns_of_covariance(solution.U, index)[index] if solution.ok else np.full((len(index),) * 2, np.nan)

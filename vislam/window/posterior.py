@@ -9,6 +9,8 @@ from vislam.geometry import skew, tangent_basis, transform
 from vislam.messages import Array, NavState
 from vislam.window.messages import WindowTilt
 
+_NO_MOTION_M = 1e-3
+
 
 @njit(cache=True, nogil=True)
 def edges(X: Array, poses: Array) -> tuple[Array, Array]:
@@ -58,19 +60,14 @@ def tilt(keyframe_id: int, x: Array, rotation_covariance: Array) -> WindowTilt:
 def scale_sigma(X: Array, poses: Array) -> float:
     """Return the relative sigma of the common scale of the positions; infinite where nothing moved.
 
-    The best linear estimate of a factor s on all displacements d from the first keyframe has the variance
-    1 / (d @ inv(P) @ d), P their joint covariance.
+    It is that of the least-squares factor on all displacements d from the first keyframe: the square root of
+    `d @ P @ d / (d @ d)**2`, P their joint covariance.
     """
     n = len(X) - 1
     d = (X[1:, 9:12] - X[0, 9:12]).ravel()
-    if n < 1 or float(np.max(np.abs(d))) < 1e-3:
+    if n < 1 or float(np.max(np.abs(d))) < _NO_MOTION_M:
         return float("inf")
+    by_positions = np.concatenate([-d.reshape(n, 3).sum(axis=0), d])
     index = (6 * np.arange(n + 1)[:, None] + np.arange(3, 6)).ravel()
-    joint = poses[np.ix_(index, index)]
-    from_first = joint[3:, 3:] - np.tile(joint[:3, 3:], (n, 1)) - np.tile(joint[3:, :3], (1, n))
-    from_first = from_first + np.tile(joint[:3, :3], (n, n))
-    try:
-        certainty = float(d @ np.linalg.solve(from_first, d))
-    except np.linalg.LinAlgError:
-        return float("inf")
-    return 1.0 / np.sqrt(certainty) if certainty > 0.0 else float("inf")
+    variance = float(by_positions @ poses[np.ix_(index, index)] @ by_positions)
+    return float(np.sqrt(max(variance, 0.0)) / (d @ d))

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from vislam.geometry import so3_exp, so3_log
 from vislam.messages import Array
-from vislam.window import inertial as links_of
-from vislam.window import linear, visual
-from vislam.window.layout import CALIBRATION, Camera, Links, Prior, Views, positions, prior_positions, retract
+from vislam.window import inertial, linear, visual
+from vislam.window.layout import CALIBRATION, Camera, Ints, Links, Prior, Views, positions, prior_positions, retract
 
 _MAX_TRIES = 8  # of damping, each ten times the last
 _FIRST_DAMPING = 1e-4  # relative to the diagonal
 _MAX_RHO = 20.0  # 1/m: nothing is seen nearer than 5 cm
-
-_links_cost, _links_linearise, _prior_shift = links_of.cost, links_of.linearise, links_of.prior_shift
-_views_cost, _views_linearise = visual.cost, visual.linearise
-_eliminate, _follow = visual.eliminate, visual.follow
-_factorise, _solve = linear.factorise, linear.solve
 
 
 class Solution(NamedTuple):
@@ -36,13 +32,140 @@ class Solution(NamedTuple):
     ok: bool  # False: the system stayed indefinite, or something is not finite
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _prior_cost(prior: Prior, dx: Array) -> float:
-    return float(prior.b @ dx + 0.5 * (dx @ (prior.H @ dx)))
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Everything that is minimised over, and where it starts.
+
+    States that are `held` are linearised at `X_first`, as the prior that touches them was. The prior speaks of the
+    first keyframes, around `X_first`. `full` is with velocities and biases, else poses alone.
+    """
+
+    X: Array  # [M, 21]
+    X_first: Array  # [M, 21]
+    held: NDArray[np.bool_]  # [M]
+    points: Array  # [L, 3]
+    calibration: Array  # [5]
+    views: Views
+    camera: Camera
+    links: Links
+    prior: Prior
+    gravity_m_s2: float
+    full: bool
+
+
+@dataclass(slots=True, eq=False)
+class _Estimate:
+    X: Array
+    points: Array
+    calibration: Array
+    dx: Array  # from where the prior was linearised
+    squares: Array
+    cost: float
+
+
+def optimise(problem: Problem, max_iterations: int, tolerance: float) -> Solution:
+    """Minimise the robust cost; `tolerance` is the relative decrease below which it has converged."""
+    equations = _Equations(problem)
+    now = equations.start()
+    ok, done, iterations, damping = True, False, 0, 0.0
+    while not done and iterations < max_iterations:
+        iterations += 1
+        equations.linearise(now)
+        new, solved = None, False
+        for _ in range(_MAX_TRIES):
+            solved = equations.solve(damping)
+            new = equations.moved(now) if solved else None
+            if new is not None and new.cost <= now.cost + (tolerance if damping == 0.0 else 0.0) * abs(now.cost):
+                break
+            damping, new = max(10.0 * damping, _FIRST_DAMPING), None
+        if new is None or new.cost > now.cost:  # first estimates: the last step may lead up by a hair
+            ok = solved
+            break
+        done = now.cost - new.cost < tolerance * (1.0 + abs(new.cost))
+        now, damping = new, 0.0 if damping < 10.0 * _FIRST_DAMPING else 0.1 * damping
+    ok = (
+        ok
+        and (equations.undamped or equations.solve(0.0))
+        and bool(np.isfinite(now.X).all())
+        and bool(np.isfinite(now.cost))
+    )
+    return Solution(now.X, now.points, now.calibration, equations.U, now.squares, now.cost, iterations, ok)
+
+
+class _Equations:
+    """The normal equations of a problem and room to solve them."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        count, landmarks = len(problem.X), len(problem.points)
+        self._size = 15 if problem.full else 6
+        self._poses_at = 9 * count if problem.full else 0
+        D = self._size * count + CALIBRATION
+        self._where = positions(count, problem.full)
+        self._held_by_prior = (len(problem.prior.b) - CALIBRATION) // self._size
+        self._prior_where = prior_positions(count, self._held_by_prior, problem.full)
+        self._A, self._g = np.empty((D, D)), np.empty(D)
+        self.U = np.empty((D, D))  # the factor of what was solved last
+        self.undamped = False  # and whether that was the system itself
+        self._step = np.empty(D)
+        self._blocks, self._inverses = np.empty((landmarks, 3, 3)), np.empty((landmarks, 3, 3))
+        self._gradients = np.empty((landmarks, 3))
+        self._cross = np.empty((landmarks, 3, D - self._poses_at))
+
+    def start(self) -> _Estimate:
+        p = self._problem
+        return self._estimate(p.X, p.points, p.calibration)
+
+    def linearise(self, now: _Estimate) -> None:
+        p, A, g = self._problem, self._A, self._g
+        A[:], g[:] = 0.0, 0.0
+        add_prior(p.prior, now.dx, self._prior_where, A, g)
+        count = len(now.X)
+        inertial.linearise(
+            now.X, p.X_first, p.held, p.links, p.gravity_m_s2, self._where, count - 1, count, A, g
+        )  # fmt: skip
+        fixed = len(g) - CALIBRATION + np.flatnonzero(~p.camera.active)
+        A[fixed, fixed] += 1.0
+        visual.linearise(
+            now.X, p.X_first, p.held, now.points, now.calibration, p.views, p.camera, self._poses_at,
+            A, g, self._blocks, self._gradients, self._cross,
+        )  # fmt: skip
+
+    def solve(self, damping: float) -> bool:
+        """Solve the damped equations; False if they are indefinite."""
+        S, s = self.U, self._g.copy()
+        S[:] = self._A
+        np.fill_diagonal(S, np.diag(S) * (1.0 + damping))
+        if not visual.eliminate(
+            self._inverses, self._blocks, self._gradients, self._cross, damping, self._poses_at, S, s
+        ) or not linear.factorise(S):
+            self.undamped = False
+            return False
+        self._step, self.undamped = linear.solve(S, -s), damping == 0.0
+        return True
+
+    def moved(self, now: _Estimate) -> _Estimate | None:
+        """Return the estimate after the step; None if it is not finite."""
+        step = self._step
+        if not np.isfinite(step).all():
+            return None
+        X, points = moved_states(now.X, step, self._where), np.empty_like(now.points)
+        visual.follow(now.points, self._inverses, self._gradients, self._cross, step[self._poses_at :], points)
+        np.minimum(points[:, 2], _MAX_RHO, out=points[:, 2])
+        calibration = move_calibration(now.calibration, step[-CALIBRATION:], self._problem.camera.active)
+        return self._estimate(X, points, calibration)
+
+    def _estimate(self, X: Array, points: Array, calibration: Array) -> _Estimate:
+        p = self._problem
+        dx = inertial.prior_shift(X, p.X_first, calibration, p.prior.calibration, self._held_by_prior, self._size)
+        squares = np.zeros((len(p.views.xy), 2))
+        cost = visual.cost(X, points, calibration, p.views, p.camera, squares)
+        cost += inertial.cost(X, p.links, p.gravity_m_s2) + float(p.prior.b @ dx + 0.5 * (dx @ (p.prior.H @ dx)))
+        return _Estimate(X, points, calibration, dx, squares, cost)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_prior(prior: Prior, dx: Array, where: np.ndarray, A: Array, g: Array) -> None:
+def add_prior(prior: Prior, dx: Array, where: Ints, A: Array, g: Array) -> None:
     """Add the prior at shift `dx` to the upper triangle of the normal equations A, g."""
     gradient = prior.b + prior.H @ dx
     for i in range(len(where)):
@@ -56,7 +179,7 @@ def add_prior(prior: Prior, dx: Array, where: np.ndarray, A: Array, g: Array) ->
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move_calibration(calibration: Array, step: Array, active: np.ndarray) -> Array:
+def move_calibration(calibration: Array, step: Array, active: NDArray[np.bool_]) -> Array:
     """Return the calibration [5] after a step [5]; what is not estimated stays."""
     out = calibration.copy()
     if active[0]:
@@ -69,111 +192,12 @@ def move_calibration(calibration: Array, step: Array, active: np.ndarray) -> Arr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def optimise(  # noqa: PLR0912, PLR0915 (compiled as one, so that the loop never leaves machine code)
-    X: Array,
-    X_first: Array,
-    held: np.ndarray,
-    points: Array,
-    calibration: Array,
-    views: Views,
-    camera: Camera,
-    links: Links,
-    prior: Prior,
-    gravity_m_s2: float,
-    full: bool,
-    max_iterations: int,
-    tolerance: float,
-) -> Solution:
-    """Minimise the robust cost of views, links and prior.
-
-    Args:
-        X: start [M, 21].
-        X_first: where states are linearised that the prior holds, [M, 21]; the first n of them.
-        held: which they are [M]. Give none held to have the prior without fixing derivatives (batch).
-        points: start of the landmarks [L, 3].
-        calibration: start [5].
-        views: observations.
-        camera: geometry and timing.
-        links: between keyframes.
-        prior: on calibration and the first keyframes.
-        gravity_m_s2: along -z.
-        full: with velocities and biases, else poses alone.
-        max_iterations: of Gauss-Newton.
-        tolerance: relative decrease of the cost below which it has converged.
-    """
-    count = len(X)
-    size = 15 if full else 6
-    D = size * count + CALIBRATION
-    poses_at = 9 * count if full else 0
-    where = positions(count, full)
-    prior_held = (len(prior.b) - CALIBRATION) // size
-    prior_where = prior_positions(count, prior_held, full)
-    A, S, g, s = np.empty((D, D)), np.empty((D, D)), np.empty(D), np.empty(D)
-    L = len(points)
-    A_points, inverses, g_points = np.empty((L, 3, 3)), np.empty((L, 3, 3)), np.empty((L, 3))
-    cross = np.empty((L, 3, D - poses_at))
-    squares, new_squares = np.zeros((len(views.xy), 2)), np.zeros((len(views.xy), 2))
-    X, points, calibration = X.copy(), points.copy(), calibration.copy()
-    new_points = points.copy()
-    dx = _prior_shift(X, X_first, calibration, prior.calibration, prior_held, size)
-    views_cost = _views_cost(X, points, calibration, views, camera, squares)
-    now = views_cost + _links_cost(X, links, gravity_m_s2) + _prior_cost(prior, dx)
-    done, ok, iterations, damping = False, True, 0, 0.0
-    while not done and iterations < max_iterations:
-        iterations += 1
-        A[:] = 0.0
-        g[:] = 0.0
-        add_prior(prior, dx, prior_where, A, g)
-        _links_linearise(X, X_first, held, links, gravity_m_s2, where, count - 1, count, A, g)
-        for i in range(CALIBRATION):
-            if not camera.active[i]:
-                at = D - CALIBRATION + i
-                A[at, at] += 1.0
-        _views_linearise(
-            X, X_first, held, points, calibration, views, camera, poses_at, A, g, A_points, g_points, cross
-        )
-        accepted = False
-        for _ in range(_MAX_TRIES):
-            S[:] = A
-            s[:] = g
-            for i in range(D):
-                S[i, i] *= 1.0 + damping
-            solved = _eliminate(inverses, A_points, g_points, cross, damping, poses_at, S, s) and _factorise(S)
-            if solved:
-                step = _solve(S, -s)
-                new_X = X.copy()
-                for k in range(count):
-                    d = np.empty(size)
-                    for i in range(size):
-                        d[i] = step[where[k, i]]
-                    retract(new_X[k], d)
-                new_calibration = move_calibration(calibration, step[D - CALIBRATION :], camera.active)
-                _follow(points, inverses, g_points, cross, step[poses_at:], new_points)
-                for p in range(L):
-                    new_points[p, 2] = min(new_points[p, 2], _MAX_RHO)
-                new_dx = _prior_shift(new_X, X_first, new_calibration, prior.calibration, prior_held, size)
-                new_views = _views_cost(new_X, new_points, new_calibration, views, camera, new_squares)
-                new = new_views + _links_cost(new_X, links, gravity_m_s2) + _prior_cost(prior, new_dx)
-                if new <= now + 1e-9 * abs(now):
-                    accepted = True
-                    break
-                if now + tolerance * (1.0 + views_cost) > new and damping == 0.0:
-                    break  # no worse than noise: converged as far as first estimates allow
-            damping = max(10.0 * damping, _FIRST_DAMPING)
-        if not accepted:
-            done = True
-            ok = solved
-        else:
-            done = now - new < tolerance * (1.0 + new_views)
-            X, points, calibration, dx, now, views_cost = (
-                new_X, new_points.copy(), new_calibration, new_dx, new, new_views,
-            )  # fmt: skip
-            squares[:] = new_squares
-            if damping > 0.0:
-                damping = 0.0 if damping < 10.0 * _FIRST_DAMPING else 0.1 * damping
-    if ok:  # the covariance is that of the undamped system
-        S[:] = A
-        s[:] = g
-        ok = _eliminate(inverses, A_points, g_points, cross, 0.0, poses_at, S, s) and _factorise(S)
-    ok = ok and bool(np.isfinite(X).all()) and bool(np.isfinite(now))
-    return Solution(X, points, calibration, S, squares, now, iterations, ok)
+def moved_states(X: Array, step: Array, where: Ints) -> Array:
+    """Return the states [M, 21] after a step [D]; `where` [M, S] says which unknowns are whose."""
+    out = X.copy()
+    d = np.empty(where.shape[1])
+    for k in range(len(X)):
+        for i in range(len(d)):
+            d[i] = step[where[k, i]]
+        retract(out[k], d)
+    return out

@@ -170,17 +170,15 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
 def _derivative(w: Array, views: Views, n: int, own: int, rho: float, same: bool, J: Array) -> None:
     """Fill J [3, 20], the derivative of view n's whitened error, from the chain in the scratch space.
 
+    Without a depth, its third row is left as it was.
+
     A row of the derivative is carried back through the frames, as the landmark was carried forth.
     """
     at = _CAMS + 4 * views.camera[n]
     z = w[_F_CAM, 2]
     x, y = w[_F_CAM, 0] / z, w[_F_CAM, 1] / z
     depth_weight = views.depth_weight[n]
-    for k in range(3):
-        if k == 2 and depth_weight == 0.0:
-            for i in range(COLUMNS):
-                J[k, i] = 0.0
-            continue
+    for k in range(3 if depth_weight > 0.0 else 2):
         if k < 2:
             w[_BY_CAM, 0], w[_BY_CAM, 1] = views.white[n, k, 0] / z, views.white[n, k, 1] / z
             w[_BY_CAM, 2] = -(w[_BY_CAM, 0] * x + w[_BY_CAM, 1] * y)

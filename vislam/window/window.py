@@ -26,12 +26,16 @@ from vislam.window.linear import columns_of_covariance, trailing_covariance
 from vislam.window.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowTilt, WindowUpdate
 from vislam.window.posterior import edges, nav_state, pose, scale_sigma, tilt
-from vislam.window.solver import Solution, optimise
+from vislam.window.solver import Problem, Solution, optimise
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import Selection, TrackTable, check_observations
 
 _RHO_START = 0.2  # 1/m: 5 m, where nothing is known
 _UNKNOWN_SPEED_M_S = 0.5  # a velocity less certain than this predicts worse than odometry does
+_SURE_SPEED_M_S = 0.3  # until velocity is known so well, the window is still finding its feet:
+_SURE_KEYFRAMES = 6  # nothing is rejected, calibration waits, and landmarks start afresh with each keyframe
+_MAX_SPEED_M_S = 300.0  # a prediction that is faster is nonsense to restart from
+_UNSURE_EFFORT = 5  # times the iterations
 _MAX_OFFSET_S = 0.1  # a residual time offset beyond this is a wrong clock, not a late camera
 
 
@@ -66,6 +70,8 @@ class SlidingWindow:
         self._tracks = TrackTable(config, rig)
         self._links = LinkStore(config, noise, gravity_m_s2)
         self._last_edges: list[WindowEdge] = []
+        self._sure: bool = False
+        self._start_variances: Array = np.zeros(CALIBRATION)
         self._start: NavState | None = None
         self._T_start: Array | None = None
         self._initialised = False
@@ -109,14 +115,15 @@ class SlidingWindow:
         if not solution.ok:
             return self._restart(packet)
         self._take(selection, solution)
-        rejected = self._reject(selection, solution)
         posterior = self._posterior(solution)
+        rejected = self._reject(selection, solution)
         T_edges, P_edges = edges(self._X, posterior.poses)
         if not self._measures_scale:
             sigma = scale_sigma(self._X, posterior.poses)
             self._scale_sigma = sigma if np.isfinite(sigma) else self._scale_sigma
         newest = self._newest(posterior)
         calibration = self._calibration_estimate(posterior)
+        self._sure = self._sure or not self._full or self._found_its_feet()
         settled: list[WindowEdge] = []
         tilts: list[WindowTilt] = []
         states: list[tuple[int, NavState]] = []
@@ -154,6 +161,8 @@ class SlidingWindow:
         self._prior: Prior | None = None
         self._speed_sigma_m_s = 0.0
         self._last_edges = []
+        self._sure = False
+        self._start_variances = np.zeros(CALIBRATION)
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
 
@@ -193,7 +202,7 @@ class SlidingWindow:
         self._t_ns = np.append(self._t_ns, packet.keyframe.t_ns)
         self._X = np.vstack([self._X, x])
         self._X_first = np.vstack([self._X_first, x])
-        self._held = np.append(self._held, first)  # the first prior is linearised there
+        self._held = np.append(self._held, False)
         self._gyro = np.vstack([self._gyro, gyro])
         self._applied = np.append(self._applied, packet.time_offset_s)
         self._T_odom.append(None if T_odom_body is None else T_odom_body.copy())
@@ -207,7 +216,8 @@ class SlidingWindow:
         sigmas = np.array(
             [config.time_offset_sigma_s, *[np.deg2rad(config.rotation_sigma_deg)] * 3, config.readout_sigma_s]
         )
-        sigmas *= self._active()
+        sigmas *= self._wanted()
+        self._start_variances = sigmas**2
         if self._full:
             assert self._start is not None
             T = self._start.T_world_body
@@ -265,6 +275,11 @@ class SlidingWindow:
     # ---- the solution
 
     def _active(self) -> NDArray[np.bool_]:
+        """Return which calibration the solver may move now."""
+        return self._wanted() & self._sure
+
+    def _wanted(self) -> NDArray[np.bool_]:
+        """Return which calibration is to be estimated."""
         config = self._config
         return np.array(
             [
@@ -292,6 +307,8 @@ class SlidingWindow:
         selection = self._tracks.select(self._ids)
         hosts = self._ids[selection.views.host]
         fresh = self._tracks.host[selection.slots] != hosts
+        if not self._sure:
+            fresh[:] = True
         if fresh.any():
             points = self._tracks.points[selection.slots]
             visual.start(self._X, self._calibration, selection.views, self._camera(), fresh, _RHO_START, points)
@@ -302,11 +319,12 @@ class SlidingWindow:
     def _optimise(self, selection: Selection) -> Solution:
         assert self._prior is not None
         self._links.refresh(self._X[:, 15:])
-        return optimise(
+        problem = Problem(
             self._X, self._X_first, self._held, self._tracks.points[selection.slots], self._calibration,
             selection.views, self._camera(), self._links.arrays, self._prior, self._gravity_m_s2, self._full,
-            self._config.iterations, self._config.tolerance,
         )  # fmt: skip
+        iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
+        return optimise(problem, iterations, self._config.tolerance)
 
     def _take(self, selection: Selection, solution: Solution) -> None:
         self._X = solution.X
@@ -318,7 +336,7 @@ class SlidingWindow:
     def _reject(self, selection: Selection, solution: Solution) -> int:
         """Take out observations beyond the gate, and tracks with too many of them; return how many tracks."""
         bad = solution.squares.max(axis=1, initial=0.0) > self._gate
-        if not bad.any():
+        if not self._sure or not bad.any():
             return 0
         first = selection.views.first
         counts = np.add.reduceat(bad.astype(np.int64), first[:-1])
@@ -351,13 +369,17 @@ class SlidingWindow:
         return nav_state(int(self._t_ns[-1]), self._X[-1], covariance)
 
     def _calibration_estimate(self, posterior: _Posterior) -> CalibrationEstimate:
-        sigmas = np.sqrt(np.diag(posterior.calibration)) * self._active()
+        sigmas = np.sqrt(np.diag(posterior.calibration) if self._active().any() else self._start_variances)
+        sigmas = sigmas * self._wanted()
         c = self._calibration
         applied = float(self._applied[-1])
-        offset_s = float(c[0]) if self._active()[0] else applied
+        offset_s = float(c[0]) if self._wanted()[0] else applied
         return CalibrationEstimate(
             offset_s, float(sigmas[0]), c[1:4].copy(), sigmas[1:4], float(c[4]), float(sigmas[4])
         )  # fmt: skip
+
+    def _found_its_feet(self) -> bool:
+        return len(self._ids) >= _SURE_KEYFRAMES and self._speed_sigma_m_s < _SURE_SPEED_M_S
 
     # ---- what leaves
 
@@ -411,11 +433,15 @@ class SlidingWindow:
         )
         covariance = np.diag(wide**2)
         known = {(e.from_id, e.to_id): e.covariance for e in self._last_edges}
+        dt_s = float(self._t_ns[-1] - self._t_ns[-2]) * 1e-9 if len(ids) > 1 else 0.0
+        x = self._X[-1]
+        if len(ids) > 1 and not np.abs(x[9:12] - self._X[-2, 9:12]).max() < _MAX_SPEED_M_S * dt_s:  # NaN too
+            x = self._X[-1] = self._X[-2]
         settled = tuple(
             WindowEdge(a, b, invert(pose(xa)) @ pose(xb), known.get((a, b), covariance[:6, :6]), True)
             for a, b, xa, xb in zip(ids[:-1].tolist(), ids[1:].tolist(), self._X[:-1], self._X[1:], strict=True)
         )
-        state = nav_state(packet.keyframe.t_ns, self._X[-1], covariance)
+        state = nav_state(packet.keyframe.t_ns, x, covariance)
         self.initialise(state if self._full else None, state.T_world_body)
         self._push(packet, None)
         return WindowUpdate(
