@@ -109,7 +109,7 @@ class InitConfig:
     attempt_s: float = 0.3  # between attempts: one costs up to 0.1 s, and a window changes little in this time
     max_nodes: int = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
     mono_max_nodes: int = 20  # the same without scale, where every node also carries its sightings of points
-    max_points: int = 80  # monocular: points solved for; more cost time and hardly sharpen scale
+    max_points: int = 60  # monocular: points solved for; more cost time and hardly sharpen scale
     min_points: int = 20  # monocular: fewer leave too little redundancy to tell a wrong one
     min_parallax_px: float = 12.0  # monocular: median over the points; below, depth and so scale drown in noise
     min_excitation_m_s2: float = 0.15  # monocular: rms change of acceleration; less is also what vibration leaves
@@ -118,7 +118,7 @@ class InitConfig:
     time_offset_sigma_s: float = 0.015  # of that; drivers that stamp on arrival are off by up to 30 ms
     time_offset_settled_s: float = 0.0005  # sigma at which the estimate is final
     time_offset_min_s: float = 0.001  # smaller corrections are not worth a step in time
-    max_time_offset_sigma_s: float = 0.003  # worse is not applied; a metric start waits for it, but no longer than its window
+    max_time_offset_sigma_s: float = 0.003  # a metric start waits for this, but no longer than its window: 1 m/s makes it 3 mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +166,7 @@ class EkfConfig:
     tight_min_range_m: float = 0.1
     tight_max_range_m: float = 200.0  # beyond, nothing but rotation is seen
     tight_still_px: float = 1.0  # image motion between clones below which the older one is kept instead of the newer
+    tight_min_interval_s: float = 0.03  # between clones; a fast camera would leave a window too short for parallax
     tight_rest_sigma_m: float = 0.002  # sway against the pose at which rest began
     tight_rest_sigma_deg: float = 0.05
     tight_imu_inflation: float = 4.0  # on the white-noise sigmas, as in `imu_inflation`

@@ -42,7 +42,9 @@ class Feed:
         motion, rng = Motion.random(seed), np.random.default_rng(seed)
         samples, _ = motion.samples(duration_s, 200.0, QUIET, rng, GYRO_BIAS, ACCEL_BIAS)
         stamps = [T0_NS + 50_000_000 * k + 1_000_000 for k in range(int(duration_s * 20) - 1)]
-        return Feed(samples, stamps, SimulatedVision().motions([motion.pose((t - T0_NS) / NS) for t in stamps], stamps, rng))
+        return Feed(
+            samples, stamps, SimulatedVision().motions([motion.pose((t - T0_NS) / NS) for t in stamps], stamps, rng)
+        )
 
     @staticmethod
     def still(duration_s: float = 2.0, gravity: float = GRAVITY_M_S2) -> Feed:

@@ -109,11 +109,11 @@ class CameraClock:
         return self._change()
 
     def _change(self) -> int:
-        found, config = self._offset.estimate, self._config
+        found = self._offset.estimate
         target_ns = round(found.offset_s * _NS)
         shift_ns = target_ns - self.applied_ns
-        needed_s = max(_SIGNIFICANT * found.sigma_s, config.time_offset_min_s)
-        if found.sigma_s > config.max_time_offset_sigma_s or abs(shift_ns) < needed_s * _NS:
+        needed_s = max(_SIGNIFICANT * found.sigma_s, self._config.time_offset_min_s)
+        if abs(shift_ns) < needed_s * _NS:
             return 0
         shift_ns = max(shift_ns, -round(_MOST_BACK * self._interval_ns))
         self.applied_ns += shift_ns

@@ -37,8 +37,10 @@ _PLACED = 5.0  # information on a point's distance against what noise alone woul
 _NEAR = 0.02  # of the median distance; nearer points are weighted as if there
 _HUBER = 2.0  # standard deviations
 _OUTLIER = 3.5  # standard deviations of one observation, after convergence
-_ROUNDS = 20  # of Levenberg-Marquardt; 5 to 8 are usual
-_SETTLED = 1e-3  # relative change of cost
+_ROUNDS = 25  # of Levenberg-Marquardt; 5 to 10 are usual
+_ROUGH = 2.0  # change of cost, chi-square, that ends the rounds before outliers are dropped
+_SETTLED = 0.02  # the same at the end: scale lies in a flat valley, along which steps change the cost little
+_ENOUGH = 3  # steps
 _FLOOR = 1e-10  # variance added to inertial pieces, which may claim to be exact
 _RHO_MIN, _RHO_MAX = 1e-3, 20.0  # 1/m, of the points at the start
 
@@ -303,7 +305,7 @@ def refine_tracks(window: Window, tracks: Tracks, path: InertialPath, start: Sta
     used = np.ones(len(tracks.xy), dtype=np.bool_)
     problem = _Problem(window, tracks, pieces, used, offset_sigma_s)
     for _ in range(2):
-        state, system = problem.minimise(state)
+        state, _ = problem.minimise(state, _ROUGH)
         residuals = problem.residuals(state)
         spread = 1.4826 * float(np.median(np.abs(residuals[used]))) * problem.tracks.sigma_xy
         # corners jump by more than they scatter; the floor keeps a lucky window from looking exact
@@ -311,7 +313,7 @@ def refine_tracks(window: Window, tracks: Tracks, path: InertialPath, start: Sta
         gate = _OUTLIER * sigma / problem.tracks.sigma_xy
         used = np.asarray(np.max(np.abs(residuals), axis=1) < gate)
         problem = _Problem(window, replace(tracks, sigma_xy=sigma), pieces, used, offset_sigma_s)
-    state, system = problem.minimise(state)
+    state, system = problem.minimise(state, _SETTLED)
     return _solution(problem, state, system, used)
 
 
@@ -347,9 +349,9 @@ class _Problem:
         rates = [span.gyro_rad_s[0] for span in window.spans]
         self._rates = np.array([*rates, window.spans[-1].gyro_rad_s[-1]])
 
-    def minimise(self, state: _State) -> tuple[_State, NormalEquations]:
+    def minimise(self, state: _State, settled: float) -> tuple[_State, NormalEquations]:
         """Levenberg-Marquardt; the system returned is that of the solution, points eliminated, without damping."""
-        damping = 1e-4
+        damping, good, change = 1e-4, 0, np.inf
         system, back = self._build(state, damping)
         for _ in range(_ROUNDS):
             diagonal = np.arange(len(system.g))
@@ -366,8 +368,13 @@ class _Problem:
                 continue
             state, system, back = candidate, better, better_back
             damping = max(0.1 * damping, 1e-9)
-            if change <= _SETTLED * (1.0 + system.cost):
+            good += 1
+            if change <= settled:
                 return state, system
+        if (
+            good >= _ENOUGH and abs(change) < _ROUGH
+        ):  # the time offset's part of the gradient is approximate, which can end the descent early
+            return state, system
         raise np.linalg.LinAlgError("Levenberg-Marquardt does not settle")
 
     def residuals(self, state: _State) -> Array:
@@ -482,7 +489,7 @@ def _visual_system(
         inverses[k] = np.linalg.inv(block)
         heads[k] = head
         _eliminate(H, g, links[k], inverses[k], head, node[begin[k] : begin[k + 1]], a)
-    return H, g, cost, inverses, heads, links, residuals
+    return np.tril(H) + np.tril(H, -1).T, g, cost, inverses, heads, links, residuals
 
 
 @njit(cache=True, nogil=True)
@@ -527,7 +534,7 @@ def _add_rows(
 
 @njit(cache=True, nogil=True)
 def _eliminate(H: Array, g: Array, link: Array, inverse: Array, head: Array, seen_by: Ints, anchor: int) -> None:
-    """Take the point out of the system: only columns of nodes that see it, and the time offset, change."""
+    """Take the point out of the system's lower triangle: columns of nodes that see it, and the time offset."""
     count = len(seen_by)
     columns = np.empty(6 * count + 1, dtype=np.int64)
     for n in range(count):
@@ -546,7 +553,7 @@ def _eliminate(H: Array, g: Array, link: Array, inverse: Array, head: Array, see
         row = columns[c]
         l0, l1, l2 = link[0, row], link[1, row], link[2, row]
         g[row] -= through[0, c] * head[0] + through[1, c] * head[1] + through[2, c] * head[2]
-        for e in range(len(columns)):
+        for e in range(c + 1):  # columns ascend: the lower triangle
             H[row, columns[e]] -= l0 * through[0, e] + l1 * through[1, e] + l2 * through[2, e]
 
 

@@ -159,7 +159,8 @@ def _integrate(t_s: Array, gyro: Array, bias: Array) -> tuple[Array, Array]:
 @njit(cache=True, nogil=True)
 def _at(t: float, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array) -> tuple[Array, Array, Array]:
     """Return attitude, its integral and rate at a time inside the samples."""
-    k = min(max(np.searchsorted(t_s, t) - 1, 0), len(t_s) - 2)
+    k = int(np.searchsorted(t_s, t)) - 1
+    k = min(max(k, 0), len(t_s) - 2)
     h = t - t_s[k]
     rate = gyro[k] + (gyro[k + 1] - gyro[k]) * (h / (t_s[k + 1] - t_s[k]))
     turned = R[k] @ so3_exp((0.5 * (gyro[k] + rate) - bias) * h)
