@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import skew, so3_exp, so3_left_jacobian
 from vislam.messages import Array
 
 NOMINAL = 23
@@ -49,6 +48,24 @@ def _right_jacobian(x: float, y: float, z: float, scale: float, J: Array) -> Non
     J[2, 0] = scale * (0.5 * y + x * z / 6.0)
     J[1, 2] = scale * (0.5 * x + y * z / 6.0)
     J[2, 1] = scale * (-0.5 * x + y * z / 6.0)
+
+
+@njit(cache=True, nogil=True)
+def _left_jacobian(x: float, y: float, z: float, J: Array) -> None:
+    """J = J_l([x, y, z]), at any angle."""
+    t2 = x * x + y * y + z * z
+    t = math.sqrt(t2)
+    a = 0.5 - t2 / 24.0 if t < 1e-3 else (1.0 - math.cos(t)) / t2
+    b = 1.0 / 6.0 - t2 / 120.0 if t < 1e-3 else (t - math.sin(t)) / (t2 * t)
+    J[0, 0] = 1.0 - b * (y * y + z * z)
+    J[1, 1] = 1.0 - b * (x * x + z * z)
+    J[2, 2] = 1.0 - b * (x * x + y * y)
+    J[0, 1] = -a * z + b * x * y
+    J[1, 0] = a * z + b * x * y
+    J[0, 2] = a * y + b * x * z
+    J[2, 0] = -a * y + b * x * z
+    J[1, 2] = -a * x + b * y * z
+    J[2, 1] = a * x + b * y * z
 
 
 @njit(cache=True, nogil=True)
@@ -253,8 +270,12 @@ def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Arra
     A = np.eye(ERRORS) - K @ H
     d = K @ residual
     G = np.eye(ERRORS)  # from the error about the old state to that about the new
-    _move(x, d, G, 6, 0, ((0, 3), (3, 6)))
-    _move(x, d, G, 19, 15, ((16, 18),))
+    R, J = np.empty((3, 3)), np.empty((3, 3))
+    _begin_move(x, d, G, 6, 0, R, J)
+    _move(x, d, G, 0, 3, 0, R, J)
+    _move(x, d, G, 3, 6, 0, R, J)
+    _begin_move(x, d, G, 19, 15, R, J)
+    _move(x, d, G, 16, 18, 15, R, J)
     for i in range(3):
         x[10 + i] += d[12 + i]
         x[13 + i] += d[9 + i]
@@ -265,17 +286,37 @@ def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Arra
 
 
 @njit(cache=True, nogil=True)
-def _move(x: Array, d: Array, G: Array, at_q: int, row: int, vectors: tuple[tuple[int, int], ...]) -> None:
-    """Correct the rotation whose error is at `row`, and the vectors (place in x, place of error) that turn with it."""
-    turned = d[row : row + 3].copy()
-    R = pose(x, 0, at_q)[:3, :3].copy()
-    along = so3_left_jacobian(R @ turned)
-    G[row : row + 3, row : row + 3] = so3_exp(-turned)
-    for at_x, at_error in vectors:
-        moved = along @ d[at_error : at_error + 3].copy()
-        x[at_x : at_x + 3] += moved
-        G[at_error : at_error + 3, row : row + 3] = -skew(moved) @ R
-    turn(x, at_q, turned[0], turned[1], turned[2])
+def _begin_move(x: Array, d: Array, G: Array, at_q: int, row: int, R: Array, J: Array) -> None:
+    """Correct the rotation at `at_q` by the error at `row`; give R as it was, and the left Jacobian in world axes."""
+    _rotation(x[at_q], x[at_q + 1], x[at_q + 2], x[at_q + 3], R)
+    rx, ry, rz = d[row], d[row + 1], d[row + 2]
+    angle = math.sqrt(rx * rx + ry * ry + rz * rz)
+    s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
+    _rotation(math.cos(0.5 * angle), -s * rx, -s * ry, -s * rz, J)
+    for i in range(3):
+        for j in range(3):
+            G[row + i, row + j] = J[i, j]
+    wx = R[0, 0] * rx + R[0, 1] * ry + R[0, 2] * rz
+    wy = R[1, 0] * rx + R[1, 1] * ry + R[1, 2] * rz
+    wz = R[2, 0] * rx + R[2, 1] * ry + R[2, 2] * rz
+    _left_jacobian(wx, wy, wz, J)
+    if angle > 0.0:  # not even rounding may move what the gain leaves alone
+        turn(x, at_q, rx, ry, rz)
+
+
+@njit(cache=True, nogil=True)
+def _move(x: Array, d: Array, G: Array, at: int, error: int, row: int, R: Array, J: Array) -> None:
+    """Correct the vector at `at` by its error, along the turn that the rotation at `row` just made."""
+    mx = J[0, 0] * d[error] + J[0, 1] * d[error + 1] + J[0, 2] * d[error + 2]
+    my = J[1, 0] * d[error] + J[1, 1] * d[error + 1] + J[1, 2] * d[error + 2]
+    mz = J[2, 0] * d[error] + J[2, 1] * d[error + 1] + J[2, 2] * d[error + 2]
+    x[at] += mx
+    x[at + 1] += my
+    x[at + 2] += mz
+    for j in range(3):
+        G[error, row + j] = mz * R[1, j] - my * R[2, j]
+        G[error + 1, row + j] = mx * R[2, j] - mz * R[0, j]
+        G[error + 2, row + j] = my * R[0, j] - mx * R[1, j]
 
 
 @njit(cache=True, nogil=True)
