@@ -17,7 +17,10 @@ from vislam.trajectory.poses import Trajectory
 
 Array = NDArray[np.float64]
 
-_HALF_STEP_NS = 25_000_000  # true velocity by central difference: 0.1 mm of noise are 3 mm/s
+_HALF_WINDOW_NS = 150_000_000  # of the fit that gives true velocities: 1 mm of noise at 200 Hz becomes 4 mm/s
+_MAX_HALF_WINDOW_NS = 500_000_000  # a rarer truth says nothing about velocity
+_MIN_SAMPLES = 10  # of the truth in the window, for four coefficients
+_REACH = 0.6  # of half the window, on both sides
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +41,8 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
     freedom = count * dof
     if freedom < 1:
         raise ValueError("an average needs at least one value")
-    low, high = chi2.ppf((0.025, 0.975), freedom) / freedom
-    return Consistency(total / freedom, float(low), float(high), count)
+    low, high = (float(chi2.ppf(share, freedom)) / freedom for share in (0.025, 0.975))
+    return Consistency(total / freedom, low, high, count)
 
 
 def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistency]:
@@ -47,7 +50,8 @@ def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistenc
 
     Yaw and position of the first state are a free choice that its covariance does not hold, so the truth is brought
     into the states' world by them: the error there is zero and grows with drift, as the covariance does. A fit over
-    all states would hide drift. The true velocity is the difference of true positions 25 ms before and after.
+    all states would hide drift. The true velocity is that of a fit to the true positions,
+    and its variance joins the state's; errors of the true poses themselves count as the state's.
     What was not estimated (NaN) is left out; so is the first state. Raises DataError with fewer than 2 matching states.
     """
     estimate = Trajectory(
@@ -62,7 +66,7 @@ def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistenc
     R = Rotation.from_rotvec([0.0, 0.0, yaw]).as_matrix()
     true_R = R @ pairs.reference[:, :3, :3]
     true_p = (pairs.reference[:, :3, 3] - pairs.reference[0, :3, 3]) @ R.T + pairs.estimate[0, :3, 3]
-    velocity, has_velocity = _velocities(truth, pairs.t_ns)
+    velocity, velocity_variance = _velocities(truth, pairs.t_ns)
     errors = {
         "rotation": Rotation.from_matrix(pairs.estimate[:, :3, :3].transpose(0, 2, 1) @ true_R).as_rotvec(),
         "position": true_p - pairs.estimate[:, :3, 3],
@@ -71,8 +75,11 @@ def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistenc
     covariance = np.array([s.covariance for s in matched])
     results = {}
     for i, (name, error) in enumerate(errors.items()):
-        values = _squared_mahalanobis(error, covariance[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
-        usable = np.isfinite(values) & (has_velocity if name == "velocity" else True)
+        P = covariance[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        if name == "velocity":
+            P = P + velocity_variance[:, None, None] * np.eye(3)
+        values = _squared_mahalanobis(error, P)
+        usable = np.isfinite(values)
         usable[0] = False
         if usable.any():
             results[name] = chi_square_mean(float(values[usable].sum()), int(usable.sum()), 3)
@@ -84,13 +91,26 @@ def _heading_rad(R: Array) -> float:
     return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
 
 
-def _velocities(truth: Trajectory, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return true velocities [N, 3] and where there are any: not at the ends of the truth."""
-    inside = (t_ns - _HALF_STEP_NS >= truth.t_ns[0]) & (t_ns + _HALF_STEP_NS <= truth.t_ns[-1])
-    velocity = np.full((len(t_ns), 3), np.nan)
-    after, before = truth.at(t_ns[inside] + _HALF_STEP_NS), truth.at(t_ns[inside] - _HALF_STEP_NS)
-    velocity[inside] = (after[:, :3, 3] - before[:, :3, 3]) / (2e-9 * _HALF_STEP_NS)
-    return velocity, inside
+def _velocities(truth: Trajectory, t_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return true velocities [N, 3], NaN near the ends and holes of the truth, and their variances [N].
+
+    A cubic in time is fitted to the true positions around each time; what it leaves over tells the noise of the truth.
+    """
+    period_ns = float(np.median(np.diff(truth.t_ns))) if len(truth) > 1 else np.inf
+    half_ns = max(_HALF_WINDOW_NS, 0.5 * _MIN_SAMPLES * period_ns)
+    velocity, variance = np.full((len(t_ns), 3), np.nan), np.full(len(t_ns), np.nan)
+    for i, now_ns in enumerate(t_ns.tolist()):
+        first, last = np.searchsorted(truth.t_ns, (now_ns - half_ns, now_ns + half_ns))
+        s = (truth.t_ns[first:last] - now_ns) / half_ns
+        if len(s) < _MIN_SAMPLES or s[0] > -_REACH or s[-1] < _REACH or half_ns > _MAX_HALF_WINDOW_NS:
+            continue
+        basis = np.vander(s, 4, increasing=True)
+        solution = np.linalg.lstsq(basis, truth.positions_m[first:last], rcond=None)[0]
+        rest = truth.positions_m[first:last] - basis @ solution
+        unit_variance = np.linalg.inv(basis.T @ basis)[1, 1] / (half_ns * 1e-9) ** 2
+        velocity[i] = solution[1] / (half_ns * 1e-9)
+        variance[i] = unit_variance * float(np.sum(rest**2)) / (3 * (len(s) - 4))
+    return velocity, variance
 
 
 def _squared_mahalanobis(error: Array, covariance: Array) -> Array:
