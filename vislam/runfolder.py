@@ -49,8 +49,9 @@ def prepare(out: Path, overwrite: bool) -> None:
         if not overwrite:
             raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
         with storage(out):
-            for name in _RUN_FILES:
-                (out / name).unlink(missing_ok=True)
+            named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv")]  # batch estimates have names of their own
+            for path in [*(out / name for name in _RUN_FILES), *named]:
+                path.unlink(missing_ok=True)
     with storage(out):
         out.mkdir(parents=True, exist_ok=True)
 

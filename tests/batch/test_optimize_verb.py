@@ -204,3 +204,10 @@ def test_real_recordings_are_not_worse_than_their_graph(source, seconds, bound_m
         assert 0.012 < entry["readout_s"] < 0.028  # a Kinect's colour camera: about 20 ms
     else:
         assert entry["readout_s"] == 0.0
+
+
+def test_overwriting_a_run_takes_its_batch_estimates_along(folder):
+    optimize(folder, replace(QUICK, covariances=False), name="other")
+    (folder / "manifest.json").write_text("{}")
+    prepare(folder, overwrite=True)
+    assert not list(folder.iterdir())
