@@ -49,7 +49,7 @@ def prepare(out: Path, overwrite: bool) -> None:
         if not overwrite:
             raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
         with storage(out):
-            named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv")]  # batch estimates have names of their own
+            named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv")]  # batch estimates choose their names
             for path in [*(out / name for name in _RUN_FILES), *named]:
                 path.unlink(missing_ok=True)
     with storage(out):
