@@ -57,6 +57,7 @@ class LapWorld:
         print(f"lap world seed {seed}")
         self.rng = np.random.default_rng(seed)
         self.keyframe_hz, self.tracks, self.loop_every, self.noise = keyframe_hz, tracks, loop_every, noise
+        self.imu_hz = _IMU_HZ
         self.per_lap = round(LAP_S * keyframe_hz)
         times = np.arange(self.per_lap) / keyframe_hz
         R, p = rotation(times).as_matrix(), position(times)
