@@ -98,7 +98,7 @@ class TrackTable:
 
     def remove(self, gone: NDArray[np.bool_]) -> None:
         """Forget rows [N]; a landmark without rows frees its slot, one that lost its host starts again."""
-        if not gone.any():
+        if len(gone) == 0 or not gone.any():
             return
         keep = ~gone
         self.slot, self.keyframe, self.camera = self.slot[keep], self.keyframe[keep], self.camera[keep]

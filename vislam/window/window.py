@@ -71,6 +71,7 @@ class SlidingWindow:
         self._links = LinkStore(config, noise, gravity_m_s2)
         self._last_edges: list[WindowEdge] = []
         self._sure: bool = False
+        self._at_rest: bool = False
         self._start_variances: Array = np.zeros(CALIBRATION)
         self._start: NavState | None = None
         self._T_start: Array | None = None
@@ -162,6 +163,7 @@ class SlidingWindow:
         self._speed_sigma_m_s = 0.0
         self._last_edges = []
         self._sure = False
+        self._at_rest = False
         self._start_variances = np.zeros(CALIBRATION)
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
@@ -206,6 +208,10 @@ class SlidingWindow:
         self._gyro = np.vstack([self._gyro, gyro])
         self._applied = np.append(self._applied, packet.time_offset_s)
         self._T_odom.append(None if T_odom_body is None else T_odom_body.copy())
+        if packet.at_rest and self._at_rest:
+            # rest says that nothing moved; what else the pixels say is noise, and minutes of it would add up to drift
+            self._tracks.remove(self._tracks.keyframe == self._ids[-2])
+        self._at_rest = packet.at_rest
         self._tracks.add(packet.keyframe.id, packet.observations)
 
     def _first_state(self, packet: KeyframePacket) -> Array:
