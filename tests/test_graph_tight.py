@@ -214,6 +214,35 @@ def test_half_of_the_loops_false(world: World, make) -> None:
     assert accepted == true
 
 
+def test_long_runs_accept_the_same_loops_with_bounded_work(make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With small blocks every keyframe after the 40th is in a long run: poses come back in parts, gates are cheap."""
+    joints: list[int] = []
+    ask = PoseGraph.relative_covariance
+    monkeypatch.setattr(PoseGraph, "relative_covariance", lambda g, i, j: joints.append(j) or ask(g, i, j))
+    runs = {}
+    for name, config in (("short", TIGHT), ("long", replace(TIGHT, read_newest=25, read_block=15))):
+        world = World(30.0, seed=22)
+        graph, _ = make(world, config=config)
+        rng, accepted, published = np.random.default_rng(6), set(), {}
+        joints.clear()
+        for k in range(world.count):
+            edges = []
+            if k > 102 and k % 3 == 0:
+                edges = [world.loop(k, k - 100, k), world.false_loop(1000 + k, int(rng.integers(0, k - 20)), k)]
+            update = graph.add(world.packet(k), edges)
+            accepted |= set(update.accepted_loop_ids)
+            published |= dict(zip(update.ids.tolist(), update.T_map_body, strict=True))
+            assert update.note == ""
+        final = graph.finish()
+        lag_m = [np.linalg.norm((published[k] - final.T_map_body[k])[:3, 3]) for k in range(world.count)]
+        runs[name] = accepted, len(joints), final.T_map_body, max(lag_m)
+        print(name, len(joints), "joint marginals, published poses lag", max(lag_m))
+    assert runs["short"][0] == runs["long"][0] == {k for k in range(103, world.count) if k % 3 == 0}
+    assert runs["long"][1] <= runs["short"][1] - 0.8 * len(runs["long"][0])  # true loops need none
+    assert np.max(np.abs(runs["short"][2] - runs["long"][2])) < 1e-3
+    assert runs["long"][3] < 0.05
+
+
 def test_loops_that_contradict_the_window_teach_distrust(make) -> None:
     world = World(50.0, seed=3, vo_sigma_rad=np.deg2rad(0.3), vo_sigma_m=0.008)
     graph, window = make(world, imu=False, sigma_scale=4.0)
