@@ -16,7 +16,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
 from vislam.geometry import invert, level_rotation, transform
-from vislam.imu import ImuBuffer, ImuNoise, RestDetector, subtract_bias
+from vislam.imu import ImuBuffer, ImuNoise, RestDetector, preintegrate, subtract_bias
 from vislam.messages import (
     Array,
     Frame,
@@ -261,7 +261,7 @@ class Front:
         found = self.initialisation
         solved = {}
         if found is not None and found.T_odom_body is not None and self.frontend.mode == "mono":
-            solved = dict(zip(found.t_ns, found.T_odom_body, strict=True))
+            solved = self._carried_back(found) | dict(zip(found.t_ns, found.T_odom_body, strict=True))
         released = [
             OdometryKeyframe(w.packet, solved.get(w.packet.keyframe.t_ns, T_odom_vo @ w.T_odom_body))
             for w in self._waiting
@@ -273,6 +273,17 @@ class Front:
         if released and found is not None and found.first is not None:
             self.first_state = first_keyframe_state(found.first, released[0])
         return released
+
+    def _carried_back(self, found: Initialisation) -> dict[int, Array]:
+        """Return the poses of waiting keyframes older than the window that was solved, by inertial data alone."""
+        assert found.first is not None
+        poses: dict[int, Array] = {}
+        for waiting in self._waiting:
+            t_ns = waiting.packet.keyframe.t_ns
+            span = self._buffer.span(t_ns, found.first.t_ns)  # None: not older
+            if span is not None:
+                poses[t_ns] = pose_before(found.first, span, self._config.imu.gravity_m_s2)
+        return poses
 
     def _filter(self, frame: Frame, track: TrackResult, at_rest: bool) -> tuple[Array | None, NavState | None]:
         """Return the pose in `odom` and the filter's state after this frame."""
@@ -358,6 +369,15 @@ def restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
         vo=replace(packet.vo, t_ns=packet.vo.t_ns + shift_ns),
         time_offset_s=packet.time_offset_s + shift_ns * 1e-9,
     )
+
+
+def pose_before(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
+    """Return the pose [4, 4] at the begin of a span that ends at `state`, by dead reckoning backwards in time."""
+    piece = preintegrate(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+    dt, gravity = piece.dt_s, np.array([0.0, 0.0, -gravity_m_s2])
+    R = state.T_world_body[:3, :3] @ piece.dR.T
+    velocity = state.velocity_world_m_s - gravity * dt - R @ piece.dv_m_s
+    return transform(R, state.T_world_body[:3, 3] - velocity * dt - 0.5 * dt * dt * gravity - R @ piece.dp_m)
 
 
 def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:
