@@ -154,13 +154,13 @@ def _first_rho(seen: Array, R_cam: Array, centres: Array, R_cam1_cam0: Array, t_
         a, b = R_cam[m] @ ray, R_cam[m] @ (centres[0] - centres[m])
         d = np.array([seen[m, 0], seen[m, 1], 1.0])
         u, w = np.cross(d, a), np.cross(d, b)
-        total -= u @ w
-        weight += w @ w
+        total -= float(u @ w)
+        weight += float(w @ w)
         if np.isfinite(seen[m, 6]):
             d = np.array([seen[m, 6], seen[m, 7], 1.0])
             u, w = np.cross(d, R_cam1_cam0 @ a), np.cross(d, R_cam1_cam0 @ b + t_cam1_cam0)
-            total -= u @ w
-            weight += w @ w
+            total -= float(u @ w)
+            weight += float(w @ w)
     rho = total / weight if weight > 1e-12 else 0.2
     return min(max(rho, 0.02), _NEAR_RHO)
 
@@ -298,8 +298,30 @@ def gate(H: Array, r: Array, P: Array) -> float:
     S = H @ P @ H.T
     for i in range(len(r)):
         S[i, i] += 1.0
-    nis = r @ np.linalg.solve(S, r)
+    nis = float(r @ np.linalg.solve(S, r))
     return nis if np.isfinite(nis) and nis >= 0.0 else np.inf
+
+
+@njit(cache=True, nogil=True)
+def _fitting(
+    point: Array,
+    seen: Array,
+    R_cam: Array,
+    centres: Array,
+    sigmas: Array,
+    R_cam1_cam0: Array,
+    t_cam1_cam0: Array,
+    outlier: float,
+) -> NDArray[np.int64]:
+    """Return which observations of a point are not farther from it than an outlier (in standard deviations)."""
+    keep = np.zeros(len(seen), dtype=np.bool_)
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    for m in range(len(seen)):
+        y = R_cam[m] @ (point - centres[m])
+        rows = observe(y, seen[m], sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
+        keep[m] = rows > 0 and r[0] * r[0] + r[1] * r[1] < outlier * outlier
+    return np.flatnonzero(keep)
 
 
 @njit(cache=True, nogil=True)
@@ -350,18 +372,11 @@ def process(
     stack = np.empty((ROWS_MAX * len(at), width))
     begins = np.zeros(count + 1, dtype=np.int64)
     n = 0
-    r = np.empty(ROWS_MAX)
-    J = np.empty((ROWS_MAX, 3))
     for f in range(count):
         begins[f] = n
         s, e = starts[f], starts[f + 1]
         point, rho, sigma = triangulate(seen[s:e], R_cam[s:e], centres[s:e], sigmas, R_cam1_cam0, t_cam1_cam0)
-        keep = np.zeros(e - s, dtype=np.bool_)
-        for m in range(s, e):
-            y = R_cam[m] @ (point - centres[m])
-            rows = observe(y, seen[m], sigmas, R_cam1_cam0, t_cam1_cam0, r, J)
-            keep[m - s] = rows > 0 and r[0] * r[0] + r[1] * r[1] < bounds[3] * bounds[3]
-        chosen = np.flatnonzero(keep) + s
+        chosen = s + _fitting(point, seen[s:e], R_cam[s:e], centres[s:e], sigmas, R_cam1_cam0, t_cam1_cam0, bounds[3])
         views = 0
         for m in chosen:
             views += 3 if np.isfinite(seen[m, 6]) or np.isfinite(seen[m, 12]) else 1

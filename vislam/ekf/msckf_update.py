@@ -173,6 +173,7 @@ class Updater:
             return None
         kept, candidate = window.frames[-3], window.frames[-2]
         still = image_motion_px(kept, candidate) < self._config.tight_still_px
+        still = still or candidate.t_ns - kept.t_ns < self._config.tight_min_interval_s * 1e9
         if (still or window.rest_t_ns is not None) and candidate.t_ns != window.rest_t_ns:
             return count - 2
         oldest = 0 if window.frames[0].t_ns != window.rest_t_ns else 1

@@ -1,0 +1,266 @@
+"""The tight filter as a whole: accuracy, calibration, replay, faults, rest, and a real recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS
+from msckf_world import CHEAP, MONO, RGBD, SIGMAS, STEREO, Flight, motion_of
+
+from vislam.camera import Rig
+from vislam.clock import StageClock
+from vislam.config import EkfConfig, load
+from vislam.datasets import open_dataset
+from vislam.ekf import Ekf, MsckfEkf, make_ekf
+from vislam.front import Front
+from vislam.geometry import so3_exp, transform
+from vislam.messages import Frame, ImuSample, NavState, Observations
+from vislam.trajectory import Trajectory, align, associate, ate
+
+NOTHING = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+
+
+def end_error_m(flight: Flight, ekf: MsckfEkf, **fly: object) -> float:
+    errors = [np.linalg.norm(error[3:6]) for k, error, _ in flight.fly(ekf, **fly) if k > 600]  # type: ignore[arg-type]
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
+def test_follows_a_flight_with_outliers(rig: Rig) -> None:
+    """10 s, 1 px of noise, every twentieth pixel up to 40 px off; seed 2."""
+    flight = Flight.make(2, 10.0, rig, outliers=0.05)
+    ekf = flight.filter()
+    error_m = end_error_m(flight, ekf)
+    statistics = ekf.nis_statistics
+    print(f"position error {error_m:.4f} m, {statistics}")
+    assert error_m < 0.06
+    for kind in ("tracks", "points"):
+        number, nis, dof = statistics[kind]
+        assert number > 500
+        assert 0.85 < nis / dof < 1.15
+    assert ekf.counters["soft_resets"] == 0
+    assert ekf.dead_reckoning_s < 0.2
+    assert np.linalg.eigvalsh(ekf.state().covariance)[0] > 0.0
+
+
+def test_rolling_shutter_is_accounted_for() -> None:
+    """30 ms of readout; taken for a global shutter, the same images mislead. Seed 0."""
+    flight = Flight.make(0, 8.0, readout_s=0.03)
+    known = end_error_m(flight, flight.filter(tight_readout_s=0.03))
+    ignored = end_error_m(flight, flight.filter())
+    print(f"known {known:.4f} m, ignored {ignored:.4f} m")
+    assert known < 0.05
+    assert ignored > 1.5 * known
+
+
+@pytest.mark.parametrize("offset_s", [-0.03, 0.03])
+def test_time_offset_is_found(offset_s: float) -> None:
+    flight = Flight.make(1, 12.0, offset_s=offset_s)
+    ekf = flight.filter(tight_time_offset_sigma_s=0.02)
+    for _ in flight.fly(ekf):
+        pass
+    found = ekf.calibration
+    print(f"time offset {1e3 * found.time_offset_s:.2f} of {1e3 * offset_s:.0f} ms")
+    assert abs(found.time_offset_s - offset_s) < 0.002
+    assert found.time_offset_sigma_s < 0.001
+
+
+def test_extrinsic_rotation_is_found() -> None:
+    """The filter is told a camera turned by 1 deg; seed 3."""
+    flight = Flight.make(3, 15.0)
+    wrong = np.deg2rad([0.6, -0.6, 0.53])
+    T = MONO.T_body_cams[0]
+    rig = replace(MONO, T_body_cams=(transform(T[:3, :3] @ so3_exp(wrong), T[:3, 3]),))
+    ekf = flight.filter(rig=rig, tight_extrinsic_sigma_deg=1.0)
+    for _ in flight.fly(ekf):
+        pass
+    left_deg = np.rad2deg(np.linalg.norm(ekf.calibration.rotation_rad + wrong))
+    print(f"1 deg of rotation, {left_deg:.3f} deg left, sigmas {np.rad2deg(ekf.calibration.rotation_sigma_rad)} deg")
+    assert left_deg < 0.2
+
+
+def test_calibration_can_be_switched_off() -> None:
+    flight = Flight.make(1, 4.0)
+    ekf = flight.filter(tight_time_offset=False, tight_extrinsic_rotation=False)
+    for _ in flight.fly(ekf):
+        pass
+    found = ekf.calibration
+    assert found.time_offset_s == 0.0 and found.time_offset_sigma_s == 0.0
+    assert not found.rotation_rad.any() and not found.rotation_sigma_rad.any()
+
+
+def test_any_order_of_arrival_gives_the_same_answer() -> None:
+    """In time, late by 100 ms, or shuffled within 0.4 s: bit for bit the same state."""
+    flight = Flight.make(4, 3.0)
+    rng = np.random.default_rng(5)
+    shuffled = np.concatenate(
+        [i + rng.permutation(min(8, len(flight.frames) - i)) for i in range(0, len(flight.frames), 8)]
+    )
+    states = []
+    for delay_s, order in ((0.0, None), (0.1, None), (0.0, shuffled), (0.1, shuffled)):
+        ekf = flight.filter()
+        for _ in flight.fly(ekf, delay_s, order=order):
+            pass
+        states.append((ekf.state(), ekf.counters, ekf.nis_statistics))
+    first, counters, statistics = states[0]
+    for state, counts, tests in states[1:]:
+        np.testing.assert_array_equal(state.T_world_body, first.T_world_body)
+        np.testing.assert_array_equal(state.covariance, first.covariance)
+        for name in ("tracks_used", "points_used", "vision_used"):
+            assert counts[name] == counters[name]
+        assert tests.keys() == statistics.keys()
+        np.testing.assert_allclose([tests[k] for k in tests], [statistics[k] for k in tests], rtol=1e-9)
+
+
+def test_a_start_in_the_past_catches_up() -> None:
+    flight = Flight.make(4, 2.0)
+    usual, late = flight.filter(), MsckfEkf(EkfConfig(tight_imu_inflation=1.0), CHEAP, GRAVITY_M_S2, MONO)
+    for sample in flight.samples:
+        late.predict(sample)
+        usual.predict(sample)
+    assert not late.initialised and late.pose_at(T0_NS) is None
+    assert late.update_vision(motion_of(T0_NS), flight.frames[0][1]).reason.startswith("the filter has no state")
+    late.initialise(flight.start)
+    np.testing.assert_allclose(late.state().T_world_body, usual.state().T_world_body, atol=1e-12)
+    np.testing.assert_allclose(late.state().covariance, usual.state().covariance, rtol=1e-9, atol=1e-15)
+    t_ns = flight.samples[-20].t_ns + 1_000_000
+    at, pose = late.state_at(t_ns), late.pose_at(t_ns)
+    assert at is not None and pose is not None
+    np.testing.assert_allclose(at.T_world_body, pose, atol=2e-4)
+
+
+def test_bad_input_is_counted_and_changes_nothing() -> None:
+    flight = Flight.make(6, 2.0)
+    ekf = flight.filter()
+    for _ in flight.fly(ekf):
+        pass
+    before, now = ekf.state(), flight.samples[-1].t_ns
+    ekf.predict(ImuSample(now + 5_000_000, np.full(3, np.nan), np.zeros(3)))
+    ekf.predict(ImuSample(now - 5_000_000, np.zeros(3), np.zeros(3)))
+    nan = Observations(np.arange(3), np.full((3, 2), np.nan))
+    assert not ekf.update_vision(motion_of(now), nan).accepted
+    assert not ekf.update_vision(motion_of(now), NOTHING).accepted
+    assert not ekf.update_vision(motion_of(now, lost=True), flight.frames[-1][1]).accepted
+    assert not ekf.update_vision(motion_of(flight.frames[-1][0]), flight.frames[-1][1]).accepted
+    assert not ekf.update_vision(motion_of(now - 10 * NS), flight.frames[-1][1]).accepted
+    assert not ekf.feed_back(np.full(3, np.nan), np.zeros(3), 1.0, 1.0).accepted
+    after, counters = ekf.state(), ekf.counters
+    np.testing.assert_array_equal(after.T_world_body, before.T_world_body)
+    names = ("imu_nan", "imu_backward", "vision_invalid", "vision_lost", "vision_duplicate", "too_late", "bias_invalid")
+    assert [counters[name] for name in names] == [1, 1, 2, 1, 1, 1, 1]
+    with pytest.raises(ValueError, match="not finite"):
+        ekf.initialise(replace(flight.start, velocity_world_m_s=np.full(3, np.nan)))
+
+
+def test_a_wild_frame_and_swapped_tracks_do_no_harm() -> None:
+    """One frame is random, and for a second every id belongs to another corner; seed 7."""
+    flight = Flight.make(7, 9.0)
+    rng = np.random.default_rng(8)
+    for i in (80, *range(100, 120)):
+        t_ns, seen = flight.frames[i]
+        wrong = rng.uniform(0.0, 450.0, seen.pixels_px.shape) if i == 80 else rng.permutation(seen.pixels_px)
+        flight.frames[i] = (t_ns, replace(seen, pixels_px=wrong))
+    ekf = flight.filter()
+    error_m = end_error_m(flight, ekf)
+    print(f"position error {error_m:.3f} m, {ekf.counters}")
+    assert error_m < 0.15
+    assert ekf.counters["tracks_gated"] + ekf.counters["tracks_few"] > 50
+
+
+def test_an_outage_is_bridged() -> None:
+    """No vision for 5 s: uncertainty grows, the error stays within it, and afterwards vision goes on. Seed 9."""
+    flight = Flight.make(9, 14.0)
+    flight.frames = [f for f in flight.frames if not 6.0 < (f[0] - T0_NS) * 1e-9 < 11.0]
+    ekf = flight.filter()
+    for k, error, state in flight.fly(ekf):
+        if k == 2180:
+            assert ekf.dead_reckoning_s > 4.5
+            assert np.sqrt(np.diag(state.covariance)[3:6]).max() > 0.1
+        if k > 1200:
+            assert error[3:6] @ np.linalg.solve(state.covariance[3:6, 3:6], error[3:6]) < 30.0
+    assert ekf.dead_reckoning_s < 0.2
+
+
+def test_known_biases_move_only_the_biases() -> None:
+    flight = Flight.make(4, 2.0)
+    ekf = flight.filter()
+    for _ in flight.fly(ekf):
+        pass
+    before = ekf.state()
+    assert ekf.feed_back(flight.biases[-1][:3], flight.biases[-1][3:], 0.002, 0.01).accepted
+    after = ekf.state()
+    np.testing.assert_allclose(after.T_world_body, before.T_world_body, atol=1e-14)
+    assert np.linalg.norm(after.gyro_bias_rad_s - flight.biases[-1][:3]) < 0.003
+    assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
+
+
+@pytest.mark.slow
+def test_standing_still_does_not_drift() -> None:
+    """30 s at rest from the first moment, with unknown biases; noise of 0.3 px and of a cheap IMU go on. Seed 11."""
+    flight = Flight.make(10, 4.0)
+    ekf = flight.filter()
+    rng = np.random.default_rng(11)
+    T, *_ = flight.motion.at(4.0)
+    bias, begin = flight.biases[-1], flight.samples[-1].t_ns
+    ekf.initialise(NavState(begin, T, np.zeros(3), np.zeros(3), np.zeros(3), np.diag(SIGMAS**2)))
+    landmarks_px = rng.uniform([10, 10], [740, 470], (150, 2))
+    force = T[:3, :3].T @ np.array([0.0, 0.0, GRAVITY_M_S2])
+    white = np.repeat([CHEAP.gyro_noise_density, CHEAP.accel_noise_density], 3) * np.sqrt(CHEAP.rate_hz)
+    first = None
+    for k in range(1, 6001):
+        values = np.concatenate((np.zeros(3), force)) + bias + rng.normal(size=6) * white
+        t_ns = begin + 5_000_000 * k
+        ekf.predict(ImuSample(t_ns, values[:3], values[3:]))
+        if k % 10 == 0:
+            stamp = t_ns - 1_000_000
+            seen = Observations(np.arange(150), landmarks_px + rng.normal(size=(150, 2)) * 0.3)
+            ekf.update_vision(motion_of(stamp), seen)
+            ekf.update_zero_velocity(stamp)
+        if k == 400:
+            first = ekf.state()
+    assert first is not None
+    last = ekf.state()
+    moved_m = np.linalg.norm(last.T_world_body[:3, 3] - first.T_world_body[:3, 3])
+    print(f"moved {1e3 * moved_m:.2f} mm")
+    assert moved_m < 0.005
+    turned = first.T_world_body[:3, :3].T @ last.T_world_body[:3, :3]
+    assert np.arccos(min((np.trace(turned) - 1.0) / 2.0, 1.0)) < np.deg2rad(0.2)
+    assert np.linalg.norm(last.velocity_world_m_s) < 0.02
+    assert ekf.counters["hold_accepted"] > 500
+
+
+def test_the_configuration_chooses_the_filter() -> None:
+    loose = make_ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2, MONO)
+    tight = make_ekf(EkfConfig(coupling="tight"), EUROC_NOISE, GRAVITY_M_S2, STEREO)
+    assert isinstance(loose, Ekf) and isinstance(tight, MsckfEkf)
+
+
+@pytest.mark.data
+def test_real_recording_with_one_camera(data_root) -> None:  # type: ignore[no-untyped-def]
+    """8 s of EuRoC MH_01 after its start from rest or motion, one camera: causal poses against motion capture."""
+    recording = open_dataset(str(data_root / "euroc_mh01_17s"))
+    config = load(None, {"ekf.coupling": "tight", "frontend.mode": "mono"})
+    front = Front(config, recording.rig, recording.imu_noise, StageClock())
+    waiting: list[Frame] = []
+    stamps, poses = [], []
+    for value in recording.events():
+        if isinstance(value, Frame):
+            waiting.append(value)
+        else:
+            front.add(value)
+        while waiting and front.is_ready(waiting[0].t_ns, waiting[-1].t_ns):
+            step = front.process(waiting.pop(0))
+            if step.T_odom_body is not None:
+                stamps.append(step.frame.t_ns)
+                poses.append(step.T_odom_body)
+        if len(stamps) >= 160:
+            break
+    assert len(stamps) >= 160, front.last_refusal
+    truth = recording.truth()
+    assert truth is not None
+    pairs = associate(Trajectory(np.array(stamps), np.array(poses)), truth)
+    error = ate(pairs.aligned(align(pairs, "yaw")))
+    print(f"causal ATE {error['rmse_m']:.4f} m over {len(stamps)} frames")
+    assert error["rmse_m"] < 0.05
