@@ -269,7 +269,7 @@ class Initialiser:
         refusal = (
             self._start_refusal(start)
             or self._bundle_refusal(bundle)
-            or self._quality_refusal(bundle.aligned, bundle.aligned.scale_sigma())
+            or self._quality_refusal(bundle.aligned, config.vo_inflation * bundle.aligned.scale_sigma())
             or self._repetition_refusal(before, self._before)
         )
         if refusal is not None:
@@ -391,6 +391,8 @@ class Initialiser:
         turn[:3, 3] = origin[:3, 3] if metric else 0.0
         poses = turn @ aligned.T_world_body
         inflation = max(aligned.residual_ratio, 1.0)  # what the model does not explain makes the answer less certain
+        if not metric:  # metric motions come inflated; sightings do not, though their errors are correlated in time
+            inflation *= self._config.vo_inflation**2
         first, last = (
             NavState(
                 t_ns=chosen[i].t_ns,
