@@ -178,7 +178,10 @@ class WindowSource:
         """Choose what the graph takes: the newest edge, settled ones, and provisional ones that changed most."""
         notes = [update.note]
         kept, changed = [], []
+        recent = record.id - 2 * self._config.window_refresh_max  # older edges hardly change any more
         for edge in update.odometry:
+            if not edge.settled and edge.to_id < recent:
+                continue
             try:
                 taken = _edge_record(edge)
             except DataError as error:
