@@ -101,20 +101,18 @@ class World:
         return packets, truths
 
     def _seen(self, t_s: float, T_body_cam: Array, world: Array) -> tuple[Array, Array]:
-        row = np.zeros(len(world))
-        for _ in range(3 if self.readout_s else 1):
-            if self.readout_s:
-                p = np.full((len(world), 3), np.nan)
-                for i in range(len(world)):
-                    T = invert(self.motion.pose(t_s + row[i] * self.readout_s) @ T_body_cam)
+        T = invert(self.motion.pose(t_s) @ T_body_cam)
+        p = world @ T[:3, :3].T + T[:3, 3]
+        pixels = PINHOLE.project(p)
+        pixels[~PINHOLE.contains(pixels) | (p[:, 2] < 0.3)] = np.nan
+        if self.readout_s:  # of those in view, each where its own row sees it
+            for i in np.flatnonzero(np.isfinite(pixels[:, 1])):
+                for _ in range(2):
+                    row = pixels[i, 1] / PINHOLE.height - 0.5
+                    T = invert(self.motion.pose(t_s + row * self.readout_s) @ T_body_cam)
                     p[i] = T[:3, :3] @ world[i] + T[:3, 3]
-            else:
-                T = invert(self.motion.pose(t_s) @ T_body_cam)
-                p = world @ T[:3, :3].T + T[:3, 3]
-            pixels = PINHOLE.project(p)
-            outside = ~PINHOLE.contains(pixels) | (p[:, 2] < 0.3)
-            row = np.where(np.isfinite(pixels[:, 1]), pixels[:, 1] / PINHOLE.height - 0.5, 0.0)
-        pixels[outside] = np.nan
+                    pixels[i] = PINHOLE.project(p[i : i + 1])[0]
+            pixels[~PINHOLE.contains(pixels)] = np.nan
         return pixels, p[:, 2]
 
 
