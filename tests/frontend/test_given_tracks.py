@@ -12,6 +12,7 @@ import pytest
 from vislam.config import FrontEndConfig
 from vislam.errors import DataError
 from vislam.frontend import TrackResult, make_frontend
+from vislam.frontend.epipolar import RotationPrior, direction_given_rotation, refine_two_view
 from vislam.frontend.intake import Intake
 from vislam.frontend.metric import MetricFrontEnd
 from vislam.frontend.rgbd import ImageDepth
@@ -236,3 +237,23 @@ def test_keyframes_follow_each_other_while_moving() -> None:
     stamps = [result.keyframe.t_ns for result in new if result.keyframe is not None]
     assert len(new) > 8 and new[0].reason == "first keyframe"
     assert all(b - a <= 2_100_000_000 for a, b in pairwise(stamps))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gross_outliers_do_not_decide_the_direction(seed: int) -> None:
+    """Wrong matches over half the image have fifty times the parallax of true ones."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(3.0, 8.0, 150)
+    key_xy = rng.uniform([-0.7, -0.45], [0.7, 0.45], (150, 2))
+    direction = np.array([0.8, 0.36, 0.48])
+    moved = np.column_stack([key_xy, np.ones(150)]) * z[:, None] - 0.06 * direction
+    xy = moved[:, :2] / moved[:, 2:] + rng.normal(0.0, 5e-4, (150, 2))
+    xy[:12] = rng.uniform([-0.7, -0.45], [0.7, 0.45], (12, 2))
+    start = direction_given_rotation(np.eye(3), key_xy, xy)
+    assert start is not None
+    prior = RotationPrior(np.eye(3), 5e-4)
+    found = refine_two_view(prior.R_key_cam, start, key_xy, xy, 7e-4, CONFIG.cauchy, prior)
+    off_deg = np.rad2deg(np.arccos(np.clip(found.direction_key @ direction, -1.0, 1.0)))
+    print(f"seed {seed}: start {np.rad2deg(np.arccos(abs(start @ direction))):.1f} deg off, refined {off_deg:.1f} deg")
+    assert np.rad2deg(np.arccos(abs(start @ direction))) < 30.0
+    assert found.converged and off_deg < 6.0

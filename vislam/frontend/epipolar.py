@@ -16,6 +16,8 @@ CHI2_GATE = 10.8  # squared deviation with one degree of freedom that one good r
 _MAX_ITERATIONS = 20
 _CONVERGED = 1e-7  # rad, of rotation and direction together
 _SETTLED = 5e-3  # a step that still matters after the last iteration
+_LONGEST = 3.0  # times the usual parallax that one track may count for
+_REWEIGHTED = 4
 _CONFIDENCE = 0.999
 _MAX_TRIES = 500
 
@@ -111,7 +113,9 @@ def essential_ransac(
 def direction_given_rotation(R_key_cam: Array, key_xy: Array, xy: Array) -> Array | None:
     """Return the unit direction [3] that best meets the epipolar constraint at a known rotation, or None.
 
-    Points [N, 2] are on z = 1, NaN rows are ignored. The constraint is linear in the direction.
+    Points [N, 2] are on z = 1, NaN rows are ignored. The constraint is linear in the direction. A gross outlier moves
+    much further than the others and would decide alone: lengths are cut, and misfits count linearly (reweighted least
+    squares).
     """
     usable = np.isfinite(xy).all(axis=1)
     if usable.sum() < 2:
@@ -119,7 +123,16 @@ def direction_given_rotation(R_key_cam: Array, key_xy: Array, xy: Array) -> Arra
     a = np.column_stack([key_xy[usable], np.ones(int(usable.sum()))])
     b = np.column_stack([xy[usable], np.ones(int(usable.sum()))]) @ R_key_cam.T
     normals = np.cross(a, b)
-    return np.asarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    usual = float(np.median(length))
+    if usual > 0.0:
+        normals *= np.minimum(1.0, _LONGEST * usual / np.maximum(length, usual))[:, None]
+    direction = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    for _ in range(_REWEIGHTED):
+        misfit = np.abs(normals @ direction)
+        weight = 1.0 / np.maximum(misfit, max(float(np.median(misfit)), 1e-12))
+        direction = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
+    return np.asarray(direction)
 
 
 @njit(cache=True, nogil=True)
@@ -147,6 +160,22 @@ def _linearise(R: Array, t: Array, basis: Array, key_xy: Array, xy: Array, sigma
 
 
 @njit(cache=True, nogil=True)
+def _bounded(J: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return weights [N] that bound what one track may say about the direction (Mallows; Hampel et al. 1986).
+
+    A wrong match over half the image that lies near some epipolar line by chance has more leverage than all the true
+    ones with their few pixels of parallax, and would draw the direction to itself.
+    """
+    reach = np.sqrt(J[:, 3] ** 2 + J[:, 4] ** 2)
+    longest = _LONGEST * np.median(reach[seen])
+    weights = np.ones(len(J))
+    for i in range(len(J)):
+        if reach[i] > longest > 0.0:
+            weights[i] = (longest / reach[i]) ** 2
+    return weights
+
+
+@njit(cache=True, nogil=True)
 def _refine(
     R_start: Array,
     t_start: Array,
@@ -170,12 +199,13 @@ def _refine(
         # the kernel starts as wide as the residuals are and closes with them
         last = iteration == _MAX_ITERATIONS or size < _CONVERGED
         scale = cauchy if last else max(cauchy, 1.5 * np.sqrt(np.median(chi2[seen])))
+        leverage = _bounded(J, seen)
         H, b = np.zeros((5, 5)), np.zeros(5)
         weighted, weights = 0.0, 0.0
         for i in range(len(r)):
             if not seen[i]:
                 continue
-            w = 1.0 / (1.0 + chi2[i] / (scale * scale))
+            w = leverage[i] / (1.0 + chi2[i] / (scale * scale))
             for a in range(5):
                 b[a] += w * J[i, a] * r[i]
                 for c in range(5):

@@ -70,6 +70,7 @@ class MonoFrontEnd:
         self._tracker = Tracker(config)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
         self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
+        self._min_parallax_px = config.mono_min_parallax_px
         self._keyframe: Keyframe | None = None
         self._keyframe_tracks = 0
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
@@ -86,6 +87,7 @@ class MonoFrontEnd:
         # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy there as here
         given = _BOTH_ENDS if frame.tracks is not None else 1.0
         self._sigma_xy = given * self._config.track_sigma_px / self._camera.fx
+        self._min_parallax_px = given * self._config.mono_min_parallax_px
         if self._keyframe is None:
             return self._start(frame, "")
         R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])
@@ -127,7 +129,7 @@ class MonoFrontEnd:
         view = still
         followed = int(np.isfinite(xy[:, 0]).sum())
         explained = still.converged and still.inliers.sum() >= _TURN_EXPLAINS * followed
-        if not explained or parallax_px > self._config.mono_min_parallax_px:
+        if not explained or parallax_px > self._min_parallax_px:
             both = self._two_view(R_guess, prior, key_xy, xy)
             # a direction that does not settle is no reason to give up a rotation that does
             if both.converged or not still.converged:
@@ -158,7 +160,7 @@ class MonoFrontEnd:
         """Take the gyroscope's rotation: what vision finds alone swallows small translations before a flat scene."""
         moved_px = self._moved_xy(prior.R_key_cam, key_xy, xy) * self._camera.fx
         with np.errstate(invalid="ignore"):
-            inliers = np.asarray(moved_px < self._config.mono_min_parallax_px, dtype=np.bool_)
+            inliers = np.asarray(moved_px < self._min_parallax_px, dtype=np.bool_)
         covariance = np.eye(6) * (_GYRO_KNOWN_ALREADY * prior.sigma_rad) ** 2
         return _turn_only(TwoViewEstimate(prior.R_key_cam, np.zeros(3), covariance, inliers, True))
 
