@@ -103,7 +103,7 @@ class InitConfig:
     max_tilt_sigma_deg: float = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
     max_velocity_sigma_m_s: float = 0.2
     max_gyro_bias_sigma_rad_s: float = 0.02
-    max_scale_sigma: float = 0.0225  # relative, monocular only; 38 simulated starts and 7 real ones were within 3 %
+    max_scale_sigma: float = 0.0225  # relative, monocular only; 38 simulated starts and 6 real ones were within 3 %
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
     attempt_s: float = 0.3  # between attempts: one costs up to 0.1 s, and a window changes little in this time
@@ -118,7 +118,7 @@ class InitConfig:
     time_offset_sigma_s: float = 0.015  # of that; drivers that stamp on arrival are off by up to 30 ms
     time_offset_settled_s: float = 0.0005  # sigma at which the estimate is final
     time_offset_min_s: float = 0.001  # smaller corrections are not worth a step in time
-    max_time_offset_sigma_s: float = 0.003  # a metric start waits for this, but no longer than its window: 1 m/s makes it 3 mm
+    max_time_offset_sigma_s: float = 0.003  # a metric start waits for this, no longer than its window: 3 mm at 1 m/s
 
 
 @dataclass(frozen=True, slots=True)
