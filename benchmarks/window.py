@@ -33,7 +33,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "window")]
 
 import numpy as np  # noqa: E402
 from inertial_world import GRAVITY_M_S2, Motion, state_error  # noqa: E402
-from landmark_world import MONO, PINHOLE, START_SIGMAS, T_BODY_CAM0, World, start_state  # noqa: E402
+from window_world import MONO, PINHOLE, START_SIGMAS, T_BODY_CAM0, World, start_state  # noqa: E402
 
 from vislam.config import WindowConfig  # noqa: E402
 from vislam.messages import Array, KeyframePacket, NavState  # noqa: E402

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, Motion
-from landmark_world import MONO, World
+from window_world import MONO, World
 
 from vislam.config import WindowConfig
 from vislam.geometry import so3_exp

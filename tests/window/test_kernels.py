@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, Motion
-from landmark_world import RGBD, STEREO, World, start_state
+from window_world import RGBD, STEREO, World, start_state
 
 from vislam.config import WindowConfig
 from vislam.messages import Array

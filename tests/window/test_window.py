@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, state_error
-from landmark_world import MONO, RGBD, STEREO, World, packet, start_state
+from window_world import MONO, RGBD, STEREO, World, packet, start_state
 
 from vislam.camera import Rig
 from vislam.config import WindowConfig
