@@ -28,6 +28,7 @@ class ImuConfig:
     accel_bias_walk: float | None = None  # m/s^3/sqrt(Hz)
     gravity_m_s2: float = 9.81
     buffer_s: float = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
+    noise_tolerance: float = 3.0  # a model of white noise that the quietest half second exceeds by more is raised
     max_gap_s: float = 0.1  # a longer hole between samples is an outage, not something to interpolate across
     max_wait_s: float = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
 
@@ -85,7 +86,7 @@ class FrontEndConfig:
 class InitConfig:
     """How the first gravity-aligned state is found."""
 
-    still_px: float = 0.5  # median image motion between frames below which the camera may be at rest
+    still_px: float = 0.8  # median image motion over 0.5 s, noise taken out: below, the camera may be at rest
     rest_s: float = 0.75  # the IMU's statistics need this long; shorter pauses happen in hand-held motion
     rest_gyro_std_rad_s: float = 0.03  # idling EuRoC drone 0.007 to 0.03, hovering above 0.065 (0.5 s windows)
     rest_accel_std_m_s2: float = 0.4  # idling motors shake up to 0.35; the gyro and the image decide between the two
@@ -295,6 +296,9 @@ class GraphConfig:
     consistency_inflation: float = 3.0  # on odometry sigma; loops are parked because odometry is overconfident
     consistency_max_sigma_m: float = 0.5  # odometry looser than this between two loops proves nothing
     consistency_max_sigma_deg: float = 5.0
+    loop_gain_min: float = 1.0  # on long runs a loop of more than 1 / this times the graph's own variance adds no factor
+    anchor_reach: int = 10  # keyframes; on long runs a loop to one so near a tied one ties to the latter's anchor ...
+    anchor_variance_max: float = 1.0  # ... if the way there adds at most so many times the loop's own variance
     vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
 
 

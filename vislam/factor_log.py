@@ -6,12 +6,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vislam.camera import Camera, Rig
+from vislam.frames import LoggedFrames
 from vislam.imu import ImuNoise
 from vislam.messages import Array, KeyframePacket, LoopEdge, NavState
-from vislam.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,32 +31,6 @@ class LoggedEdge:
 
     edge: LoopEdge
     accepted: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoggedFrames:
-    """All frames of a run, relative to the keyframes that they were tracked against."""
-
-    t_ns: NDArray[np.int64]  # [N]
-    keyframe_ids: NDArray[np.int64]  # [N], -1 before the first keyframe
-    T_keyframe_body: list[Array | None]  # [4, 4] each; None: known by interpolation only
-
-    def placed(self, keyframe_t_ns: dict[int, int], T_map_body: dict[int, Array]) -> Trajectory:
-        """Return the pose of every frame, given times and poses of keyframes by id.
-
-        Frames whose motion since their keyframe is unknown are interpolated between those that are known.
-        """
-        known = {keyframe_t_ns[i]: T for i, T in T_map_body.items()}
-        ids = self.keyframe_ids.tolist()
-        for t_ns, keyframe_id, T in zip(self.t_ns.tolist(), ids, self.T_keyframe_body, strict=True):
-            if T is not None and keyframe_id in T_map_body:
-                known[t_ns] = T_map_body[keyframe_id] @ T
-        stamps = np.array(sorted(known), dtype=np.int64)
-        anchors = Trajectory(stamps, np.array([known[t] for t in stamps.tolist()]).reshape(-1, 4, 4))
-        if len(anchors) == 0:
-            return anchors
-        frames = self.t_ns[(self.t_ns >= stamps[0]) & (self.t_ns <= stamps[-1])]
-        return Trajectory(frames, anchors.at(frames))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
+from vislam.frontend.stillness import Stillness
 from vislam.geometry import invert, level_rotation, transform
-from vislam.imu import ImuBuffer, ImuNoise, RestDetector, preintegrate, subtract_bias
+from vislam.imu import ImuBuffer, ImuNoise, NoiseEnvelope, RestDetector, subtract_bias
 from vislam.messages import (
     Array,
     Frame,
@@ -26,22 +28,12 @@ from vislam.messages import (
     KeyframePacket,
     MagSample,
     NavState,
-    Observations,
     Tracking,
     VoMeasurement,
 )
+from vislam.odometry_keyframe import OdometryKeyframe, first_keyframe_state, pose_before, restamped
 
-_MIN_SHARED_TRACKS = 10  # fewer say nothing about the motion of the camera
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
-_UNKNOWN_VELOCITY_M_S = 3.0  # sigma for a keyframe whose velocity the initialisation did not estimate
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OdometryKeyframe:
-    """A keyframe on its way to the back end, with the pose that odometry gave it."""
-
-    packet: KeyframePacket
-    T_odom_body: Array  # [4, 4]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +67,11 @@ class Front:
                 "one camera without an IMU cannot see scale; use --frontend.mode stereo or rgbd where the recording "
                 "allows it, or record an IMU"
             )
+        if config.ekf.vision == "accumulated" and self.frontend.mode == "mono":
+            raise UsageError(
+                "--ekf.vision accumulated sums up motion in metres, which one camera does not see; use --frontend.mode "
+                "stereo or rgbd, or --ekf.vision relative"
+            )
         self.initialisation: Initialisation | None = None
         self._refused: Initialisation | None = None  # the newest answer without a state
         self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
@@ -82,20 +79,23 @@ class Front:
         self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0}
         self._config = config
         self._clock = clock
+        self.noise = self._noise_told = noise  # `noise` is gone by: raised where the samples show more
         self._has_imu = noise is not None
         self.camera_clock = CameraClock(config.init)
         self._ekf: Ekf | MsckfEkf | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu)
+            self.envelope = NoiseEnvelope(noise)
             self._rest = RestDetector(config.init, noise)
+            self._stillness = Stillness(config.init)
             self._initialiser = Initialiser(
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
                 config.frontend.track_sigma_px,
             )  # fmt: skip
-            self._ekf = make_ekf(config.ekf, noise, config.imu.gravity_m_s2, rig)
+            self._make_ekf = partial(make_ekf, config.ekf, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
+            self._ekf = self._make_ekf(noise=noise)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
         self._last_frame_t_ns: int | None = None
-        self._last_seen: Observations | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
         self._rested_since_keyframe = True
@@ -114,6 +114,8 @@ class Front:
             self._mag = value
         elif self._has_imu and self._ekf is not None and self._buffer.add(value):
             self._ekf.predict(value)
+            if self.envelope.add(value) and self.initialisation is None:
+                self._follow_noise()
 
     def is_ready(self, frame_t_ns: int, newest_frame_t_ns: int) -> bool:
         """Whether a frame can be processed: an inertial sample newer than it is there, or none will come in time."""
@@ -132,7 +134,7 @@ class Front:
         with self._clock.measure("track"):
             track = self.frontend.track(frame, *self._without_bias(span))
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, self._state()))
-        still_image = self._is_still(track.observations)
+        still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
         T_vo_keyframe_body = track.vo.T_keyframe_body if track.vo.has_scale else None
@@ -146,7 +148,6 @@ class Front:
             ready += self._take_keyframe(track, T_odom_body)
             T_keyframe_body = np.eye(4)
         self._last_frame_t_ns = frame.t_ns
-        self._last_seen = track.observations
         self._follow_clock(track.vo)
         return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready)
 
@@ -200,6 +201,24 @@ class Front:
         sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max())) + self.camera_clock.gyro_sigma_rad_s(span)
         return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2), sigma_rad_s
 
+    def _follow_noise(self) -> None:
+        """Raise the noise model, until the first state is found, to what the quietest half second shows."""
+        self.noise = self.envelope.at_least_seen(self._config.imu.noise_tolerance)
+        self._rest.trust(self.noise)
+        self._initialiser.trust(self.noise)
+
+    def _start_filter(self, ekf: Ekf | MsckfEkf, state: NavState, vo: VoMeasurement) -> Ekf | MsckfEkf:
+        """Return the filter, started; another one if the noise is not what it was told at first."""
+        newest_t_ns = self._buffer.newest_t_ns
+        if self.noise is not None and self.noise != self._noise_told and newest_t_ns is not None:
+            ekf = self._make_ekf(noise=self.noise)
+            span = self._buffer.span(state.t_ns, newest_t_ns)
+            if span is not None:
+                for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
+                    ekf.predict(ImuSample(t_ns, gyro, accel))
+        ekf.initialise(state, vo)
+        return ekf
+
     def _state(self) -> NavState | None:
         return self._ekf.state() if self._ekf is not None and self._ekf.initialised else None
 
@@ -229,10 +248,6 @@ class Front:
             self._waiting[i] = replace(waiting, packet=replace(packet, imu=imu))
             before_ns = t_ns
 
-    def _is_still(self, seen: Observations) -> bool:
-        flow_px = median_flow_px(self._last_seen, seen)
-        return flow_px is not None and flow_px < self._config.init.still_px
-
     def _count(self, track: TrackResult, at_rest: bool) -> None:
         self.counters["frames_lost"] += track.vo.tracking == Tracking.LOST
         self.counters["frames_degraded"] += track.vo.tracking == Tracking.DEGRADED
@@ -250,7 +265,7 @@ class Front:
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
         self.initialisation = found
-        self._ekf.initialise(found.last, track.vo)
+        self._ekf = self._start_filter(self._ekf, found.last, track.vo)
         return self._release(found.T_odom_vo)
 
     def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
@@ -360,53 +375,9 @@ class Front:
         return released
 
 
-def restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
-    """Return the packet `shift_ns` later in the IMU's time; its inertial data have to be cut anew."""
-    keyframe, t_ns = packet.keyframe, packet.keyframe.t_ns + shift_ns
-    return replace(
-        packet,
-        keyframe=replace(keyframe, t_ns=t_ns, frame=replace(keyframe.frame, t_ns=t_ns)),
-        vo=replace(packet.vo, t_ns=packet.vo.t_ns + shift_ns),
-        time_offset_s=packet.time_offset_s + shift_ns * 1e-9,
-    )
-
-
-def pose_before(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
-    """Return the pose [4, 4] at the begin of a span that ends at `state`, by dead reckoning backwards in time."""
-    piece = preintegrate(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
-    dt, gravity = piece.dt_s, np.array([0.0, 0.0, -gravity_m_s2])
-    R = state.T_world_body[:3, :3] @ piece.dR.T
-    velocity = state.velocity_world_m_s - gravity * dt - R @ piece.dv_m_s
-    return transform(R, state.T_world_body[:3, 3] - velocity * dt - 0.5 * dt * dt * gravity - R @ piece.dp_m)
-
-
-def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:
-    """Return the state of the first keyframe, given the state of the first frame that the initialisation used.
-
-    If that frame came later, the keyframe's velocity is unknown, and its covariance says so.
-    """
-    t_ns = keyframe.packet.keyframe.t_ns
-    if first.t_ns == t_ns:
-        return replace(first, T_world_body=keyframe.T_odom_body)
-    covariance = first.covariance.copy()
-    covariance[6:9, :] = covariance[:, 6:9] = 0.0
-    covariance[6:9, 6:9] = np.eye(3) * _UNKNOWN_VELOCITY_M_S**2
-    return NavState(t_ns, keyframe.T_odom_body, np.zeros(3), first.gyro_bias_rad_s, first.accel_bias_m_s2, covariance)
-
-
 def scaled_motion(vo: VoMeasurement) -> Array:
     """Return the motion [4, 4] since the keyframe as far as it is known: without scale, its rotation alone."""
     assert vo.T_keyframe_body is not None
     if vo.has_scale:
         return vo.T_keyframe_body
     return transform(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]), np.zeros(3))
-
-
-def median_flow_px(before: Observations | None, after: Observations) -> float | None:
-    """Return the median image motion in pixels of the tracks that both frames saw; None with fewer than ten."""
-    if before is None:
-        return None
-    _, i, j = np.intersect1d(before.track_ids, after.track_ids, assume_unique=True, return_indices=True)
-    if len(i) < _MIN_SHARED_TRACKS:
-        return None
-    return float(np.median(np.linalg.norm(after.pixels_px[j] - before.pixels_px[i], axis=1)))

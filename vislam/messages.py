@@ -71,6 +71,7 @@ class Observations:
     pixels_px: Array  # [N, 2] in cam0
     right_px: Array | None = None  # [N, 2] in cam1, NaN where not matched
     depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
+    instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from vislam.batch import BatchResult, optimize_run
-from vislam.batch.frames import place_frames
 from vislam.config import BatchConfig, Config, from_data
 from vislam.errors import DataError, UsageError, VislamError
 from vislam.factor_log import FactorLog
+from vislam.messages import NavState
 from vislam.runfolder import write_json
 from vislam.session import Session
 from vislam.trajectory import Trajectory, evaluate, read_tum, write_states_csv, write_tum
@@ -34,7 +35,7 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     start = time.perf_counter()
     log, settings = _read(run, config)
     result = optimize_run(log, settings)
-    trajectory = place_frames(log, result.states, settings.imu.max_gap_s)
+    trajectory = _placed(log, result.states, settings.imu.max_gap_s)
     metrics = _metrics(run)
     entry = _entry(result, log, trajectory)
     accuracy = _accuracy(run, trajectory, log, entry["warnings"])
@@ -46,6 +47,14 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     write_states_csv(run / f"states_{name}.csv", range(len(result.states)), result.states)
     write_json(run / "metrics.json", metrics)
     return entry
+
+
+def _placed(log: FactorLog, states: Sequence[NavState], max_gap_s: float) -> Trajectory:
+    """Return the pose of every frame: by the IMU between keyframes, else by the motion that the run measured."""
+    spans = {k.packet.keyframe.id: k.packet.imu for k in log.keyframes if k.packet.imu is not None}
+    frames = log.frames.carried_by_imu(states, spans, log.gravity_m_s2, max_gap_s, measured_too=True)
+    times = {k: int(state.t_ns) for k, state in enumerate(states)}
+    return frames.placed(times, {k: state.T_world_body for k, state in enumerate(states)})
 
 
 def _check(run: Path, name: str) -> None:

@@ -156,11 +156,13 @@ class Run:
         """Write states and tables; return the final trajectory and the counts of loop decisions."""
         graph = None if self.slam.back is None else self.slam.back.graph
         if graph is None:
-            return self.log.final_trajectory([], np.zeros((0, 4, 4))), self.log.write_tables(self.out, {})
+            nothing = self.log.final_trajectory([], np.zeros((0, 4, 4)), [], self.config.imu)
+            return nothing, self.log.write_tables(self.out, {})
         ids = [int(i) for i in graph.ids]
-        self.log.write_states(self.out, ids, graph.states())
+        states = graph.states()
+        self.log.write_states(self.out, ids, states)
         loops = self.log.write_tables(self.out, {report.loop_id: report for report in graph.edge_reports()})
-        return self.log.final_trajectory(ids, graph.poses()), loops
+        return self.log.final_trajectory(ids, graph.poses(), states, self.config.imu), loops
 
     def _write_pictures(self, mapper: Mapper, final: Trajectory) -> None:
         """Write the pictures of the map that the report shows; an empty map has none."""
@@ -202,6 +204,8 @@ class Run:
             rooms = {"loop": back.loops, "map": back.mapper}
             counters |= {name: dict(room.counters) for name, room in rooms.items() if room is not None}
         found = front.initialisation
+        if self.noise is not None:
+            self.warnings += front.envelope.warnings(self.config.imu.noise_tolerance)
         if self.noise is not None and found is None:
             self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.last_refusal}")
         return {

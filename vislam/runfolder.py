@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import Config, dump
+from vislam.config import Config, ImuConfig, dump
 from vislam.errors import StorageError, UsageError
-from vislam.factor_log import LoggedFrames
-from vislam.messages import Array, LoopCandidate, LoopDecision, NavState
+from vislam.frames import LoggedFrames
+from vislam.messages import Array, ImuSpan, LoopCandidate, LoopDecision, NavState
 from vislam.slam import KeyframeStep, Step
 from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
 
@@ -144,6 +144,7 @@ class RunLog:
         self._tracking: list[tuple[Any, ...]] = []
         self._ekf_states: dict[int, NavState] = {}
         self._keyframe_t_ns: dict[int, int] = {}
+        self._spans: dict[int, ImuSpan] = {}  # between a keyframe and the one before
         self._candidates: list[LoopCandidate] = []
         self._edge_ids: dict[tuple[int, int], int] = {}
         self.revisions = 0
@@ -180,17 +181,21 @@ class RunLog:
         """Remember what the back end did with a keyframe."""
         keyframe = step.odometry.packet.keyframe
         self._keyframe_t_ns[keyframe.id] = keyframe.t_ns
+        if step.odometry.packet.imu is not None:
+            self._spans[keyframe.id] = step.odometry.packet.imu
         self._candidates.extend(step.candidates)
         for edge in step.edges:
             self._edge_ids[edge.from_id, edge.to_id] = edge.id
         self.revisions = step.update.revision
 
-    def final_trajectory(self, ids: list[int], T_map_body: Array) -> Trajectory:
+    def final_trajectory(self, ids: list[int], T_map_body: Array, states: list[NavState], imu: ImuConfig) -> Trajectory:
         """Return the pose of every frame from the final poses of the keyframes that they were tracked against.
 
-        Frames whose motion since their keyframe is unknown are interpolated between those that are known.
+        Frames whose motion since their keyframe is unknown are carried by the IMU between `states` (of the keyframes,
+        empty without an IMU), or interpolated between those that are known.
         """
         frames = LoggedFrames(self.stamps_ns, np.array(self._keyframe_ids, dtype=np.int64), self._since_keyframe)
+        frames = frames.carried_by_imu(states, self._spans, imu.gravity_m_s2, imu.max_gap_s)
         return frames.placed(self._keyframe_t_ns, dict(zip(ids, T_map_body, strict=True)))
 
     def odometry_trajectory(self) -> Trajectory:

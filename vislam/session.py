@@ -23,13 +23,13 @@ from vislam.errors import DataError, StorageError
 from vislam.factor_log import (
     FactorLog,
     LoggedEdge,
-    LoggedFrames,
     LoggedKeyframe,
     rig_data,
     rig_from,
     state_data,
     state_from,
 )
+from vislam.frames import LoggedFrames
 from vislam.imu import ImuNoise
 from vislam.messages import (
     Array,

@@ -16,12 +16,13 @@ import numpy as np
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
-from vislam.front import Front, FrontStep, OdometryKeyframe
+from vislam.front import Front, FrontStep
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
 from vislam.mapping.mapper import Mapper
 from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopCandidate, LoopEdge, MagSample, NavState
+from vislam.odometry_keyframe import OdometryKeyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +119,7 @@ class Slam:
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock)
         self.back: Back | None = None  # begins with the first keyframe, when gravity is known
-        self._make_back = partial(Back, config, rig, noise, self.clock)
+        self._make_back = partial(Back, config, rig)
         self._frames: deque[Frame] = deque()
 
     def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
@@ -143,7 +144,7 @@ class Slam:
 
     def _add(self, odometry: OdometryKeyframe) -> KeyframeStep:
         if self.back is None:
-            self.back = self._make_back(self.front.first_state, odometry.T_odom_body)
+            self.back = self._make_back(self.front.noise, self.clock, self.front.first_state, odometry.T_odom_body)
         step = self.back.add(odometry)
         self.front.feed_back(step.update)
         return step

@@ -15,8 +15,9 @@ from vislam.batch.chain import Chain
 from vislam.batch.loops import Loops
 from vislam.camera import Camera, Rig
 from vislam.config import Config
-from vislam.factor_log import FactorLog, LoggedEdge, LoggedFrames, LoggedKeyframe
+from vislam.factor_log import FactorLog, LoggedEdge, LoggedKeyframe
 from vislam.factors.keys import X
+from vislam.frames import LoggedFrames
 from vislam.geometry import invert, se3_exp, se3_log, transform, transform_points
 from vislam.messages import Array, GraphUpdate, KeyframePacket, Observations
 from vislam.session import SessionWriter

@@ -8,10 +8,9 @@ from graph_world import position, rotation
 from session_world import simulate
 
 from vislam.batch import optimize_run
-from vislam.batch.frames import place_frames
 from vislam.config import BatchConfig, Config
 from vislam.errors import DataError
-from vislam.factor_log import LoggedFrames
+from vislam.frames import LoggedFrames
 from vislam.geometry import invert, so3_log
 from vislam.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
 
@@ -180,7 +179,12 @@ def test_frames_between_keyframes_follow_the_imu():
     frames = LoggedFrames(t_ns, np.minimum(t_ns // 250_000_000, len(states) - 1), [None] * len(t_ns))
 
     def worst(log):
-        placed = place_frames(replace(log, frames=frames), states, 0.1)
+        spans = {k.packet.keyframe.id: k.packet.imu for k in log.keyframes if k.packet.imu is not None}
+        carried = frames.carried_by_imu(states, spans, log.gravity_m_s2, 0.1)
+        placed = carried.placed(
+            {k: state.t_ns for k, state in enumerate(states)},
+            {k: state.T_world_body for k, state in enumerate(states)},
+        )
         assert np.array_equal(placed.t_ns, t_ns)
         turned = [so3_log(a.T @ b) for a, b in zip(placed.T_world_body[:, :3, :3], R, strict=True)]
         return np.linalg.norm(placed.positions_m - p, axis=1).max(), np.linalg.norm(turned, axis=1).max()

@@ -40,7 +40,9 @@ class Ripe:
 def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float) -> FrameTracks:
     """Return the usable observations of a frame: finite, one per track, with a ray in the camera model."""
     ids, first = np.unique(np.asarray(observations.track_ids, dtype=np.int64), return_index=True)
-    pixels = np.asarray(observations.pixels_px, dtype=np.float64).reshape(-1, 2)[first]
+    at_once = observations.instant_px is not None
+    given = observations.instant_px if observations.instant_px is not None else observations.pixels_px
+    pixels = np.asarray(given, dtype=np.float64).reshape(-1, 2)[first]
     seen = np.full((len(ids), COLUMNS), np.nan)
     camera = rig.cameras[0]
     seen[:, :6] = _rays(camera, pixels)
@@ -51,7 +53,7 @@ def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float) -
         good = np.isfinite(depth) & (depth > 0.0)
         seen[good, 12] = 1.0 / depth[good]
     rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
-    seen[:, 13] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * readout_s
+    seen[:, 13] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
     fit = np.isfinite(seen[:, :6]).all(axis=1) & np.isfinite(seen[:, 13])
     return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_))
 

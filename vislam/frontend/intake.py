@@ -75,5 +75,5 @@ class Intake:
             given.pixels_px[good],
             None if given.right_px is None else given.right_px[good],
             None if given.depth_m is None else given.depth_m[good],
-            None if given.descriptors is None else given.descriptors[good],
+            descriptors=None if given.descriptors is None else given.descriptors[good],
         )

@@ -198,7 +198,9 @@ class MetricFrontEnd:
             new, observations = self._continue_from(frame, attempt)
             return TrackResult(vo, observations, new, departure.parallax_px, reason)
         good = attempt.estimate.inliers
-        observations = Observations(self._tracker.ids[good].copy(), attempt.pixels[good])
+        observations = Observations(
+            self._tracker.ids[good].copy(), attempt.pixels[good], instant_px=self._instant_px(attempt.xy[good])
+        )
         self._landmarks.keep(self._tracker.judge(good))
         return TrackResult(vo, observations, None, departure.parallax_px, self._weakness(attempt))
 
@@ -291,7 +293,7 @@ class MetricFrontEnd:
         self._lost = False
         self._blind, self._blind_px = not self._depth.available(frame), self._tracker.pixels.copy()
         keyframe = self._install(frame, np.zeros(6))
-        observations = self._observations(self._tracker.pixels, reading)
+        observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
         if last_id < 0:
             vo = identity_motion(frame.t_ns, 0, True, count)
             return TrackResult(vo, observations, keyframe, 0.0, "first keyframe")
@@ -325,7 +327,8 @@ class MetricFrontEnd:
         count = self._tracker.begin(frame, kept, pixels)
         fresh = self._add_landmarks(frame, count, attempt.twist_per_s)
         seen_at = np.vstack([attempt.pixels[kept], self._tracker.pixels[len(self._tracker) - count :]])
-        observations = self._observations(seen_at, reading.joined(fresh))
+        instant = np.vstack([attempt.xy[kept], landmarks.mean[len(landmarks.mean) - count :, :2]])
+        observations = self._observations(seen_at, reading.joined(fresh), instant)
         return self._install(frame, attempt.twist_per_s), observations
 
     def _add_landmarks(self, frame: Frame, count: int, twist_per_s: Array) -> DepthReading:
@@ -341,8 +344,15 @@ class MetricFrontEnd:
         self._landmarks.append(xy, reading.rho, sigma_xy, reading.sigma_rho)
         return reading
 
-    def _observations(self, pixels: Array, reading: DepthReading) -> Observations:
-        return Observations(self._tracker.ids.copy(), pixels.copy(), reading.right_px, reading.depth_m)
+    def _observations(self, pixels: Array, reading: DepthReading, xy: Array) -> Observations:
+        """Return what a keyframe sees: raw pixels [N, 2] and directions [N, 2] of the middle row's time."""
+        ids = self._tracker.ids.copy()
+        return Observations(ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self._instant_px(xy))
+
+    def _instant_px(self, xy: Array) -> Array | None:
+        if self._shutter.readout_s == 0.0:
+            return None
+        return self._camera.project(np.column_stack([xy, np.ones(len(xy))]))
 
     def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
         def measure_depth(pixels: Array, ids: NDArray[np.int64] | None) -> Array:

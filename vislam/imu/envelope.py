@@ -41,8 +41,8 @@ class NoiseEnvelope:
         self._last_t_ns = 0
         self._levels: list[tuple[float, float]] = []  # (gyro, accel) sigma of one sample, per window
 
-    def add(self, sample: ImuSample) -> None:
-        """Take a sample; a hole begins a new window."""
+    def add(self, sample: ImuSample) -> bool:
+        """Take a sample and return whether it ended a window; a hole begins a new one."""
         if sample.t_ns - self._last_t_ns > self._longest_step_ns:
             self._pending = []
         self._last_t_ns = sample.t_ns
@@ -51,6 +51,8 @@ class NoiseEnvelope:
             rms = np.sqrt(np.mean(np.diff(np.array(self._pending), n=2, axis=0) ** 2, axis=0) / 6.0)
             self._levels.append((float(rms[:3].mean()), float(rms[3:].mean())))
             self._pending = []
+            return True
+        return False
 
     @property
     def ratios(self) -> NoiseRatios | None:

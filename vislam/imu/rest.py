@@ -24,12 +24,17 @@ class RestDetector:
 
     def __init__(self, config: InitConfig, noise: ImuNoise) -> None:
         """Set thresholds from the configuration, widened where the sensor's own white noise needs it."""
-        per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
+        self._config = config
         self._rest_ns = round(config.rest_s * _NS)
-        self._gyro_std = max(config.rest_gyro_std_rad_s, per_sample * noise.gyro_noise_density)
-        self._accel_std = max(config.rest_accel_std_m_s2, per_sample * noise.accel_noise_density)
         self._gyro_max = config.rest_gyro_max_rad_s
         self._spans: deque[ImuSpan] = deque()
+        self.trust(noise)
+
+    def trust(self, noise: ImuNoise) -> None:
+        """Go by another noise model from now on."""
+        per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
+        self._gyro_std = max(self._config.rest_gyro_std_rad_s, per_sample * noise.gyro_noise_density)
+        self._accel_std = max(self._config.rest_accel_std_m_s2, per_sample * noise.accel_noise_density)
 
     def clear(self) -> None:
         """Forget what was seen, as after a hole in the data."""

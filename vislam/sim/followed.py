@@ -227,7 +227,7 @@ class SimulatedTracker:
             pixels[found],
             None if right is None else right[found],
             None if depth is None else depth[found],
-            self._describe(points_cam[found], self.landmarks[found]) if noise.descriptors else None,
+            descriptors=self._describe(points_cam[found], self.landmarks[found]) if noise.descriptors else None,
         )
 
     def _describe(self, points_cam: Array, landmarks: Ids) -> Descriptors:

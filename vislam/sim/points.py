@@ -295,4 +295,5 @@ def _parts(t_s: Array) -> Iterator[Array]:
 
 def _nothing(rig: Rig) -> Observations:
     right, depth = np.empty((0, 2)) if rig.is_stereo else None, np.empty(0) if rig.has_depth else None
-    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)), right, depth, np.empty((0, 32), dtype=np.uint8))
+    descriptors = np.empty((0, 32), dtype=np.uint8)
+    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)), right, depth, descriptors=descriptors)

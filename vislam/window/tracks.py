@@ -134,7 +134,9 @@ class TrackTable:
         self._values = np.concatenate([self._values, values])
 
     def _measure(self, seen: Observations) -> tuple[Array, NDArray[np.bool_]]:
-        values = _whitened(self._rig.cameras[0], seen.pixels_px, self._config.sigma_px)
+        at_once = seen.instant_px is not None
+        pixels = seen.pixels_px if seen.instant_px is None else seen.instant_px
+        values = _whitened(self._rig.cameras[0], pixels, self._config.sigma_px, at_once)
         if seen.depth_m is not None:
             known = np.isfinite(seen.depth_m) & (seen.depth_m > 0.0)
             values[known, 7] = 1.0 / seen.depth_m[known]
@@ -158,12 +160,16 @@ def check_observations(seen: Observations, where: str) -> None:
         raise DataError(f"{where}: depths of shape {seen.depth_m.shape} for {count} tracks; use NaN where unknown")
 
 
-def _whitened(camera: Camera, pixels_px: Array, sigma_px: float) -> Array:
-    """Return rows [N, 9] of the table without depth; NaN where no ray gives the pixel."""
+def _whitened(camera: Camera, pixels_px: Array, sigma_px: float, at_once: bool = False) -> Array:
+    """Return rows [N, 9] of the table without depth; NaN where no ray gives the pixel.
+
+    `at_once` says that all rows of the image count as seen at the frame's own time.
+    """
     out = np.zeros((len(pixels_px), _VALUES))
     xy = camera.normalise(pixels_px)
     out[:, :2] = xy
     rays = np.column_stack([xy, np.ones(len(xy))])
     out[:, 2:6] = camera.project_jacobian(rays)[:, :, :2].reshape(-1, 4) / sigma_px
-    out[:, 6] = pixels_px[:, 1] / camera.height - 0.5
+    if not at_once:
+        out[:, 6] = pixels_px[:, 1] / camera.height - 0.5
     return out
