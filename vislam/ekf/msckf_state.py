@@ -45,6 +45,7 @@ class Window:
     points: Array = field(default_factory=lambda: _none(0, 3))  # [S, 3] m, odom
     misses: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # [S] frames in a row
     rest_t_ns: int | None = None  # stamp of the frame at which the body came to rest; None: it moves
+    rested_t_ns: int = 0  # stamp of the newest frame at which it still rested
     rejects: int = 0  # frames in a row whose tracks contradict the state
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0

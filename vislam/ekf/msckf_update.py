@@ -137,6 +137,8 @@ class Updater:
         they are apart, and one linear step would take the wrong parallax for knowledge.
         """
         R = np.ascontiguousarray(pose(x, 0, 6)[:3, :3])
+        if window.frames and window.frames[-1].t_ns > window.rested_t_ns:  # nobody said that this one rested
+            window = replace(window, rest_t_ns=None)
         prior = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
         leaving = self._leaving(prior)
         before = x.copy()
@@ -334,7 +336,7 @@ class Updater:
         )
         if not self._passes("zero_velocity", window, H, r, out):
             return replace(window, rest_t_ns=None), out
-        window = corrected(window, x, H, r)
+        window = replace(corrected(window, x, H, r), rested_t_ns=t_ns)
         stamps = [frame.t_ns for frame in window.frames]
         if window.rest_t_ns in stamps:
             window = self._hold(window, x, stamps.index(window.rest_t_ns), out)
