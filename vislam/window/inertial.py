@@ -11,7 +11,8 @@ from numba import njit
 
 from vislam.geometry import skew, so3_exp, so3_log, so3_right_jacobian, so3_right_jacobian_inverse
 from vislam.messages import Array
-from vislam.window.layout import Ints, Links, difference
+from vislam.window.layout import CALIBRATION, Ints, Links, difference
+from vislam.window.small import product, product_back, put, put_back, rotated_back, rotation
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -20,83 +21,107 @@ def imu_error(a: Array, b: Array, links: Links, k: int, gravity_m_s2: float, J: 
 
     Columns of J: error of state a [15], then of state b.
     """
-    Ra, Rb = a[:9].copy().reshape(3, 3), b[:9].copy().reshape(3, 3)
-    dt = links.dt[k]
-    change = np.empty(6)
-    change[:3] = a[15:18] - links.bias[k, :3]
-    change[3:] = a[18:21] - links.bias[k, 3:]
-    by_bias = links.by_bias[k]
-    moved = by_bias @ change
-    turn = moved[:3].copy()
-    dR = links.dR[k] @ so3_exp(turn)
-    dv, dp = links.dv[k] + moved[3:6], links.dp[k] + moved[6:]
-    velocity = b[12:15] - a[12:15]
+    Ra, Rb, by_bias, dt = rotation(a), rotation(b), links.by_bias[k], links.dt[k]
+    moved = np.zeros(9)
+    for i in range(9):
+        for j in range(6):
+            moved[i] += by_bias[i, j] * (a[15 + j] - links.bias[k, j])
+    turn, velocity, position = moved[:3], np.empty(3), np.empty(3)
+    for i in range(3):
+        velocity[i] = b[12 + i] - a[12 + i]
+        position[i] = b[9 + i] - a[9 + i] - dt * a[12 + i]
     velocity[2] += gravity_m_s2 * dt
-    position = b[9:12] - a[9:12] - dt * a[12:15]
     position[2] += 0.5 * gravity_m_s2 * dt * dt
-    Rt = Ra.T.copy()
-    v, p = Rt @ velocity, Rt @ position
+    v, p, Rab = rotated_back(Ra, velocity), rotated_back(Ra, position), product_back(Ra, Rb)
+    error = so3_log(product_back(product(links.dR[k], so3_exp(turn)), Rab))
     out = np.empty(9)
-    out[:3] = so3_log(dR.T.copy() @ (Rt @ Rb))
-    out[3:6] = v - dv
-    out[6:] = p - dp
-    rotation = out[:3].copy()
-    inverse = so3_right_jacobian_inverse(rotation)
+    for i in range(3):
+        out[i] = error[i]
+        out[3 + i] = v[i] - (links.dv[k, i] + moved[3 + i])
+        out[6 + i] = p[i] - (links.dp[k, i] + moved[6 + i])
+    inverse = so3_right_jacobian_inverse(error)
+    back = product_back(so3_exp(error), product(so3_right_jacobian(turn), by_bias))  # its first rows and columns
     J[:] = 0.0
-    J[:3, :3] = -(inverse @ (Rb.T.copy() @ Ra))
-    J[:3, 15:18] = inverse
-    J[:3, 9:12] = -(inverse @ so3_exp(-rotation) @ so3_right_jacobian(turn) @ by_bias[:3, :3].copy())
-    J[3:6, :3] = skew(v)
-    J[6:, :3] = skew(p)
-    J[3:6, 6:9] = -Rt
-    J[3:6, 21:24] = Rt
-    J[6:, 3:6] = -Rt
-    J[6:, 6:9] = -dt * Rt
-    J[6:, 18:21] = Rt
-    J[3:6, 9:15] = -by_bias[3:6]
-    J[6:, 9:15] = -by_bias[6:]
+    put(J, 0, 0, -1.0, _by_transposed(inverse, Rab))
+    put(J, 0, 15, 1.0, inverse)
+    put(J, 0, 9, -1.0, product(inverse, back))
+    put(J, 3, 0, 1.0, skew(v))
+    put(J, 6, 0, 1.0, skew(p))
+    put_back(J, 3, 6, -1.0, Ra)
+    put_back(J, 3, 21, 1.0, Ra)
+    put_back(J, 6, 3, -1.0, Ra)
+    put_back(J, 6, 6, -dt, Ra)
+    put_back(J, 6, 18, 1.0, Ra)
+    for i in range(3, 9):
+        for j in range(6):
+            J[i, 9 + j] = -by_bias[i, j]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _by_transposed(A: Array, B: Array) -> Array:
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def guess_error(a: Array, b: Array, guess: Array, J: Array) -> Array:
     """Return the error [6] of the motion between two states against a guess [4, 4], and J [6, 12] by both poses."""
-    Ra, Rb = a[:9].copy().reshape(3, 3), b[:9].copy().reshape(3, 3)
-    Rt = Ra.T.copy()
+    Ra, Rb, apart = rotation(a), rotation(b), np.empty(3)
+    for i in range(3):
+        apart[i] = b[9 + i] - a[9 + i]
+    moved, Rab = rotated_back(Ra, apart), product_back(Ra, Rb)
+    error = so3_log(product_back(guess, Rab))
     out = np.empty(6)
-    out[:3] = so3_log(guess[:3, :3].copy().T @ (Rt @ Rb))
-    moved = Rt @ (b[9:12] - a[9:12])
-    out[3:] = moved - guess[:3, 3]
-    inverse = so3_right_jacobian_inverse(out[:3].copy())
+    for i in range(3):
+        out[i], out[3 + i] = error[i], moved[i] - guess[i, 3]
+    inverse = so3_right_jacobian_inverse(error)
     J[:] = 0.0
-    J[:3, :3] = -(inverse @ (Rb.T.copy() @ Ra))
-    J[:3, 6:9] = inverse
-    J[3:, :3] = skew(moved)
-    J[3:, 3:6] = -Rt
-    J[3:, 9:] = Rt
+    put(J, 0, 0, -1.0, _by_transposed(inverse, Rab))
+    put(J, 0, 6, 1.0, inverse)
+    put(J, 3, 0, 1.0, skew(moved))
+    put_back(J, 3, 3, -1.0, Ra)
+    put_back(J, 3, 9, 1.0, Ra)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scatter(J: Array, information: Array, r: Array, at: Ints, A: Array, g: Array) -> None:
-    weighted = J.T.copy() @ information
-    H, b = weighted @ J, weighted @ r
-    for i in range(len(at)):
-        g[at[i]] += b[i]
-        for j in range(len(at)):
+def _scatter(J: Array, information: Array, r: Array, where: Ints, k: int, A: Array, g: Array) -> None:
+    """Add an error r [n] of keyframes k and k + 1 to the normal equations; `information` [n, n] is symmetric."""
+    rows, width = J.shape
+    half = width // 2
+    weighted, at, row = np.zeros((rows, width)), np.empty(width, dtype=np.int64), np.empty(width)
+    for i in range(width):
+        at[i] = where[k + i // half, i % half]
+    for m in range(rows):
+        for n in range(rows):
+            factor = information[m, n]
+            for j in range(width):
+                weighted[m, j] += factor * J[n, j]
+    for i in range(width):
+        row[:] = 0.0
+        for m in range(rows):
+            factor = weighted[m, i]
+            g[at[i]] += factor * r[m]
+            for j in range(width):
+                row[j] += factor * J[m, j]
+        out = A[at[i]]
+        for j in range(width):
             if at[j] >= at[i]:
-                A[at[i], at[j]] += H[i, j]
+                out[at[j]] += row[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _diagonal(at_a: int, at_b: int, weight: float, error: float, A: Array, g: Array) -> None:
-    """Add the square of `weight * (b - a)` whose value is `error`; at_a < 0: of b alone."""
+    """Add the square of `weight * (b - a)` whose value is `error`."""
     A[at_b, at_b] += weight
     g[at_b] += weight * error
-    if at_a >= 0:
-        A[at_a, at_a] += weight
-        A[min(at_a, at_b), max(at_a, at_b)] -= weight
-        g[at_a] -= weight * error
+    A[at_a, at_a] += weight
+    A[min(at_a, at_b), max(at_a, at_b)] -= weight
+    g[at_a] -= weight * error
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -104,19 +129,23 @@ def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
     """Return half the squared error of all links and of rest."""
     J9, J6 = np.empty((9, 30)), np.empty((6, 12))
     total = 0.0
+    for k in range(len(X)):
+        for i in range(12, 15):
+            total += (links.rest_weight[k] * X[k, i]) ** 2
     for k in range(len(X) - 1):
         if links.inertial[k]:
             r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, J9)
-            total += r @ (links.information[k] @ r)
-        change = X[k + 1, 15:21] - X[k, 15:21]
-        total += np.sum(links.walk_information[k] * change * change)
+            for i in range(9):
+                for j in range(9):
+                    total += r[i] * links.information[k, i, j] * r[j]
+        for i in range(6):
+            total += links.walk_information[k, i] * (X[k + 1, 15 + i] - X[k, 15 + i]) ** 2
         if links.guess_weight[k, 0] > 0.0:
             r = guess_error(X[k], X[k + 1], links.guess[k], J6)
-            total += links.guess_weight[k, 0] ** 2 * np.sum(r[:3] ** 2)
-            total += links.guess_weight[k, 1] ** 2 * np.sum(r[3:] ** 2)
-        total += links.velocity_weight[k] ** 2 * np.sum((X[k + 1, 12:15] - X[k, 12:15]) ** 2)
-    for k in range(len(X)):
-        total += links.rest_weight[k] ** 2 * np.sum(X[k, 12:15] ** 2)
+            for i in range(6):
+                total += (links.guess_weight[k, i // 3] * r[i]) ** 2
+        for i in range(12, 15):
+            total += (links.velocity_weight[k] * (X[k + 1, i] - X[k, i])) ** 2
     return 0.5 * total
 
 
@@ -138,41 +167,42 @@ def linearise(
     They are the upper triangle of A [D, D] and g [D]. `where` [M, 15] (or [M, 6]) says at which unknown each
     keyframe's error lies; with six there are no velocities.
     """
-    J9, J6, waste = np.empty((9, 30)), np.empty((6, 12)), np.empty((9, 30))
+    J9, waste9, J6, waste6 = np.empty((9, 30)), np.empty((9, 30)), np.empty((6, 12)), np.empty((6, 12))
+    weights = np.zeros((6, 6))
     full = where.shape[1] == 15
     for k in range(count):
         a = X_first[k] if held[k] else X[k]
         b = X_first[k + 1] if held[k + 1] else X[k + 1]
         if full:
-            both = np.concatenate((where[k], where[k + 1]))
             if links.inertial[k]:
+                r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, waste9)
                 imu_error(a, b, links, k, gravity_m_s2, J9)
-                r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, waste)
-                _scatter(J9, links.information[k], r, both, A, g)
-            for i in range(6):
-                error = X[k + 1, 15 + i] - X[k, 15 + i]
-                _diagonal(where[k, 9 + i], where[k + 1, 9 + i], links.walk_information[k, i], error, A, g)
-            for i in range(3):
-                error = X[k + 1, 12 + i] - X[k, 12 + i]
-                _diagonal(where[k, 6 + i], where[k + 1, 6 + i], links.velocity_weight[k] ** 2, error, A, g)
+                _scatter(J9, links.information[k], r, where, k, A, g)
+            for i in range(6, 15):  # velocity, biases
+                weight = links.velocity_weight[k] ** 2 if i < 9 else links.walk_information[k, i - 9]
+                _diagonal(where[k, i], where[k + 1, i], weight, X[k + 1, 6 + i] - X[k, 6 + i], A, g)
         if links.guess_weight[k, 0] > 0.0:
+            r = guess_error(X[k], X[k + 1], links.guess[k], waste6)
             guess_error(a, b, links.guess[k], J6)
-            r6 = guess_error(X[k], X[k + 1], links.guess[k], np.empty((6, 12)))
-            information = np.zeros((6, 6))
             for i in range(6):
-                information[i, i] = links.guess_weight[k, 0 if i < 3 else 1] ** 2
-            _scatter(J6, information, r6, np.concatenate((where[k, :6], where[k + 1, :6])), A, g)
+                weights[i, i] = links.guess_weight[k, i // 3] ** 2
+            _scatter(J6, weights, r, where, k, A, g)
     if full:
         for k in range(rests):
-            for i in range(3):
-                _diagonal(-1, where[k, 6 + i], links.rest_weight[k] ** 2, X[k, 12 + i], A, g)
+            weight = links.rest_weight[k] ** 2
+            for i in range(6, 9):
+                A[where[k, i], where[k, i]] += weight
+                g[where[k, i]] += weight * X[k, 6 + i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def prior_shift(X: Array, X_first: Array, calibration: Array, calibration_first: Array, held: int, size: int) -> Array:
     """Return how far [5 + held * size] the states are from where the prior was linearised."""
-    out = np.empty(5 + held * size)
-    out[:5] = calibration - calibration_first
+    out = np.empty(CALIBRATION + held * size)
+    for i in range(CALIBRATION):
+        out[i] = calibration[i] - calibration_first[i]
     for k in range(held):
-        out[5 + k * size : 5 + (k + 1) * size] = difference(X[k], X_first[k])[:size]
+        d = difference(X[k], X_first[k])
+        for i in range(size):
+            out[CALIBRATION + k * size + i] = d[i]
     return out

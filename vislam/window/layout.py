@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vislam.geometry import so3_exp, so3_log
 from vislam.messages import Array
+from vislam.window.small import product, product_back, rotation
 
 STATE = 21
 CALIBRATION = 5  # time offset, rotation of the camera (3), readout
@@ -74,44 +75,38 @@ class Prior(NamedTuple):
     calibration: Array  # [5]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def retract(x: Array, d: Array) -> None:
     """Move a state [21] by an error [15] (or [6]: its pose) in place."""
-    R = x[:9].copy().reshape(3, 3) @ so3_exp(d[:3].copy())
-    x[:9] = R.reshape(9)
-    x[9 : 6 + len(d)] += d[3:]
+    R = product(rotation(x), so3_exp(d[:3]))
+    for i in range(3):
+        for j in range(3):
+            x[3 * i + j] = R[i, j]
+    for i in range(3, len(d)):
+        x[6 + i] += d[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def difference(x: Array, x0: Array) -> Array:
     """Return the error [15] that moves state x0 to x."""
+    turn = so3_log(product_back(rotation(x0), rotation(x)))
     out = np.empty(15)
-    out[:3] = so3_log(x0[:9].copy().reshape(3, 3).T @ x[:9].copy().reshape(3, 3))
-    out[3:] = x[9:] - x0[9:]
+    for i in range(3):
+        out[i] = turn[i]
+    for i in range(3, 15):
+        out[i] = x[6 + i] - x0[6 + i]
     return out
 
 
-@njit(cache=True, nogil=True)
 def positions(count: int, inertial: bool) -> Ints:
     """Return where [count, 15] (or [count, 6]) each keyframe's error lies among the unknowns."""
-    size, start = (15, 9 * count) if inertial else (6, 0)
-    out = np.empty((count, size), dtype=np.int64)
-    for k in range(count):
-        for i in range(6):
-            out[k, i] = start + 6 * k + i
-        for i in range(6, size):
-            out[k, i] = 9 * k + i - 6
-    return out
+    if not inertial:
+        return np.arange(6 * count).reshape(count, 6)
+    others = np.arange(9 * count).reshape(count, 9)
+    return np.hstack([9 * count + np.arange(6 * count).reshape(count, 6), others])
 
 
-@njit(cache=True, nogil=True)
 def prior_positions(count: int, held: int, inertial: bool) -> Ints:
     """Return where the prior's unknowns (calibration, then the first `held` keyframes) lie among all."""
     where = positions(count, inertial)
-    size = where.shape[1]
-    out = np.empty(CALIBRATION + held * size, dtype=np.int64)
-    for i in range(CALIBRATION):
-        out[i] = (15 if inertial else 6) * count + i
-    for k in range(held):
-        out[CALIBRATION + k * size : CALIBRATION + (k + 1) * size] = where[k]
-    return out
+    return np.concatenate([where.size + np.arange(CALIBRATION), where[:held].ravel()])

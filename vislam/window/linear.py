@@ -53,9 +53,14 @@ def solve(U: Array, rhs: Array) -> Array:
     return y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def trailing_covariance(U: Array, start: int) -> Array:
     """Return the covariance [D - start, D - start] of the unknowns that were eliminated last."""
+    inverse = _trailing_inverse(U, start)
+    return np.asarray(inverse @ inverse.T)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _trailing_inverse(U: Array, start: int) -> Array:
     n = len(U) - start
     inverse = np.zeros((n, n))  # of the trailing triangle, by rows from the last
     for i in range(n - 1, -1, -1):
@@ -69,15 +74,10 @@ def trailing_covariance(U: Array, start: int) -> Array:
                 below = inverse[k]
                 for j in range(k, n):
                     out[j] += factor * below[j]
-    return inverse @ inverse.T
+    return inverse
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def columns_of_covariance(U: Array, columns: np.ndarray) -> Array:
     """Return columns [D, N] of the inverse of `U.T @ U`."""
-    out = np.empty((len(columns), len(U)))
-    for i in range(len(columns)):
-        unit = np.zeros(len(U))
-        unit[columns[i]] = 1.0
-        out[i] = solve(U, unit)
-    return out.T.copy()
+    unit = np.eye(len(U))[columns]
+    return np.ascontiguousarray(np.array([solve(U, row) for row in unit]).T)

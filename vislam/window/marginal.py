@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.messages import Array, NavState
-from vislam.window import inertial, visual
+from vislam.window import inertial, schur, visual
 from vislam.window.layout import CALIBRATION, Camera, Links, Prior, Views, positions, prior_positions
 from vislam.window.solver import add_prior
 
@@ -55,7 +55,7 @@ def marginalise(
     visual.linearise(
         X, X_first, held, leaving.points, calibration, leaving.views, camera, poses_at, A, g, A_points, g_points, cross
     )
-    visual.eliminate(np.empty((L, 3, 3)), A_points, g_points, cross, 0.0, poses_at, A, g)
+    schur.eliminate(np.empty((L, 3, 3)), A_points, g_points, cross, 0.0, poses_at, A, g)
     A = np.triu(A) + np.triu(A, 1).T
     gone = where[0]
     kept = np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])

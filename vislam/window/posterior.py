@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from vislam.geometry import skew, tangent_basis, transform
 from vislam.messages import Array, NavState
@@ -12,31 +11,25 @@ from vislam.window.messages import WindowTilt
 _NO_MOTION_M = 1e-3
 
 
-@njit(cache=True, nogil=True)
 def edges(X: Array, poses: Array) -> tuple[Array, Array]:
     """Return motions [M - 1, 4, 4] between consecutive states [M, 21] and their covariances [M - 1, 6, 6].
 
     `poses` [6 M, 6 M] is the joint covariance of the poses: rotation on the body side, position in world axes.
     """
     n = len(X) - 1
-    T, P = np.zeros((n, 4, 4)), np.empty((n, 6, 6))
-    J = np.zeros((6, 12))
-    for k in range(n):
-        Rat = X[k, :9].copy().reshape(3, 3).T.copy()
-        Rb = X[k + 1, :9].copy().reshape(3, 3)
-        R = Rat @ Rb
-        t = Rat @ (X[k + 1, 9:12] - X[k, 9:12])
-        T[k, :3, :3], T[k, :3, 3], T[k, 3, 3] = R, t, 1.0
-        back = R.T.copy()
-        J[:] = 0.0
-        J[:3, :3] = -back
-        J[3:, :3] = back @ skew(t)
-        J[3:, 3:6] = -(back @ Rat)
-        for i in range(3):
-            J[i, 6 + i] = 1.0
-        J[3:, 9:] = Rb.T.copy()
-        P[k] = J @ poses[6 * k : 6 * k + 12, 6 * k : 6 * k + 12].copy() @ J.T.copy()
-    return T, P
+    R, p = X[:, :9].reshape(-1, 3, 3), X[:, 9:12]
+    Ra_back, Rb_back = R[:-1].transpose(0, 2, 1), R[1:].transpose(0, 2, 1)
+    T = np.zeros((n, 4, 4))
+    T[:, :3, :3], T[:, 3, 3] = Ra_back @ R[1:], 1.0
+    T[:, :3, 3] = t = np.einsum("kij,kj->ki", Ra_back, p[1:] - p[:-1])
+    back = T[:, :3, :3].transpose(0, 2, 1)
+    cross = np.zeros((n, 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = t, -t
+    J = np.zeros((n, 6, 12))
+    J[:, :3, :3], J[:, :3, 6:9] = -back, np.eye(3)
+    J[:, 3:, :3], J[:, 3:, 3:6], J[:, 3:, 9:] = back @ cross, -Rb_back, Rb_back
+    index = 6 * np.arange(n)[:, None] + np.arange(12)
+    return T, J @ poses[index[:, :, None], index[:, None, :]] @ J.transpose(0, 2, 1)
 
 
 def pose(x: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vislam.geometry import so3_exp, so3_log
 from vislam.messages import Array
-from vislam.window import inertial, linear, visual
+from vislam.window import inertial, linear, schur, visual
 from vislam.window.layout import CALIBRATION, Camera, Ints, Links, Prior, Views, positions, prior_positions, retract
 
 _MAX_TRIES = 8  # of damping, each ten times the last
@@ -136,7 +136,7 @@ class _Equations:
         S, s = self.U, self._g.copy()
         S[:] = self._A
         np.fill_diagonal(S, np.diag(S) * (1.0 + damping))
-        if not visual.eliminate(
+        if not schur.eliminate(
             self._inverses, self._blocks, self._gradients, self._cross, damping, self._poses_at, S, s
         ) or not linear.factorise(S):
             self.undamped = False
@@ -150,7 +150,7 @@ class _Equations:
         if not np.isfinite(step).all():
             return None
         X, points = moved_states(now.X, step, self._where), np.empty_like(now.points)
-        visual.follow(now.points, self._inverses, self._gradients, self._cross, step[self._poses_at :], points)
+        schur.follow(now.points, self._inverses, self._gradients, self._cross, step[self._poses_at :], points)
         np.minimum(points[:, 2], _MAX_RHO, out=points[:, 2])
         calibration = move_calibration(now.calibration, step[-CALIBRATION:], self._problem.camera.active)
         return self._estimate(X, points, calibration)
@@ -167,27 +167,22 @@ class _Equations:
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_prior(prior: Prior, dx: Array, where: Ints, A: Array, g: Array) -> None:
     """Add the prior at shift `dx` to the upper triangle of the normal equations A, g."""
-    gradient = prior.b + prior.H @ dx
     for i in range(len(where)):
         at = where[i]
-        g[at] += gradient[i]
         row = prior.H[i]
         out = A[at]
+        g[at] += prior.b[i]
         for j in range(len(where)):
+            g[at] += row[j] * dx[j]
             if where[j] >= at:
                 out[where[j]] += row[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def move_calibration(calibration: Array, step: Array, active: NDArray[np.bool_]) -> Array:
     """Return the calibration [5] after a step [5]; what is not estimated stays."""
-    out = calibration.copy()
-    if active[0]:
-        out[0] += step[0]
+    out = np.where(active, calibration + step, calibration)
     if active[1]:
-        out[1:4] = so3_log(so3_exp(calibration[1:4].copy()) @ so3_exp(step[1:4].copy()))
-    if active[4]:
-        out[4] += step[4]
+        out[1:4] = so3_log(so3_exp(calibration[1:4]) @ so3_exp(step[1:4]))
     return out
 
 

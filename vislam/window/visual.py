@@ -15,6 +15,8 @@ from numba import njit
 from vislam.geometry import so3_exp
 from vislam.messages import Array
 from vislam.window.layout import CALIBRATION, Camera, Views
+from vislam.window.schur import invert
+from vislam.window.small import product
 
 COLUMNS = 20  # of an error: host pose 6, pose 6, calibration 5, landmark 3
 _MIN_Z = 0.02  # relative to the host's depth: nearer is beside or behind the camera
@@ -30,20 +32,22 @@ _BEARING, _F_HOST, _F_WORLD, _F_SEEN, _Q, _F_CAM, _GAP, _FREE = 30, 31, 32, 33, 
 _BY_CAM, _BY_Q, _BY_SEEN, _BY_WORLD, _BY_HOST, _BY_BEARING = 38, 39, 40, 41, 42, 43  # rows of a derivative
 _ROWS = 44
 
+# The signatures of the first helpers are given, for numba would compile them again for each constant among the rows.
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+@njit("void(f8[:, ::1], i8, i8, i8)", cache=True, nogil=True, error_model="numpy")
 def _rotate(w: Array, matrix: int, vector: int, out: int) -> None:
     for i in range(3):
         w[out, i] = w[matrix + i, 0] * w[vector, 0] + w[matrix + i, 1] * w[vector, 1] + w[matrix + i, 2] * w[vector, 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit("void(f8[:, ::1], i8, i8, i8)", cache=True, nogil=True, error_model="numpy")
 def _rotate_back(w: Array, matrix: int, vector: int, out: int) -> None:
     for i in range(3):
         w[out, i] = w[matrix, i] * w[vector, 0] + w[matrix + 1, i] * w[vector, 1] + w[matrix + 2, i] * w[vector, 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit("void(f8[:, ::1], i8, i8, i8)", cache=True, nogil=True, error_model="numpy")
 def _cross(w: Array, a: int, b: int, out: int) -> None:
     w[out, 0] = w[a, 1] * w[b, 2] - w[a, 2] * w[b, 1]
     w[out, 1] = w[a, 2] * w[b, 0] - w[a, 0] * w[b, 2]
@@ -54,15 +58,21 @@ def _cross(w: Array, a: int, b: int, out: int) -> None:
 def _scratch(camera: Camera, calibration: Array) -> Array:
     """Return scratch space with the cameras' geometry in it."""
     w = np.zeros((_ROWS, 3))
-    w[_BODY_CAM : _BODY_CAM + 3] = camera.T_body_cam[:3, :3].copy() @ so3_exp(calibration[1:4].copy())
-    w[_BODY_CAM + 3] = camera.T_body_cam[:3, 3]
+    R = product(camera.T_body_cam, so3_exp(calibration[1:4]))
+    for i in range(3):
+        w[_BODY_CAM + 3, i] = camera.T_body_cam[i, 3]
+        for j in range(3):
+            w[_BODY_CAM + i, j] = R[i, j]
     for c in range(len(camera.T_cam0_cams)):
-        w[_CAMS + 4 * c : _CAMS + 4 * c + 3] = camera.T_cam0_cams[c, :3, :3]
-        w[_CAMS + 4 * c + 3] = camera.T_cam0_cams[c, :3, 3]
+        T, at = camera.T_cam0_cams[c], _CAMS + 4 * c
+        for i in range(3):
+            w[at + 3, i] = T[i, 3]
+            for j in range(3):
+                w[at + i, j] = T[i, j]
     return w
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit("void(f8[:, ::1], i8, f8[:, ::1], f8, f8[:, ::1], i8, i8, i8, i8)", cache=True, nogil=True, error_model="numpy")
 def _place(X: Array, k: int, rates: Array, dt: float, w: Array, at: int, turn: int, rate: int, velocity: int) -> None:
     """Put the pose `dt` after the stamp of keyframe k into the scratch space, and the turn since.
 
@@ -265,7 +275,8 @@ def linearise(
     X_by = X.copy()
     for k in range(len(X)):
         if held[k]:
-            X_by[k] = X_first[k]
+            for i in range(X.shape[1]):
+                X_by[k, i] = X_first[k, i]
     cross[:] = 0.0
     for p in range(len(points)):
         host, own, rho = views.host[p], views.first[p], points[p, 2]
@@ -347,69 +358,6 @@ def _accumulate(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def eliminate(
-    points_at: Array, A_points: Array, g_points: Array, cross: Array, damping: float, poses_at: int, A: Array, g: Array
-) -> bool:
-    """Take the landmarks out of the normal equations A, g (Schur complement); False if one is indefinite.
-
-    `points_at` [L, 3, 3] gets the inverses of the landmarks' own blocks, for `follow`.
-    """
-    width = cross.shape[2]
-    y = np.empty((3, width))
-    for p in range(len(A_points)):
-        H, inverse, W = A_points[p], points_at[p], cross[p]
-        a, b, c = H[0, 0] * (1.0 + damping), H[0, 1], H[0, 2]
-        d, e, f = H[1, 1] * (1.0 + damping), H[1, 2], H[2, 2] * (1.0 + damping)
-        inverse[0, 0], inverse[0, 1], inverse[0, 2] = d * f - e * e, c * e - b * f, b * e - c * d
-        inverse[1, 1], inverse[1, 2], inverse[2, 2] = a * f - c * c, b * c - a * e, a * d - b * b
-        det = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
-        if not det > 1e-14 * a * d * f:
-            return False
-        inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
-        for i in range(3):
-            for j in range(3):
-                inverse[i, j] /= det
-        q = g_points[p]
-        for j in range(width):
-            w0, w1, w2 = W[0, j], W[1, j], W[2, j]
-            y[0, j] = inverse[0, 0] * w0 + inverse[0, 1] * w1 + inverse[0, 2] * w2
-            y[1, j] = inverse[1, 0] * w0 + inverse[1, 1] * w1 + inverse[1, 2] * w2
-            y[2, j] = inverse[2, 0] * w0 + inverse[2, 1] * w1 + inverse[2, 2] * w2
-            g[poses_at + j] -= y[0, j] * q[0] + y[1, j] * q[1] + y[2, j] * q[2]
-        # only the columns of keyframes that see it; they lie together, and calibration lies at the end
-        end = width - CALIBRATION
-        while end > 0 and W[0, end - 1] == 0.0 and W[1, end - 1] == 0.0 and W[2, end - 1] == 0.0:
-            end -= 1
-        for i in range(width):
-            y0, y1, y2 = y[0, i], y[1, i], y[2, i]
-            if y0 == 0.0 and y1 == 0.0 and y2 == 0.0:
-                continue
-            out = A[poses_at + i, poses_at:]
-            for j in range(i, end):
-                out[j] -= y0 * W[0, j] + y1 * W[1, j] + y2 * W[2, j]
-            for j in range(max(i, width - CALIBRATION), width):
-                out[j] -= y0 * W[0, j] + y1 * W[1, j] + y2 * W[2, j]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def follow(points: Array, points_at: Array, g_points: Array, cross: Array, step: Array, out: Array) -> None:
-    """Move the landmarks [L, 3] to where the step [D - poses_at] of poses and calibration wants them, into `out`."""
-    b = np.empty(3)
-    for p in range(len(points)):
-        for i in range(3):
-            total = g_points[p, i]
-            W = cross[p, i]
-            for j in range(len(step)):
-                total += W[j] * step[j]
-            b[i] = total
-        for i in range(3):
-            out[p, i] = points[p, i] - (
-                points_at[p, i, 0] * b[0] + points_at[p, i, 1] * b[1] + points_at[p, i, 2] * b[2]
-            )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def start(
     X: Array, calibration: Array, views: Views, camera: Camera, wanted: Array, rho_start: float, points: Array
 ) -> None:
@@ -417,12 +365,12 @@ def start(
 
     Once through the linear equation for the inverse depth, then three Gauss-Newton steps with the poses fixed.
     """
-    w, r, J = _scratch(camera, calibration), np.empty(3), np.empty((3, COLUMNS))
+    w = _scratch(camera, calibration)
     for p in range(len(points)):
         if not wanted[p]:
             continue
         point, host, own = points[p], views.host[p], views.first[p]
-        point[:2] = views.xy[own]
+        point[0], point[1] = views.xy[own, 0], views.xy[own, 1]
         dt_host = _shift(views, camera, calibration, own, host)
         numerator, denominator = 1e2 * rho_start, 1e2
         for n in range(own, views.first[p + 1]):
@@ -447,23 +395,38 @@ def start(
                 numerator += views.depth_weight[n] ** 2 * a * views.inverse_depth[n] * far_z
                 denominator += views.depth_weight[n] ** 2 * a * a
         point[2] = min(max(numerator / denominator, 1e-3), 5.0)
-        for _ in range(3):
-            H, b = np.eye(3) * camera.rho_information, point * camera.rho_information
-            _place_host(X, host, camera, dt_host, point, w)
-            for n in range(own, views.first[p + 1]):
-                seen = views.keyframe[n]
-                dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
-                _chain(X, seen, camera, dt, point[2], views.camera[n], w)
-                if not _residual(w, views, n, point[2], r):
-                    continue
-                _derivative(w, views, n, own, point[2], seen == host, J)
-                rows = 3 if views.depth_weight[n] > 0.0 else 2
-                _weigh(J, r, rows, camera.huber_k)
-                for k in range(rows):
-                    for i in range(3):
-                        b[i] += J[k, 17 + i] * r[k]
-                        for j in range(3):
-                            H[i, j] += J[k, 17 + i] * J[k, 17 + j]
-            step = np.linalg.solve(H, b)
-            point[:2] -= step[:2]
-            point[2] = min(max(point[2] - step[2], -0.1), 10.0)
+        _refine(X, calibration, views, camera, p, point, dt_host, w)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refine(
+    X: Array, calibration: Array, views: Views, camera: Camera, p: int, point: Array, dt_host: float, w: Array
+) -> None:
+    """Move landmark p [3] by three Gauss-Newton steps with the poses fixed."""
+    host, own, r, J = views.host[p], views.first[p], np.empty(3), np.empty((3, COLUMNS))
+    H, b, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for _ in range(3):
+        for i in range(3):
+            b[i] = camera.rho_information * point[i]
+            for j in range(3):
+                H[i, j] = camera.rho_information if i == j else 0.0
+        _place_host(X, host, camera, dt_host, point, w)
+        for n in range(own, views.first[p + 1]):
+            seen = views.keyframe[n]
+            dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
+            _chain(X, seen, camera, dt, point[2], views.camera[n], w)
+            if not _residual(w, views, n, point[2], r):
+                continue
+            _derivative(w, views, n, own, point[2], seen == host, J)
+            rows = 3 if views.depth_weight[n] > 0.0 else 2
+            _weigh(J, r, rows, camera.huber_k)
+            for k in range(rows):
+                for i in range(3):
+                    b[i] += J[k, 17 + i] * r[k]
+                    for j in range(3):
+                        H[i, j] += J[k, 17 + i] * J[k, 17 + j]
+        if not invert(H, 0.0, inverse):
+            break
+        for i in range(3):
+            point[i] -= inverse[i, 0] * b[0] + inverse[i, 1] * b[1] + inverse[i, 2] * b[2]
+        point[2] = min(max(point[2], -0.1), 10.0)
