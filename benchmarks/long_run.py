@@ -16,7 +16,6 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
@@ -30,10 +29,9 @@ import psutil  # noqa: E402
 
 matplotlib.use("Agg")
 
-from fake_window import FakeWindow  # noqa: E402
 from g2o_edges import BEST_CHI2, EdgeFile  # noqa: E402
 from graph_world import GRAVITY_M_S2, packet_of  # noqa: E402
-from lap_world import STEREO, LapWorld  # noqa: E402
+from lap_world import STEREO, LapWorld, window_of_truth  # noqa: E402
 from matplotlib import pyplot as plt  # noqa: E402
 
 import vislam.window  # noqa: E402
@@ -98,25 +96,6 @@ class Meter:
         figure.savefig(path, dpi=120)
         plt.close(figure)
         return path
-
-
-def window_of_truth(world: LapWorld, count: int) -> FakeWindow:
-    """Return a window that costs nothing, so that what is measured is the graph."""
-    laps = -(-count // world.per_lap)
-    zeros = np.zeros((round(count * world.imu_hz / world.keyframe_hz) + 1, 3))
-    motion = SimpleNamespace(
-        truth=np.tile(world.truth, (laps, 1, 1)),
-        velocity=np.tile(world.velocity, (laps, 1)),
-        true_gyro_bias=zeros,
-        true_accel_bias=zeros,
-        vo_sigma_rad=world.vo_sigmas[0],
-        vo_sigma_m=world.vo_sigmas[3],
-        imu_hz=world.imu_hz,
-        keyframe_hz=world.keyframe_hz,
-        t_ns=world.t_ns,
-        seed=1,
-    )
-    return FakeWindow(motion, keyframes=15)
 
 
 def hour(coupling: str, minutes: float, loop_every: int, tracks: int) -> None:

@@ -296,9 +296,10 @@ class GraphConfig:
     consistency_inflation: float = 3.0  # on odometry sigma; loops are parked because odometry is overconfident
     consistency_max_sigma_m: float = 0.5  # odometry looser than this between two loops proves nothing
     consistency_max_sigma_deg: float = 5.0
-    loop_gain_min: float = 1.0  # on long runs a loop of more than 1 / this times the graph's own variance adds no factor
-    anchor_reach: int = 10  # keyframes; on long runs a loop to one so near a tied one ties to the latter's anchor ...
-    anchor_variance_max: float = 1.0  # ... if the way there adds at most so many times the loop's own variance
+    loop_gain_min: float = 1.0  # variance of the graph over that of a loop; on long runs less adds no factor
+    anchor_after: int = 20  # loops in the graph; after them a loop to a keyframe that is tied to an older one, or ...
+    anchor_reach: int = 10  # ... is so many keyframes from one that is, ties to that older one, the place's anchor ...
+    anchor_variance_max: float = 4.0  # ... if the way there adds at most so many times the loop's own variance
     vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
 
 

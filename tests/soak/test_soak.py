@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from g2o_edges import BEST_CHI2, EdgeFile
 from graph_world import GRAVITY_M_S2, RIG, packet_of
-from lap_world import STEREO, LapWorld
+from lap_world import STEREO, LapWorld, window_of_truth
 
+import vislam.window
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError
 from vislam.factors.replay import Between, EdgeGraph
 from vislam.geometry import se3_exp, transform
 from vislam.graph import PoseGraph
-from vislam.messages import LoopEdge, Tracking, VoMeasurement
+from vislam.messages import LoopDecision, LoopEdge, Tracking, VoMeasurement
 
 
 @pytest.mark.data
@@ -104,3 +105,30 @@ def test_minutes_of_keyframes_with_loops(coupling: str, minutes: float) -> None:
     print(f"rmse {np.sqrt(np.mean(error_m**2)):.3f} m, published poses were {lag_m.max():.4f} m from the final ones")
     assert np.sqrt(np.mean(error_m**2)) < 0.1
     assert lag_m.max() < 0.1
+
+
+def test_loops_to_any_earlier_visit_tie_to_few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What bounds the work of an update: the older ends of loop factors do not grow in number with the visits."""
+    count, runs = 640, {}
+    for name, after in (("as measured", 10**9), ("to anchors", 20)):
+        world = LapWorld(seed=8, tracks=0)
+        fake = window_of_truth(world, count)
+        monkeypatch.setattr(vislam.window, "SlidingWindow", lambda *_, fake=fake: fake)
+        graph = PoseGraph(
+            GraphConfig(coupling="tight", anchor_after=after), world.noise, GRAVITY_M_S2, STEREO, WindowConfig()
+        )
+        graph.initialise(world.initial_state())
+        truth = []
+        for step in world.steps(count):
+            assert graph.add(step.packet, step.edges).note == ""
+            truth.append(step.truth)
+        assert all(report.decision is LoopDecision.ACCEPTED for report in graph.edge_reports())
+        keys = [model.factor(robust=True).keys() for model in graph._estimator.loops.values()]
+        live, final = graph.poses(), graph.finish().T_map_body
+        errors = [np.sqrt(np.mean(np.sum((T - np.stack(truth))[:, :3, 3] ** 2, axis=1))) for T in (live, final)]
+        runs[name] = len({min(pair) for pair in keys[20:]}), len(keys), *errors
+        print(name, "{} older ends of {} loops, rmse live {:.4f} m, final {:.4f} m".format(*runs[name]))
+    measured, anchored = runs["as measured"], runs["to anchors"]
+    assert anchored[0] <= 10 and measured[0] > 25
+    assert anchored[2] < 1.3 * measured[2]
+    assert abs(anchored[3] - measured[3]) < 1e-3

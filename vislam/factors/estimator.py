@@ -33,8 +33,8 @@ class Loop(Protocol):
     def id(self) -> int:
         """Return its number, unique in a run."""
 
-    def factor(self, robust: bool) -> gtsam.NonlinearFactor:
-        """Return the factor, under a kernel when `robust`."""
+    def factor(self, robust: bool, as_measured: bool = False) -> gtsam.NonlinearFactor:
+        """Return the factor, under a kernel when `robust`, between the loop's own ends when `as_measured`."""
 
 
 L = TypeVar("L", bound=Loop)
@@ -61,6 +61,7 @@ class Estimator(Generic[L]):
         self._next_old = 0  # where the next block of older poses begins
         self._read: list[NDArray[np.int64]] = []  # ids since `take_read`
         self.loops: dict[int, L] = {}  # in the graph, by loop id
+        self.spare: dict[int, L] = {}  # accepted without a factor, which only `converge` takes
         self.vo_scale = 1.0  # on the sigma of visual odometry, learnt from loops that it contradicted
 
     @property
@@ -192,7 +193,8 @@ class Estimator(Generic[L]):
     def converge(self) -> str:
         """Iterate to convergence, then keep the better of that and a batch solution; return which, with the costs.
 
-        The batch integrates the IMU anew at the final biases, so both are judged on that graph.
+        The batch integrates the IMU anew at the final biases and has all loops as measured, so both are judged on that
+        graph.
         """
         note = ""
         for _ in range(self._config.finish_iterations):
@@ -204,7 +206,7 @@ class Estimator(Generic[L]):
                 note = self._recover(self._values, [], error) + "; "
             if float(np.max(np.abs(self.poses - before))) < _CONVERGED_M:
                 break
-        graph, _ = self._whole(self._values, self.loops)
+        graph, _ = self._whole(self._values, self.loops | self.spare, as_measured=True)
         cost = float(graph.error(self._values))
         try:
             values = optimize(graph, self._values, _BATCH_ITERATIONS)
@@ -323,16 +325,24 @@ class Estimator(Generic[L]):
         self._solver, self.loops, self._slots = solver, loops, _named(labels, slots)
 
     def _whole(
-        self, values: gtsam.Values, loops: dict[int, L], plain: set[int] | None = None
+        self,
+        values: gtsam.Values,
+        loops: dict[int, L],
+        plain: set[int] | None = None,
+        as_measured: bool = False,
     ) -> tuple[gtsam.NonlinearFactorGraph, list[Label | None]]:
-        """Build all factors at the biases of `values`, with their names; loops in `plain` without a kernel."""
+        """Build all factors at the biases of `values`, with their names; loops in `plain` without a kernel.
+
+        `as_measured` leaves out what keeps the work of an update small: each loop is between its own ends.
+        """
         factors, _ = self._odometry.start()
         labels: list[Label | None] = [None] * len(factors)
         for k in range(1, self._count):
             step = self._step(k, values)
             factors += [*step.factors, *step.named.values()]
             labels += [*[None] * len(step.factors), *step.named]
-        factors += [edge.factor(robust=loop_id not in (plain or set())) for loop_id, edge in loops.items()]
+        robust = {loop_id: loop_id not in (plain or set()) for loop_id in loops}
+        factors += [edge.factor(robust[loop_id], as_measured) for loop_id, edge in loops.items()]
         labels += [("loop", loop_id) for loop_id in loops]
         return _graph(factors), labels
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import gtsam
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from vislam.config import GraphConfig
 from vislam.factors.journal import LoopRecord
-from vislam.factors.keys import X
+from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.noise import cauchy, conditioned, gaussian, inflated
 from vislam.factors.visual import (
     DirectionMeasurement,
@@ -23,6 +25,15 @@ from vislam.messages import Array
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """A loop as it was put into the graph, with another older keyframe that stands for its own."""
+
+    from_id: int
+    T_from_to: Array  # [4, 4]
+    covariance: Array  # [6, 6]
+
+
 class LoopModel:
     """One loop edge, metric or scale-free: its factor, its residual and its chi-square."""
 
@@ -31,6 +42,7 @@ class LoopModel:
         self.record = record
         self._config = config
         self._lever_m = lever_m
+        self.tie: Tie | None = None  # how the graph has it, when not as measured
         covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), config.loop_floor_m)
         self._direction: DirectionMeasurement | None = None
         if not record.has_scale:
@@ -46,15 +58,42 @@ class LoopModel:
         """Return the id of the loop."""
         return self.record.id
 
-    def factor(self, robust: bool) -> gtsam.NonlinearFactor:
-        """Return the factor, under a Cauchy kernel when `robust`."""
+    def gain(self, relative_covariance: Array) -> float:
+        """Return how large the graph's variance of the relative pose [6, 6] is in units of the loop's own.
+
+        The larger of rotation and translation. For scale-free loops infinity: they measure something else.
+        """
+        if self._direction is not None:
+            return float("inf")
+        parts = (slice(3), slice(3, 6))
+        return float(max(np.trace(relative_covariance[n, n]) / np.trace(self.covariance[n, n]) for n in parts))
+
+    def tie_to(self, anchor_id: int, T_anchor_from: Array, covariance: Array) -> bool:
+        """Let another keyframe stand for the older one: T_anchor_from [4, 4] is where that is, known to `covariance`.
+
+        Returns False, and changes nothing, where that would add too much to the loop's own variance in rotation or
+        translation, and for scale-free loops, whose meaning is bound to their ends.
+        """
+        T = self.record.T_from_to
+        carry = se3_adjoint(invert(T))
+        added = carry @ covariance @ carry.T
+        if self.gain(added) > self._config.anchor_variance_max:
+            return False
+        self.tie = Tie(anchor_id, nearest_rigid(T_anchor_from @ T), self.covariance + added)
+        return True
+
+    def factor(self, robust: bool, as_measured: bool = False) -> gtsam.NonlinearFactor:
+        """Return the factor, under a Cauchy kernel when `robust`, between the loop's own ends when `as_measured`."""
         record, config = self.record, self._config
-        model: gtsam.noiseModel.Base = gaussian(self.covariance, config.covariance_ratio_max)
+        tie = Tie(record.from_id, record.T_from_to, self.covariance)
+        if self.tie is not None and not as_measured:
+            tie = self.tie
+        model: gtsam.noiseModel.Base = gaussian(tie.covariance, config.covariance_ratio_max)
         if robust:
             model = cauchy(model, config.loop_cauchy_k)
-        a, b = X(record.from_id), X(record.to_id)
+        a, b = X(tie.from_id), X(record.to_id)
         if self._direction is None:
-            return pose_factor(a, b, record.T_from_to, model)
+            return pose_factor(a, b, tie.T_from_to, model)
         return direction_factor(
             a, b, self._direction, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model
         )

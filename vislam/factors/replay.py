@@ -35,8 +35,8 @@ class Between:
     T_from_to: Array  # [4, 4]
     covariance: Array  # [6, 6] perturbed on the side of `to_id`
 
-    def factor(self, robust: bool) -> gtsam.NonlinearFactor:
-        """Return the factor; it has no kernel, whatever `robust` says."""
+    def factor(self, robust: bool, as_measured: bool = False) -> gtsam.NonlinearFactor:
+        """Return the factor; it has no kernel, whatever `robust` says, and is always as measured."""
         return pose_factor(X(self.from_id), X(self.to_id), self.T_from_to, gaussian(self.covariance, _RATIO_MAX))
 
 

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError, UsageError
+from vislam.factors.anchors import Anchors, Tied
 from vislam.factors.estimator import Estimator
 from vislam.factors.gate import CarPark, EdgeReport, Travel
 from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe_record, loop_record, start_record
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel, relative_covariance
-from vislam.geometry import invert
+from vislam.geometry import invert, se3_adjoint
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.imu import ImuNoise
 from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState
@@ -56,11 +57,11 @@ class PoseGraph:
         self._keyframes: list[KeyframeRecord] = []
         self._travel = Travel()
         self._park = CarPark(config)
+        self._anchors = Anchors(config)
         self._reports: dict[int, EdgeReport] = {}
         self._published: Array = np.zeros((0, 4, 4))
         self._T_map_odom: Array = np.eye(4)
         self._revision = 0
-        self._last_closed = 0  # newest keyframe that a loop ties to older ones
 
     @property
     def ids(self) -> NDArray[np.int64]:
@@ -69,7 +70,7 @@ class PoseGraph:
 
     @property
     def journal(self) -> list[Record]:
-        """Return everything that was measured, as plain records in the order of arrival."""
+        """Return what was measured, as far as a rebuild needs it: plain records in the order of arrival."""
         return list(self._journal)
 
     def initialise(self, state: NavState | None, T_map_body: Array | None = None) -> None:
@@ -104,6 +105,8 @@ class PoseGraph:
         if previous is None:
             self._check_start(record)
         said = self._source.add(packet, record, T_odom_body)
+        if self._config.coupling == "tight":
+            record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
         self._journal += [self._start, record, *said] if previous is None else [record, *said]
         if previous is None:
             notes = [self._estimator.begin()]
@@ -211,30 +214,28 @@ class PoseGraph:
     def _gate(self, model: LoopModel) -> bool:
         """Test an edge against the current estimate and note the chi-square.
 
-        A joint marginal takes as long as the run is long: there, a loop that passes with less is inside with it too.
+        On long runs one that passes, and of whose relative pose the graph is as sure as the loop, is kept in spare.
         """
         record = model.record
-        chi2 = np.inf
-        if self._estimator.is_long:
-            chi2 = model.chi2(*self._ends(model), self._least_covariance(record.to_id))
-        if chi2 > model.threshold:
-            chi2 = model.chi2(*self._ends(model), self.relative_covariance(record.from_id, record.to_id))
+        to_anchor = self._tie(model)
+        if model.tie is None or to_anchor is None:
+            known = self.relative_covariance(record.from_id, record.to_id)
+        else:  # an upper bound, as if the two ways shared nothing
+            T_map_older, T_map_newer = self._ends(model)
+            carry = se3_adjoint(invert(T_map_newer) @ T_map_older)
+            known = self.relative_covariance(model.tie.from_id, record.to_id) + carry @ to_anchor @ carry.T
+        chi2 = model.chi2(*self._ends(model), known)
         inside = bool(chi2 <= model.threshold)
         decision = LoopDecision.ACCEPTED if inside else LoopDecision.PARKED
         reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
         self._reports[record.id] = EdgeReport(
             record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason
         )  # fmt: skip
+        gain = model.gain(known)
+        if inside and self._estimator.is_long and gain < self._config.loop_gain_min:
+            self._estimator.spare[record.id] = model
+            self._report(model, decision, f"redundant, the graph has {gain:.2f} times its variance")
         return inside
-
-    def _least_covariance(self, k: int) -> Array:
-        """Return what the relative pose of keyframe k and an old one is uncertain by at least: odometry since a loop.
-
-        With an IMU in the graph nothing is said: the motion is known better than odometry alone knows it.
-        """
-        if self._estimator.has_imu or self._last_closed > k:
-            return np.zeros((6, 6))
-        return self._travel.relative_covariance(self._last_closed, k)
 
     def _report(self, model: LoopModel, decision: LoopDecision, reason: str) -> None:
         old = self._reports[model.record.id]
@@ -242,6 +243,9 @@ class PoseGraph:
 
     def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> list[LoopModel]:
         """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
+        fresh = [m for m in fresh if m.record.id not in self._estimator.spare]
+        if not fresh:
+            return []
         far = promoted or any(self._is_far(m) for m in fresh)
         fits = not far and all(m.weight(*self._ends(m)) >= _FITS for m in fresh)
         notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._estimator.is_long))
@@ -256,11 +260,48 @@ class PoseGraph:
                 decision = LoopDecision.REJECTED if promoted else LoopDecision.PARKED
                 self._report(model, decision, f"contradicted by the graph, weight {weight:.3f}")
             else:
-                self._report(model, LoopDecision.ACCEPTED, reason)
-                self._last_closed = max(self._last_closed, model.record.to_id)
+                self._report(
+                    model,
+                    LoopDecision.ACCEPTED,
+                    reason + ("" if model.tie is None else f", by way of keyframe {model.tie.from_id}"),
+                )
+                self._remember(model)
         if contradicted:
             notes.append(self._estimator.drop(contradicted))
         return contradicted
+
+    def _remember(self, model: LoopModel) -> None:
+        """Take note of which anchor an accepted loop ties its newer end to."""
+        older, newer = model.record.from_id, model.record.to_id
+        if not model.record.has_scale:
+            return
+        anchor = self._anchors.of(older) if model.tie is None else model.tie.from_id
+        if anchor == older:
+            self._anchors.tie(Tied(older, older, np.zeros((6, 6))))
+        self._anchors.tie(Tied(newer, anchor, self.relative_covariance(anchor, newer)))
+
+    def _tie(self, model: LoopModel) -> Array | None:
+        """Where loops are many, let an anchor stand for the older end; return the covariance [6, 6] of T_anchor_older.
+
+        Otherwise each visit of a place would tie to all others, and the work of an update would grow with their number.
+        What was known when the older end was tied does mostly; an exact marginal takes long where loops are many.
+        """
+        model.tie = None
+        older = model.record.from_id
+        near = self._anchors.near(older) if len(self._estimator.loops) >= self._config.anchor_after else None
+        if near is None or near.anchor_id in (older, model.record.to_id):
+            return None
+        anchor = near.anchor_id
+        self._estimator.look_at([anchor, near.id])
+        T_map_anchor, T_map_near, T_map_older = (self._estimator.poses[k] for k in (anchor, near.id, older))
+        carry = se3_adjoint(invert(T_map_older) @ T_map_near)
+        covariance = carry @ near.covariance @ carry.T
+        if near.id != older:
+            covariance += self._travel.relative_covariance(near.id, older)
+        if not model.tie_to(anchor, invert(T_map_anchor) @ T_map_older, covariance):
+            covariance = self.relative_covariance(anchor, older)
+            model.tie_to(anchor, invert(T_map_anchor) @ T_map_older, covariance)
+        return None if model.tie is None else covariance
 
     def _is_far(self, model: LoopModel) -> bool:
         """Return whether a loop asks for a correction beyond what incremental steps should try."""
@@ -293,6 +334,8 @@ class PoseGraph:
         factor = float(np.clip(np.sqrt(misfit), 1.0, max(room, 1.0)))
         self._estimator.distrust_odometry(factor)
         self._travel.scale(factor)
+        for model in group:
+            self._tie(model)
         self._accept(group, notes, f"one of {len(group)} parked loops that agree", promoted=True)
         torn = [m for m in sound if m.weight(*self._ends(m)) < _COLLAPSED]
         if len(torn) >= len(group):

@@ -1,0 +1,49 @@
+"""Anchors: the keyframe that stands for a place, so that a run's loops tie to few keyframes however long it goes on."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+from vislam.config import GraphConfig
+from vislam.messages import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tied:
+    """A keyframe that a loop ties to an anchor, or an anchor itself."""
+
+    id: int
+    anchor_id: int
+    covariance: Array  # [6, 6] of its pose relative to the anchor when it was tied; later it is known better
+
+
+class Anchors:
+    """Remembers to which anchor accepted loops tie keyframes.
+
+    Loops from each visit of a place to any earlier one fill the factorised system with every visit; loops to the same
+    old keyframe with one. The idea is that of the reduced pose graph (Johannsson et al., "Temporally scalable visual
+    SLAM using a reduced pose graph", ICRA 2013), whose size follows the space explored and not the time.
+    """
+
+    def __init__(self, config: GraphConfig) -> None:
+        """Start without any."""
+        self._reach = config.anchor_reach
+        self._tied: dict[int, Tied] = {}
+        self._ids: list[int] = []  # keys of the above, ascending
+
+    def near(self, k: int) -> Tied | None:
+        """Return the tied keyframe nearest to k along the run; None when there is none in reach."""
+        n = bisect_left(self._ids, k)
+        around = [c for c in self._ids[max(n - 1, 0) : n + 1] if abs(c - k) <= self._reach]
+        return self._tied[min(around, key=lambda c: abs(c - k))] if around else None
+
+    def of(self, k: int) -> int:
+        """Return the anchor of a keyframe; itself when nothing ties it yet."""
+        return self._tied[k].anchor_id if k in self._tied else k
+
+    def tie(self, tied: Tied) -> None:
+        """Take note of a keyframe; what is known of one stays."""
+        if tied.id not in self._tied:
+            self._tied[tied.id] = tied
+            self._ids.insert(bisect_left(self._ids, tied.id), tied.id)
