@@ -156,7 +156,9 @@ def test_factorisation_solution_and_covariance_agree_with_numpy() -> None:
     inverse = np.linalg.inv(A)
     np.testing.assert_allclose(linear.trailing_covariance(U, 12), inverse[12:, 12:], rtol=1e-6, atol=1e-9)
     columns = np.array([3, 17])
-    np.testing.assert_allclose(linear.columns_of_covariance(U, columns), inverse[:, columns], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        linear.joint_covariance(U, columns), inverse[np.ix_(columns, columns)], rtol=1e-6, atol=1e-9
+    )
     A[4, 4] = -1.0
     assert not linear.factorise(A)
 

@@ -19,7 +19,7 @@ from vislam.imu import ImuNoise, Preintegrated
 from vislam.messages import Array, Observations
 from vislam.window import visual
 from vislam.window.layout import CALIBRATION, STATE, Camera, Links, Prior
-from vislam.window.linear import columns_of_covariance
+from vislam.window.linear import joint_covariance
 from vislam.window.posterior import pose, scale_sigma
 from vislam.window.solver import Problem, optimise
 from vislam.window.spans import information, jacobian_by_bias
@@ -110,7 +110,7 @@ def solve(
     )
     poses_at = 9 * count
     index = np.concatenate([np.arange(poses_at, poses_at + 6 * count), np.arange(9), np.arange(poses_at - 9, poses_at)])
-    joint = columns_of_covariance(solution.U, index)[index] if solution.ok else np.full((len(index),) * 2, np.nan)
+    joint = joint_covariance(solution.U, index) if solution.ok else np.full((len(index),) * 2, np.nan)
     at = 6 * count
     first = np.concatenate([np.arange(6), np.arange(at, at + 9)])
     last = np.concatenate([np.arange(at - 6, at), np.arange(at + 9, at + 18)])

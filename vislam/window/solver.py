@@ -167,15 +167,17 @@ class _Equations:
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_prior(prior: Prior, dx: Array, where: Ints, A: Array, g: Array) -> None:
     """Add the prior at shift `dx` to the upper triangle of the normal equations A, g."""
-    for i in range(len(where)):
+    touched = np.flatnonzero(np.diag(prior.H))  # of the others it says nothing: their rows and columns are zero
+    for i in touched:
         at = where[i]
         row = prior.H[i]
         out = A[at]
-        g[at] += prior.b[i]
-        for j in range(len(where)):
-            g[at] += row[j] * dx[j]
+        total = prior.b[i]
+        for j in touched:
+            total += row[j] * dx[j]
             if where[j] >= at:
                 out[where[j]] += row[j]
+        g[at] += total
 
 
 def move_calibration(calibration: Array, step: Array, active: NDArray[np.bool_]) -> Array:

@@ -239,6 +239,16 @@ def _derivative(w: Array, views: Views, n: int, own: int, rho: float, same: bool
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _where_linearised(X: Array, X_first: Array, held: Array) -> Array:
+    out = X.copy()
+    for k in range(len(X)):
+        if held[k]:
+            for i in range(X.shape[1]):
+                out[k, i] = X_first[k, i]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def linearise(
     X: Array,
     X_first: Array,
@@ -272,11 +282,7 @@ def linearise(
         cross: landmarks by poses and calibration [L, 3, D - poses_at], overwritten.
     """
     w, r, J, waste = _scratch(camera, calibration), np.empty(3), np.empty((3, COLUMNS)), np.empty(3)
-    X_by = X.copy()
-    for k in range(len(X)):
-        if held[k]:
-            for i in range(X.shape[1]):
-                X_by[k, i] = X_first[k, i]
+    X_by = _where_linearised(X, X_first, held)
     cross[:] = 0.0
     for p in range(len(points)):
         host, own, rho = views.host[p], views.first[p], points[p, 2]
@@ -285,15 +291,20 @@ def linearise(
         A_points[p, 2, 2] = camera.rho_information
         g_points[p, 2] = camera.rho_information * rho
         dt_host = _shift(views, camera, calibration, own, host)
+        placed = False
         for n in range(own, views.first[p + 1]):
             seen = views.keyframe[n]
             dt = dt_host if seen == host else _shift(views, camera, calibration, n, seen)
-            _place_host(X, host, camera, dt_host, points[p], w)
+            if not placed:
+                _place_host(X, host, camera, dt_host, points[p], w)
+                placed = True
             _chain(X, seen, camera, dt, rho, views.camera[n], w)
             if not _residual(w, views, n, rho, r):
                 continue
             if held[host] or held[seen]:
-                _place_host(X_by, host, camera, dt_host, points[p], w)
+                if held[host]:
+                    _place_host(X_by, host, camera, dt_host, points[p], w)
+                    placed = False
                 _chain(X_by, seen, camera, dt, rho, views.camera[n], w)
                 if not _residual(w, views, n, rho, waste):
                     continue
@@ -350,11 +361,15 @@ def _accumulate(
                 g[poses_at + at] += value * r[k]
                 for j in range(3):
                     cross[p, j, at] += J[k, 17 + j] * value
-                for b in range(a, 3):
-                    start = i if b == a else 0
-                    first = poses_at + blocks[b]
-                    for j in range(start, 6 if b < 2 else CALIBRATION):
-                        A[poses_at + at, first + j] += value * J[k, 6 * b + j]
+            out = A[poses_at + at]
+            for b in range(a, 3):
+                start = i if b == a else 0
+                first = poses_at + blocks[b]
+                for j in range(start, 6 if b < 2 else CALIBRATION):
+                    total = J[0, column] * J[0, 6 * b + j] + J[1, column] * J[1, 6 * b + j]
+                    if rows == 3:
+                        total += J[2, column] * J[2, 6 * b + j]
+                    out[first + j] += total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

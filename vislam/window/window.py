@@ -22,7 +22,7 @@ from vislam.messages import Array, ImuSpan, KeyframePacket, NavState, Tracking
 from vislam.window import visual
 from vislam.window.layout import CALIBRATION, STATE, Camera, Ints, Prior
 from vislam.window.leaving import split
-from vislam.window.linear import columns_of_covariance, trailing_covariance
+from vislam.window.linear import joint_covariance, trailing_covariance
 from vislam.window.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowTilt, WindowUpdate
 from vislam.window.posterior import edges, nav_state, pose, scale_sigma, tilt
@@ -398,7 +398,7 @@ class SlidingWindow:
         if not self._full:
             return settled, [], []
         index = np.concatenate([9 * len(self._ids) + np.arange(6), np.arange(9)])
-        covariance = columns_of_covariance(solution.U, index)[index]
+        covariance = joint_covariance(solution.U, index)
         state = nav_state(int(self._t_ns[0]), self._X[0], covariance)
         return settled, [tilt(oldest, self._X[0], covariance[:3, :3])], [(oldest, state)]
 
