@@ -30,7 +30,8 @@ _START = "from vislam.cli import main; main()"  # what the script `vislam` does,
 COLUMNS = (
     "recording",
     "mode",
-    "ATE final [m]",
+    "ATE batch [m]",
+    "ATE graph [m]",
     "ATE EKF alone [m]",
     "keyframes",
     "loops",
@@ -45,7 +46,7 @@ class Entry:
 
     name: str
     recording: str  # as the reader of the table knows it
-    source: str  # "tum:FOLDER" and "euroc:FOLDER" below the data folder, or "sim:WORLD"
+    source: str  # "tum:FOLDER", "euroc:FOLDER", "points:FOLDER,option=value" below the data folder, or "sim:WORLD"
     options: tuple[str, ...] = ()
 
 
@@ -62,6 +63,14 @@ ENTRIES = (
     Entry("tum_fr1_desk", "TUM fr1_desk, 20 s", "tum:tum_fr1_desk"),
     Entry("euroc_mh01_stereo", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "stereo")),
     Entry("euroc_mh01_mono", "EuRoC MH_01, 17 s", "euroc:euroc_mh01_17s", ("--frontend.mode", "mono")),
+    Entry(
+        "euroc_mh01_mono_loose",
+        "the same, loosely coupled",
+        "euroc:euroc_mh01_17s",
+        ("--frontend.mode", "mono", "--graph.coupling", "loose", "--ekf.coupling", "loose"),
+    ),
+    Entry("v101_points", "EuRoC V1_01, IMU real, vision simulated", "points:euroc_v101_imu,rig=mono"),
+    Entry("v201_points", "EuRoC V2_01, IMU real, vision simulated", "points:euroc_v201_imu,rig=mono"),
     Entry("corridor_loop", "simulated corridor-loop", "sim:corridor-loop"),
     Entry("corridor_open", "the same, loop closing off", "sim:corridor-loop", ("--loop.no-enabled",)),
     Entry(
@@ -89,14 +98,17 @@ def data_root() -> Path:
 
 def measure(entry: Entry, out: Path, root: Path, reuse: bool = False) -> Outcome:
     """Run one entry in a process of its own; with `reuse`, a finished run in `out` is taken as it is."""
-    kind, _, name = entry.source.partition(":")
+    kind, _, rest = entry.source.partition(":")
+    name, *options = rest.split(",")
     if kind != "sim" and not (root / name).is_dir():
         return Outcome(entry, None, "recording missing")
     if not (reuse and (out / "metrics.json").is_file()):
         shutil.rmtree(out, ignore_errors=True)
         folder = out.parent / "recordings" / name if kind == "sim" else root / name
         failure = _call("simulate", name, "--out", str(folder)) if kind == "sim" and not folder.exists() else ""
-        failure = failure or _call("run", str(folder), "--out", str(out), *entry.options)
+        source = ",".join([f"points:{folder}", *options]) if kind == "points" else str(folder)
+        failure = failure or _call("run", source, "--out", str(out), *entry.options)
+        failure = failure or _call("optimize", str(out))
         if failure:
             return Outcome(entry, None, failure)
     try:
@@ -142,6 +154,7 @@ def row(outcome: Outcome) -> list[str]:
     return [
         outcome.entry.recording,
         mode,
+        _number((accuracy.get("batch") or {}).get("ate_rmse_m"), 3),
         _number(final.get("ate_rmse_m"), 3) + note,
         causal if inertial or causal == "–" else f"{causal} (odometry)",
         _number(metrics.get("keyframes"), 0),

@@ -22,6 +22,7 @@ METRICS = {
     "loops": {"candidates": 40, "accepted": 7, "parked": 1, "rejected": 32},
     "accuracy": {
         "ekf": {"ate_rmse_m": 0.1234, "coverage": 1.0, "scale": 1.0},
+        "batch": {"ate_rmse_m": 0.0191, "coverage": 1.0, "scale": 1.0},
         "graph": {"ate_rmse_m": 0.0216, "coverage": 0.996, "scale": 1.003},
     },
 }
@@ -33,17 +34,17 @@ def cells(metrics):
 
 def test_row_holds_the_measured_numbers():
     assert cells(METRICS) == [
-        "TUM fr1_desk, 20 s", "stereo, inertial", "0.022", "0.123", "85", "7 of 40", "1.34", "100 %",
+        "TUM fr1_desk, 20 s", "stereo, inertial", "0.019", "0.022", "0.123", "85", "7 of 40", "1.34", "100 %",
     ]  # fmt: skip
 
 
 def test_row_without_imu_or_truth_and_with_wrong_scale():
     visual = METRICS | {"has_imu": False, "mode": "rgbd"}
-    assert cells(visual)[1:4] == ["rgbd", "0.022", "0.123 (odometry)"]
-    assert cells(METRICS | {"accuracy": {}})[2:4] == ["–", "–"]
+    assert cells(visual)[1:5] == ["rgbd", "0.019", "0.022", "0.123 (odometry)"]
+    assert cells(METRICS | {"accuracy": {}})[2:5] == ["–", "–", "–"]
     drifted = {"graph": METRICS["accuracy"]["graph"] | {"scale": 1.08}}
-    assert cells(METRICS | {"accuracy": drifted})[2] == "0.022 (scale 1.080)"
-    assert cells({})[4:] == ["–", "– of –", "–", "–"]
+    assert cells(METRICS | {"accuracy": drifted})[3] == "0.022 (scale 1.080)"
+    assert cells({})[5:] == ["–", "– of –", "–", "–"]
 
 
 def test_table_keeps_rows_that_failed():

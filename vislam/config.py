@@ -126,7 +126,9 @@ class InitConfig:
 class EkfConfig:
     """The fast path."""
 
-    coupling: Literal["loose", "tight"] = "loose"  # loose: motions of visual odometry; tight: tracks (MSCKF)
+    # loose: motions of visual odometry; tight: the tracks themselves (MSCKF), ten times the time; auto: tight for one
+    # camera, whose motions lack scale, loose with stereo or depth
+    coupling: Literal["auto", "loose", "tight"] = "auto"
     vision: Literal["relative", "accumulated"] = "relative"  # accumulated: vision's own sum of motions, taken as a pose
     odom: Literal["continuous", "corrected"] = "continuous"  # corrected: 3-30 % less error, 5 cm steps at a first turn
     history_s: float = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
@@ -155,6 +157,7 @@ class EkfConfig:
     tight_clones: int = 11  # past poses that tracks tie together; half a second at 20 Hz
     tight_points: int = 25  # long tracks kept as points of the state; they stop the drift while little moves
     tight_point_depth_ratio: float = 0.1  # sigma of its distance over it that such a point may have at first
+    tight_point_inflation: float = 3.0  # on their pixel sigma: a corner errs alike in frame after frame
     tight_point_misses: int = 1  # frames in a row that may not see such a point before it is dropped
     tight_max_tracks: int = 60  # used per frame; bounds its time
     tight_iterations: int = 5  # of one update at most; more than one only while velocity is badly known
@@ -229,7 +232,7 @@ class WindowConfig:
 class GraphConfig:
     """The iSAM2 pose graph: sigmas of its factors, the gate for loops, and how much work an update may do."""
 
-    coupling: Literal["loose", "tight"] = "loose"  # loose: motions of visual odometry; tight: tracks, in a window
+    coupling: Literal["loose", "tight"] = "tight"  # loose: motions of visual odometry; tight: tracks, in a window
     relinearize_rotation_rad: float = (
         0.002  # IMU factors are stiff: 0.01 left 5-13 mm against the exact optimum, this 1.4
     )

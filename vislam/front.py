@@ -92,7 +92,11 @@ class Front:
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
                 config.frontend.track_sigma_px,
             )  # fmt: skip
-            self._make_ekf = partial(make_ekf, config.ekf, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
+            self.ekf_coupling = config.ekf.coupling
+            if self.ekf_coupling == "auto":
+                self.ekf_coupling = "tight" if self.frontend.mode == "mono" else "loose"
+            ekf_config = replace(config.ekf, coupling=self.ekf_coupling)
+            self._make_ekf = partial(make_ekf, ekf_config, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
             self._ekf = self._make_ekf(noise=noise)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
         self._last_frame_t_ns: int | None = None

@@ -212,6 +212,7 @@ class Run:
             "name": self.recording.name,
             "mode": front.frontend.mode,
             "has_imu": self.noise is not None,
+            "coupling": {"ekf": None if self.noise is None else front.ekf_coupling, "graph": self.config.graph.coupling},
             "frames": len(self.log),
             "frames_expected": self.recording.frame_count,
             "keyframes": self.log.keyframes,
