@@ -13,6 +13,7 @@ from test_graph_faults import Failing
 
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError
+from vislam.factors import estimator
 from vislam.factors.estimator import Estimator
 from vislam.factors.journal import KeyframeRecord, StartRecord, WindowRecord
 from vislam.factors.loop import LoopModel
@@ -239,6 +240,29 @@ def test_long_runs_accept_the_same_loops(make) -> None:
     assert runs["short"][1] == 0 < runs["long"][1]
     assert np.max(np.abs(runs["short"][2] - runs["long"][2])) < 1e-3
     assert runs["long"][3] < 0.05
+
+
+def test_a_loop_that_a_long_run_knows_already_is_accepted_without_a_factor(
+    make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Odometry far better than loops; false ones are parked all the same, and the end takes all true ones."""
+    world = World(26.0, seed=4, vo_sigma_rad=np.deg2rad(0.005), vo_sigma_m=0.0001)
+    graph, _ = make(world, config=replace(TIGHT, read_newest=25, read_block=15))
+    for k in range(world.count):
+        edges = [world.loop(k, k - 100, k), world.false_loop(1000 + k, 3, k)] if k > 102 and k % 5 == 0 else []
+        graph.add(world.packet(k), edges)
+    true = [r for r in graph.edge_reports() if r.loop_id < 1000]
+    redundant = {r.loop_id for r in true if "redundant" in r.reason}
+    assert all(r.decision is LoopDecision.ACCEPTED for r in true) and len(redundant) > 3
+    assert all(r.decision is LoopDecision.PARKED for r in graph.edge_reports() if r.loop_id >= 1000)
+    assert redundant == set(graph._estimator.spare) and not redundant & set(graph._estimator.loops)
+    before = graph._estimator._whole(graph._estimator._values, graph._estimator.loops)[0].size()
+    sizes = []
+    whole = estimator.optimize
+    monkeypatch.setattr(estimator, "optimize", lambda g, *rest: sizes.append(g.size()) or whole(g, *rest))
+    graph.finish()
+    assert sizes == [before + len(redundant)]
+    assert rmse_m(graph.poses(), world.truth) < 0.02
 
 
 def test_loops_that_contradict_the_window_teach_distrust(make) -> None:
