@@ -23,7 +23,7 @@ _HOLE_STEP_S = 0.01
 _HOLE_STEPS = 2000  # at most: a clock that leaps by a year must not stop the filter for as long
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _rotation(w: float, x: float, y: float, z: float, R: Array) -> None:
     R[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     R[0, 1] = 2.0 * (x * y - w * z)
@@ -36,7 +36,7 @@ def _rotation(w: float, x: float, y: float, z: float, R: Array) -> None:
     R[2, 2] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _right_jacobian(x: float, y: float, z: float, scale: float, J: Array) -> None:
     """J = scale * J_r([x, y, z]), to second order in the angle."""
     J[0, 0] = scale * (1.0 - (y * y + z * z) / 6.0)
@@ -68,7 +68,7 @@ def _left_jacobian(x: float, y: float, z: float, J: Array) -> None:
     J[2, 1] = a * x + b * y * z
 
 
-@njit(cache=True, nogil=True)
+@njit("void(f8[::1], i8, f8, f8, f8)", cache=True, nogil=True)  # else compiled again for each constant `at`
 def turn(x: Array, at: int, rx: float, ry: float, rz: float) -> None:
     """Multiply the quaternion in `x[at:at+4]` by a rotation vector on its body side, in place."""
     angle = math.sqrt(rx * rx + ry * ry + rz * rz)
@@ -228,6 +228,20 @@ def _add_noise(P: Array, dt: float, gap_s: float, sigmas: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def between(a: Array, b: Array, share: float, out: Array) -> None:
+    """Write the sample at a share of the way from a [6] to b [6] into `out`."""
+    for i in range(6):
+        out[i] = a[i] + share * (b[i] - a[i])
+
+
+@njit(cache=True, nogil=True)
+def store(x: Array, out: Array) -> None:
+    """Write position, velocity and quaternion into `out` [10]."""
+    for i in range(10):
+        out[i] = x[i]
+
+
+@njit(cache=True, nogil=True)
 def predict_run(
     x: Array,
     P: Array,
@@ -243,22 +257,23 @@ def predict_run(
 
     `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
     """
-    track[0] = x[:10]
+    before, after = np.empty(6), np.empty(6)
+    store(x, track[0])
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
         pieces = 1
         if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
             pieces = min(max(math.ceil(dt / _HOLE_STEP_S), 1), _HOLE_STEPS)
         for j in range(pieces):
-            before = samples[k - 1] + (j / pieces) * (samples[k] - samples[k - 1])
-            after = samples[k - 1] + ((j + 1) / pieces) * (samples[k] - samples[k - 1])
-            if pieces == 1:
-                before, after = samples[k - 1], samples[k]  # not even rounding may tell this from a single `predict`
+            if pieces == 1:  # not even rounding may tell this from a single `predict`
+                predict(x, P, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, work)
+                break
+            between(samples[k - 1], samples[k], j / pieces, before)
+            between(samples[k - 1], samples[k], (j + 1) / pieces, after)
             predict(x, P, before, after, dt / pieces, gaps_s[k], sigmas, gravity, work)
-        track[k] = x[:10]
+        store(x, track[k])
 
 
-@njit(cache=True, nogil=True)
 def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Array) -> None:
     """Apply a gain K [21, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain.
 
@@ -267,22 +282,25 @@ def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Arra
     in the error of `NavState`, is carried to the new state so that the invariant error keeps its covariance. What
     vision and gravity cannot tell, heading and position, then stays untold however often the state is corrected.
     """
-    A = np.eye(ERRORS) - K @ H
-    d = K @ residual
     G = np.eye(ERRORS)  # from the error about the old state to that about the new
+    _move_all(x, K @ residual, G)
+    A, K = G @ (np.eye(ERRORS) - K @ H), G @ K
+    P[:, :] = A @ P @ A.T + K @ noise @ K.T
+    symmetrise(P)
+
+
+@njit(cache=True, nogil=True)
+def _move_all(x: Array, d: Array, G: Array) -> None:
+    """Correct the nominal state by the error d, and write the derivative of the move into G, both in place."""
     R, J = np.empty((3, 3)), np.empty((3, 3))
-    _begin_move(x, d, G, 6, 0, R, J)
-    _move(x, d, G, 0, 3, 0, R, J)
-    _move(x, d, G, 3, 6, 0, R, J)
-    _begin_move(x, d, G, 19, 15, R, J)
-    _move(x, d, G, 16, 18, 15, R, J)
+    for clone in range(2):  # in a loop, for numba would compile the moves again for each constant
+        row = 15 * clone
+        _begin_move(x, d, G, 6 + 13 * clone, row, R, J)
+        for vector in range(2 - clone):  # position and velocity; the clone has a position
+            _move(x, d, G, 16 * clone + 3 * vector, row + 3 + 3 * vector, row, R, J)
     for i in range(3):
         x[10 + i] += d[12 + i]
         x[13 + i] += d[9 + i]
-    A = G @ A
-    K = G @ K
-    P[:, :] = A @ P @ A.T + K @ noise @ K.T
-    symmetrise(P)
 
 
 @njit(cache=True, nogil=True)
@@ -319,7 +337,6 @@ def _move(x: Array, d: Array, G: Array, at: int, error: int, row: int, R: Array,
         G[error + 2, row + j] = my * R[0, j] - mx * R[1, j]
 
 
-@njit(cache=True, nogil=True)
 def innovation(P: Array, H: Array, noise: Array, residual: Array) -> tuple[float, Array]:
     """Return the normalised innovation squared and the optimal gain [21, m]."""
     PHt = P @ H.T
@@ -329,7 +346,6 @@ def innovation(P: Array, H: Array, noise: Array, residual: Array) -> tuple[float
     return nis, PHt @ S_inverse
 
 
-@njit(cache=True, nogil=True)
 def clone(x: Array, P: Array) -> None:
     """Make the clone a copy of the present pose, fully correlated with it, in place."""
     x[16:19] = x[0:3]

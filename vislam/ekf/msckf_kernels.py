@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.ekf.kernels import pose, turn
+from vislam.ekf.kernels import between, pose, store, turn
 from vislam.geometry import skew, so3_right_jacobian
 from vislam.messages import Array
 
@@ -81,7 +81,7 @@ def _chain(
 ) -> None:
     """Phi = F Phi and Q = F Q F^T + noise; x is that at the end of the step, f the mean force in world axes."""
     J_end = so3_right_jacobian(turning)
-    J_middle = so3_right_jacobian(0.5 * turning)
+    J_middle = so3_right_jacobian(np.array([0.5 * turning[0], 0.5 * turning[1], 0.5 * turning[2]]))
     B = np.zeros((9, 3))  # rotation, position, velocity by gyro bias
     M = np.zeros((3, 3))  # rotation at mid-step by gyro bias
     for i in range(3):
@@ -156,22 +156,21 @@ def run(
 
     `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
     """
-    track[0] = x[:10]
+    before, after = np.empty(6), np.empty(6)
+    store(x, track[0])
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
         if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
             pieces = max(math.ceil(dt / _HOLE_STEP_S), 1)
-            change = samples[k] - samples[k - 1]
             for j in range(pieces):
-                before = samples[k - 1] + (j / pieces) * change
-                after = samples[k - 1] + ((j + 1) / pieces) * change
+                between(samples[k - 1], samples[k], j / pieces, before)
+                between(samples[k - 1], samples[k], (j + 1) / pieces, after)
                 step(x, Phi, Q, before, after, dt / pieces, gaps_s[k], sigmas, gravity)
         else:
             step(x, Phi, Q, samples[k - 1], samples[k], dt, 0.0, sigmas, gravity)
-        track[k] = x[:10]
+        store(x, track[k])
 
 
-@njit(cache=True, nogil=True)
 def to_nav_error(x: Array) -> Array:
     """Return M [15, 15] that turns the invariant error into that of `NavState`; to first order."""
     T = pose(x, 0, 6)
@@ -182,12 +181,11 @@ def to_nav_error(x: Array) -> Array:
     return M
 
 
-@njit(cache=True, nogil=True)
 def from_nav_error(x: Array) -> Array:
     """Return the inverse of `to_nav_error`."""
     T = pose(x, 0, 6)
     M = np.eye(INERTIAL)
     M[0:3, 0:3] = T[:3, :3]
-    M[3:6, 0:3] = skew(x[0:3]) @ np.ascontiguousarray(T[:3, :3])
-    M[6:9, 0:3] = skew(x[3:6]) @ np.ascontiguousarray(T[:3, :3])
+    M[3:6, 0:3] = skew(x[0:3]) @ T[:3, :3]
+    M[6:9, 0:3] = skew(x[3:6]) @ T[:3, :3]
     return M

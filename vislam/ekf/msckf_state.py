@@ -246,27 +246,42 @@ def moved(window: Window, x: Array, change: Array) -> Window:
 
 @njit(cache=True, nogil=True)
 def _retract(x: Array, R: Array, p: Array, velocity: Array, points: Array, change: Array) -> None:
-    turned = so3_exp(change[0:3].copy())
-    J = so3_left_jacobian(change[0:3].copy())
+    by = change[0:3]
+    turned, J, none = so3_exp(by), so3_left_jacobian(by), np.zeros(3)
     w, a, b, c = x[6], x[7], x[8], x[9]
     body = np.empty(3)  # the same turn on the body side
-    e = change[0:3]
-    body[0] = (1 - 2 * (b * b + c * c)) * e[0] + 2 * (a * b + w * c) * e[1] + 2 * (a * c - w * b) * e[2]
-    body[1] = 2 * (a * b - w * c) * e[0] + (1 - 2 * (a * a + c * c)) * e[1] + 2 * (b * c + w * a) * e[2]
-    body[2] = 2 * (a * c + w * b) * e[0] + 2 * (b * c - w * a) * e[1] + (1 - 2 * (a * a + b * b)) * e[2]
+    body[0] = (1 - 2 * (b * b + c * c)) * by[0] + 2 * (a * b + w * c) * by[1] + 2 * (a * c - w * b) * by[2]
+    body[1] = 2 * (a * b - w * c) * by[0] + (1 - 2 * (a * a + c * c)) * by[1] + 2 * (b * c + w * a) * by[2]
+    body[2] = 2 * (a * c + w * b) * by[0] + 2 * (b * c - w * a) * by[1] + (1 - 2 * (a * a + b * b)) * by[2]
     turn(x, 6, body[0], body[1], body[2])
-    x[0:3] = turned @ x[0:3].copy() + J @ change[3:6].copy()
-    x[3:6] = turned @ x[3:6].copy() + J @ change[6:9].copy()
-    x[13:16] += change[9:12]
-    x[10:13] += change[12:15]
+    _move(turned, x[0:3], J, change[3:6])
+    _move(turned, x[3:6], J, change[6:9])
+    for i in range(3):
+        x[13 + i] += change[9 + i]
+        x[10 + i] += change[12 + i]
     C = len(R)
-    for i in range(C):
-        at = 19 + 6 * i
-        by = change[at : at + 3].copy()
-        turn_i = so3_exp(by)
-        R[i] = turn_i @ R[i]
-        p[i] = turn_i @ p[i] + so3_left_jacobian(by) @ change[at + 3 : at + 6].copy()
-        velocity[i] = turn_i @ velocity[i]
+    column = np.empty(3)
+    for k in range(C):
+        at = 19 + 6 * k
+        by = change[at : at + 3]
+        turn_k = so3_exp(by)
+        for j in range(3):
+            for i in range(3):
+                column[i] = R[k, i, j]
+            _move(turn_k, column, J, none)
+            for i in range(3):
+                R[k, i, j] = column[i]
+        _move(turn_k, p[k], so3_left_jacobian(by), change[at + 3 : at + 6])
+        _move(turn_k, velocity[k], J, none)
     for s in range(len(points)):
         at = 19 + 6 * C + 3 * s
-        points[s] = turned @ points[s] + J @ change[at : at + 3].copy()
+        _move(turned, points[s], J, change[at : at + 3])
+
+
+@njit(cache=True, nogil=True)
+def _move(turned: Array, v: Array, J: Array, change: Array) -> None:
+    """Replace v [3] by turned @ v + J @ change."""
+    a, b, c = v[0], v[1], v[2]
+    for i in range(3):
+        v[i] = turned[i, 0] * a + turned[i, 1] * b + turned[i, 2] * c
+        v[i] += J[i, 0] * change[0] + J[i, 1] * change[1] + J[i, 2] * change[2]
