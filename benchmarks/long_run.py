@@ -124,7 +124,11 @@ def chain(kilometres: float, step_m: float) -> None:
     rng = np.random.default_rng(3)
     sigmas = np.repeat([0.001, 0.002], 3)
     graph = PoseGraph(
-        GraphConfig(vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0), None, 9.81, STEREO, WindowConfig()
+        GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0),
+        None,
+        9.81,
+        STEREO,
+        WindowConfig(),
     )
     graph.initialise(None)
     meter = Meter(f"{kilometres:g} km in steps of {step_m:g} m")

@@ -16,7 +16,7 @@ from vislam.geometry import invert, se3_exp, so3_log, transform
 from vislam.graph import PoseGraph
 from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Tracking, VoMeasurement
 
-EXACT = GraphConfig(vo_inflation=1.0, imu_inflation=1.0)  # the simulation tells its sigmas honestly
+EXACT = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)  # the simulation tells its sigmas honestly
 
 
 def graph_of(world: World, imu: bool = True, config: GraphConfig = EXACT) -> PoseGraph:
@@ -208,7 +208,7 @@ def test_mono_without_imu_stays_connected_at_the_scale_of_its_guess() -> None:
 
 def test_defaults_beat_odometry_too() -> None:
     world = World(45.0, seed=9)
-    graph, _, packets = run(world, loop_every=10, config=GraphConfig())
+    graph, _, packets = run(world, loop_every=10, config=GraphConfig(coupling="loose"))
     graph.finish()
     assert rmse_m(graph.poses(), world.truth) < 0.5 * rmse_m(world.dead_reckoning(packets), world.truth)
 
@@ -386,7 +386,7 @@ def test_long_open_loop_chain_survives_gtsams_pivot_test() -> None:
     rng = np.random.default_rng(0)
     sigmas = np.array([0.002] * 3 + [0.01] * 3)
     covariance = np.diag(sigmas**2)
-    config = GraphConfig(vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
+    config = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
     graph = PoseGraph(config, None, GRAVITY_M_S2, RIG, WindowConfig())
     graph.initialise(None)
     truth, chain, notes = [np.eye(4)], [np.eye(4)], []

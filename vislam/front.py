@@ -95,7 +95,9 @@ class Front:
             self.ekf_coupling = config.ekf.coupling
             if self.ekf_coupling == "auto":
                 self.ekf_coupling = "tight" if self.frontend.mode == "mono" else "loose"
-            ekf_config = replace(config.ekf, coupling=self.ekf_coupling)
+            readout_s = config.ekf.tight_readout_s
+            readout_s = config.frontend.readout_s if readout_s is None else readout_s
+            ekf_config = replace(config.ekf, coupling=self.ekf_coupling, tight_readout_s=readout_s)
             self._make_ekf = partial(make_ekf, ekf_config, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
             self._ekf = self._make_ekf(noise=noise)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time

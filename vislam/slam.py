@@ -8,7 +8,7 @@ keyframe        -> loop detector -> graph -> mapper     -> poses in map, T_map_o
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -67,9 +67,9 @@ class Back:
     ) -> None:
         """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity."""
         has_gravity = first_state is not None
-        self.graph = PoseGraph(
-            config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, config.window
-        )
+        readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
+        window = replace(config.window, readout_s=readout_s)
+        self.graph = PoseGraph(config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, window)
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self.mapper = Mapper(config.map, rig) if config.map.enabled else None

@@ -212,7 +212,7 @@ class MsckfEkf:
             return self._refuse("vision_lost", "tracking lost")
         if self._history is not None and self._history.has_frame(vo.t_ns):
             return self._refuse("vision_duplicate", f"a frame of {vo.t_ns} ns is here already")
-        frame = prepare(vo.t_ns, observations, self._rig, self._config.tight_readout_s)
+        frame = prepare(vo.t_ns, observations, self._rig, self._config.tight_readout_s or 0.0)
         if not len(frame.ids):
             return self._refuse("vision_invalid", "no track with finite pixels inside the camera model")
         return self._insert(Event(vo.t_ns, Kind.FRAME, frame=frame))

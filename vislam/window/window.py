@@ -218,7 +218,7 @@ class SlidingWindow:
         """Return the state of the first keyframe, and set the prior on it."""
         config, x = self._config, np.zeros(STATE)
         self._calibration[0] = packet.time_offset_s
-        self._calibration[4] = config.readout_s
+        self._calibration[4] = config.readout_s or 0.0
         sigmas = np.array(
             [config.time_offset_sigma_s, *[np.deg2rad(config.rotation_sigma_deg)] * 3, config.readout_sigma_s]
         )
@@ -458,7 +458,7 @@ class SlidingWindow:
             tilts=(),
             states=(),
             calibration=CalibrationEstimate(
-                packet.time_offset_s, config.time_offset_sigma_s, np.zeros(3), np.zeros(3), config.readout_s, 0.0
+                packet.time_offset_s, config.time_offset_sigma_s, np.zeros(3), np.zeros(3), config.readout_s or 0.0, 0.0
             ),
             scale_sigma=self._scale_sigma,
             rejected_tracks=0,
