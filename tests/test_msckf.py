@@ -117,7 +117,10 @@ def test_any_order_of_arrival_gives_the_same_answer() -> None:
 
 def test_a_start_in_the_past_catches_up() -> None:
     flight = Flight.make(4, 2.0)
-    usual, late = flight.filter(), MsckfEkf(EkfConfig(tight_imu_inflation=1.0), CHEAP, GRAVITY_M_S2, MONO)
+    usual, late = (
+        flight.filter(),
+        MsckfEkf(EkfConfig(tight_imu_inflation=1.0, tight_point_inflation=1.0), CHEAP, GRAVITY_M_S2, MONO),
+    )
     for sample in flight.samples:
         late.predict(sample)
         usual.predict(sample)

@@ -100,6 +100,7 @@ class Updater:
         self._sigmas = np.array(
             [config.tight_pixel_sigma_px, config.tight_stereo_sigma_px, config.tight_depth_sigma_rho]
         )
+        self._point_sigmas = self._sigmas * np.array([config.tight_point_inflation, 1.0, 1.0])
         self._bounds = np.array(
             [
                 1.0 / config.tight_max_range_m,
@@ -197,7 +198,7 @@ class Updater:
             window.points,
             frame.seen[row],
             *self._cameras(window, at, frame.seen[row]),
-            self._sigmas,
+            self._point_sigmas,
             self._R_cam1_cam0,
             self._t_cam1_cam0,
             window.P,
