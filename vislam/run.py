@@ -30,6 +30,7 @@ from vislam.viewer import open_viewer
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
 _PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
+_LOST_SIGMA_M = 1.0  # of the filter's position: no controller can use it, and a user must be told
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
@@ -206,13 +207,22 @@ class Run:
         found = front.initialisation
         if self.noise is not None:
             self.warnings += front.envelope.warnings(self.config.imu.noise_tolerance)
+            sigma_m = self.log.worst_position_sigma_m
+            if sigma_m > _LOST_SIGMA_M:
+                self.warnings.append(
+                    f"the filter's position was uncertain by {sigma_m:.1f} m (1 sigma) at its worst: too long without "
+                    "vision, or without motion that shows scale"
+                )
         if self.noise is not None and found is None:
             self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.last_refusal}")
         return {
             "name": self.recording.name,
             "mode": front.frontend.mode,
             "has_imu": self.noise is not None,
-            "coupling": {"ekf": None if self.noise is None else front.ekf_coupling, "graph": self.config.graph.coupling},
+            "coupling": {
+                "ekf": None if self.noise is None else front.ekf_coupling,
+                "graph": self.config.graph.coupling,
+            },
             "frames": len(self.log),
             "frames_expected": self.recording.frame_count,
             "keyframes": self.log.keyframes,

@@ -158,6 +158,12 @@ class RunLog:
         return np.array(self._t_ns, dtype=np.int64)
 
     @property
+    def worst_position_sigma_m(self) -> float:
+        """Largest sigma of the filter's position at a keyframe, in metres; 0 without a filter."""
+        variances = [np.trace(state.covariance[3:6, 3:6]) for state in self._ekf_states.values()]
+        return float(np.sqrt(max(variances, default=0.0)))
+
+    @property
     def keyframes(self) -> int:
         """How many keyframes reached the back end."""
         return len(self._keyframe_t_ns)
