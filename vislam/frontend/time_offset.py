@@ -26,6 +26,7 @@ _MIN_FRAMES = 15  # fewer are no statistics
 _SIGMA_RAD = 1e-3  # nominal, of a visual rotation; residuals tell the real one
 _MIN_RATIO = 0.05  # of real to nominal variance: better than 0.2 mrad nobody is
 _GYRO_BIAS_SIGMA = 0.5  # rad/s, prior: wide enough for any
+_TOLD_SIGMA_S = 1e-3  # what others find is believed no further: their models have errors in common with ours
 _TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
 _CAUCHY = 3.0  # standard deviations
 _ROUNDS = 5
@@ -61,6 +62,7 @@ class TimeOffset:
         self.estimate = TimeOffsetEstimate(
             config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, _TURN_SIGMA), 0
         )
+        self._prior = (config.time_offset_s, config.time_offset_sigma_s)  # of the offset: what else is known of it
         self.settled = not config.time_offset
         self._t_ns: list[int] = []  # of the frames, by the camera
         self._keyframe_ns: list[int] = []
@@ -108,9 +110,9 @@ class TimeOffset:
         """Estimate from the frames that `span` covers, no bias taken off; keep the old estimate if that fails."""
         problem = self._problem(span)
         x = np.concatenate([[self.estimate.offset_s], self.estimate.gyro_bias_rad_s, self.estimate.R_correction])
-        sigmas = np.repeat([self._config.time_offset_sigma_s, _GYRO_BIAS_SIGMA, _TURN_SIGMA], [1, 3, 3])
+        sigmas = np.repeat([self._prior[1], _GYRO_BIAS_SIGMA, _TURN_SIGMA], [1, 3, 3])
         mean = np.zeros(_UNKNOWNS)
-        mean[0] = self._config.time_offset_s
+        mean[0] = self._prior[0]
         scale, H, used = 1.0, np.eye(_UNKNOWNS), 0
         for _ in range(_ROUNDS):
             H, g, squares, used = _normal_equations(*problem, x, scale)
@@ -133,6 +135,7 @@ class TimeOffset:
         """Take an offset that was found by other means, with its sigma."""
         if not self.settled and sigma_s < self.estimate.sigma_s:
             e = self.estimate
+            self._prior = (offset_s, max(sigma_s, _TOLD_SIGMA_S))
             self.estimate = TimeOffsetEstimate(
                 offset_s, sigma_s, e.gyro_bias_rad_s, e.R_correction, e.R_correction_sigma, e.frames
             )
