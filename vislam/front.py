@@ -33,6 +33,7 @@ from vislam.messages import (
 )
 from vislam.odometry_keyframe import OdometryKeyframe, first_keyframe_state, pose_before, restamped
 
+_KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
@@ -138,7 +139,7 @@ class Front:
         frame = self.camera_clock.in_imu_time(frame)
         span = self._span(self._last_frame_t_ns, frame.t_ns)
         with self._clock.measure("track"):
-            track = self.frontend.track(frame, *self._without_bias(span))
+            track = self.frontend.track(frame, *self._without_bias(span), self._predicted(frame.t_ns))
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, self._state()))
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and still_image
@@ -206,6 +207,17 @@ class Front:
         state = self._ekf.state()
         sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max())) + self.camera_clock.gyro_sigma_rad_s(span)
         return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2), sigma_rad_s
+
+    def _predicted(self, t_ns: int) -> Array | None:
+        """Return the motion since the last frame where the filter knows it to centimetres."""
+        state = self._state()
+        if self._ekf is None or state is None or self._last_frame_t_ns is None:
+            return None
+        dt_s = (t_ns - self._last_frame_t_ns) * 1e-9
+        if np.sqrt(np.trace(state.covariance[6:9, 6:9])) * dt_s > _KNOWN_MOTION_M:
+            return None
+        T_last, T_now = self._ekf.pose_at(self._last_frame_t_ns), self._ekf.pose_at(t_ns)
+        return None if T_last is None or T_now is None else invert(T_last) @ T_now
 
     def _follow_noise(self) -> None:
         """Raise the noise model, until the first state is found, to what the quietest half second shows."""

@@ -31,6 +31,9 @@ Progress = Callable[[int, int, str], None]  # frames done, frames in all, a shor
 
 _PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
 _LOST_SIGMA_M = 1.0  # of the filter's position: no controller can use it, and a user must be told
+_APART_M = 0.5  # rms between filter and graph that is no drift ...
+_APART_SHARE = 0.05  # ... and the share of the way that is none either
+_MIN_COMPARED = 10  # poses
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
@@ -213,6 +216,7 @@ class Run:
                     f"the filter's position was uncertain by {sigma_m:.1f} m (1 sigma) at its worst: too long without "
                     "vision, or without motion that shows scale"
                 )
+        self._compare_filter_and_graph(final)
         if self.noise is not None and found is None:
             self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.last_refusal}")
         return {
@@ -246,6 +250,20 @@ class Run:
             "coverage_frames": len(final) / max(len(self.log), 1),
             "warnings": self.warnings,
         }
+
+    def _compare_filter_and_graph(self, final: Trajectory) -> None:
+        """Warn when filter and graph went different ways by more than drift explains: one of them is wrong."""
+        odometry = self.log.odometry_trajectory()
+        if self.noise is None or len(odometry) < _MIN_COMPARED or len(final) < _MIN_COMPARED:
+            return
+        path_m = float(np.linalg.norm(np.diff(final.positions_m, axis=0), axis=1).sum())
+        with suppress(VislamError):  # nothing in common to compare
+            apart_m = evaluate(odometry, final, "yaw")["ate_rmse_m"]
+            if apart_m > max(_APART_M, _APART_SHARE * path_m):
+                self.warnings.append(
+                    f"filter and graph are {apart_m:.1f} m apart over {path_m:.0f} m of way: one of them is wrong; look "
+                    "at tracking.csv for lost or degraded frames, and for something that moves through the image"
+                )
 
     def _accuracy(self, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
         if truth is None:

@@ -236,3 +236,21 @@ def _in_front(R: Array, t: Array, key_xy: Array, xy: Array) -> int:
     in_key = np.einsum("ni,ni->n", np.cross(t, b), normal)
     in_cam = np.einsum("ni,ni->n", np.cross(t, a), normal)
     return int(((in_key > 0.0) & (in_cam > 0.0)).sum())
+
+
+def from_epipolar_segment(T_key_cam: Array, key_xy: Array, xy: Array, max_rho: float) -> Array:
+    """Return how far points [N] of the keyframe lie from where a motion can put what is now seen at `xy`.
+
+    Args:
+        T_key_cam: motion [4, 4] of the camera since the keyframe, in metres.
+        key_xy: directions [N, 2] on z = 1 in the keyframe.
+        xy: directions [N, 2] now; NaN where not seen, and so is the answer.
+        max_rho: inverse depth in 1/m of the nearest point that there can be.
+    """
+    turned = np.column_stack([xy, np.ones(len(xy))]) @ T_key_cam[:3, :3].T
+    at_infinity = turned[:, :2] / turned[:, 2:]
+    reach = max_rho * (T_key_cam[:2, 3] - T_key_cam[2, 3] * at_infinity)
+    gap = key_xy - at_infinity
+    length = np.maximum(np.sum(reach * reach, axis=1), np.finfo(float).tiny)
+    share = np.clip(np.sum(gap * reach, axis=1) / length, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(gap - share[:, None] * reach, axis=1))

@@ -27,6 +27,8 @@ Bools = NDArray[np.bool_]
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
+_ASTRAY_PX = 6.0  # from where a filter that knows its motion expects a track: it belongs to something that moves
+_MIN_AS_PREDICTED = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
 _FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
@@ -77,16 +79,20 @@ class MetricFrontEnd:
         self._blind = False  # the keyframe is the first and has no depth
         self._blind_px: Array = np.empty((0, 2))  # where its tracks were last seen
 
-    def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
+    def track(
+        self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
+    ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         frame, dt_s = self._intake.accept(frame)
         if self._keyframe is None:
             return self._start(frame, "")
         T_before = self._T_key_cam
         T_guess = T_before @ self._predictor.predict(dt_s, imu)
+        if T_last_now is not None:
+            T_guess = T_before @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
         if self._blind:
             return self._leave_blindness(frame, self._keyframe, T_guess)
-        attempt = self._attempt(frame, T_before, T_guess, dt_s)
+        attempt = self._attempt(frame, T_before, T_guess, dt_s, trusted=T_last_now is not None)
         if attempt.failure:
             T_found = self._recognise(frame, self._keyframe)
             if T_found is not None:
@@ -104,13 +110,19 @@ class MetricFrontEnd:
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
-    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float) -> _Attempt:
+    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float, trusted: bool = False) -> _Attempt:
         landmarks = self._landmarks
         twist = se3_log(invert(T_before) @ T_guess) / dt_s
-        predicted, _ = move(landmarks.mean, landmarks.covariance, T_guess)
+        predicted, covariance = move(landmarks.mean, landmarks.covariance, T_guess)
         pixels = self._tracker.follow(frame, self._shutter.project(predicted, twist))
         seen = self._camera.normalise(pixels)
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
+        if trusted:
+            gate_xy = _ASTRAY_PX / self._camera.fx + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+            astray = np.linalg.norm(xy - predicted[:, :2], axis=1) > gate_xy
+            followed = np.isfinite(xy[:, 0]).sum()
+            if followed - astray.sum() >= max(self._config.min_inliers, _MIN_AS_PREDICTED * followed):
+                pixels, seen, xy = (np.where(astray[:, None], np.nan, values) for values in (pixels, seen, xy))
         depth_now = None
         if self._depth.every_frame and self._depth.available(frame):
             depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2], self._tracker.ids)

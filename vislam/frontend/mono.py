@@ -13,6 +13,7 @@ from vislam.frontend.epipolar import (
     TwoViewEstimate,
     direction_given_rotation,
     essential_ransac,
+    from_epipolar_segment,
     refine_two_view,
 )
 from vislam.frontend.intake import Intake
@@ -21,7 +22,7 @@ from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.refine import refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
 from vislam.frontend.tracker import Tracker
-from vislam.geometry import so3_log, transform
+from vislam.geometry import invert, so3_log, transform
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
 _RANSAC_PX = 1.5
@@ -30,6 +31,8 @@ _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a trans
 _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
 _GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
 _BOTH_ENDS = 2.0**0.5
+_ASTRAY_PX = 6.0  # from where a filter that knows its motion can explain a track: it belongs to something that moves
+_MIN_AS_EXPECTED = 0.2  # of the tracks have to be where they can be, or the expectation is wrong
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
@@ -77,11 +80,14 @@ class MonoFrontEnd:
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
         self._R_key_gyro: Array = np.eye(3)  # of the last frame, by the gyroscope alone
         self._gyro_sigma_rad = 0.0
+        self._T_key_filter: Array | None = np.eye(4)  # of the last frame's camera, by the filter; None: not all known
         self._direction_key: Array = np.zeros(3)  # to the last frame, or where it will probably go; zero: not known
         self._t_placed_ns = -1
         self._lost = False
 
-    def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
+    def track(
+        self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
+    ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         frame, dt_s = self._intake.accept(frame)
         # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy there as here
@@ -99,6 +105,7 @@ class MonoFrontEnd:
         pixels = self._tracker.follow(frame, guess)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
+        pixels = self._as_expected(pixels, T_last_now)
         motion = self._locate(R_guess, prior, pixels)
         if motion.failure:
             self._R_key_cam = R_guess
@@ -121,6 +128,19 @@ class MonoFrontEnd:
         if not np.isfinite(self._gyro_sigma_rad):
             return None
         return RotationPrior(self._R_key_gyro, self._config.mono_gyro_sigma_rad + self._gyro_sigma_rad)
+
+    def _as_expected(self, pixels: Array, T_last_now: Array | None) -> Array:
+        """Return the pixels [N, 2] without those that no depth explains by the filter's motion since the keyframe."""
+        if T_last_now is None or self._T_key_filter is None:
+            self._T_key_filter = None
+            return pixels
+        self._T_key_filter = self._T_key_filter @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
+        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
+        off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, key_xy, xy, 1.0 / self._config.min_depth_m)
+        astray, followed = off_px > _ASTRAY_PX, np.isfinite(off_px).sum()
+        if followed - astray.sum() < max(self._config.min_inliers, _MIN_AS_EXPECTED * followed):
+            return pixels
+        return np.where(astray[:, None], np.nan, pixels)
 
     def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
         key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
@@ -300,6 +320,7 @@ class MonoFrontEnd:
         self._direction_key = self._R_key_cam.T @ self._direction_key
         self._R_key_cam = np.eye(3)
         self._R_key_gyro, self._gyro_sigma_rad = np.eye(3), 0.0
+        self._T_key_filter = np.eye(4)
         self._t_placed_ns = frame.t_ns
         return keyframe
 

@@ -28,10 +28,18 @@ class FrontEnd(Protocol):
 
     mode: str
 
-    def track(self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf) -> TrackResult:
+    def track(
+        self,
+        frame: Frame,
+        imu: ImuSpan | None,
+        gyro_sigma_rad_s: float = np.inf,
+        T_last_now: Array | None = None,
+    ) -> TrackResult:
         """Follow the last keyframe into `frame`; `imu` is the bias-corrected span since the previous frame.
 
         `gyro_sigma_rad_s` is how well the gyroscope's bias is known; infinite: not at all, the span only predicts.
+        `T_last_now` [4, 4] is the body's motion since the previous frame where a filter knows it to centimetres: tracks
+        that contradict it by far belong to something that moves, however many they are.
 
         Raises DataError when the images do not fit the rig or time does not advance.
         """
