@@ -192,7 +192,7 @@ class WindowConfig:
     sigma_px: float = 1.0  # of a tracked corner between keyframes
     right_sigma_px: float = 1.0  # of the match in the right image
     depth_sigma_rho: float = 4e-3  # 1/m: sigma of 1/z of a depth image; a Kinect's own is 1.4e-3, then registration
-    huber_k: float = 1.345  # of a reprojection error, in standard deviations; 95 % efficient on Gaussian noise
+    huber_k: float = 2.0  # of a reprojection error, in standard deviations
     gate_probability: float = 0.999  # chi-square of an observation; above it after optimisation, it is taken out
     gate_track_fraction: float = 0.34  # of a track's observations beyond the gate: the whole track goes
     rho_sigma_1_m: float = 10.0  # prior of inverse depth: only keeps points without parallax from running away
