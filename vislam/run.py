@@ -261,8 +261,8 @@ class Run:
             apart_m = evaluate(odometry, final, "yaw")["ate_rmse_m"]
             if apart_m > max(_APART_M, _APART_SHARE * path_m):
                 self.warnings.append(
-                    f"filter and graph are {apart_m:.1f} m apart over {path_m:.0f} m of way: one of them is wrong; look "
-                    "at tracking.csv for lost or degraded frames, and for something that moves through the image"
+                    f"filter and graph are {apart_m:.1f} m apart over {path_m:.0f} m of way: one of them is wrong; "
+                    "look at tracking.csv for lost or degraded frames, and for something that moves through the image"
                 )
 
     def _accuracy(self, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
