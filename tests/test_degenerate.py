@@ -1,0 +1,88 @@
+"""Cases that break most systems, end to end on simulated vision; their long versions are experiments/degenerate.toml."""
+
+import json
+
+import numpy as np
+import pytest
+
+from vislam.config import load
+from vislam.frontend.epipolar import from_epipolar_segment
+from vislam.geometry import so3_exp, transform
+from vislam.run import execute
+from vislam.runfolder import prepare
+from vislam.sources import open_source
+from vislam.trajectory import evaluate, read_trajectory
+
+SEED = 0
+QUICK = {"map.enabled": False, "view.enabled": False, "loop.enabled": False, "seed": SEED}
+CAMERA = "camera_hz=10,tracks=80"
+
+
+def run(tmp_path, uri, **settings):
+    """Return the run's metrics, and the true errors of its trajectories by name."""
+    config = load(None, QUICK | {name.replace("__", "."): value for name, value in settings.items()})
+    out = tmp_path / "run"
+    prepare(out, False)
+    metrics = execute(open_source(uri, SEED), config, out, uri, [])
+    assert json.loads((out / "metrics.json").read_text())["frames"] == metrics["frames"]
+    truth = read_trajectory(out / "trajectory_truth.tum")
+    found = {name: read_trajectory(out / f"trajectory_{name}.tum") for name in ("ekf", "graph")}
+    print(f"{uri}, seed {SEED}:", {n: evaluate(t, truth, "yaw")["ate_max_m"] for n, t in found.items()})
+    return metrics, {n: evaluate(t, truth, "yaw") for n, t in found.items()}, found
+
+
+@pytest.mark.parametrize("rig", ["mono", "stereo"])
+def test_half_a_minute_of_rest(tmp_path, rig):
+    metrics, _, found = run(tmp_path, f"points:still,rig={rig},duration_s=30,{CAMERA}", ekf__coupling="tight")
+    assert metrics["initialisation"]["status"] == "static"
+    assert metrics["counters"]["front"]["frames_at_rest"] > 250
+    for name, trajectory in found.items():  # a frame's own noise is no drift: five seconds are averaged
+        p = trajectory.positions_m
+        assert np.linalg.norm(p[-50:].mean(axis=0) - p[10:60].mean(axis=0)) < 0.005, name
+
+
+def test_no_texture_for_three_seconds(tmp_path):
+    uri = f"points:laps,rig=stereo,duration_s=16,outage_begin_s=8,outage_length_s=3,{CAMERA}"
+    metrics, errors, _ = run(tmp_path, uri)
+    assert metrics["counters"]["front"]["frames_lost"] > 20
+    assert errors["ekf"]["ate_rmse_m"] < 0.15
+    assert errors["graph"]["ate_rmse_m"] < 0.15
+
+
+@pytest.mark.parametrize("coupling", ["loose", "tight"])
+def test_somebody_fills_half_of_the_image(tmp_path, coupling):
+    uri = f"points:laps,rig=stereo,duration_s=16,moving_share=0.5,moving_begin_s=7,{CAMERA}"
+    _, errors, _ = run(tmp_path, uri, ekf__coupling=coupling, graph__coupling=coupling)
+    assert errors["ekf"]["ate_rmse_m"] < 0.1
+    assert errors["graph"]["ate_rmse_m"] < 0.15
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_noise_model_ten_times_off(tmp_path, factor):
+    uri = f"points:laps,rig=stereo,duration_s=14,imu_noise_factor={factor},{CAMERA}"
+    metrics, errors, _ = run(tmp_path, uri)
+    assert sum("noise" in warning for warning in metrics["warnings"]) == 2
+    assert errors["ekf"]["ate_rmse_m"] < 0.05
+    assert errors["graph"]["ate_rmse_m"] < 0.05
+
+
+def test_a_lost_filter_is_told(tmp_path):
+    """One camera that only turns sees no way: loosely coupled, the filter dead-reckons, and says so."""
+    uri = f"points:turn-in-place,rig=mono,duration_s=25,{CAMERA}"
+    metrics, errors, _ = run(tmp_path, uri, ekf__coupling="loose", graph__coupling="loose")
+    assert errors["ekf"]["ate_max_m"] > 1.0, "no longer degenerate; take a harder case"
+    assert any("uncertain" in warning for warning in metrics["warnings"])
+
+
+def test_a_point_is_on_its_epipolar_segment_and_a_walker_is_not():
+    rng = np.random.default_rng(SEED)
+    T_key_cam = transform(so3_exp(np.array([0.02, -0.1, 0.03])), np.array([0.2, 0.05, 0.1]))
+    points = np.column_stack([rng.uniform(-1, 1, (50, 2)), rng.uniform(1.0, 8.0, 50)])  # in the keyframe's camera
+    now = (points - T_key_cam[:3, 3]) @ T_key_cam[:3, :3]
+    key_xy, xy = points[:, :2] / points[:, 2:], now[:, :2] / now[:, 2:]
+    assert from_epipolar_segment(T_key_cam, key_xy, xy, 1.0 / 0.3).max() < 1e-9
+    walked = points + [0.0, 0.5, 0.0]
+    now = (walked - T_key_cam[:3, 3]) @ T_key_cam[:3, :3]
+    assert np.median(from_epipolar_segment(T_key_cam, key_xy, now[:, :2] / now[:, 2:], 1.0 / 0.3)) > 0.02
+    xy[3] = np.nan
+    assert np.isnan(from_epipolar_segment(T_key_cam, key_xy, xy, 1.0 / 0.3)[3])
