@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,14 +86,6 @@ class MeasuredInertial:
     noise: ImuNoise
     truth: Trajectory  # of the body, which is the IMU
     rig: Rig | None  # its own cameras, if it has any
-
-
-class _KnownMotion(Moves, Protocol):
-    """A motion that says where it is known."""
-
-    def covers(self, t_s: Array, margin_s: float = 0.0) -> NDArray[np.bool_]:
-        """Return at which times [N] the motion is known."""
-        ...
 
 
 def open_points(source: str | MeasuredInertial, seed: int = 0, **options: object) -> PointRecording:
