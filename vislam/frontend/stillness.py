@@ -20,7 +20,6 @@ _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
 _MAX_INTERVAL_NS = _NS  # tracks that bridge a longer pause say nothing about what was in it
 _MIN_FRAMES = 3  # a line through two leaves no residual
 _MIN_TRACKS = 10  # fewer say nothing about the motion of the camera
-_HOLD = 1.5  # times the threshold while at rest: noise must not end what minutes of stillness rest on
 _SIGNIFICANT = 3.0  # standard deviations
 _WIDEST = 4.0  # of the threshold: noise that hides more than this many of them excuses nothing
 _ROBUST_STEPS = 4
@@ -39,7 +38,7 @@ class Stillness:
 
     def __init__(self, config: InitConfig) -> None:
         """Start empty; `config.still_px` is the limit for motion over the window and from frame to frame."""
-        self._still_px = self._limit_px = config.still_px
+        self._limit_px = config.still_px
         self._frames: deque[tuple[int, NDArray[np.int64], Array]] = deque()  # time, ascending ids, pixels
         self.moved_px = self.parallax_px = self.noise_px = np.nan
 
@@ -62,9 +61,7 @@ class Stillness:
         pixels = self._pixels()
         if pixels.shape[1] < _MIN_TRACKS:
             return False
-        still = self._over_window(t_s, pixels) and self._in_last_step(pixels)
-        self._limit_px = _HOLD * self._still_px if still else self._still_px
-        return still
+        return self._over_window(t_s, pixels) and self._in_last_step(pixels)
 
     def _pixels(self) -> Array:
         """Return pixels [frames, N, 2] of the newest frame's tracks that were seen in most frames; NaN: not seen."""
