@@ -31,6 +31,7 @@ config = {"frontend.mode" = "mono"}
 
 [[estimators]]
 name = "loose"
+config = {"graph.coupling" = "loose"}
 
 [[estimators]]
 name = "tight"
