@@ -40,9 +40,13 @@ def compared(folder):
     """A comparison that was interrupted after its first result and taken up again."""
     command = [sys.executable, "-m", "vislam", *arguments(folder, "--workers", "1")]
     first = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job's children ignore it
-    )  # fmt: skip
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # children of a background job ignore the signal unless told otherwise
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+    )
     end_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < end_s and first.poll() is None:
         if (folder / "r.db").is_file():
