@@ -18,6 +18,7 @@ from vislam.ekf.measurements import (
     with_shared_error,
     zero_velocity,
 )
+from vislam.ekf.timeline import reset_sigmas
 from vislam.imu import ImuNoise
 from vislam.messages import Array, VoMeasurement
 
@@ -31,16 +32,7 @@ class Corrector:
         per_sample = config.imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
         self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
         self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 7)]
-        self._reset_sigmas = np.repeat(
-            [
-                np.deg2rad(config.reset_rotation_deg),
-                config.reset_position_m,
-                config.reset_velocity_m_s,
-                config.reset_gyro_bias_rad_s,
-                config.reset_accel_bias_m_s2,
-            ],
-            3,
-        )
+        self._reset_sigmas = reset_sigmas(config)
 
     def apply(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
         """Apply an event to x [23] and P [21, 21] in place, write its outcome into it, and return the new ledger."""

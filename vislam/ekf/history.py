@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
+from vislam.ekf.timeline import Timeline
 from vislam.messages import Array, VoMeasurement
 
 OUTCOMES = (  # every counter a measurement can end in, and what they cause
@@ -84,24 +84,8 @@ class Checkpoint:
     ledger: Ledger
 
 
-class History:
-    """Events in time order (ties in order of arrival) and checkpoints, both bounded by `forget_before`."""
-
-    def __init__(self, first: Checkpoint) -> None:
-        self.checkpoints = [first]
-        self._events: list[Event] = []
-        self._forgotten = 0  # events dropped from the front; all numbering counts them
-
-    def insert(self, event: Event) -> int:
-        """Sort an event in and return its number since the start."""
-        place = bisect_right(self._events, event.t_ns, key=_time)
-        self._events.insert(place, event)
-        return place + self._forgotten
-
-    def event(self, number: int) -> Event | None:
-        """Return an event by its number, None past the last."""
-        place = number - self._forgotten
-        return self._events[place] if place < len(self._events) else None
+class History(Timeline[Event, Checkpoint]):
+    """What came to the filter and where it can go back to."""
 
     def rewind(self, number: int, t_ns: int) -> Checkpoint:
         """Drop the checkpoints that an event of this number and time invalidates; return the newest that is left.
@@ -112,25 +96,6 @@ class History:
             self.checkpoints.pop()
         return self.checkpoints[-1]
 
-    def checkpoint_at(self, t_ns: int) -> Checkpoint | None:
-        """Return the newest checkpoint at or before a time, None if it is older than all."""
-        place = bisect_right(self.checkpoints, t_ns, key=_time)
-        return self.checkpoints[place - 1] if place else None
-
-    @property
-    def events(self) -> list[Event]:
-        """Those not forgotten, in time order."""
-        return self._events
-
-    def forget_before(self, t_ns: int) -> list[Event]:
-        """Drop what is not needed to go back to `t_ns` or later and return the events of it; one checkpoint stays."""
-        keep = max(bisect_right(self.checkpoints, t_ns, key=_time) - 1, 0)
-        del self.checkpoints[:keep]
-        drop = min(self.checkpoints[0].applied - self._forgotten, len(self._events))
-        forgotten, self._events = self._events[:drop], self._events[drop:]
-        self._forgotten += drop
-        return forgotten
-
 
 def add_nis(sums: dict[str, tuple[int, float, int]], events: Iterable[Event]) -> dict[str, tuple[int, float, int]]:
     """Return count, sum of NIS and sum of degrees of freedom by kind, with those of accepted events added."""
@@ -140,7 +105,3 @@ def add_nis(sums: dict[str, tuple[int, float, int]], events: Iterable[Event]) ->
             count, nis, degrees = out.get(event.kind.value, (0, 0.0, 0))
             out[event.kind.value] = count + 1, nis + event.nis, degrees + event.degrees
     return out
-
-
-def _time(item: Event | Checkpoint) -> int:
-    return item.t_ns

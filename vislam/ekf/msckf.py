@@ -23,7 +23,8 @@ from vislam.ekf.msckf_history import Checkpoint, Event, Kind, TightHistory
 from vislam.ekf.msckf_state import MOUNT, TIME, Window, propagated
 from vislam.ekf.msckf_tracks import prepare
 from vislam.ekf.msckf_update import Outcome, Updater
-from vislam.geometry import interpolate, quaternion_wxyz, so3_log
+from vislam.ekf.timeline import bias_measurement, keep_track, pose_between, stretch
+from vislam.geometry import quaternion_wxyz, so3_log
 from vislam.imu import ImuNoise, ImuSeries
 from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 
@@ -232,10 +233,8 @@ class MsckfEkf:
 
         Only the biases move. The graph has used the same images, so give sigmas well above its own.
         """
-        bias = np.concatenate(
-            [gyro_bias, accel_bias, np.broadcast_to(gyro_sigma, 3), np.broadcast_to(accel_sigma, 3)]
-        ).astype(np.float64)
-        if not np.isfinite(bias).all() or (bias[6:] <= 0.0).any():
+        bias = bias_measurement(gyro_bias, accel_bias, gyro_sigma, accel_sigma)
+        if bias is None:
             return self._refuse("bias_invalid", "biases must be finite and their sigmas positive")
         return self._insert(Event(self._t_ns, Kind.BIAS, bias=bias))
 
@@ -259,19 +258,7 @@ class MsckfEkf:
         if self._history is None or t_ns > self._t_ns:
             return None
         checkpoint = self._history.checkpoint_at(t_ns)
-        if checkpoint is None:
-            return None
-        if checkpoint.t_ns == t_ns:
-            return pose(checkpoint.x, 0, 6)
-        times, track = self._series.t_ns, self._series.extra
-        after = int(np.searchsorted(times, t_ns))
-        if after == len(times):  # the start, when it is newer than every sample
-            return pose(self._x, 0, 6)
-        before_ns, before = checkpoint.t_ns, checkpoint.x[:10]
-        if after > 0 and int(times[after - 1]) > before_ns:
-            before_ns, before = int(times[after - 1]), track[after - 1]
-        alpha = (t_ns - before_ns) / (int(times[after]) - before_ns)
-        return interpolate(pose(before.copy(), 0, 6), pose(track[after].copy(), 0, 6), alpha)
+        return None if checkpoint is None else pose_between(self._series, self._x, checkpoint, t_ns)
 
     def _refuse(self, counter: str, reason: str) -> UpdateResult:
         self._counts[counter] += 1
@@ -317,30 +304,19 @@ class MsckfEkf:
             if step_ns < t_ns:  # stop on a sample: stopping between two would change the arithmetic
                 step_ns = int(self._series.t_ns[np.searchsorted(self._series.t_ns, step_ns)])
                 step_ns = min(step_ns, t_ns)
-            self._integrate(self._x, self._Phi, self._Q, self._t_ns, step_ns, keep_track=True)
+            self._integrate(self._x, self._Phi, self._Q, self._t_ns, step_ns, keep=True)
             self._t_ns = step_ns
             if self._history is not None and step_ns - self._history.checkpoints[-1].t_ns >= self._checkpoint_ns:
                 self._take_checkpoint()
 
-    def _integrate(self, x: Array, Phi: Array, Q: Array, t0_ns: int, t1_ns: int, keep_track: bool = False) -> None:
-        series = self._series
+    def _integrate(self, x: Array, Phi: Array, Q: Array, t0_ns: int, t1_ns: int, keep: bool = False) -> None:
         if t1_ns <= t0_ns:
             return
-        times = series.t_ns
-        inner = slice(int(np.searchsorted(times, t0_ns, side="right")), int(np.searchsorted(times, t1_ns)))
-        stamps = np.concatenate(([t0_ns], times[inner], [t1_ns])).astype(np.int64)
-        samples = np.concatenate((series.at(t0_ns)[None], series.values[inner], series.at(t1_ns)[None]))
-        # A step inside a hole must know how long the whole hole is, not only its own part of it.
-        neighbours = times[max(inner.start - 1, 0) : inner.stop + 1]
-        covered = len(neighbours) == len(stamps)  # else the state is older than every sample, or newer
-        holes = np.diff(neighbours if covered else stamps)
-        gaps_s = np.concatenate(([0.0], np.where(holes > self._max_gap_ns, holes * 1e-9, 0.0)))
-        track = np.empty((len(stamps), 10))
-        kernels.run(x, Phi, Q, stamps, samples, gaps_s, track, self._sigmas, self._gravity)
-        if keep_track:
-            series.extra[inner] = track[1:-1]
-            if inner.stop < len(times) and times[inner.stop] == t1_ns:
-                series.extra[inner.stop] = track[-1]
+        piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
+        track = np.empty((len(piece.t_ns), 10))
+        kernels.run(x, Phi, Q, piece.t_ns, piece.samples, piece.gaps_s, track, self._sigmas, self._gravity)
+        if keep:
+            keep_track(self._series, piece, track)
 
     def _apply(self, event: Event, t_ns: int) -> None:
         rate = self._series.at(t_ns)[:3] if len(self._series) else np.zeros(3)

@@ -9,6 +9,7 @@ from enum import StrEnum
 from vislam.ekf.msckf_state import Window
 from vislam.ekf.msckf_tracks import FrameTracks
 from vislam.ekf.msckf_update import Outcome
+from vislam.ekf.timeline import Timeline, time_of
 from vislam.messages import Array
 
 
@@ -48,40 +49,24 @@ class Checkpoint:
     after_event: bool  # taken right after the last of them
 
 
-class TightHistory:
-    """Events in time order (ties in order of arrival) and checkpoints, both bounded by `forget_before`."""
-
-    def __init__(self, first: Checkpoint) -> None:
-        self.checkpoints = [first]
-        self._events: list[Event] = []
-        self._forgotten = 0  # events dropped from the front; all numbering counts them
+class TightHistory(Timeline[Event, Checkpoint]):
+    """What came to the filter and where it can go back to."""
 
     def has_frame(self, t_ns: int) -> bool:
         """Whether a frame of this stamp is here already."""
-        place = bisect_right(self._events, t_ns, key=_time)
+        place = bisect_right(self._events, t_ns, key=time_of)
         while place > 0 and self._events[place - 1].t_ns == t_ns:
             place -= 1
             if self._events[place].kind is Kind.FRAME:
                 return True
         return False
 
-    def insert(self, event: Event) -> int:
-        """Sort an event in and return its number since the start."""
-        place = bisect_right(self._events, event.t_ns, key=_time)
-        self._events.insert(place, event)
-        return place + self._forgotten
-
-    def event(self, number: int) -> Event | None:
-        """Return an event by its number, None past the last."""
-        place = number - self._forgotten
-        return self._events[place] if place < len(self._events) else None
-
     def is_too_old(self, event: Event) -> bool:
         """Whether an event belongs before the oldest checkpoint."""
         first = self.checkpoints[0]
         if event.effective_t_ns(first.window) < first.t_ns:
             return True
-        place = bisect_right(self._events, event.t_ns, key=_time)
+        place = bisect_right(self._events, event.t_ns, key=time_of)
         return place + self._forgotten < first.applied
 
     def rewind(self, number: int) -> Checkpoint:
@@ -98,20 +83,3 @@ class TightHistory:
                 break
             self.checkpoints.pop()
         return self.checkpoints[-1]
-
-    def checkpoint_at(self, t_ns: int) -> Checkpoint | None:
-        """Return the newest checkpoint at or before a time, None if it is older than all."""
-        place = bisect_right(self.checkpoints, t_ns, key=_time)
-        return self.checkpoints[place - 1] if place else None
-
-    def forget_before(self, t_ns: int) -> None:
-        """Drop what is not needed to go back to `t_ns` or later; one checkpoint always stays."""
-        keep = max(bisect_right(self.checkpoints, t_ns, key=_time) - 1, 0)
-        del self.checkpoints[:keep]
-        drop = min(self.checkpoints[0].applied - self._forgotten, len(self._events))
-        del self._events[:drop]
-        self._forgotten += drop
-
-
-def _time(item: Event | Checkpoint) -> int:
-    return item.t_ns

@@ -28,6 +28,7 @@ from vislam.ekf.msckf_state import (
     without_points,
 )
 from vislam.ekf.msckf_tracks import FrameTracks, image_motion_px, marked, ripe_tracks
+from vislam.ekf.timeline import reset_sigmas
 from vislam.geometry import invert, skew, so3_log
 from vislam.imu import ImuNoise
 from vislam.messages import Array
@@ -116,16 +117,7 @@ class Updater:
         self._limits = 2.0 * gammaincinv(0.5 * np.maximum(np.arange(most), 1), config.gate_probability)
         per_sample = config.tight_imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
         self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
-        self._reset_sigmas = np.repeat(
-            [
-                np.deg2rad(config.reset_rotation_deg),
-                config.reset_position_m,
-                config.reset_velocity_m_s,
-                config.reset_gyro_bias_rad_s,
-                config.reset_accel_bias_m_s2,
-            ],
-            3,
-        )
+        self._reset_sigmas = reset_sigmas(config)
 
     # -- a frame -----------------------------------------------------------------------------------------------------
 
