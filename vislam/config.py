@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from vislam.errors import UsageError
+
+Options = TypeVar("Options")
 
 
 @dataclass(frozen=True, slots=True)
@@ -473,12 +476,21 @@ def load(path: Path | None = None, overrides: dict[str, Any] | None = None) -> C
 def from_data(data: dict[str, Any], source: str) -> Config:
     """Build a configuration from plain nested data; unknown and ill-typed fields raise UsageError with `source`."""
     _refuse_unknown(data, Config, source)
+    return validated(Config, data, source)
+
+
+def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Options:
+    """Build a dataclass from plain data; unknown and ill-typed fields raise UsageError that begins with `where`."""
+    known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    for name in data:
+        if name not in known:
+            raise UsageError(f"{where}: no option '{name}'; there are: {', '.join(known)}")
     try:
-        return TypeAdapter(Config).validate_python(data)
+        return TypeAdapter(cls).validate_python(data)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{source}: {where}: {first['msg']}, got {first['input']!r}") from error
+        field_path = ".".join(str(part) for part in first["loc"])
+        raise UsageError(f"{where}: option {field_path}: {first['msg']}, got {first['input']!r}") from error
 
 
 def _refuse_unknown(data: dict[str, Any], cls: type, source: str, prefix: str = "") -> None:

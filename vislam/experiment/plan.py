@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
-
+from vislam.config import validated
 from vislam.errors import UsageError
 from vislam.experiment.identity import is_world, split_source
 
@@ -90,12 +89,7 @@ def load_plan(path: Path, variables: Mapping[str, str] | None = None) -> Plan:
 def plan_from_data(data: dict[str, Any], where: str, folder: Path, variables: Mapping[str, str]) -> Plan:
     """Build a plan from plain data; relative paths begin at `folder`. Raises UsageError with `where`."""
     _refuse_unknown(data, Plan, where)
-    try:
-        plan = TypeAdapter(Plan).validate_python(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field_name = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{where}: {field_name}: {first['msg']}, got {first['input']!r}") from error
+    plan = validated(Plan, data, where)
     sequences = tuple(_resolved(sequence, where, folder, variables) for sequence in plan.sequences)
     plan = dataclasses.replace(plan, sequences=sequences)
     _check(plan, where)

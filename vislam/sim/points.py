@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from vislam.camera import Camera, Rig
+from vislam.config import validated
 from vislam.errors import DataError, UsageError
 from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImuSample, Observations
@@ -94,17 +95,7 @@ def open_points(source: str | MeasuredInertial, seed: int = 0, **options: object
     Raises UsageError for an unknown world, and for an unknown or ill-typed option (see `PointOptions`); DataError when
     the recording's truth does not suffice.
     """
-    known = [field.name for field in fields(PointOptions)]
-    for option in options:
-        if option not in known:
-            raise UsageError(f"simulated vision has no option '{option}'; there are: {', '.join(known)}")
-    try:
-        checked = TypeAdapter(PointOptions).validate_python(options)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"simulated vision, option {where}: {first['msg']}, got {first['input']!r}") from error
-    return PointRecording(source, seed, checked)
+    return PointRecording(source, seed, validated(PointOptions, options, "simulated vision"))
 
 
 class PointRecording:

@@ -6,15 +6,16 @@ import heapq
 from collections import deque
 from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
+from vislam.config import validated
 from vislam.errors import UsageError
 from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
@@ -81,17 +82,7 @@ def open_world(name: str, seed: int = 0, **options: object) -> Simulation:
     """
     if name not in WORLDS:
         raise UsageError(f"no simulated world '{name}'; there are: {', '.join(WORLD_NAMES)}")
-    known = [field.name for field in fields(SimOptions)]
-    for option in options:
-        if option not in known:
-            raise UsageError(f"simulated worlds have no option '{option}'; there are: {', '.join(known)}")
-    try:
-        checked = TypeAdapter(SimOptions).validate_python(options)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"simulated world '{name}', option {where}: {first['msg']}, got {first['input']!r}") from error
-    return Simulation(name, seed, checked)
+    return Simulation(name, seed, validated(SimOptions, options, f"simulated world '{name}'"))
 
 
 class Simulation:
