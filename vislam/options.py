@@ -65,7 +65,9 @@ class SimulateOptions:
     workers: int = 2
     """Threads that render; they change nothing but the time"""
     seed: int = 0
-    """Same seed, same bytes"""
+    """Of motion and sensors; same seed, same bytes"""
+    world_seed: int = 0
+    """Of the place: its textures, and where things stand"""
 
 
 @dataclass(frozen=True)

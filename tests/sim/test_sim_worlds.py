@@ -8,6 +8,7 @@ LIMITS = {  # speed m/s, acceleration m/s2, rate rad/s, length m, seconds, rest 
     "workshop-cart": (1.2, 2.0, 1.4, (50.0, 60.0), (60.0, 80.0), 2.0),
     "handheld-room": (1.0, 4.0, 1.5, (8.0, 16.0), (30.0, 40.0), 1.5),
     "corridor-loop": (1.6, 4.0, 2.0, (65.0, 85.0), (50.0, 75.0), 2.0),
+    "aliased-halls": (1.6, 4.0, 2.0, (62.0, 72.0), (58.0, 66.0), 2.0),
 }
 
 
@@ -112,3 +113,36 @@ def test_the_corridor_is_walked_again_for_five_metres_and_only_there(painted):
     assert np.linalg.norm(np.diff(places[late], axis=0), axis=1).sum() > 5.0
     assert times[again[times[again] < 30.0]].max() < 12.0
     assert times[late].min() > times[-1] - 12.0
+
+
+def turned_about_the_middle(poses: np.ndarray, quarters: int) -> np.ndarray:
+    T = np.eye(4)
+    T[:2, :2] = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
+    return T @ poses
+
+
+def test_the_aliased_halls_are_the_same_pixels_but_for_a_number_and_the_fourth_is_rearranged(painted):
+    world = painted("aliased-halls", rig="mono", image_noise=False, exposure_changes=False)
+    pose = world.truth().T_world_body[150] @ world.rig.T_body_cams[0]  # in the second hall, its shelf in view
+    first, second, third, fourth = (
+        world._renderers[0].render(world.scene, turned_about_the_middle(pose, k))[0].astype(float) for k in (3, 0, 1, 2)
+    )
+    for other in (first, third):
+        assert np.median(np.abs(other - second)) <= 2.0  # soft shadows are not turned with the hall
+        assert np.mean(np.abs(other - second) > 25.0) < 0.02  # the number
+    assert np.mean(np.abs(fourth - second) > 25.0) > 0.1
+
+
+def test_the_aliased_halls_fool_appearance_and_are_revisited_truly(painted):
+    world = painted("aliased-halls", rig="mono")
+    poses = world.truth().T_world_body
+    late = 540  # in the second hall again
+    true = nearest_revisit(world, late, 15.0)
+    assert np.linalg.norm(poses[true, :3, 3] - poses[late, :3, 3]) < 0.5
+    assert inliers(world, late, true) > 60
+    for quarters in (1, -1):  # where the same is seen in the next hall and in the one before
+        turned = turned_about_the_middle(poses[late], quarters)
+        distance = np.linalg.norm(poses[:, :3, 3] - turned[:3, 3], axis=1) + 2.0 * (
+            1.0 - poses[:, :3, 0] @ turned[:3, 0]
+        )
+        assert inliers(world, late, int(np.argmin(distance))) > 60

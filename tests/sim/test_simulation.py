@@ -147,7 +147,7 @@ def test_stereo_images_agree_with_the_depth(painted):
 
 
 def test_unknown_worlds_and_options_name_what_there_is():
-    with pytest.raises(UsageError, match="workshop-cart, handheld-room, corridor-loop"):
+    with pytest.raises(UsageError, match="workshop-cart, handheld-room, corridor-loop, aliased-halls"):
         open_world("kitchen")
     with pytest.raises(UsageError, match=r"no option 'rolling'.*readout_s"):
         open_world("handheld-room", rolling=True)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.messages import Array
 from vislam.sim import furniture, paint, shell, signs
-from vislam.sim.path import Travel, rounded_path, smoothstep, wander
+from vislam.sim.path import Travel, rounded_path
 from vislam.sim.scene import SceneBuilder
 from vislam.sim.spline import BodySpline
+from vislam.sim.walk import walk
 
 _X, _Y, _Z = 10.5, 6.5, 2.6  # half sizes of the centre line, height
 _HALF_WIDTH_M = 1.15
-_EYE_M = 1.25
 _SPEED_M_S = 1.25
-_STEP_HZ = 1.8
-_KNOTS_S = 0.1
 
 
 def motion(rng: np.random.Generator) -> BodySpline:
@@ -24,22 +21,7 @@ def motion(rng: np.random.Generator) -> BodySpline:
     inner = [(2.0, -_Y - 0.15), (6.0, -_Y + 0.2)]
     path = rounded_path([(-4.0, -_Y), *inner, *around, (-4.5, -_Y + 0.05), (0.0, -_Y - 0.1), (4.0, -_Y)], 1.2)
     travel = Travel(path.length_m, _SPEED_M_S, 1.2, 2.3, 1.0)
-    seed = int(rng.integers(0, 2**32))
-
-    def design(t_s: Array) -> tuple[Array, Array]:
-        arc = travel.arc_m(t_s)
-        xy, heading = path.at(arc)
-        walking = smoothstep(arc, 0.1, 1.5) * smoothstep(path.length_m - arc, 0.1, 1.5)
-        step = 2.0 * np.pi * _STEP_HZ * t_s
-        slow = wander(t_s, np.random.default_rng(seed), 1.0, (0.08, 0.35), 4) * walking[:, None]
-        side = walking * 0.018 * np.sin(0.5 * step) + 0.04 * slow[:, 0]
-        xy = xy + side[:, None] * np.column_stack([-np.sin(heading), np.cos(heading)])
-        z = _EYE_M + walking * 0.014 * np.sin(step)
-        roll = walking * 0.009 * np.sin(0.5 * step + 0.4) + 0.015 * slow[:, 1]
-        pitch = 0.06 + walking * 0.007 * np.sin(step + 0.8) + 0.03 * slow[:, 2]
-        return np.column_stack([xy, z]), np.column_stack([roll, pitch, heading + 0.07 * slow[:, 3]])
-
-    return BodySpline.from_design(design, travel.duration_s, _KNOTS_S)
+    return walk(path, travel, int(rng.integers(0, 2**32)))
 
 
 def build(rng: np.random.Generator) -> SceneBuilder:

@@ -8,7 +8,7 @@ the ray caster reads.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +157,19 @@ class SceneBuilder:
         self.rectangle(corner, (across, 0.0, 0.0), (0.0, -across, 0.0), top or side, texels_per_m, kind=DISC)
         half = np.diag([0.9 * radius_m, 0.9 * radius_m, 0.5 * height_m])
         self.solids.append((top_centre - np.array([0.0, 0.0, 0.5 * height_m]), half))
+
+    def add_turned(self, part: SceneBuilder, yaw_rad: float) -> None:
+        """Add everything of another builder, turned about the vertical through the world's origin."""
+        R = np.array(
+            [[np.cos(yaw_rad), -np.sin(yaw_rad), 0.0], [np.sin(yaw_rad), np.cos(yaw_rad), 0.0], [0.0, 0.0, 1.0]]
+        )
+        for one in part.surfaces:
+            turned = replace(one, origin=R @ one.origin, axis_u=R @ one.axis_u, axis_v=R @ one.axis_v)
+            self.surfaces.append(turned)
+        self.solids += [(R @ centre, half @ R.T) for centre, half in part.solids]
+        for lamp in part.lamps:
+            x, y, z = (R @ np.array(lamp.position_m)).tolist()
+            self.lamps.append(replace(lamp, position_m=(x, y, z)))
 
     def lamp(self, position_m: tuple[float, float, float], power: float, bgr: tuple[float, float, float]) -> None:
         """Add a lamp without a visible body."""

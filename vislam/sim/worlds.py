@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from vislam.camera import Camera, Rig
 from vislam.messages import Array
-from vislam.sim import corridor, hall, room
+from vislam.sim import corridor, hall, halls, room
 from vislam.sim.scene import SceneBuilder
 from vislam.sim.spline import BodySpline
 
@@ -47,6 +47,10 @@ WORLDS: dict[str, World] = {
     "corridor-loop": World(
         "a walk of 70 m through four corridors, closed once at the end: 64 s, stereo",
         corridor.build, corridor.motion, "stereo", 20.0, (0.06, 0.055, 0.04), 0.0,
+    ),
+    "aliased-halls": World(
+        "a walk of 67 m through four halls that look alike, 1.6 rounds: 62 s, RGB-D, made to fool appearance",
+        halls.build, halls.motion, "rgbd", 10.0, (0.06, 0.02, 0.04), 0.0,
     ),
 }  # fmt: skip
 
