@@ -24,7 +24,7 @@ from vislam.geometry import (
     transform,
 )
 from vislam.imu import preintegrate
-from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
+from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 from vislam.relative_motion import camera_displacement, direction_residual, metric_residual
 
 LEVER = np.array([0.1, -0.05, 0.2])
@@ -439,7 +439,7 @@ def test_without_vision_the_filter_knows_that_it_does_not_know(scene: Scene) -> 
     np.testing.assert_allclose(shown, range(len(shown)), atol=1e-9)
     lost = replace(scene.motions[5], T_keyframe_body=None, tracking=Tracking.LOST)
     before = ekf.state()
-    assert not ekf.update_vo(lost).accepted
+    assert not ekf.update_vision(lost, Observations(np.arange(0), np.zeros((0, 2)))).accepted
     assert ekf.counters["vo_lost"] == 1
     assert_same(before, ekf.state())
 

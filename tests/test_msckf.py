@@ -143,6 +143,7 @@ def test_bad_input_is_counted_and_changes_nothing() -> None:
     before, now = ekf.state(), flight.samples[-1].t_ns
     ekf.predict(ImuSample(now + 5_000_000, np.full(3, np.nan), np.zeros(3)))
     ekf.predict(ImuSample(now - 5_000_000, np.zeros(3), np.zeros(3)))
+    ekf.predict(ImuSample(now + 5_000_000, np.zeros(3), np.array([0.0, 1e200, 0.0])))
     nan = Observations(np.arange(3), np.full((3, 2), np.nan))
     assert not ekf.update_vision(motion_of(now), nan).accepted
     assert not ekf.update_vision(motion_of(now), NOTHING).accepted
@@ -152,10 +153,30 @@ def test_bad_input_is_counted_and_changes_nothing() -> None:
     assert not ekf.feed_back(np.full(3, np.nan), np.zeros(3), 1.0, 1.0).accepted
     after, counters = ekf.state(), ekf.counters
     np.testing.assert_array_equal(after.T_world_body, before.T_world_body)
-    names = ("imu_nan", "imu_backward", "vision_invalid", "vision_lost", "vision_duplicate", "too_late", "bias_invalid")
-    assert [counters[name] for name in names] == [1, 1, 2, 1, 1, 1, 1]
+    imu = ("imu_nan", "imu_backward", "imu_impossible")
+    assert [counters[name] for name in imu] == [1, 1, 1]
+    names = ("vision_invalid", "vision_lost", "vision_duplicate", "too_late", "bias_invalid")
+    assert [counters[name] for name in names] == [2, 1, 1, 1, 1]
     with pytest.raises(ValueError, match="not finite"):
         ekf.initialise(replace(flight.start, velocity_world_m_s=np.full(3, np.nan)))
+
+
+@pytest.mark.parametrize("gap_s", [0.5, 3600.0, 3.15e7])
+def test_holes_of_any_length_end(gap_s: float) -> None:
+    """A stopped sensor, or a clock that leaps by a year: a state that says how little it knows. Seed 6."""
+    flight = Flight.make(6, 2.0)
+    ekf = flight.filter()
+    for _ in flight.fly(ekf):
+        pass
+    before, last = ekf.state(), flight.samples[-1]
+    for k in range(1, 101):
+        ekf.predict(replace(last, t_ns=last.t_ns + round(gap_s * NS) + k * 5_000_000))
+    state = ekf.state()
+    assert ekf.counters["imu_gaps"] == 1
+    assert np.isfinite(state.T_world_body).all()
+    assert np.isfinite(state.covariance).all()
+    sigmas_m = [np.sqrt(np.trace(s.covariance[3:6, 3:6])) for s in (before, state)]
+    assert sigmas_m[1] > sigmas_m[0] + 0.5 * gap_s**2
 
 
 def test_a_wild_frame_and_swapped_tracks_do_no_harm() -> None:

@@ -138,9 +138,10 @@ class Front:
         """Track one frame, update the filter with it, and hand over keyframes that are ready."""
         frame = self.camera_clock.in_imu_time(frame)
         span = self._span(self._last_frame_t_ns, frame.t_ns)
+        before = self._ekf.state() if self._ekf is not None and self._ekf.initialised else None
         with self._clock.measure("track"):
-            track = self.frontend.track(frame, *self._without_bias(span), self._predicted(frame.t_ns))
-            track = replace(track, vo=self.camera_clock.loosened(track.vo, span, self._state()))
+            track = self.frontend.track(frame, *self._without_bias(span, before), self._predicted(frame.t_ns, before))
+            track = replace(track, vo=self.camera_clock.loosened(track.vo, span, before))
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
@@ -200,17 +201,15 @@ class Front:
             return None
         return self._buffer.span(from_t_ns, to_t_ns)
 
-    def _without_bias(self, span: ImuSpan | None) -> tuple[ImuSpan | None, float]:
+    def _without_bias(self, span: ImuSpan | None, state: NavState | None) -> tuple[ImuSpan | None, float]:
         """Return the span with the filter's biases taken off, and how well the gyroscope's is known."""
-        if span is None or self._ekf is None or not self._ekf.initialised:
+        if span is None or state is None:
             return span, np.inf
-        state = self._ekf.state()
         sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max())) + self.camera_clock.gyro_sigma_rad_s(span)
         return subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2), sigma_rad_s
 
-    def _predicted(self, t_ns: int) -> Array | None:
+    def _predicted(self, t_ns: int, state: NavState | None) -> Array | None:
         """Return the motion since the last frame where the filter knows it to centimetres."""
-        state = self._state()
         if self._ekf is None or state is None or self._last_frame_t_ns is None:
             return None
         dt_s = (t_ns - self._last_frame_t_ns) * 1e-9
@@ -236,9 +235,6 @@ class Front:
                     ekf.predict(ImuSample(t_ns, gyro, accel))
         ekf.initialise(state, vo)
         return ekf
-
-    def _state(self) -> NavState | None:
-        return self._ekf.state() if self._ekf is not None and self._ekf.initialised else None
 
     def _follow_clock(self, vo: VoMeasurement) -> None:
         """Learn the camera's time offset; what waits for gravity is stamped anew, what left stays as it was."""

@@ -30,7 +30,6 @@ from vislam.imu import ImuNoise, ImuSeries
 from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 
 _NS = 1_000_000_000
-_MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 1e3, 1e4  # beyond every sensor: such numbers come from a broken transfer
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ class Ekf:
         self._t_ns = 0
         self._applied = 0
         self._ledger = Ledger()
-        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", "imu_impossible", *OUTCOMES), 0)
+        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *OUTCOMES), 0)
         self._nis: dict[str, tuple[int, float, int]] = {}  # of events that the history has forgotten
 
     @property
@@ -148,10 +147,6 @@ class Ekf:
         Samples that are not finite, beyond any sensor, duplicate or backward are counted and change nothing.
         """
         before = self._series.newest_t_ns
-        rate, force = max(map(abs, sample.gyro_rad_s.tolist())), max(map(abs, sample.accel_m_s2.tolist()))
-        if rate > _MAX_RATE_RAD_S or force > _MAX_FORCE_M_S2:
-            self._counts["imu_impossible"] += 1
-            return
         if not self._series.append(sample):
             return
         self._counts["imu_samples"] += 1
@@ -194,8 +189,6 @@ class Ekf:
 
     def update_vision(self, vo: VoMeasurement, observations: Observations) -> UpdateResult:
         """Take what vision made of a frame; loosely coupled, its motion counts and its tracks do not."""
-        if vo.tracking is Tracking.LOST:
-            return UpdateResult(False, float("nan"), "vision is lost")
         return self.update_vo(vo)
 
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:

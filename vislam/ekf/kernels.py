@@ -228,6 +228,12 @@ def _add_noise(P: Array, dt: float, gap_s: float, sigmas: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def pieces_of(dt: float, gap_s: float) -> int:
+    """Return in how many pieces to take a step of `dt` s; in a hole what is unseen turns the force, too."""
+    return min(max(math.ceil(dt / _HOLE_STEP_S), 1), _HOLE_STEPS) if gap_s > 0.0 else 1
+
+
+@njit(cache=True, nogil=True)
 def between(a: Array, b: Array, share: float, out: Array) -> None:
     """Write the sample at a share of the way from a [6] to b [6] into `out`."""
     for i in range(6):
@@ -261,9 +267,7 @@ def predict_run(
     store(x, track[0])
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
-        pieces = 1
-        if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
-            pieces = min(max(math.ceil(dt / _HOLE_STEP_S), 1), _HOLE_STEPS)
+        pieces = pieces_of(dt, gaps_s[k])
         for j in range(pieces):
             if pieces == 1:  # not even rounding may tell this from a single `predict`
                 predict(x, P, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, work)

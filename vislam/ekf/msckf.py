@@ -173,7 +173,7 @@ class MsckfEkf:
         self._run()
 
     def predict(self, sample: ImuSample) -> None:
-        """Take a sample and bring the state to its time. Not finite, duplicate or backward samples are counted only."""
+        """Take a sample and bring the state to its time. Not finite, impossible, duplicate or backward: only counted."""
         before = self._series.newest_t_ns
         if not self._series.append(sample):
             return

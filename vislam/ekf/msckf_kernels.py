@@ -11,18 +11,15 @@ consistency", IROS 2017.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.ekf.kernels import between, pose, store, turn
+from vislam.ekf.kernels import between, pieces_of, pose, store, turn
 from vislam.geometry import skew, so3_right_jacobian
 from vislam.messages import Array
 
 INERTIAL = 15
-_HOLE_STEP_S = 0.01
 
 
 @njit(cache=True, nogil=True)
@@ -160,14 +157,14 @@ def run(
     store(x, track[0])
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
-        if gaps_s[k] > 0.0:  # small steps: what is unseen turns the force within the hole too
-            pieces = max(math.ceil(dt / _HOLE_STEP_S), 1)
-            for j in range(pieces):
-                between(samples[k - 1], samples[k], j / pieces, before)
-                between(samples[k - 1], samples[k], (j + 1) / pieces, after)
-                step(x, Phi, Q, before, after, dt / pieces, gaps_s[k], sigmas, gravity)
-        else:
-            step(x, Phi, Q, samples[k - 1], samples[k], dt, 0.0, sigmas, gravity)
+        pieces = pieces_of(dt, gaps_s[k])
+        for j in range(pieces):
+            if pieces == 1:  # not even rounding may tell this from a single `step`
+                step(x, Phi, Q, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity)
+                break
+            between(samples[k - 1], samples[k], j / pieces, before)
+            between(samples[k - 1], samples[k], (j + 1) / pieces, after)
+            step(x, Phi, Q, before, after, dt / pieces, gaps_s[k], sigmas, gravity)
         store(x, track[k])
 
 

@@ -15,7 +15,7 @@ class ImuBuffer:
     """Takes samples in time order and cuts spans with interpolated ends; bounded by `config.buffer_s`.
 
     Attributes:
-        counters: "samples" taken; "nan", "backward", "duplicate" refused; "gaps" longer than `config.max_gap_s`.
+        counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than `config.max_gap_s`.
     """
 
     def __init__(self, config: ImuConfig) -> None:
@@ -43,7 +43,7 @@ class ImuBuffer:
         return {"samples": self._samples, **self._series.refused, "gaps": self._gaps}
 
     def add(self, sample: ImuSample) -> bool:
-        """Take a sample; False, and a counter, if it is not finite or not newer than the last."""
+        """Take a sample; False, and a counter, if no sensor gives it or it is not newer than the last."""
         newest = self._series.newest_t_ns
         if not self._series.append(sample):
             return False

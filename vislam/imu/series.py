@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from vislam.messages import Array, ImuSample, ImuSpan
 
 _FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
+_MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 1e3, 1e4  # beyond every sensor: such numbers come from a broken transfer
 
 
 class ImuSeries:
     """A growing, sliding window of samples; rows stay contiguous so that compiled code can run over them.
 
     Attributes:
-        refused: samples not taken, by reason: "nan", "backward", "duplicate".
+        refused: samples not taken, by reason: "impossible", "nan", "backward", "duplicate".
     """
 
     def __init__(self, extra: int = 0) -> None:
@@ -29,7 +30,7 @@ class ImuSeries:
         self._begin = 0
         self._end = 0
         self._newest_t_ns = -(1 << 62)
-        self.refused = {"nan": 0, "backward": 0, "duplicate": 0}
+        self.refused = {"impossible": 0, "nan": 0, "backward": 0, "duplicate": 0}
 
     def __len__(self) -> int:
         """Return the number of samples held."""
@@ -56,10 +57,13 @@ class ImuSeries:
         return self._newest_t_ns if self._end > self._begin else None
 
     def append(self, sample: ImuSample) -> bool:
-        """Take a sample that is finite and newer than the last; otherwise count why not and return False."""
+        """Take a sample that a sensor can give and that is newer than the last; else count why not, return False."""
         t_ns = sample.t_ns
-        gyro, accel = sample.gyro_rad_s, sample.accel_m_s2
-        if not math.isfinite(sum(gyro.tolist()) + sum(accel.tolist())):
+        gyro, accel = sample.gyro_rad_s.tolist(), sample.accel_m_s2.tolist()
+        if max(map(abs, gyro)) > _MAX_RATE_RAD_S or max(map(abs, accel)) > _MAX_FORCE_M_S2:
+            self.refused["impossible"] += 1
+            return False
+        if not math.isfinite(sum(gyro) + sum(accel)):
             self.refused["nan"] += 1
             return False
         if t_ns <= self._newest_t_ns:
