@@ -173,7 +173,7 @@ class MsckfEkf:
         self._run()
 
     def predict(self, sample: ImuSample) -> None:
-        """Take a sample and bring the state to its time. Not finite, impossible, duplicate or backward: only counted."""
+        """Take a sample and bring the state to its time; one that `ImuSeries` refuses changes nothing but a counter."""
         before = self._series.newest_t_ns
         if not self._series.append(sample):
             return

@@ -28,7 +28,8 @@ _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the land
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _ASTRAY_PX = 6.0  # from where a filter that knows its motion expects a track: it belongs to something that moves
-_MIN_AS_PREDICTED = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
+_CONTRADICTS = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
+_MIN_AS_EXPECTED = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
 _FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
@@ -88,11 +89,12 @@ class MetricFrontEnd:
             return self._start(frame, "")
         T_before = self._T_key_cam
         T_guess = T_before @ self._predictor.predict(dt_s, imu)
-        if T_last_now is not None:
-            T_guess = T_before @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
         if self._blind:
             return self._leave_blindness(frame, self._keyframe, T_guess)
-        attempt = self._attempt(frame, T_before, T_guess, dt_s, trusted=T_last_now is not None)
+        attempt = self._attempt(frame, T_before, T_guess, dt_s)
+        if T_last_now is not None:
+            T_expected = T_before @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
+            attempt = self._confirmed(attempt, frame, T_before, T_expected, dt_s)
         if attempt.failure:
             T_found = self._recognise(frame, self._keyframe)
             if T_found is not None:
@@ -110,19 +112,33 @@ class MetricFrontEnd:
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
-    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float, trusted: bool = False) -> _Attempt:
-        landmarks = self._landmarks
+    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float) -> _Attempt:
         twist = se3_log(invert(T_before) @ T_guess) / dt_s
-        predicted, covariance = move(landmarks.mean, landmarks.covariance, T_guess)
+        predicted, _ = move(self._landmarks.mean, self._landmarks.covariance, T_guess)
         pixels = self._tracker.follow(frame, self._shutter.project(predicted, twist))
+        return self._place(frame, T_before, T_guess, dt_s, pixels)
+
+    def _confirmed(self, attempt: _Attempt, frame: Frame, T_before: Array, T_expected: Array, dt_s: float) -> _Attempt:
+        """Return the attempt, or another without the tracks that contradict the filter's motion, where most do.
+
+        Where they do not, the filter has no say: vision drawn to what the filter believes would tell it nothing new.
+        """
+        expected, covariance = move(self._landmarks.mean, self._landmarks.covariance, T_expected)
+        gate_xy = _ASTRAY_PX / self._camera.fx + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+        astray = np.linalg.norm(attempt.xy - expected[:, :2], axis=1) > gate_xy
+        if not attempt.failure and (astray & attempt.estimate.inliers).sum() <= _CONTRADICTS * attempt.inliers:
+            return attempt
+        pixels = np.where(astray[:, None], np.nan, attempt.pixels)
+        other = self._place(frame, T_before, T_expected, dt_s, pixels)
+        few = other.inliers < _MIN_AS_EXPECTED * attempt.followed
+        return attempt if few or other.failure else other
+
+    def _place(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float, pixels: Array) -> _Attempt:
+        """Place the frame by tracks found at `pixels` [N, 2], from a guess."""
+        twist = se3_log(invert(T_before) @ T_guess) / dt_s
+        predicted, _ = move(self._landmarks.mean, self._landmarks.covariance, T_guess)
         seen = self._camera.normalise(pixels)
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
-        if trusted:
-            gate_xy = _ASTRAY_PX / self._camera.fx + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
-            astray = np.linalg.norm(xy - predicted[:, :2], axis=1) > gate_xy
-            followed = np.isfinite(xy[:, 0]).sum()
-            if followed - astray.sum() >= max(self._config.min_inliers, _MIN_AS_PREDICTED * followed):
-                pixels, seen, xy = (np.where(astray[:, None], np.nan, values) for values in (pixels, seen, xy))
         depth_now = None
         if self._depth.every_frame and self._depth.available(frame):
             depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2], self._tracker.ids)

@@ -32,6 +32,7 @@ _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no lo
 _GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
 _BOTH_ENDS = 2.0**0.5
 _ASTRAY_PX = 6.0  # from where a filter that knows its motion can explain a track: it belongs to something that moves
+_CONTRADICTS = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
 _MIN_AS_EXPECTED = 0.2  # of the tracks have to be where they can be, or the expectation is wrong
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
@@ -105,8 +106,7 @@ class MonoFrontEnd:
         pixels = self._tracker.follow(frame, guess)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
-        pixels = self._as_expected(pixels, T_last_now)
-        motion = self._locate(R_guess, prior, pixels)
+        motion = self._confirmed(self._locate(R_guess, prior, pixels), R_guess, prior, T_last_now)
         if motion.failure:
             self._R_key_cam = R_guess
             return self._lose(frame, self._keyframe, motion)
@@ -129,18 +129,26 @@ class MonoFrontEnd:
             return None
         return RotationPrior(self._R_key_gyro, self._config.mono_gyro_sigma_rad + self._gyro_sigma_rad)
 
-    def _as_expected(self, pixels: Array, T_last_now: Array | None) -> Array:
-        """Return the pixels [N, 2] without those that no depth explains by the filter's motion since the keyframe."""
+    def _confirmed(
+        self, motion: _Motion, R_guess: Array, prior: RotationPrior | None, T_last_now: Array | None
+    ) -> _Motion:
+        """Return the motion, or another without the tracks that contradict the filter's motion, where most do.
+
+        A track contradicts it where no depth explains it by the filter's motion since the keyframe. Where most do not,
+        the filter has no say: vision drawn to what the filter believes would tell it nothing new.
+        """
         if T_last_now is None or self._T_key_filter is None:
             self._T_key_filter = None
-            return pixels
+            return motion
         self._T_key_filter = self._T_key_filter @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
-        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
+        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(motion.pixels)
         off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, key_xy, xy, 1.0 / self._config.min_depth_m)
-        astray, followed = off_px > _ASTRAY_PX, np.isfinite(off_px).sum()
-        if followed - astray.sum() < max(self._config.min_inliers, _MIN_AS_EXPECTED * followed):
-            return pixels
-        return np.where(astray[:, None], np.nan, pixels)
+        astray = off_px > _ASTRAY_PX
+        if not motion.failure and (astray & motion.view.inliers).sum() <= _CONTRADICTS * motion.inliers:
+            return motion
+        other = self._locate(R_guess, prior, np.where(astray[:, None], np.nan, motion.pixels))
+        few = other.inliers < _MIN_AS_EXPECTED * motion.followed
+        return motion if few or other.failure else other
 
     def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
         key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)

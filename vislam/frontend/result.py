@@ -38,8 +38,8 @@ class FrontEnd(Protocol):
         """Follow the last keyframe into `frame`; `imu` is the bias-corrected span since the previous frame.
 
         `gyro_sigma_rad_s` is how well the gyroscope's bias is known; infinite: not at all, the span only predicts.
-        `T_last_now` [4, 4] is the body's motion since the previous frame where a filter knows it to centimetres: tracks
-        that contradict it by far belong to something that moves, however many they are.
+        `T_last_now` [4, 4] is the body's motion since the previous frame where a filter knows it to centimetres: where
+        most tracks that vision moves by contradict it, they belong to something else that moves, and the others count.
 
         Raises DataError when the images do not fit the rig or time does not advance.
         """

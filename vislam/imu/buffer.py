@@ -15,7 +15,8 @@ class ImuBuffer:
     """Takes samples in time order and cuts spans with interpolated ends; bounded by `config.buffer_s`.
 
     Attributes:
-        counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than `config.max_gap_s`.
+        counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than
+            `config.max_gap_s`.
     """
 
     def __init__(self, config: ImuConfig) -> None:
