@@ -373,6 +373,9 @@ class LoopConfig:
     min_apart_keyframes: int = 3  # between odometry candidates, so that they constrain different places
     nominal_depth_m: float = 3.0  # of features without depth, to guess what two keyframes share
     max_appearance: int = 2  # candidates per keyframe that look alike
+    tags: Literal["off", "16h5", "25h9", "36h10", "36h11"] = "36h11"  # AprilTag family; 3 ms per keyframe
+    tag_size_m: float | None = None  # side of the black square; known, a tag alone gives a relative pose
+    max_tags: int = 2  # candidates per keyframe that saw the same tag
     retrieved: int = 10  # keyframes asked of the index before they are grouped into islands
     island_gap: int = 3  # ids in one island differ by at most this
     appearance_skip_keyframes: int = 20  # the newest ones always look most alike

@@ -212,6 +212,23 @@ def match(
     return np.asarray(_match(words_a, words_b, ratio, max_distance), dtype=np.int64)
 
 
+def find_tags(image: ImageU8, family: str) -> tuple[Indices, Array]:
+    """Find AprilTags (Olson 2011) of a family, as "36h11", in a grey image [H, W].
+
+    Returns:
+        Ids [T], ascending, and corners [T, 4, 2] in pixels: top left of the tag first, then clockwise as printed.
+    """
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_APRILTAG_{family}"))
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    if ids is None:
+        return np.empty(0, np.int64), np.empty((0, 4, 2))
+    found = np.asarray(ids, np.int64).reshape(-1)
+    order = np.argsort(found, kind="stable")
+    return found[order], np.asarray(corners, np.float64).reshape(-1, 4, 2)[order]
+
+
 @njit(cache=True, nogil=True)
 def _popcount(x: np.uint64) -> int:
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))

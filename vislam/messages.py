@@ -131,7 +131,7 @@ class LoopCandidate:
 
     from_id: int  # the older keyframe
     to_id: int  # the newer keyframe
-    source: str  # "appearance" or "odometry"
+    source: str  # "appearance", "odometry" or "tag"
     score: float
     inliers: int
     decision: LoopDecision

@@ -137,6 +137,8 @@ def _doubt(found: Verification, agreeing: int, disagreeing: int, config: LoopCon
     if not found.has_scale:  # never taken alone: wrong matches fit an essential matrix too easily
         needed = config.min_agreeing_direction
         return "" if agreeing >= needed else f"{agreeing} neighbours agree so far, needs {needed} without depth"
+    if found.needs_witness and agreeing == 0:
+        return "no neighbour agrees yet, and a tag alone can be misread"
     limit = config.max_sigma_m * np.fmax(_REFERENCE_DEPTH_M, found.median_depth_m) / _REFERENCE_DEPTH_M
     if agreeing >= 1 or found.sigma_m <= limit:
         return ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import LoopConfig
@@ -13,6 +14,7 @@ from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_can
 from vislam.loop.checks import Judgement, Measured, agree, agrees_with_map, judge, objection, tilt_error_rad
 from vislam.loop.database import PlaceDatabase
 from vislam.loop.pose_table import PoseTable
+from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verifier import Verification, Verifier
 from vislam.loop.view import View, make_view
 from vislam.loop.vocabulary import Vocabulary
@@ -49,6 +51,7 @@ class LoopDetector:
         self._database = PlaceDatabase(config, seed)
         self._appearance = AppearanceCandidates(config.island_gap)
         self._verifier = Verifier(config, rig, seed)
+        self._tags = TagBook()
         self._witnesses: list[Measured] = []  # poses that the last keyframes measured, accepted or parked
         self._parked: list[_Trial] = []
         self._next_edge_id = 0
@@ -74,6 +77,7 @@ class LoopDetector:
             return [], []
         view = make_view(keyframe, self._rig)
         self._poses.add(view.id, T_map_body)
+        self._tags.add(view.id, sight_tags(keyframe.frame, self._rig.cameras[0], self._config))
         trials = self._try(view)
         self._witnesses += [trial.measured for trial in trials if trial.measured is not None]
         edges: list[LoopEdge] = []
@@ -93,13 +97,19 @@ class LoopDetector:
         self._poses.move(update)
 
     def _candidates(self, view: View) -> list[Candidate]:
-        """Return the candidates in the order of verification: by odometry and by appearance in turn, no place twice."""
-        near, gap = self._near(view), self._config.island_gap
-        alike = [c for c in self._alike(view) if all(abs(c.id - other.id) > gap for other in near)]
-        order: list[Candidate] = []
+        """Return candidates in the order of verification: by tags, then by odometry and appearance in turn."""
+        gap = self._config.island_gap
+        old = self._old_ids()
+        order = self._tags.candidates(view.id, int(old[-1]), self._config.max_tags) if len(old) else []
+        near = [c for c in self._near(view) if all(c.id != other.id for other in order)]
+        alike = [c for c in self._alike(view) if all(abs(c.id - other.id) > gap for other in near + order)]
         for turn in range(max(len(near), len(alike))):
             order += near[turn : turn + 1] + alike[turn : turn + 1]
         return order
+
+    def _old_ids(self) -> NDArray[np.int64]:
+        """Return the ids of keyframes that visual odometry does not tie to the newest one any more."""
+        return self._poses.ids[: max(0, len(self._poses) - 1 - self._config.odometry_skip_keyframes)]
 
     def _alike(self, view: View) -> list[Candidate]:
         """Return candidates by appearance, leaving out what was seen just now: it always looks most alike."""
@@ -116,8 +126,8 @@ class LoopDetector:
     def _near(self, view: View) -> list[Candidate]:
         """Return candidates by odometry: old keyframes that should see most of the same by the current map."""
         config = self._config
-        old = len(self._poses) - 1 - config.odometry_skip_keyframes
-        if old <= 0:
+        old = len(self._old_ids())
+        if old == 0:
             return []
         T_body_cam = self._rig.T_body_cams[0]
         T_map_cam = self._poses[view.id] @ T_body_cam
@@ -142,8 +152,7 @@ class LoopDetector:
         candidates = self._candidates(view)
         trials = [self._trial(candidate, view) for candidate in candidates[:budget]]
         tried = {candidate.id for candidate in candidates}
-        newest = len(self._poses) - 1 - self._config.odometry_skip_keyframes
-        allowed = set(self._poses.ids[: max(0, newest)].tolist())
+        allowed = set(self._old_ids().tolist())
         for trial in list(trials):
             if trial.measured is None or trial.found.T_a_b is None or self._is_settled(trial, trials):
                 continue
@@ -162,6 +171,8 @@ class LoopDetector:
     def _trial(self, candidate: Candidate, view: View) -> _Trial:
         self.counters["verified"] += 1
         found = self._verifier.verify(self._views[candidate.id], view)
+        if found.T_a_b is None and candidate.source == "tag":
+            found = self._tags.verify(candidate.id, view.id, self._rig.T_body_cams[0], self._config) or found
         tilt_rad, measured = None, None
         if found.T_a_b is not None:
             if self._gravity_aligned:

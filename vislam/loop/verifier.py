@@ -46,6 +46,7 @@ class Verification:
     median_depth_m: float = float("nan")
     reverse_agreement: float = float("nan")  # share of matches that also agree the other way round; NaN: none could
     depth_agreement: float = float("nan")  # share of matches with two depths whose depths agree; NaN: too few
+    needs_witness: bool = False  # never taken alone, however small its sigma
 
 
 class Verifier:
