@@ -82,6 +82,7 @@ class FrontEndConfig:
     keyframe_min_inliers: int = 60  # fewer: new corners are worth the drift
     keyframe_min_interval_s: float = 0.15  # brisk motion: at most about six keyframes a second
     keyframe_max_interval_s: float = 2.0  # a camera at rest still reports
+    restart_keyframes: int = 8  # after a loss, so many come as soon as they may: chances to recognise the place
     described_features: int = 1000  # ORB keypoints per keyframe for loop closing
 
 
@@ -155,6 +156,7 @@ class EkfConfig:
     zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
     vision_delay_s: float = 0.0  # for experiments: vision reaches the filter so much later than it was seen
+    piece_sigma_m: float = 5.0  # without vision, a way known no better ties nothing: a new piece of trajectory begins
     graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
 
     tight_clones: int = 11  # past poses that tracks tie together; half a second at 20 Hz
@@ -307,6 +309,16 @@ class GraphConfig:
     anchor_reach: int = 10  # ... is so many keyframes from one that is, ties to that older one, the place's anchor ...
     anchor_variance_max: float = 4.0  # ... if the way there adds at most so many times the loop's own variance
     vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
+
+    # the link to a keyframe with which a new piece of trajectory begins: nothing is known, but equations stay solvable.
+    # 100 times weaker than a loop, no more than 4096 times weaker than an edge, beyond which gtsam 4.3.0 throws
+    piece_sigma_m: float = 2.0
+    piece_sigma_deg: float = 30.0
+    piece_tilt_sigma_deg: float = 5.0  # roll and pitch, where gravity is known on both sides
+    piece_speed_sigma_m_s: float = 3.0  # of the first velocity in a piece, with loose coupling
+    join_frames: int = 2  # new frames whose loops must agree through odometry to join two pieces: one image can deceive
+    join_waiting: int = 20  # newest loops between pieces that are compared for that; bounds the work
+    join_max_contradicting: float = 0.25  # of the loops between two pieces; more, and they wait for further ones
 
 
 @dataclass(frozen=True, slots=True)

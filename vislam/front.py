@@ -34,6 +34,7 @@ from vislam.messages import (
 from vislam.odometry_keyframe import OdometryKeyframe, first_keyframe_state, pose_before, restamped
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
+_BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
@@ -77,7 +78,7 @@ class Front:
         self._refused: Initialisation | None = None  # the newest answer without a state
         self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
         self.last_refusal = "no frame yet"  # why there is no first state
-        self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0}
+        self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0, "pieces": 1}
         self._config = config
         self._clock = clock
         self.noise = self._noise_told = noise  # `noise` is gone by: raised where the samples show more
@@ -105,6 +106,7 @@ class Front:
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
+        self._keyframe_variance_m2 = 0.0  # of the filter's position there
         self._rested_since_keyframe = True
         self._mag: MagSample | None = None
         # without gravity, up is where the first image has it
@@ -153,7 +155,7 @@ class Front:
             T_odom_body, state = self._filter(frame, track, at_rest)
         T_keyframe_body = self._since_keyframe(T_vo_keyframe_body, T_odom_body)
         if track.keyframe is not None:
-            ready += self._take_keyframe(track, T_odom_body)
+            ready += self._take_keyframe(track, T_odom_body, state)
             T_keyframe_body = np.eye(4)
         self._last_frame_t_ns = frame.t_ns
         self._follow_clock(track.vo)
@@ -351,7 +353,9 @@ class Front:
             return invert(self._T_odom_keyframe) @ T_odom_body
         return None
 
-    def _take_keyframe(self, track: TrackResult, T_odom_body: Array | None) -> list[OdometryKeyframe]:
+    def _take_keyframe(
+        self, track: TrackResult, T_odom_body: Array | None, state: NavState | None
+    ) -> list[OdometryKeyframe]:
         """Pack a new keyframe with all that the back end needs of it; return it unless it has to wait for gravity."""
         keyframe = track.keyframe
         assert keyframe is not None
@@ -359,10 +363,14 @@ class Front:
         if self._has_imu and self._keyframe_id >= 0:
             imu = self._buffer.span(self._keyframe_t_ns, keyframe.t_ns)
         at_rest = self._rested_since_keyframe and self._keyframe_id >= 0
+        variance_m2 = np.inf if state is None else float(np.trace(state.covariance[3:6, 3:6]))
+        begins_piece = track.vo.tracking is Tracking.LOST and not self._bridged(keyframe.t_ns, imu, variance_m2)
+        self.counters["pieces"] += begins_piece
         packet = KeyframePacket(
-            keyframe, track.vo, track.observations, imu, self._mag, at_rest, self.camera_clock.applied_s
+            keyframe, track.vo, track.observations, imu, self._mag, at_rest, self.camera_clock.applied_s, begins_piece
         )
         self.camera_clock.took_keyframe()
+        self._keyframe_variance_m2 = variance_m2
         self._keyframe_id, self._keyframe_t_ns = keyframe.id, keyframe.t_ns
         self._rested_since_keyframe, self._mag = True, None
         self._T_vo_keyframe = self._T_vo_body.copy()
@@ -371,6 +379,18 @@ class Front:
             return [OdometryKeyframe(packet, T_odom_body)]
         self._waiting.append(OdometryKeyframe(packet, self._T_vo_body.copy()))
         return self._give_up_if_late(keyframe.t_ns)
+
+    def _bridged(self, t_ns: int, imu: ImuSpan | None, variance_m2: float) -> bool:
+        """Return whether inertial data tell where a keyframe is from the one before, which vision has lost.
+
+        `variance_m2` is that of the filter's position at the keyframe, infinite before it has a state.
+        """
+        if imu is None:
+            return False
+        if not np.isfinite(self._keyframe_variance_m2):
+            return (t_ns - self._keyframe_t_ns) * 1e-9 <= _BLIND_S
+        grown_m2 = variance_m2 - self._keyframe_variance_m2
+        return bool(grown_m2 <= self._config.ekf.piece_sigma_m**2)
 
     def _give_up_if_late(self, now_t_ns: int) -> list[OdometryKeyframe]:
         """Go on without the IMU when gravity could not be found for too long; keyframes must not wait for ever."""

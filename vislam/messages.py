@@ -9,7 +9,9 @@ Tangents and 6x6 covariances are ordered rotation, then translation, with the pe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -123,6 +125,7 @@ class KeyframePacket:
     mag: MagSample | None = None
     at_rest: bool = False  # zero velocity held over the span, decided by IMU and image together
     time_offset_s: float = 0.0  # what has been added to the camera's own stamp to get the IMU's time
+    begins_piece: bool = False  # nothing measured the motion since the previous keyframe: a new piece of trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,6 +169,47 @@ class NavState:
     covariance: Array  # [15, 15]; rotation perturbed on the body side, position and velocity in world axes
 
 
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """Pieces of trajectory: stretches of consecutive keyframes that odometry ties, and which of them loops have joined.
+
+    Poses of keyframes in pieces that are not joined mean nothing to each other.
+    """
+
+    first_ids: tuple[int, ...] = (0,)  # the keyframe with which each piece begins
+    groups: tuple[int, ...] = (0,)  # of each piece: the oldest piece that it is joined with, itself when with none
+
+    def begun(self, keyframe_id: int) -> Pieces:
+        """Return these pieces and a new one that begins with a keyframe."""
+        return Pieces((*self.first_ids, keyframe_id), (*self.groups, len(self.groups)))
+
+    def joined_by(self, pairs: Iterable[tuple[int, int]]) -> Pieces:
+        """Return these pieces joined by exactly these pairs of keyframes."""
+        groups = list(range(len(self.first_ids)))
+        for one, other in pairs:
+            low, high = sorted((groups[self.of(one)], groups[self.of(other)]))
+            if low != high:
+                groups = [low if group == high else group for group in groups]
+        return replace(self, groups=tuple(groups))
+
+    def of(self, keyframe_id: int) -> int:
+        """Return the piece of a keyframe."""
+        return bisect_right(self.first_ids, keyframe_id) - 1
+
+    def group(self, keyframe_id: int) -> int:
+        """Return the group of a keyframe: the oldest piece that its own is joined with."""
+        return self.groups[self.of(keyframe_id)]
+
+    def are_joined(self, one: int, other: int) -> bool:
+        """Return whether two keyframes are in one piece, or in pieces that are joined."""
+        return self.group(one) == self.group(other)
+
+    def groups_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the groups [N] of keyframes [N]."""
+        places = np.searchsorted(np.array(self.first_ids), ids, side="right") - 1
+        return np.array(self.groups, dtype=np.int64)[places]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphUpdate:
     """What one graph update changed; consumers keep the newest revision."""
@@ -179,3 +223,4 @@ class GraphUpdate:
     rejected_loop_ids: tuple[int, ...] = ()
     note: str = ""  # what happened when a plain update was not possible
     details: dict[str, Any] | None = None
+    pieces: Pieces = Pieces()

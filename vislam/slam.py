@@ -83,7 +83,9 @@ class Back:
         candidates: list[LoopCandidate] = []
         if self.loops is not None:
             with self.clock.measure("loop"):
-                edges, candidates = self.loops.detect(keyframe, self.T_map_odom @ odometry.T_odom_body)
+                edges, candidates = self.loops.detect(
+                    keyframe, self.T_map_odom @ odometry.T_odom_body, odometry.packet.begins_piece
+                )
         with self.clock.measure("graph"):
             update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
         self._follow(update)

@@ -110,6 +110,8 @@ class Builder:
     def _visual_covariance(self, record: KeyframeRecord, vo_scale: float) -> Array:
         assert record.covariance is not None
         config = self._config
+        if record.begins_piece:
+            return record.covariance
         factor = vo_scale * config.vo_inflation * (config.vo_degraded_inflation if record.degraded else 1.0)
         floor_m = config.vo_floor_m if record.has_scale else 0.0
         return inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)
@@ -138,7 +140,8 @@ class Builder:
         """Keep velocity and biases bounded where the IMU factor had to be dropped."""
         assert self._preintegrator is not None
         walk = self._preintegrator.bias_walk_sigmas(duration_s)
-        speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, self._config.lost_speed_sigma_m_s)
+        sigma_m_s = self._config.piece_speed_sigma_m_s if record.begins_piece else self._config.lost_speed_sigma_m_s
+        speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, sigma_m_s)
         return [speed, motion.bias_walk(record.id, walk)]
 
     def _rest(self, k: int, has_imu: bool) -> list[gtsam.NonlinearFactor]:
@@ -170,7 +173,9 @@ class Builder:
         elif measured is not None and integrated is None:
             step_m = float(np.linalg.norm(last_motion[:3, 3]))
             T = before.T_map_body @ transform(measured[:3, :3].copy(), step_m * measured[:3, 3])
-        if integrated is None:
+        if record.begins_piece:
+            velocity = np.zeros(3)
+        elif integrated is None:
             velocity = (T[:3, 3] - before.T_map_body[:3, 3]) / duration_s
         return Guess(nearest_rigid(T), velocity, before.bias)
 

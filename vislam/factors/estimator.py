@@ -18,6 +18,7 @@ from vislam.config import GraphConfig
 from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
 from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
 from vislam.factors.odometry import Odometry
+from vislam.factors.priors import held_pose
 from vislam.factors.solver import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
 from vislam.geometry import invert
 from vislam.messages import Array
@@ -60,6 +61,7 @@ class Estimator(Generic[L]):
         self._reach_m: Array = np.zeros(64)
         self._next_old = 0  # where the next block of older poses begins
         self._read: list[NDArray[np.int64]] = []  # ids since `take_read`
+        self._held: dict[int, Array] = {}  # poses that stay, by keyframe id
         self.loops: dict[int, L] = {}  # in the graph, by loop id
         self.spare: dict[int, L] = {}  # accepted without a factor, which only `converge` takes
         self.vo_scale = 1.0  # on the sigma of visual odometry, learnt from loops that it contradicted
@@ -161,6 +163,31 @@ class Estimator(Generic[L]):
     def _enter(self, fresh: list[L], slots: list[int]) -> None:
         for edge, slot in zip(fresh, slots, strict=True):
             self.loops[edge.id], self._slots["loop", edge.id] = edge, slot
+
+    def move(self, ids: NDArray[np.int64], T: Array) -> str:
+        """Move keyframes rigidly by T [4, 4] in map, and go on from there; return what went wrong.
+
+        For what no factor holds back but weak ones: no step of Gauss-Newton would find so far a way.
+        """
+        values = gtsam.Values(self._values)
+        for k in ids.tolist():
+            values.update(X(k), gtsam.Pose3(nearest_rigid(T @ self._values.atPose3(X(k)).matrix())))
+            if self.has_imu:
+                values.update(V(k), T[:3, :3] @ self._values.atVector(V(k)))
+        try:
+            self._restart(values, [], self._new_solver(), from_batch=False)
+        except FAILURES as error:
+            return self._recover(values, [], error)
+        return ""
+
+    def hold(self, ids: NDArray[np.int64]) -> str:
+        """Hold keyframes where they are, as firmly as the first; return what went wrong."""
+        self._held |= {k: self._buffer[k].copy() for k in ids.tolist()}
+        try:
+            self._restart(self._values, [], self._new_solver(), from_batch=False)
+        except FAILURES as error:
+            return self._recover(self._values, [], error)
+        return ""
 
     def drop(self, edges: list[L]) -> str:
         """Take loops out again; return what went wrong."""
@@ -336,6 +363,7 @@ class Estimator(Generic[L]):
         `as_measured` leaves out what keeps the work of an update small: each loop is between its own ends.
         """
         factors, _ = self._odometry.start()
+        factors += [held_pose(k, T, self._config) for k, T in self._held.items()]
         labels: list[Label | None] = [None] * len(factors)
         for k in range(1, self._count):
             step = self._step(k, values)

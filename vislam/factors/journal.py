@@ -43,6 +43,7 @@ class KeyframeRecord:
     degraded: bool
     imu: ImuSpan | None
     at_rest: bool
+    begins_piece: bool = False  # nothing was measured; then the motion above is a guess, with sigmas that say so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +67,7 @@ class EdgeRecord:
     T_previous_body: Array  # [4, 4]
     covariance: Array  # [6, 6] perturbed on the newer keyframe's side
     settled: bool  # no later one will replace it
+    begins_piece: bool = False  # nothing was measured: a guess, with sigmas that say so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +121,8 @@ def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> 
         raise DataError(f"{what}: ids must be dense, expected {expected}")
     if previous is None:
         return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, packet.at_rest)
+    if packet.begins_piece:  # of another recording perhaps, whose clock began anew
+        return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, packet.at_rest, True)
     if keyframe.t_ns <= previous.t_ns:
         raise DataError(f"{what}: time must increase, the previous keyframe is at {previous.t_ns} ns")
     T: Array | None = None

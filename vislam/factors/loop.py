@@ -98,6 +98,10 @@ class LoopModel:
             a, b, self._direction, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model
         )
 
+    def eye(self, T_map_body: Array) -> Array:
+        """Return where cam0 is [3], to which the direction of a loop without scale belongs."""
+        return np.asarray(T_map_body[:3, :3] @ self._lever_m + T_map_body[:3, 3])
+
     def residual(self, T_from: Array, T_to: Array) -> tuple[Array, Array]:
         """Return the residual [n] at two map poses and its Jacobian [n, 6] by the relative pose (its end perturbed)."""
         if self._direction is None:

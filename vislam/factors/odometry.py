@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import gtsam
 
 from vislam.factors.builder import Builder, Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, KeyframeRecord, StartRecord
+from vislam.factors.keys import nearest_rigid
 from vislam.messages import Array
 
 
@@ -74,4 +76,10 @@ class MotionOdometry:
 
     def reach_m(self, k: int) -> float:
         """See Odometry."""
+        if self._records[k].begins_piece:
+            return float("inf")
         return SPEED_MAX_M_S * (self._records[k].t_ns - self._records[k - 1].t_ns) * 1e-9
+
+    def relink(self, k: int, T_previous_body: Array) -> None:
+        """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""
+        self._records[k] = replace(self._records[k], T_previous_body=nearest_rigid(T_previous_body))

@@ -46,3 +46,9 @@ def pose_covariance(start: StartRecord, config: GraphConfig) -> Array:
     world[2, 2] = config.gauge_sigma_rad**2
     out[:3, :3] = R.T @ world @ R
     return out
+
+
+def held_pose(k: int, T_map_body: Array, config: GraphConfig) -> gtsam.PriorFactorPose3:
+    """Return the factor that holds keyframe k at a pose [4, 4]."""
+    model = sigmas(np.repeat([config.gauge_sigma_rad, config.gauge_sigma_m], 3))
+    return gtsam.PriorFactorPose3(X(k), gtsam.Pose3(T_map_body), model)

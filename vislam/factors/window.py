@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
@@ -106,7 +108,16 @@ class WindowOdometry:
 
     def reach_m(self, k: int) -> float:
         """See Odometry."""
+        edge = self._edges[k]
+        if edge is not None and edge.begins_piece:
+            return float("inf")
         return SPEED_MAX_M_S * (self._t_ns[k] - self._t_ns[k - 1]) * 1e-9
+
+    def relink(self, k: int, T_previous_body: Array) -> None:
+        """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""
+        edge = self._edges[k]
+        assert edge is not None
+        self._edges[k] = replace(edge, T_previous_body=nearest_rigid(T_previous_body))
 
     def _variances(self, edge: EdgeRecord, vo_scale: float) -> tuple[float, float]:
         covariance = self._covariance(edge, vo_scale)
@@ -114,6 +125,8 @@ class WindowOdometry:
 
     def _covariance(self, edge: EdgeRecord, vo_scale: float) -> Array:
         config = self._config
+        if edge.begins_piece:
+            return edge.covariance
         floor_rad = np.deg2rad(config.window_floor_deg)
         return inflated(edge.covariance, vo_scale * config.window_inflation, floor_rad, config.window_floor_m)
 

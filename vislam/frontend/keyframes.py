@@ -25,6 +25,7 @@ class Departure:
     alive: float  # fraction of the keyframe's tracks that are still followed
     inliers: int
     fit: bool  # whether the frame has what a keyframe of this front end needs, such as depth
+    restarted: bool = False  # whether tracking was lost a few keyframes ago
 
 
 def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
@@ -38,6 +39,8 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
         return f"only {departure.alive:.0%} of the tracks left"
     if not departure.fit or departure.dt_s < config.keyframe_min_interval_s:
         return ""
+    if departure.restarted:
+        return "one of the first since tracking was lost"
     if departure.inliers < config.keyframe_min_inliers:
         return f"only {departure.inliers} tracks agree"
     turned_deg = float(np.rad2deg(departure.rotation_rad))

@@ -72,6 +72,7 @@ class MetricFrontEnd:
         self._sigma_xy = config.track_sigma_px / self._camera.fx
         self._landmarks = Landmarks()
         self._keyframe: Keyframe | None = None
+        self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
         self._keyframe_tracks = 0
         self._keyframe_twist: Array = np.zeros(6)
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
@@ -220,6 +221,7 @@ class MetricFrontEnd:
             alive=attempt.followed / max(self._keyframe_tracks, 1),
             inliers=attempt.inliers,
             fit=self._depth.available(frame),
+            restarted=self._since_restart < self._config.restart_keyframes,
         )
         reason = keyframe_reason(departure, self._config)
         if reason:
@@ -325,6 +327,7 @@ class MetricFrontEnd:
         if last_id < 0:
             vo = identity_motion(frame.t_ns, 0, True, count)
             return TrackResult(vo, observations, keyframe, 0.0, "first keyframe")
+        self._since_restart = 0
         vo = lost_motion(frame.t_ns, last_id, True)
         return TrackResult(vo, observations, keyframe, 0.0, f"restarted: {failure}")
 
@@ -391,6 +394,7 @@ class MetricFrontEnd:
         features = self._config.described_features
         keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, measure_depth)
         self._keyframe = keyframe
+        self._since_restart += 1
         self._keyframe_tracks = len(self._tracker)
         self._keyframe_twist = twist_per_s
         self._T_key_cam = np.eye(4)

@@ -76,6 +76,7 @@ class MonoFrontEnd:
         self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
         self._min_parallax_px = config.mono_min_parallax_px
         self._keyframe: Keyframe | None = None
+        self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
         self._keyframe_tracks = 0
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
@@ -248,6 +249,7 @@ class MonoFrontEnd:
             alive=motion.followed / max(self._keyframe_tracks, 1),
             inliers=motion.inliers,
             fit=True,
+            restarted=self._since_restart < self._config.restart_keyframes,
         )
         reason = keyframe_reason(departure, self._config)
         if reason:
@@ -312,6 +314,7 @@ class MonoFrontEnd:
         if last_id < 0:
             vo = identity_motion(frame.t_ns, 0, False, count)
             return TrackResult(vo, self._observations(), keyframe, 0.0, "first keyframe")
+        self._since_restart = 0
         vo = lost_motion(frame.t_ns, last_id, False)
         return TrackResult(vo, self._observations(), keyframe, 0.0, f"restarted: {failure}")
 
@@ -323,6 +326,7 @@ class MonoFrontEnd:
         features = self._config.described_features
         keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, None)
         self._keyframe = keyframe
+        self._since_restart += 1
         self._keyframe_tracks = len(self._tracker)
         self._last_px = self._tracker.pixels.copy()
         self._direction_key = self._R_key_cam.T @ self._direction_key

@@ -18,13 +18,15 @@ from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.geometry import invert, se3_adjoint
+from vislam.graph.joining import Placement, Waiting, relinked, weak_link
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.imu import ImuNoise
-from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState
+from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Pieces
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
 _COLLAPSED = 0.1  # weight below which an older loop counts as torn by newer ones
+_NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 
 
 class PoseGraph:
@@ -59,6 +61,9 @@ class PoseGraph:
         self._park = CarPark(config)
         self._anchors = Anchors(config)
         self._reports: dict[int, EdgeReport] = {}
+        self._pieces = Pieces()
+        self._waiting = Waiting(config)
+        self._T_odom_last: Array | None = None
         self._published: Array = np.zeros((0, 4, 4))
         self._T_map_odom: Array = np.eye(4)
         self._revision = 0
@@ -88,6 +93,22 @@ class PoseGraph:
         self._source.begin(self._start, state)
         self._start_t_ns = None if state is None else state.t_ns
 
+    def begin_recording(self, state: NavState | None, T_odom_body: Array) -> None:
+        """Prepare for another recording after the keyframes that are there: its first keyframe begins a new piece.
+
+        `state` is that of this keyframe, or None without an IMU; `T_odom_body` [4, 4] its pose in the new odom, whose
+        axes are those of map until loops say otherwise. Raises as `initialise`.
+        """
+        if self._config.coupling != "tight":
+            raise UsageError("a map is continued with tight coupling only; use --graph.coupling tight")
+        start = start_record(state, T_odom_body)
+        self._source.begin_piece(start, state)
+        self._T_odom_last = self._estimator.poses[-1].copy()
+
+    def hold(self) -> None:
+        """Hold the keyframes that are there where they are: those to come are found in a map that does not change."""
+        self._estimator.hold(self.ids)
+
     def add(
         self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None
     ) -> GraphUpdate:
@@ -104,6 +125,9 @@ class PoseGraph:
             raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
         if previous is None:
             self._check_start(record)
+        elif record.begins_piece:
+            before, config = self._estimator.poses[-1], self._config
+            record = weak_link(record, before, self._T_odom_last, T_odom_body, self._noise is not None, config)
         said = self._source.add(packet, record, T_odom_body)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
@@ -118,6 +142,10 @@ class PoseGraph:
                 self._travel.amend(older, variance_rad2, variance_m2)
             notes = [step.note, note]
         self._keyframes.append(record)
+        if record.begins_piece:
+            self._pieces = self._pieces.begun(record.id)
+            notes.append(f"keyframe {record.id} begins piece {len(self._pieces.groups) - 1} of the trajectory")
+        self._T_odom_last = T_odom_body
         accepted, refused = self._close(edges, notes)
         if T_odom_body is not None:
             self._T_map_odom = self._estimator.poses[-1] @ invert(np.ascontiguousarray(T_odom_body, dtype=np.float64))
@@ -176,8 +204,14 @@ class PoseGraph:
         for edge in edges:
             model = self._admit(edge)
             touched.append(edge.id)
-            if model is not None:
+            if model is None:
+                continue
+            if not self._pieces.are_joined(edge.from_id, edge.to_id):
+                touched += self._wait(model)
+            else:
                 (passed if self._gate(model) else parked).append(model)
+        for model in self._join(touched, notes):
+            (passed if self._gate(model) else parked).append(model)
         if passed:
             parked += self._accept(passed, notes, "inside the gate")
             touched += self._retest(notes)
@@ -195,6 +229,62 @@ class PoseGraph:
         decided = sorted(set(touched))
         accepted = [n for n in decided if self._reports[n].decision is LoopDecision.ACCEPTED]
         return accepted, [n for n in decided if n not in accepted]
+
+    def _wait(self, model: LoopModel) -> list[int]:
+        """Let a loop between pieces that are not joined wait for other frames; return the ids of those that left."""
+        record = model.record
+        self._reports[record.id] = EdgeReport(
+            record.id, record.from_id, record.to_id, float("nan"), 0.0, LoopDecision.PARKED,
+            "between pieces that are not joined, waits for loops of other frames that agree",
+        )  # fmt: skip
+        gone = self._waiting.add(model)
+        if gone is None:
+            return []
+        self._report(gone, LoopDecision.REJECTED, "too many newer ones wait")
+        return [gone.record.id]
+
+    def _join(self, touched: list[int], notes: list[str]) -> list[LoopModel]:
+        """Join pieces as far as loops between them agree; return those that waited and can be gated now."""
+        while (found := self._waiting.place(self._pieces, self._estimator.poses, self._between)) is not None:
+            touched += [m.record.id for m in found.agreeing]
+            self._bring(found, notes)
+            witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"
+            for model in self._accept(found.agreeing, notes, f"joins two pieces, as {witnesses} say"):
+                self._report(model, LoopDecision.REJECTED, "though it was to join two pieces")
+            kept = [m for m in found.agreeing if m.record.id in self._estimator.loops]
+            if len({m.record.to_id for m in kept}) < self._config.join_frames:
+                for model in kept:
+                    self._report(model, LoopDecision.REJECTED, "its witnesses against one another do not hold")
+                notes.append(self._estimator.drop(kept))
+            self._count_joined()
+        ready = self._waiting.take_joined(self._pieces)
+        touched += [m.record.id for m in ready]
+        return ready
+
+    def _bring(self, found: Placement, notes: list[str]) -> None:
+        """Move a group of pieces to where loops say that it is, with the weak links that it has to others."""
+        ids = self.ids[self._pieces.groups_of(self.ids) == found.group]
+        self._estimator.look_at(self.ids.tolist())
+        poses = self._estimator.poses.copy()
+        poses[ids] = found.T_map_moved @ poses[ids]
+        for k in relinked(self._pieces, ids):
+            self._source.relink(k, invert(poses[k - 1]) @ poses[k])
+        notes.append(self._estimator.move(ids, found.T_map_moved))
+        notes.append(
+            f"piece {found.group}, {len(ids)} keyframes with what it was joined with before, joins an older one"
+        )
+
+    def _count_joined(self) -> None:
+        """Find out which pieces are joined, by the loops that the graph holds now."""
+        if len(self._pieces.groups) > 1:
+            held = [*self._estimator.loops.values(), *self._estimator.spare.values()]
+            self._pieces = self._pieces.joined_by((m.record.from_id, m.record.to_id) for m in held)
+
+    def _between(self, i: int, j: int) -> Array:
+        """Return the covariance [6, 6] of T_i_j: by summed odometry, an upper bound, where that is short."""
+        if abs(i - j) <= _NEAR_KEYFRAMES and self._pieces.of(i) == self._pieces.of(j):
+            return self._travel.relative_covariance(i, j)
+        return self.relative_covariance(i, j)
 
     def _admit(self, edge: LoopEdge) -> LoopModel | None:
         """Journal an edge; one that cannot be used is reported as rejected, not raised."""
@@ -349,6 +439,7 @@ class PoseGraph:
 
     def _publish(self, accepted: list[int], refused: list[int], note: str, everything: bool = False) -> GraphUpdate:
         """Return the poses that moved since they were last published, and remember them."""
+        self._count_joined()
         poses, known = self._estimator.poses, self._published
         ids = self._estimator.take_read()
         if everything:
@@ -381,4 +472,5 @@ class PoseGraph:
             tuple(refused),
             note,
             details,
+            self._pieces,
         )

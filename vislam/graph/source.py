@@ -54,6 +54,9 @@ class Source(Protocol):
     def begin(self, start: StartRecord, state: NavState | None) -> None:
         """Take the first state."""
 
+    def begin_piece(self, start: StartRecord, state: NavState | None) -> None:
+        """Take the first state of another recording, whose first keyframe comes next."""
+
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
         """Take a keyframe, validated as `record`; return what else belongs into the journal.
 
@@ -62,6 +65,9 @@ class Source(Protocol):
 
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
+
+    def relink(self, k: int, T_previous_body: Array) -> None:
+        """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""
 
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
         """Return the state of keyframe k in map with its covariance, NaN where nobody can tell."""
@@ -88,6 +94,9 @@ class MotionSource:
         """See Source."""
         self._odometry.begin(start)
 
+    def begin_piece(self, start: StartRecord, state: NavState | None) -> None:
+        """See Source; the graph's own velocities and biases go on."""
+
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
         """See Source."""
         self._odometry.append(record)
@@ -96,6 +105,10 @@ class MotionSource:
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """See Source."""
         return []
+
+    def relink(self, k: int, T_previous_body: Array) -> None:
+        """See Source."""
+        self._odometry.relink(k, T_previous_body)
 
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
         """See Source; gtsam's covariance turned to NavState's order and axes."""
@@ -139,6 +152,10 @@ class WindowSource:
         self._odometry.begin(start)
         self._window.initialise(state, start.T_map_body)
 
+    def begin_piece(self, start: StartRecord, state: NavState | None) -> None:
+        """See Source."""
+        self._window.initialise(state, start.T_map_body)
+
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
         """See Source."""
         update = self._window.add(packet, T_odom_body)
@@ -157,6 +174,10 @@ class WindowSource:
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """See Source."""
         return self._odometry.amended(vo_scale)
+
+    def relink(self, k: int, T_previous_body: Array) -> None:
+        """See Source."""
+        self._odometry.relink(k, T_previous_body)
 
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
         """See Source; the window's state carried to the keyframe's pose in map, whose covariance is the graph's."""
@@ -180,7 +201,7 @@ class WindowSource:
         kept, changed = [], []
         recent = record.id - 2 * self._config.window_refresh_max  # older edges hardly change any more
         for edge in update.odometry:
-            if not edge.settled and edge.to_id < recent:
+            if (not edge.settled and edge.to_id < recent) or self._begins_piece(edge.to_id, record):
                 continue
             try:
                 taken = _edge_record(edge)
@@ -196,7 +217,8 @@ class WindowSource:
         kept += [edge for _, edge in changed[: self._config.window_refresh_max]]
         if record.id and all(edge.to_id != record.id for edge in kept):
             kept.append(self._stand_in(record))
-            notes.append("no usable edge from the window, went on as odometry or the last motion says")
+            if not record.begins_piece:
+                notes.append("no usable edge from the window, went on as odometry or the last motion says")
         tilts = tuple(
             TiltRecord(tilt.id, np.array(tilt.up_body), float(tilt.sigma_rad))
             for tilt in update.tilts
@@ -204,11 +226,18 @@ class WindowSource:
         )
         return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, "; ".join(n for n in notes if n))
 
+    def _begins_piece(self, k: int, newest: KeyframeRecord) -> bool:
+        """Return whether keyframe k begins a piece: what a window makes of its motion is no edge."""
+        edge = self._odometry.edge(k)
+        return newest.begins_piece if k == newest.id else edge is not None and edge.begins_piece
+
     def _stand_in(self, record: KeyframeRecord) -> EdgeRecord:
         """Return an edge to the newest keyframe where the window gave none: from odometry, else as before, loosely."""
         config = self._config
         if record.T_previous_body is not None and record.covariance is not None and record.has_scale:
-            return EdgeRecord(record.id, record.T_previous_body, record.covariance * config.vo_inflation**2, False)
+            weak = record.begins_piece
+            covariance = record.covariance * (1.0 if weak else config.vo_inflation**2)
+            return EdgeRecord(record.id, record.T_previous_body, covariance, weak, weak)
         last = self._odometry.edge(record.id - 1)
         T = np.eye(4) if last is None else last.T_previous_body
         rad, m = np.deg2rad(config.lost_rate_sigma_deg_s), config.lost_speed_sigma_m_s  # of a second, the usual gap

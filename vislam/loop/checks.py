@@ -111,9 +111,13 @@ def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -
 
 
 def judge(
-    found: Verification, tilt_rad: float | None, agreeing: int, disagreeing: int, config: LoopConfig
-) -> Judgement:
-    """Decide about a candidate from its verification, its tilt (None: unknown) and what its neighbours say."""
+    found: Verification, tilt_rad: float | None, agreeing: int, disagreeing: int, config: LoopConfig,
+    joined: bool = True,
+) -> Judgement:  # fmt: skip
+    """Decide about a candidate from its verification, its tilt (None: unknown) and what its neighbours say.
+
+    Unless its keyframes are `joined` by odometry or other loops, it never goes without a witness.
+    """
     if found.T_a_b is None:
         return Judgement(LoopDecision.REJECTED, found.reason)
     seen = f"{found.inliers} inliers, {found.supporters} with guided matching"
@@ -124,19 +128,21 @@ def judge(
         seen += f", sigma {100.0 * found.sigma_m:.1f} cm"
     else:
         seen += f", direction good to {np.rad2deg(found.sigma_m):.1f} deg"
-    doubt = _doubt(found, agreeing, disagreeing, config)
+    doubt = _doubt(found, agreeing, disagreeing, config, joined)
     if doubt:
         return Judgement(LoopDecision.PARKED, f"{seen}, but {doubt}")
     return Judgement(LoopDecision.ACCEPTED, f"{seen}, {agreeing} of {agreeing + disagreeing} neighbours agree")
 
 
-def _doubt(found: Verification, agreeing: int, disagreeing: int, config: LoopConfig) -> str:
+def _doubt(found: Verification, agreeing: int, disagreeing: int, config: LoopConfig, joined: bool) -> str:
     """Return why a pose that nothing speaks against has to wait for witnesses, or an empty string."""
     if disagreeing > config.max_disagreeing_share * (agreeing + disagreeing):
         return f"{disagreeing} of {agreeing + disagreeing} neighbours disagree"
     if not found.has_scale:  # never taken alone: wrong matches fit an essential matrix too easily
         needed = config.min_agreeing_direction
         return "" if agreeing >= needed else f"{agreeing} neighbours agree so far, needs {needed} without depth"
+    if not joined:
+        return "" if agreeing else "no other frame agrees yet on where its piece of trajectory belongs"
     if found.needs_witness and agreeing == 0:
         return "no neighbour agrees yet, and a tag alone can be misread"
     limit = config.max_sigma_m * np.fmax(_REFERENCE_DEPTH_M, found.median_depth_m) / _REFERENCE_DEPTH_M

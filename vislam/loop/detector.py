@@ -18,7 +18,7 @@ from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verifier import Verification, Verifier
 from vislam.loop.view import View, make_view
 from vislam.loop.vocabulary import Vocabulary
-from vislam.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
+from vislam.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge, Pieces
 
 _PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
 _NEIGHBOUR_STEPS = (-1, 1, -2, 2)  # where a second witness is looked for beside a candidate
@@ -48,6 +48,7 @@ class LoopDetector:
         self._bounds = view_bounds(rig.cameras[0])
         self._views: dict[int, View] = {}
         self._poses = PoseTable()
+        self._pieces = Pieces()
         self._database = PlaceDatabase(config, seed)
         self._appearance = AppearanceCandidates(config.island_gap)
         self._verifier = Verifier(config, rig, seed)
@@ -62,12 +63,15 @@ class LoopDetector:
         """The vocabulary in use; None before the first training."""
         return self._database.vocabulary
 
-    def detect(self, keyframe: Keyframe, T_map_body: Array) -> tuple[list[LoopEdge], list[LoopCandidate]]:
+    def detect(
+        self, keyframe: Keyframe, T_map_body: Array, begins_piece: bool = False
+    ) -> tuple[list[LoopEdge], list[LoopCandidate]]:
         """Look for loops that a new keyframe closes.
 
         Args:
             keyframe: the newest keyframe; ids ascend.
             T_map_body: its current estimate [4, 4].
+            begins_piece: no odometry ties it to the one before.
 
         Returns:
             Verified edges, some perhaps to an earlier keyframe whose parked edge was confirmed now, and every candidate
@@ -76,6 +80,8 @@ class LoopDetector:
         if not self._config.enabled:
             return [], []
         view = make_view(keyframe, self._rig)
+        if begins_piece and len(self._poses):
+            self._pieces = self._pieces.begun(view.id)
         self._poses.add(view.id, T_map_body)
         self._tags.add(view.id, sight_tags(keyframe.frame, self._rig.cameras[0], self._config))
         trials = self._try(view)
@@ -93,13 +99,14 @@ class LoopDetector:
         return edges, records
 
     def move(self, update: GraphUpdate) -> None:
-        """Follow the keyframes that the graph moved."""
+        """Follow the keyframes that the graph moved, and the pieces that it joined."""
         self._poses.move(update)
+        self._pieces = update.pieces
 
     def _candidates(self, view: View) -> list[Candidate]:
         """Return candidates in the order of verification: by tags, then by odometry and appearance in turn."""
         gap = self._config.island_gap
-        old = self._old_ids()
+        old = self._poses.ids[self._old(view)]
         order = self._tags.candidates(view.id, int(old[-1]), self._config.max_tags) if len(old) else []
         near = [c for c in self._near(view) if all(c.id != other.id for other in order)]
         alike = [c for c in self._alike(view) if all(abs(c.id - other.id) > gap for other in near + order)]
@@ -107,33 +114,46 @@ class LoopDetector:
             order += near[turn : turn + 1] + alike[turn : turn + 1]
         return order
 
-    def _old_ids(self) -> NDArray[np.int64]:
-        """Return the ids of keyframes that visual odometry does not tie to the newest one any more."""
-        return self._poses.ids[: max(0, len(self._poses) - 1 - self._config.odometry_skip_keyframes)]
-
     def _alike(self, view: View) -> list[Candidate]:
-        """Return candidates by appearance, leaving out what was seen just now: it always looks most alike."""
+        """Return candidates by appearance, leaving out what was seen just now: it always looks most alike.
+
+        Until its piece is joined with the oldest, a keyframe has no other candidates, and gets more of these.
+        """
         config = self._config
         recent: list[int] = []
         for old in reversed(self._views.values()):
             age_s = (view.t_ns - old.t_ns) * 1e-9
-            if len(recent) >= config.appearance_skip_keyframes and age_s >= config.appearance_skip_s:
+            long_ago = len(recent) >= config.appearance_skip_keyframes and age_s >= config.appearance_skip_s
+            if long_ago or self._pieces.of(old.id) != self._pieces.of(view.id):
                 break
             recent.append(old.id)
+        is_lost = self._pieces.group(view.id) != 0
+        wanted = config.max_verifications if is_lost else config.max_appearance
+        if self._database.vocabulary is None and is_lost:  # the first keyframes of all: try the newest
+            others = [k for k in reversed(self._views) if not self._pieces.are_joined(k, view.id)]
+            return [Candidate(k, "appearance", 0.0) for k in others[:wanted]]
         ids, scores = self._database.query(view, config.retrieved, np.array(recent, dtype=np.int64))
-        return self._appearance.select(ids, scores)[: config.max_appearance]
+        return self._appearance.select(ids, scores)[:wanted]
+
+    def _old(self, view: View) -> NDArray[np.int64]:
+        """Return the places, in the table of poses, of keyframes that visual odometry does not tie to a view."""
+        ids, own = self._poses.ids, self._pieces.of(view.id)
+        begin = int(np.searchsorted(ids, self._pieces.first_ids[own]))
+        return np.arange(max(begin, len(ids) - 1 - self._config.odometry_skip_keyframes))
 
     def _near(self, view: View) -> list[Candidate]:
         """Return candidates by odometry: old keyframes that should see most of the same by the current map."""
         config = self._config
-        old = len(self._old_ids())
-        if old == 0:
+        old = self._old(view)
+        if len(self._pieces.groups) > 1:  # poses in pieces that are not joined mean nothing to each other
+            old = old[self._pieces.groups_of(self._poses.ids[old]) == self._pieces.group(view.id)]
+        if len(old) == 0:
             return []
         T_body_cam = self._rig.T_body_cams[0]
         T_map_cam = self._poses[view.id] @ T_body_cam
         return odometry_candidates(
-            transform_points(T_map_cam, self._probes(view)), T_map_cam[:3, 3], self._poses.ids[:old],
-            invert_many(self._poses.poses[:old] @ T_body_cam), self._bounds, config.max_odometry, config.min_overlap,
+            transform_points(T_map_cam, self._probes(view)), T_map_cam[:3, 3], self._poses.ids[old],
+            invert_many(self._poses.poses[old] @ T_body_cam), self._bounds, config.max_odometry, config.min_overlap,
             config.min_apart_keyframes,
         )  # fmt: skip
 
@@ -152,7 +172,7 @@ class LoopDetector:
         candidates = self._candidates(view)
         trials = [self._trial(candidate, view) for candidate in candidates[:budget]]
         tried = {candidate.id for candidate in candidates}
-        allowed = set(self._old_ids().tolist())
+        allowed = set(self._poses.ids[self._old(view)].tolist())
         for trial in list(trials):
             if trial.measured is None or trial.found.T_a_b is None or self._is_settled(trial, trials):
                 continue
@@ -190,16 +210,31 @@ class LoopDetector:
     def _judge(self, trial: _Trial, fresh: list[Measured] | None = None) -> Judgement:
         """Judge a trial with all witnesses, and those of this keyframe that are not among them yet."""
         agreeing, disagreeing = 0, 0
-        measured, reach = trial.measured, self._config.neighbour_keyframes
+        measured, joined = trial.measured, True
         if measured is not None:
-            agreeing += agrees_with_map(measured, self._poses, self._config)
+            joined = self._pieces.are_joined(measured.from_id, measured.to_id)
+            agreeing += joined and agrees_with_map(measured, self._poses, self._config)
             for witness in self._witnesses + (fresh or []):
-                apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
-                if apart != (0, 0) and max(apart) <= reach:
+                if self._can_witness(witness, measured, joined):
                     says_the_same = agree(measured, witness, self._poses, self._config)
                     agreeing += says_the_same
                     disagreeing += not says_the_same
-        return judge(trial.found, trial.tilt_rad, agreeing, disagreeing, self._config)
+        return judge(trial.found, trial.tilt_rad, agreeing, disagreeing, self._config, joined)
+
+    def _can_witness(self, witness: Measured, measured: Measured, joined: bool) -> bool:
+        """Return whether a measurement can tell about another one: if the way between them is known on both sides.
+
+        Between pieces that are not joined one image is one witness, however many old keyframes it resembles.
+        """
+        apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
+        reach = self._config.neighbour_keyframes
+        if joined:
+            return apart != (0, 0) and max(apart) <= reach
+        return (
+            0 < apart[1] <= reach
+            and self._pieces.are_joined(witness.to_id, measured.to_id)
+            and self._pieces.are_joined(witness.from_id, measured.from_id)
+        )
 
     def _reconsider(self, newest_id: int, edges: list[LoopEdge]) -> list[LoopCandidate]:
         """Promote parked edges that the new keyframe, or the map that moved meanwhile, confirms."""

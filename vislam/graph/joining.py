@@ -1,0 +1,200 @@
+"""Where a piece of trajectory belongs: the rigid motion on which loops from several frames agree.
+
+Between pieces that no odometry ties there is nothing that a loop could be tested against, so loops have to be each
+other's witnesses: through the odometry inside both pieces they must say the same, and one image is one witness however
+many old keyframes it resembles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from vislam.config import GraphConfig
+from vislam.factors.journal import KeyframeRecord, checked_pose
+from vislam.factors.keys import nearest_rigid
+from vislam.factors.loop import LoopModel
+from vislam.geometry import invert, se3_adjoint, transform
+from vislam.messages import Array, Pieces
+
+_MIN_RAY_ANGLE_RAD = np.deg2rad(5.0)  # between two directions that are to fix a place
+
+RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed at j
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """The motion [4, 4], in map, that brings a group of pieces to where loops say it is, and the loops that agree."""
+
+    group: int
+    T_map_moved: Array
+    agreeing: list[LoopModel]
+
+
+class Waiting:
+    """Loops between pieces that are not joined."""
+
+    def __init__(self, config: GraphConfig) -> None:
+        """Start empty."""
+        self._config = config
+        self._limit = float(chi2_distribution.ppf(config.loop_gate_probability, 6))
+        self._edges: list[LoopModel] = []
+
+    def add(self, edge: LoopModel) -> LoopModel | None:
+        """Take a loop; return the oldest when it has to leave for this one."""
+        self._edges.append(edge)
+        return self._edges.pop(0) if len(self._edges) > self._config.join_waiting else None
+
+    def take_joined(self, pieces: Pieces) -> list[LoopModel]:
+        """Remove and return the loops whose two ends are joined by now."""
+        joined = [e for e in self._edges if pieces.are_joined(e.record.from_id, e.record.to_id)]
+        self._edges = [e for e in self._edges if not pieces.are_joined(e.record.from_id, e.record.to_id)]
+        return joined
+
+    def place(self, pieces: Pieces, poses: Array, known: RelativeCovariance) -> Placement | None:
+        """Return where the newer of two groups belongs, if enough of its loops agree on that; those wait no longer.
+
+        `poses` [M, 4, 4] are those of all keyframes, good within each group; `known` says how good.
+        """
+        pairs = [(pieces.group(e.record.from_id), pieces.group(e.record.to_id)) for e in self._edges]
+        for pair in sorted({(min(p), max(p)) for p in pairs}):
+            edges = [e for e, p in zip(self._edges, pairs, strict=True) if (min(p), max(p)) == pair]
+            if len({e.record.to_id for e in edges}) < self._config.join_frames:
+                continue
+            found = self._place(edges, _Ends(poses, pieces, pair[1]), known)
+            if found is not None:
+                self._edges = [e for e in self._edges if all(e is not other for other in found[1])]
+                return Placement(pair[1], *found)
+        return None
+
+    def _place(
+        self, edges: list[LoopModel], ends: _Ends, known: RelativeCovariance
+    ) -> tuple[Array, list[LoopModel]] | None:
+        """Return the motion with the most witnesses, and those, if they are enough and few contradict."""
+        best: tuple[Array, list[LoopModel]] | None = None
+        metric = [e for e in edges if e.record.has_scale]
+        for edge in metric:
+            T = ends.motion_by(edge)
+            agreeing = [e for e in edges if e is edge or self._agree(edge, e, T, ends, known)]
+            if best is None or _witnesses(agreeing) > _witnesses(best[1]):
+                best = T, agreeing
+        if not metric:
+            best = self._place_by_directions(edges, ends)
+        if best is None or len({e.record.to_id for e in best[1]}) < self._config.join_frames:
+            return None
+        contradicting = len(edges) - len(best[1])
+        return best if contradicting <= self._config.join_max_contradicting * len(edges) else None
+
+    def _agree(self, one: LoopModel, other: LoopModel, T: Array, ends: _Ends, known: RelativeCovariance) -> bool:
+        """Return whether a loop fits where another one, which asks for the motion `T`, says that it should."""
+        config, a, b = self._config, one.record, other.record
+        uncertainty = np.zeros((6, 6))
+        if b.to_id != a.to_id:
+            uncertainty += known(a.to_id, b.to_id)
+        T_from, T_to = ends.of(other, T)
+        T_one_from, T_one_to = ends.of(one, T)
+        back = se3_adjoint(invert(T_to) @ T_one_to)
+        uncertainty += back @ one.covariance @ back.T
+        if b.from_id != a.from_id:
+            back = se3_adjoint(invert(T_to) @ T_one_from)
+            uncertainty += back @ known(b.from_id, a.from_id) @ back.T
+        if np.trace(uncertainty[3:, 3:]) > 3.0 * config.consistency_max_sigma_m**2:
+            return False  # odometry so loose proves nothing
+        return other.chi2(T_from, T_to, uncertainty) < self._limit
+
+    def _place_by_directions(self, edges: list[LoopModel], ends: _Ends) -> tuple[Array, list[LoopModel]] | None:
+        """Return the motion that lets most loops without scale look along their directions, at least three of them."""
+        best: tuple[Array, list[LoopModel]] | None = None
+        for pair in combinations(edges, 2):
+            T = ends.motion_by_rays(list(pair))
+            if T is None:
+                continue
+            agreeing = [e for e in edges if e.chi2(*ends.of(e, T)) < self._limit]
+            if len(agreeing) > 2 and (best is None or _witnesses(agreeing) > _witnesses(best[1])):
+                best = T, agreeing
+        return best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ends:
+    """The poses of both ends of a loop, one of which moves with its group."""
+
+    poses: Array  # [M, 4, 4]
+    pieces: Pieces
+    moving: int  # the group
+
+    def of(self, edge: LoopModel, T: Array) -> tuple[Array, Array]:
+        """Return both poses [4, 4] once the group has moved by T [4, 4]."""
+        older, newer = self.poses[edge.record.from_id], self.poses[edge.record.to_id]
+        return (T @ older, newer) if self._older_moves(edge) else (older, T @ newer)
+
+    def motion_by(self, edge: LoopModel) -> Array:
+        """Return the motion [4, 4] that a metric loop asks for."""
+        older, newer, T = self.poses[edge.record.from_id], self.poses[edge.record.to_id], edge.record.T_from_to
+        motion = newer @ invert(older @ T) if self._older_moves(edge) else older @ T @ invert(newer)
+        return nearest_rigid(motion)
+
+    def motion_by_rays(self, edges: list[LoopModel]) -> Array | None:
+        """Return the motion [4, 4] that lets rays of loops without scale meet best; None when they are parallel."""
+        R: Array | None = None
+        A, b = np.zeros((3, 3)), np.zeros(3)
+        for edge in edges:
+            older, newer, T = self.poses[edge.record.from_id], self.poses[edge.record.to_id], edge.record.T_from_to
+            if R is None:
+                R = newer[:3, :3] @ (older[:3, :3] @ T[:3, :3]).T
+                R = R if self._older_moves(edge) else R.T
+            eye_older, eye_newer = edge.eye(older), edge.eye(newer)
+            if self._older_moves(edge):
+                ray, still, moving = R @ older[:3, :3] @ T[:3, 3], eye_newer, R @ eye_older
+            else:
+                ray, still, moving = older[:3, :3] @ T[:3, 3], eye_older, R @ eye_newer
+            if np.linalg.norm(ray) < 0.5:  # rotation alone
+                return None
+            across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+            A += across
+            b += across @ (still - moving)
+        if R is None or np.linalg.eigvalsh(A)[0] < 0.5 * len(edges) * _MIN_RAY_ANGLE_RAD**2 / 2.0:
+            return None
+        return nearest_rigid(transform(R, np.linalg.solve(A, b)))
+
+    def _older_moves(self, edge: LoopModel) -> bool:
+        return self.pieces.group(edge.record.from_id) == self.moving
+
+
+def _witnesses(edges: list[LoopModel]) -> tuple[int, int]:
+    """Return how many frames a set of loops comes from, and how many loops it has."""
+    return len({e.record.to_id for e in edges}), len(edges)
+
+
+def relinked(pieces: Pieces, moved: NDArray[np.int64]) -> list[int]:
+    """Return the keyframes that begin a piece and move otherwise than the one before them."""
+    inside = set(moved.tolist())
+    return [k for k in pieces.first_ids[1:] if (k in inside) != (k - 1 in inside)]
+
+
+def weak_link(
+    record: KeyframeRecord, T_map_before: Array, T_odom_before: Array | None, T_odom_body: Array | None,
+    has_gravity: bool, config: GraphConfig,
+) -> KeyframeRecord:  # fmt: skip
+    """Return the record of a keyframe that begins a piece, tied to the one before as loosely as it deserves.
+
+    The motion is what odom makes of it, a guess for the eye. Without any tie the equations had no unique solution.
+
+    Raises:
+        DataError: a pose in odom is none.
+    """
+    T = np.eye(4)
+    if T_odom_before is not None and T_odom_body is not None:
+        T = checked_pose(invert(T_odom_before) @ T_odom_body, f"keyframe {record.id}: its motion in odom")
+    variances = np.full(3, np.deg2rad(config.piece_sigma_deg) ** 2)
+    if has_gravity:
+        variances[:2] = np.deg2rad(config.piece_tilt_sigma_deg) ** 2
+    R = (T_map_before @ T)[:3, :3]
+    covariance = np.eye(6) * config.piece_sigma_m**2
+    covariance[:3, :3] = R.T @ np.diag(variances) @ R
+    return replace(record, T_previous_body=T, covariance=covariance)
