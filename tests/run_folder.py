@@ -109,7 +109,10 @@ def _write_tracking(folder: Path, truth: Trajectory, rng) -> None:
 
 def _write_loops(folder: Path, truth: Trajectory, rng, total: int) -> dict[str, int]:
     counts = {"candidates": total, "accepted": 0, "parked": 0, "rejected": 0}
-    header = "from_id,to_id,from_t_ns,to_t_ns,source,score,inliers,sigma_m,consistency,chi2,weight,decision,reason"
+    header = (
+        "from_id,to_id,from_t_ns,to_t_ns,source,score,inliers,supporters,sigma_m,consistency,chi2,weight,moved_rms_m,"
+        "moved_max_m,tx,ty,tz,qx,qy,qz,qw,decision,reason"
+    )
     with (folder / "loops.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header.split(","))
@@ -126,8 +129,9 @@ def _write_loops(folder: Path, truth: Trajectory, rng, total: int) -> dict[str, 
             }[decision]
             good = decision == "accepted"
             row = [from_id, to_id, truth.t_ns[from_id * 10], truth.t_ns[to_id * 10], "appearance"]
-            row += [f"{rng.uniform(0.05, 0.5):.3f}", inliers, "0.021" if good else "", 3 if good else 0]
-            row += ["4.2" if good else "", "0.97" if good else "", decision, reason]
+            row += [f"{rng.uniform(0.05, 0.5):.3f}", inliers, 2 * inliers, "0.021" if good else "", 3 if good else 0]
+            row += ["4.2", "0.97", "0.013", "0.082"] if good else [""] * 4
+            row += [*([0.1, 0.2, 0, 0, 0, 0, 1] if good else [""] * 7), decision, reason]
             writer.writerow(row)
     return counts
 

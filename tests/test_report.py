@@ -270,3 +270,41 @@ def test_without_gravity_the_truth_says_what_is_up(copy):
     np.testing.assert_allclose(scene.truth.positions_m, files.truth.positions_m, atol=1e-9)
     (copy / "trajectory_truth.tum").unlink()
     assert any("z is that of the first camera" in text for text in Page(write_report(copy).read_text()).texts)
+
+
+def _evaluation():
+    curve = {"threshold": [60.0, 30.0], "precision": [1.0, 0.9], "recall": [0.5, 0.7]}
+    stage = {
+        "answers": 40, "wrong": 4, "precision": 0.9, "recall": 0.7, "recall_at_full_precision": 0.5,
+        "interval": [0.3, 0.6], "curve": curve,
+    }  # fmt: skip
+    spread = {"median": 0.01, "p95": 0.02, "max": 0.7}
+    edges = {"accepted": 12, "apart": 9, "gross": 1, "error_m": spread, "error_deg": spread, "errors_m": [0.01, 0.7]}
+    rule = {"min_apart_s": 10.0, "min_apart_keyframes": 30, "min_overlap": 0.3, "gross_m": 0.5, "gross_deg": 10.0}
+    stages = dict.fromkeys(("appearance", "geometry", "graph"), stage)
+    return {"rule": rule, "keyframes": 120, "revisits": 60, "stages": stages, "edges": edges}
+
+
+def test_loops_against_the_truth_and_their_pictures_are_shown(copy):
+    (copy / "loops_eval.json").write_text(json.dumps(_evaluation()))
+    (copy / "loops").mkdir()
+    loop = next(loop for loop in read_run(copy).loops if loop.decision == "accepted")
+    picture = cv2.imencode(".jpg", np.full((100, 300, 3), 90, np.uint8))[1].tobytes()
+    for name in (f"00_{loop.from_id}_{loop.to_id}_accepted.jpg", "01_900_901_rejected.jpg", "02_odd.jpg"):
+        (copy / "loops" / name).write_bytes(picture)
+    text = write_report(copy).read_text()
+    page = Page(text)
+    assert "Against the truth" in page.texts
+    assert any("1 of 12 edges in the graph are off by more than 0.5 m" in part for part in page.texts)
+    assert any("moved the map by 1.3 cm rms, 8.2 cm at most" in part for part in page.texts)
+    assert text.count("data:image/jpeg") == 1  # only what loops.csv knows
+    assert page.outside == []
+
+
+@pytest.mark.parametrize("spoil", [lambda e: e["stages"]["graph"].pop("curve"), lambda e: e.update(stages=3)])
+def test_an_evaluation_of_another_shape_is_named(copy, spoil):
+    evaluation = _evaluation()
+    spoil(evaluation)
+    (copy / "loops_eval.json").write_text(json.dumps(evaluation))
+    page = Page(write_report(copy).read_text())
+    assert any("loops_eval.json cannot be drawn" in part for part in page.texts)

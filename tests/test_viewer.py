@@ -132,6 +132,22 @@ def test_loops_follow_their_keyframes(tmp_path):
     assert notes[1] == ["loop 0 - 1 rejected: 5 inliers of 20"]
 
 
+def test_loops_are_shown_in_the_end_as_they_were_decided_in_the_end(tmp_path):
+    with open_viewer(tmp_path / "run.rrd", rig=RIG) as viewer:
+        for k in range(3):
+            viewer.log_keyframe(keyframe(k), pose(10 * k))
+        viewer.log_loop(LoopCandidate(0, 2, "appearance", 0.4, 50, LoopDecision.ACCEPTED, "verified"))
+        viewer.log_loop_picture(5_000_000_000, b"jpeg bytes", "0 - 2 rejected: out of the graph again")
+        viewer.settle_loops(9_000_000_000, {(0, 2): LoopDecision.REJECTED})
+    rejected = columns(tmp_path / "run.rrd", "/world/loops/rejected")["LineStrips3D:strips"]
+    np.testing.assert_allclose(rejected[-1][0], [pose(0)[:3, 3], pose(20)[:3, 3]], atol=1e-5)
+    assert not columns(tmp_path / "run.rrd", "/world/loops/accepted")["LineStrips3D:strips"][-1]  # cleared
+    assert columns(tmp_path / "run.rrd", "/loop/pair")["EncodedImage:media_type"] == [["image/jpeg"]]
+    assert columns(tmp_path / "run.rrd", "/loop/why")["TextDocument:text"] == [
+        ["0 - 2 rejected: out of the graph again"]
+    ]
+
+
 def test_long_paths_grow_linearly(tmp_path):
     sizes = []
     for count in (500, 2000):

@@ -19,6 +19,7 @@ from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
 if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets.inspect import Inspection
+    from vislam.options import EvalOptions
 
 # the matrices here are small: threads cost more than they bring, and replay must not depend on them
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -223,6 +224,8 @@ def _eval(arguments: list[str]) -> int:
     from vislam.options import EvalOptions
 
     options = _parse(EvalOptions, arguments, "eval")
+    if options.loops:
+        return _eval_loops(options)
     results = _evaluate(options.estimate, options.reference, options.align, options.association)
     if options.json:
         print(json.dumps(results))
@@ -235,6 +238,42 @@ def _eval(arguments: list[str]) -> int:
             "check that both use the same clock, or lower --min-coverage"
         )
     return 0
+
+
+def _eval_loops(options: EvalOptions) -> int:
+    from vislam.loop_evaluation import evaluate_loops
+    from vislam.report import write_loop_plot, write_report
+
+    answer = evaluate_loops(options.estimate, options.truth, options.reference)
+    write_loop_plot(options.estimate / "loops_eval.png", {options.estimate.resolve().name: answer})
+    write_report(options.estimate)
+    if options.json:
+        print(json.dumps(answer))
+    else:
+        _print_loops(answer)
+    return 0
+
+
+def _print_loops(answer: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{answer['revisits']} of {answer['keyframes']} keyframes revisit a place")
+    for title in ("stage", "answers", "wrong", "precision", "recall", "recall at full precision", "interval"):
+        table.add_column(title, justify="left" if title == "stage" else "right")
+    for name, stage in answer["stages"].items():
+        numbers = [_number(stage[key], 3) for key in ("precision", "recall", "recall_at_full_precision")]
+        low, high = stage["interval"]
+        table.add_row(name, str(stage["answers"]), str(stage["wrong"]), *numbers, f"{low:.2f} to {high:.2f}")
+    edges, rule = answer["edges"], answer["rule"]
+    errors = [_number(edges[part][key], 3) for part in ("error_m", "error_deg") for key in ("median", "max")]
+    console = Console()
+    console.print(table)
+    console.print(
+        f"{edges['accepted']} edges in the graph, {edges['apart']} of them loops; off by {errors[0]} m and "
+        f"{errors[2]} deg in the median, {errors[1]} m and {errors[3]} deg at most; {edges['gross']} gross "
+        f"(over {rule['gross_m']:g} m or {rule['gross_deg']:g} deg)"
+    )
 
 
 def _evaluate(estimate: Path, reference: Path | None, align: str, association: Any) -> dict[str, dict[str, Any]]:

@@ -322,6 +322,23 @@ class GraphConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LoopTruthConfig:
+    """What counts as a true revisit, and as a wrong edge, when loops are compared with the truth."""
+
+    min_overlap: float = 0.3  # of two views by their true poses; ORB closes few loops below
+    doubtful_overlap: float = 0.05  # between this and min_overlap a retrieved image is neither right nor wrong
+    min_apart_s: float = 10.0  # a pair is a loop when it is this far apart in time ...
+    min_apart_keyframes: int = 30  # ... or by so many keyframes; nearer pairs are tied by odometry anyway
+    gross_m: float = 0.5  # an edge whose translation is off by more would ruin a map
+    gross_deg: float = 10.0  # or whose rotation is
+    nominal_depth_m: float = 3.0  # of features without depth, to know what two views share
+    resamples: int = 1000  # of the bootstrap
+    block_keyframes: int = 10  # drawn together, because what follows each other errs alike
+    confidence: float = 0.95
+    seed: int = 0  # of the bootstrap
+
+
+@dataclass(frozen=True, slots=True)
 class BatchConfig:
     """Batch optimisation of a finished run: visual-inertial bundle adjustment over all keyframes."""
 

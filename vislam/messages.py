@@ -140,7 +140,21 @@ class LoopCandidate:
     decision: LoopDecision
     reason: str
     sigma_m: float = float("nan")
-    consistency: int = 0  # neighbours that agree
+    consistency: int = 0  # by appearance: how many keyframes before this one pointed at the same place in a row
+    supporters: int = 0  # matches that agree with the refined pose
+    T_from_to: Array | None = None  # [4, 4] that verification found; None: no pose. A unit direction without scale
+    matches_px: Array | None = None  # [M, 4] some of the matches: x, y in the older keyframe, x, y in the newer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RetrievedKeyframe:
+    """An old keyframe that the index found to look like a new one, before anything else was asked of it."""
+
+    from_id: int  # the older keyframe
+    to_id: int  # the newer keyframe
+    score: float  # 0..1
+    island_score: float  # sum over the retrieved keyframes around it
+    consistency: int  # how many keyframes before the newer one pointed at that place in a row
 
 
 @dataclass(frozen=True, slots=True, eq=False)

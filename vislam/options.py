@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from vislam.config import BatchConfig, Config
+from vislam.config import BatchConfig, Config, LoopTruthConfig
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,9 @@ class EvalOptions:
     """Interpolate the reference at the estimate's times, or take the nearest pose within 10 ms"""
     min_coverage: float = 0.8
     """Below this share of the reference's time the evaluation fails with exit code 4"""
+    loops: bool = False
+    """Judge the loops of a run folder instead of its trajectories; writes loops_eval.json into it"""
+    truth: LoopTruthConfig = field(default_factory=LoopTruthConfig)
     json: bool = False
     """Print JSON instead of the table"""
 

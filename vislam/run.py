@@ -15,11 +15,13 @@ import numpy as np
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, TrackingLostError, VislamError
 from vislam.imu import ImuNoise
+from vislam.loop.table import LoopRow, caption
+from vislam.loop_gallery import LoopGallery
 from vislam.mapping.cloud import Cloud
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.picture import Line, render_cloud, render_octree
 from vislam.mapping.ply import read_ply
-from vislam.messages import Tracking
+from vislam.messages import LoopDecision, Tracking
 from vislam.recording import Recording
 from vislam.runfolder import RunLog, storage, write_json, write_setup
 from vislam.session import SessionWriter
@@ -58,6 +60,7 @@ class Run:
         self.noise = imu_noise(config.imu, recording.imu_noise)
         self.slam = Slam(config, recording.rig, self.noise)
         self.log = RunLog()
+        self.gallery = LoopGallery()
         info = {"source": source, "config": asdict(config)}
         gravity_m_s2 = config.imu.gravity_m_s2
         self.session = SessionWriter(out / "session.db", info, recording.rig, self.noise, gravity_m_s2)
@@ -112,6 +115,7 @@ class Run:
             odometry = step.odometry
             first_state = self.slam.front.first_state
             self.session.add(odometry.packet, odometry.T_odom_body, step.update, step.edges, first_state)
+            self.gallery.add(step)
 
     def _show(self, step: Step) -> None:
         """Log a step for the viewer: the image with its tracks, the poses, what the back end did."""
@@ -142,7 +146,8 @@ class Run:
             self.session.move(finish.update)
             self.viewer.move(finish.update)
         self.session.close()
-        final, loops = self._write_estimates()
+        final, rows, loops = self._write_estimates()
+        self._explain(rows)
         truth = self._truth()
         self.log.write_trajectories(self.out, final, truth)
         if self.slam.back is not None and self.slam.back.mapper is not None:
@@ -156,17 +161,26 @@ class Run:
         write_json(self.out / "metrics.json", metrics)
         return metrics
 
-    def _write_estimates(self) -> tuple[Trajectory, dict[str, int]]:
-        """Write states and tables; return the final trajectory and the counts of loop decisions."""
+    def _write_estimates(self) -> tuple[Trajectory, list[LoopRow], dict[str, int]]:
+        """Write states and tables; return the final trajectory, the loop candidates and the counts of decisions."""
         graph = None if self.slam.back is None else self.slam.back.graph
         if graph is None:
             nothing = self.log.final_trajectory([], np.zeros((0, 4, 4)), [], self.config.imu)
-            return nothing, self.log.write_tables(self.out, {})
+            return nothing, [], self.log.write_tables(self.out, [])
         ids = [int(i) for i in graph.ids]
         states = graph.states()
         self.log.write_states(self.out, ids, states)
-        loops = self.log.write_tables(self.out, {report.loop_id: report for report in graph.edge_reports()})
-        return self.log.final_trajectory(ids, graph.poses(), states, self.config.imu), loops
+        rows = self.log.loop_rows({report.loop_id: report for report in graph.edge_reports()})
+        loops = self.log.write_tables(self.out, rows)
+        return self.log.final_trajectory(ids, graph.poses(), states, self.config.imu), rows, loops
+
+    def _explain(self, rows: list[LoopRow]) -> None:
+        """Write the pictures of telling loop candidates, and show all as they were decided in the end."""
+        for row, path in self.gallery.write(self.out, rows):
+            self.viewer.log_loop_picture(row.to_t_ns, path.read_bytes(), caption(row))
+        decided = {(row.from_id, row.to_id): LoopDecision(row.decision) for row in rows}  # the last word counts
+        if decided:
+            self.viewer.settle_loops(int(self.log.stamps_ns[-1]), decided)
 
     def _write_pictures(self, mapper: Mapper, final: Trajectory) -> None:
         """Write the pictures of the map that the report shows; an empty map has none."""

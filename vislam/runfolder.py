@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
+import math
 import platform
 import subprocess
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import metadata
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 from vislam.config import Config, ImuConfig, dump
 from vislam.errors import StorageError, UsageError
 from vislam.frames import LoggedFrames
-from vislam.messages import Array, ImuSpan, LoopCandidate, LoopDecision, NavState
+from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
+from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDecision, NavState, RetrievedKeyframe
 from vislam.slam import KeyframeStep, Step
 from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
 
@@ -28,17 +30,13 @@ _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: has
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
 _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
 _RUN_FILES = (
-    "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "session.db", "session.db-wal",
-    "session.db-shm", "run.rrd", "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum",
-    "trajectory_live.tum", "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
-    "map/cloud.ply", "map/mesh.ply", "map/octomap.bt", "map/grid.pgm", "map/grid.yaml", "map/picture_cloud.png",
-    "map/picture_octree.png",
+    "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "loops_eval.json",
+    "loops_eval.png", "session.db", "session.db-wal", "session.db-shm", "run.rrd", "report.html", "states_ekf.csv",
+    "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum", "trajectory_batch.tum",
+    "trajectory_truth.tum", "states_batch.csv", "map/cloud.ply", "map/mesh.ply", "map/octomap.bt", "map/grid.pgm",
+    "map/grid.yaml", "map/picture_cloud.png", "map/picture_octree.png",
 )  # fmt: skip
 _TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
-_LOOPS_HEADER = (
-    "from_id", "to_id", "from_t_ns", "to_t_ns", "source", "score", "inliers", "sigma_m", "consistency",
-    "chi2", "weight", "decision", "reason",
-)  # fmt: skip
 
 
 def prepare(out: Path, overwrite: bool) -> None:
@@ -49,7 +47,8 @@ def prepare(out: Path, overwrite: bool) -> None:
         if not overwrite:
             raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
         with storage(out):
-            named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv")]  # batch estimates choose their names
+            # batch estimates choose their names, and the pictures of loops are named after them
+            named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv"), *out.glob("loops/*.jpg")]
             for path in [*(out / name for name in _RUN_FILES), *named]:
                 path.unlink(missing_ok=True)
     with storage(out):
@@ -147,6 +146,9 @@ class RunLog:
         self._spans: dict[int, ImuSpan] = {}  # between a keyframe and the one before
         self._candidates: list[LoopCandidate] = []
         self._edge_ids: dict[tuple[int, int], int] = {}
+        self._retrieved: list[RetrievedKeyframe] = []
+        self._positions: dict[int, Array] = {}  # of the keyframes in the map, in order of their ids
+        self._shifts: dict[int, tuple[float, float]] = {}  # edge: rms and largest shift of the update that took it in
         self.revisions = 0
 
     def __len__(self) -> int:
@@ -189,10 +191,25 @@ class RunLog:
         self._keyframe_t_ns[keyframe.id] = keyframe.t_ns
         if step.odometry.packet.imu is not None:
             self._spans[keyframe.id] = step.odometry.packet.imu
-        self._candidates.extend(step.candidates)
+        self._candidates += [replace(candidate, matches_px=None) for candidate in step.candidates]
+        self._retrieved += step.retrieved
         for edge in step.edges:
             self._edge_ids[edge.from_id, edge.to_id] = edge.id
+        self._follow(step.update)
+        self._positions.setdefault(keyframe.id, (step.update.T_map_odom @ step.odometry.T_odom_body)[:3, 3])
         self.revisions = step.update.revision
+
+    def _follow(self, update: GraphUpdate) -> None:
+        """Take over what an update moved, and note by how much for the loops that it took in."""
+        square, largest, known = 0.0, 0.0, len(self._positions)
+        for keyframe_id, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
+            old = self._positions.get(keyframe_id)
+            if old is not None:
+                shift = float(np.linalg.norm(T[:3, 3] - old))
+                square, largest = square + shift**2, max(largest, shift)
+            self._positions[keyframe_id] = T[:3, 3]
+        rms = float(np.sqrt(square / max(known, 1)))
+        self._shifts |= dict.fromkeys(update.accepted_loop_ids, (rms, largest))
 
     def final_trajectory(self, ids: list[int], T_map_body: Array, states: list[NavState], imu: ImuConfig) -> Trajectory:
         """Return the pose of every frame from the final poses of the keyframes that they were tracked against.
@@ -232,37 +249,48 @@ class RunLog:
         if self._ekf_states:
             write_states_csv(out / "states_ekf.csv", list(self._ekf_states), list(self._ekf_states.values()))
 
-    def write_tables(self, out: Path, loop_reports: dict[int, Any]) -> dict[str, int]:
-        """Write tracking.csv and loops.csv; return how many candidates were accepted, parked and rejected.
+    def loop_rows(self, loop_reports: dict[int, Any]) -> list[LoopRow]:
+        """Return every candidate, in the order of its recording, with what became of it.
 
         `loop_reports` maps edge ids to what the graph decided (chi2, weight, decision, reason).
         """
-        write_text(out / "tracking.csv", _csv(_TRACKING_HEADER, self._tracking))
-        rows, decisions = [], {"candidates": len(self._candidates), "accepted": 0, "parked": 0, "rejected": 0}
-        for candidate in self._candidates:
-            decision, reason, report = candidate.decision, candidate.reason, None
-            if decision == LoopDecision.ACCEPTED:  # a pair that was parked before has a row for that, too
-                report = loop_reports.get(self._edge_ids.get((candidate.from_id, candidate.to_id), -1))
-            if report is not None:
-                decision, reason = report.decision, f"{candidate.reason}; {report.reason}"
-            decisions[str(decision)] += 1
-            times = (self._keyframe_t_ns.get(candidate.from_id), self._keyframe_t_ns.get(candidate.to_id))
-            rows.append((
-                candidate.from_id, candidate.to_id, *times, candidate.source, f"{candidate.score:.6g}",
-                candidate.inliers, f"{candidate.sigma_m:.6g}", candidate.consistency,
-                "" if report is None else f"{report.chi2:.6g}", "" if report is None else f"{report.weight:.6g}",
-                str(decision), reason,
-            ))  # fmt: skip
-        write_text(out / "loops.csv", _csv(_LOOPS_HEADER, rows))
-        return decisions
+        return [self._loop_row(candidate, loop_reports) for candidate in self._candidates]
 
+    def _loop_row(self, candidate: LoopCandidate, loop_reports: dict[int, Any]) -> LoopRow:
+        decision, reason, report, edge_id = candidate.decision, candidate.reason, None, -1
+        if decision == LoopDecision.ACCEPTED:  # a pair that was parked before has a row for that, too
+            edge_id = self._edge_ids.get((candidate.from_id, candidate.to_id), -1)
+            report = loop_reports.get(edge_id)
+        if report is not None:
+            decision, reason = report.decision, f"{candidate.reason}; {report.reason}"
+        rms_m, max_m = self._shifts.get(edge_id, (math.nan, math.nan))
+        return LoopRow(
+            from_id=candidate.from_id,
+            to_id=candidate.to_id,
+            from_t_ns=self._keyframe_t_ns.get(candidate.from_id, -1),
+            to_t_ns=self._keyframe_t_ns.get(candidate.to_id, -1),
+            source=candidate.source,
+            score=candidate.score,
+            inliers=candidate.inliers,
+            supporters=candidate.supporters,
+            sigma_m=candidate.sigma_m,
+            consistency=candidate.consistency,
+            chi2=math.nan if report is None else report.chi2,
+            weight=math.nan if report is None else report.weight,
+            moved_rms_m=rms_m,
+            moved_max_m=max_m,
+            T_from_to=candidate.T_from_to,
+            decision=str(decision),
+            reason=reason,
+        )
 
-def _csv(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue()
+    def write_tables(self, out: Path, loops: list[LoopRow]) -> dict[str, int]:
+        """Write the tables of tracking and loops; return how many candidates were accepted, parked and rejected."""
+        write_text(out / "tracking.csv", csv_text(_TRACKING_HEADER, self._tracking))
+        write_text(out / "retrieved.csv", retrieved_text(self._retrieved))
+        write_text(out / "loops.csv", loops_text(loops))
+        decisions = Counter(row.decision for row in loops)
+        return {"candidates": len(loops), **{str(decision): decisions[str(decision)] for decision in LoopDecision}}
 
 
 def write_setup(out: Path, config: Config, source: str, command: list[str]) -> None:

@@ -8,7 +8,7 @@ keyframe        -> loop detector -> graph -> mapper     -> poses in map, T_map_o
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +21,17 @@ from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
 from vislam.mapping.mapper import Mapper
-from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopCandidate, LoopEdge, MagSample, NavState
+from vislam.messages import (
+    Array,
+    Frame,
+    GraphUpdate,
+    ImuSample,
+    LoopCandidate,
+    LoopEdge,
+    MagSample,
+    NavState,
+    RetrievedKeyframe,
+)
 from vislam.odometry_keyframe import OdometryKeyframe
 
 
@@ -33,6 +43,7 @@ class KeyframeStep:
     update: GraphUpdate
     edges: list[LoopEdge]
     candidates: list[LoopCandidate]
+    retrieved: list[RetrievedKeyframe] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +103,8 @@ class Back:
         if self.mapper is not None:
             with self.clock.measure("map"):
                 self.mapper.add(keyframe, self.T_map_odom @ odometry.T_odom_body)
-        return KeyframeStep(odometry, update, edges, candidates)
+        retrieved = [] if self.loops is None else self.loops.retrieved
+        return KeyframeStep(odometry, update, edges, candidates, retrieved)
 
     def finish(self) -> GraphUpdate:
         """Optimise to convergence and bring the map to the final poses."""

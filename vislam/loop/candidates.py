@@ -65,6 +65,10 @@ class AppearanceCandidates:
         chosen = sorted(now, key=lambda island: (-min(island.consistency, 1), -island.score, island.best_id))
         return [Candidate(island.best_id, "appearance", island.score, island.consistency) for island in chosen]
 
+    def island_of(self, keyframe_id: int) -> Island:
+        """Return the island of the last selection that holds a retrieved keyframe."""
+        return next(island for island in self._last if island.first_id <= keyframe_id <= island.last_id)
+
     def _with_history(self, island: Island) -> Island:
         reach = self._max_gap
         before = [
@@ -86,7 +90,7 @@ def view_bounds(camera: Camera) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _overlaps(points_map: Array, centre: Array, T_cam_maps: Array, bounds: Array) -> Array:
+def overlaps(points_map: Array, centre: Array, T_cam_maps: Array, bounds: Array) -> Array:
     """Return for each old camera which share of the points [P, 3] it sees, weighted by how alike they look there."""
     out = np.zeros(len(T_cam_maps))
     cos_limit = np.cos(_MAX_VIEW_ANGLE_RAD)
@@ -129,7 +133,7 @@ def odometry_candidates(
         min_overlap: least weighted share of the points that must be visible, 0..1.
         min_apart: ids of two candidates differ by at least this, so that they tie different stretches.
     """
-    overlap = _overlaps(np.ascontiguousarray(points_map_m), centre_map_m, np.ascontiguousarray(T_cam_maps), bounds)
+    overlap = overlaps(np.ascontiguousarray(points_map_m), centre_map_m, np.ascontiguousarray(T_cam_maps), bounds)
     chosen: list[Candidate] = []
     for k in np.argsort(-overlap, kind="stable").tolist():
         if overlap[k] < min_overlap or len(chosen) == count:

@@ -18,9 +18,19 @@ from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verifier import Verification, Verifier
 from vislam.loop.view import View, make_view
 from vislam.loop.vocabulary import Vocabulary
-from vislam.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge, Pieces
+from vislam.messages import (
+    Array,
+    GraphUpdate,
+    Keyframe,
+    LoopCandidate,
+    LoopDecision,
+    LoopEdge,
+    Pieces,
+    RetrievedKeyframe,
+)
 
 _PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
+_SHOWN_MATCHES = 40  # per candidate, for the picture that explains it
 _NEIGHBOUR_STEPS = (-1, 1, -2, 2)  # where a second witness is looked for beside a candidate
 
 
@@ -56,6 +66,7 @@ class LoopDetector:
         self._witnesses: list[Measured] = []  # poses that the last keyframes measured, accepted or parked
         self._parked: list[_Trial] = []
         self._next_edge_id = 0
+        self.retrieved: list[RetrievedKeyframe] = []  # what looked most like the newest keyframe
         self.counters = {"verified": 0, "accepted": 0, "parked": 0, "rejected": 0, "promoted": 0}
 
     @property
@@ -85,6 +96,7 @@ class LoopDetector:
         self._poses.add(view.id, T_map_body)
         self._tags.add(view.id, sight_tags(keyframe.frame, self._rig.cameras[0], self._config))
         trials = self._try(view)
+        self._views[view.id] = view
         self._witnesses += [trial.measured for trial in trials if trial.measured is not None]
         edges: list[LoopEdge] = []
         records = self._reconsider(view.id, edges)
@@ -93,7 +105,6 @@ class LoopDetector:
             if record.decision is LoopDecision.PARKED:
                 self._parked.append(trial)
             records.append(record)
-        self._views[view.id] = view
         self._database.add(view)
         self._forget(view.id)
         return edges, records
@@ -120,6 +131,7 @@ class LoopDetector:
         Until its piece is joined with the oldest, a keyframe has no other candidates, and gets more of these.
         """
         config = self._config
+        self.retrieved = []
         recent: list[int] = []
         for old in reversed(self._views.values()):
             age_s = (view.t_ns - old.t_ns) * 1e-9
@@ -133,7 +145,13 @@ class LoopDetector:
             others = [k for k in reversed(self._views) if not self._pieces.are_joined(k, view.id)]
             return [Candidate(k, "appearance", 0.0) for k in others[:wanted]]
         ids, scores = self._database.query(view, config.retrieved, np.array(recent, dtype=np.int64))
-        return self._appearance.select(ids, scores)[:wanted]
+        chosen = self._appearance.select(ids, scores)
+        self.retrieved = [
+            RetrievedKeyframe(id, view.id, score, place.score, place.consistency)
+            for id, score in zip(ids, scores, strict=True)
+            for place in (self._appearance.island_of(id),)
+        ]
+        return chosen[:wanted]
 
     def _old(self, view: View) -> NDArray[np.int64]:
         """Return the places, in the table of poses, of keyframes that visual odometry does not tie to a view."""
@@ -266,8 +284,19 @@ class LoopDetector:
             self._next_edge_id += 1
         return LoopCandidate(
             candidate.id, trial.to_id, candidate.source, candidate.score, found.inliers, judgement.decision,
-            judgement.reason, found.sigma_m, candidate.consistency,
+            judgement.reason, found.sigma_m, candidate.consistency, found.supporters, found.T_a_b,
+            self._matches_px(candidate.id, trial.to_id, found),
         )  # fmt: skip
+
+    def _matches_px(self, from_id: int, to_id: int, found: Verification) -> Array | None:
+        """Return some matches [M, 4] of a pair in pixels of both images."""
+        a, b = self._views.get(from_id), self._views.get(to_id)
+        if a is None or b is None or found.pairs is None or not len(found.pairs):
+            return None
+        pairs = found.pairs[:: -(-len(found.pairs) // _SHOWN_MATCHES)]
+        project = self._rig.cameras[0].project
+        ends = [np.column_stack([view.xy[pairs[:, k]], np.ones(len(pairs))]) for k, view in enumerate((a, b))]
+        return np.hstack([project(rays.astype(np.float64)) for rays in ends])
 
     def _forget(self, newest_id: int) -> None:
         """Let go of witnesses and parked edges that no coming keyframe is close enough to confirm."""

@@ -47,6 +47,7 @@ class Verification:
     reverse_agreement: float = float("nan")  # share of matches that also agree the other way round; NaN: none could
     depth_agreement: float = float("nan")  # share of matches with two depths whose depths agree; NaN: too few
     needs_witness: bool = False  # never taken alone, however small its sigma
+    pairs: NDArray[np.int64] | None = None  # [M, 2] features of a and b that agree with the pose; without one, matched
 
 
 class Verifier:
@@ -64,14 +65,14 @@ class Verifier:
         config = self._config
         pairs = match(a.descriptors, b.descriptors, config.match_ratio, config.match_max_distance)
         if len(pairs) < config.min_inliers:
-            return Verification(f"{len(pairs)} matches, needs {config.min_inliers}", len(pairs))
+            return Verification(f"{len(pairs)} matches, needs {config.min_inliers}", len(pairs), pairs=pairs)
         if not a.has_points and not b.has_points:
             return self._verify_direction(a, b, pairs)
         found = self._pnp(a, b, pairs)
         if found is None or found[1] < config.min_inliers:
             count = 0 if found is None else found[1]
             reason = f"{count} PnP inliers of {len(pairs)} matches, needs {config.min_inliers}"
-            return Verification(reason, len(pairs), count)
+            return Verification(reason, len(pairs), count, pairs=pairs)
         return self._refine(a, b, found[0], len(pairs), found[1])
 
     def _pnp(self, a: View, b: View, pairs: NDArray[np.int64]) -> tuple[Array, int] | None:
@@ -116,7 +117,8 @@ class Verifier:
         radius, limit = config.guided_radius_px * self._px, config.inlier_px * self._px
         sigma_xy = config.feature_sigma_px * self._px
         refined, matched = None, Matched(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 2)))
-        support = matched
+        support, agreeing = matched, np.empty(0, np.bool_)
+        pairs = np.empty((0, 2), np.int64)
         for _ in range(_REFINE_PASSES):
             pairs = match_guided(a, b, T_a_b, radius, config.match_max_distance)
             matched = Matched(
@@ -128,12 +130,13 @@ class Verifier:
             support = matched.take(_agreeing(T_a_b, matched, 2.0 * limit))
             refined = refine(T_a_b, support, sigma_xy, config.inverse_depth_sigma_1_m) if len(support) else None
             if refined is None:
-                return Verification("the matches do not determine a pose", matches, inliers)
+                return Verification("the matches do not determine a pose", matches, inliers, pairs=pairs)
             T_a_b = refined.T_a_b
-            support = matched.take(_agreeing(T_a_b, matched, limit))
+            agreeing = _agreeing(T_a_b, matched, limit)
+            support = matched.take(agreeing)
         if len(support) < config.min_inliers or refined is None:
             reason = f"{len(support)} matches support the refined pose, needs {config.min_inliers}"
-            return Verification(reason, matches, inliers, len(support))
+            return Verification(reason, matches, inliers, len(support), pairs=pairs)
         covariance_cam = self._covariance(refined.information, refined.variance_scale)
         adjoint = se3_adjoint(self._T_body_cam)
         covariance = adjoint @ covariance_cam @ adjoint.T
@@ -149,6 +152,7 @@ class Verifier:
             median_depth_m=float(np.nanmedian(np.concatenate([support.points_a[:, 2], support.points_b[:, 2]]))),
             reverse_agreement=reverse,
             depth_agreement=depth,
+            pairs=pairs[agreeing],
         )
 
     def _covariance(self, information: Array, variance_scale: float) -> Array:
@@ -168,13 +172,13 @@ class Verifier:
             reason = (
                 f"{count} epipolar inliers of {len(pairs)} matches, needs {config.min_inliers_direction} without depth"
             )
-            return Verification(reason, len(pairs), count, has_scale=False)
+            return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         if found.parallax < config.min_parallax_px * self._px:
             reason = f"parallax {found.parallax / self._px:.1f} px, the direction needs {config.min_parallax_px:g}"
-            return Verification(reason, len(pairs), count, has_scale=False)
+            return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         if found.plane_share > config.max_plane_share:
             reason = f"one plane explains {found.plane_share:.0%} of the matches, so that two directions fit"
-            return Verification(reason, len(pairs), count, has_scale=False)
+            return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         R = self._T_body_cam[:3, :3]
         T_a_b = np.eye(4)
         T_a_b[:3, :3] = R @ found.T_a_b[:3, :3] @ R.T
@@ -195,6 +199,7 @@ class Verifier:
             covariance=0.5 * (covariance + covariance.T),
             has_scale=False,
             sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
+            pairs=pairs[found.inliers],
         )
 
     def _pair_seed(self, a: View, b: View) -> int:

@@ -108,7 +108,7 @@ def folded(title: str, content: str) -> str:
 def picture(path: Path, caption: str) -> str:
     """Return an image embedded as data, made smaller where it is large; a reason when it cannot be read."""
     data = path.read_bytes()
-    mime = "image/png"
+    mime = "image/png" if path.suffix == ".png" else "image/jpeg"
     if len(data) > _KEEP_BYTES:
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if image is None:

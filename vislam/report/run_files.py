@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.errors import DataError
+from vislam.loop.table import LoopRow, read_loops, read_rows
 from vislam.messages import NavState, Tracking
 from vislam.trajectory import Trajectory, read_states_csv, read_tum
 
@@ -21,31 +20,9 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 ESTIMATES = ("ekf", "live", "graph", "batch")
-_LOOP_COLUMNS = (
-    "from_id", "to_id", "from_t_ns", "to_t_ns", "source", "score", "inliers",
-    "sigma_m", "consistency", "chi2", "weight", "decision", "reason",
-)  # fmt: skip
 _TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
+_MAX_LOOP_PICTURES = 24
 _MAX_JSON_BYTES = 64 * 2**20
-
-
-@dataclass(frozen=True, slots=True)
-class LoopRow:
-    """One line of loops.csv; numbers that do not apply are NaN, an unknown time is -1."""
-
-    from_id: int
-    to_id: int
-    from_t_ns: int
-    to_t_ns: int
-    source: str
-    score: float
-    inliers: float
-    sigma_m: float
-    consistency: float
-    chi2: float
-    weight: float
-    decision: str
-    reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +47,10 @@ class RunFiles:
     estimates: dict[str, Trajectory]
     states: dict[str, list[NavState]]
     loops: list[LoopRow]
+    loops_eval: dict[str, Any]
     tracking: TrackingRows | None
     pictures: list[Path]
+    loop_pictures: list[Path]
     unread: dict[str, str] = field(default_factory=dict)  # file name: why it could not be used
 
 
@@ -103,8 +82,10 @@ def read_run(folder: Path) -> RunFiles:
         truth=attempt("trajectory_truth.tum", read_tum),
         estimates={name: trajectory for name, trajectory in found.items() if trajectory is not None},
         states={name: pair[1] for name, pair in states.items() if pair is not None},
-        loops=attempt("loops.csv", _read_loops) or [],
+        loops_eval=attempt("loops_eval.json", _read_json) or {},
+        loops=attempt("loops.csv", read_loops) or [],
         tracking=attempt("tracking.csv", _read_tracking),
+        loop_pictures=sorted((folder / "loops").glob("*.jpg"))[:_MAX_LOOP_PICTURES],
         pictures=sorted((folder / "map").glob("picture*.png")),
         unread=unread,
     )
@@ -125,47 +106,12 @@ def _read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def _rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
-    """Return (line, fields) of a CSV file with this header; a line cut short is an error."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file, restkey="", restval="")
-            if tuple(reader.fieldnames or ()) != columns:
-                raise DataError(f"{path}:1: expected the columns {','.join(columns)}, got {reader.fieldnames}")
-            rows = []
-            for row in reader:
-                if "" in row or row[columns[-2]] == "":
-                    raise DataError(f"{path}:{reader.line_num}: wrong number of columns; is the line cut short?")
-                rows.append((reader.line_num, row))
-            return rows
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise DataError(f"{path} is not a CSV file: {error}") from error
-
-
-def _read_loops(path: Path) -> list[LoopRow]:
-    loops = []
-    for line, row in _rows(path, _LOOP_COLUMNS):
-        try:
-            whole = {name: int(row[name] or -1) for name in _LOOP_COLUMNS[:4]}
-            real = {name: _number(row[name]) for name in _LOOP_COLUMNS[5:11]}
-        except ValueError as error:
-            raise DataError(f"{path}:{line}: {error}") from error
-        loops.append(
-            LoopRow(**whole, **real, source=row["source"], decision=row["decision"], reason=row["reason"])  # type: ignore[arg-type]
-        )
-    return loops
-
-
 def _read_tracking(path: Path) -> TrackingRows:
-    rows = _rows(path, _TRACKING_COLUMNS)
+    rows = read_rows(path, _TRACKING_COLUMNS)
     try:
         t_ns = np.array([int(row["t_ns"]) for _, row in rows], dtype=np.int64)
-        inliers = np.array([_number(row["inliers"]) for _, row in rows])
+        inliers = np.array([float(row["inliers"] or "nan") for _, row in rows])
         tracking = [Tracking(row["tracking"]).value for _, row in rows]
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: {error}") from error
     return TrackingRows(t_ns, tracking, inliers, [row["reason"] for _, row in rows])
-
-
-def _number(text: str) -> float:
-    return float(text) if text else math.nan

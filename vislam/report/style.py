@@ -60,6 +60,14 @@ def stylesheet() -> str:
     return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
 
 
+def light() -> tuple[dict[str, str], dict[str, Any]]:
+    """Return the page's colours by name as they are by day, and the same settings as `RC` with them, for a PNG."""
+    root = stylesheet().partition("}")[0]
+    colors = {name: value for name, value in re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", root) if name in CODE}
+    by_code = {CODE[name]: value for name, value in colors.items()}
+    return colors, {key: by_code.get(value, value) if isinstance(value, str) else value for key, value in RC.items()}
+
+
 def svg(figure: Figure, name: str) -> str:
     """Return the figure as an SVG element without a size of its own; the same figure gives the same bytes."""
     buffer = io.StringIO()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from vislam.camera import Rig
 from vislam.config import ViewConfig
-from vislam.messages import Array, Frame, GraphUpdate, Keyframe, LoopCandidate, Observations, Tracking
+from vislam.messages import Array, Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, Observations, Tracking
 
 if TYPE_CHECKING:
     from vislam.viewer.recording import RunViewer
@@ -38,6 +38,12 @@ class NullViewer:
 
     def log_loop(self, candidate: LoopCandidate) -> None:
         """Ignore a loop candidate."""
+
+    def log_loop_picture(self, t_ns: int, jpeg: bytes, text: str) -> None:
+        """Ignore a picture of a loop candidate."""
+
+    def settle_loops(self, t_ns: int, decided: Mapping[tuple[int, int], LoopDecision]) -> None:
+        """Ignore what became of loop candidates."""
 
     def log_scalars(self, t_ns: int, values: Mapping[str, float]) -> None:
         """Ignore numbers."""

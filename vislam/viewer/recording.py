@@ -78,6 +78,7 @@ class RunViewer:
         self._poses: dict[int, Array] = {}  # of keyframes, as last written
         self._paths: dict[str, list[Array]] = {}
         self._loops: dict[LoopDecision, list[tuple[int, int]]] = {}
+        self._has_loop_pictures = False
         self._log_static()
 
     def log_frame(self, frame: Frame, observations: Observations, tracking: Tracking) -> None:
@@ -142,6 +143,27 @@ class RunViewer:
         self._log_loops(candidate.decision)
         text = f"loop {candidate.from_id} - {candidate.to_id} {candidate.decision.value}: {candidate.reason}"
         self._stream.log("notes", rr.TextLog(text, level="INFO"))
+
+    def log_loop_picture(self, t_ns: int, jpeg: bytes, text: str) -> None:
+        """Show both images of a loop candidate with their matches, at the time when it was found."""
+        self._set_time(t_ns)
+        self._stream.log("loop/pair", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        self._stream.log("loop/why", rr.TextDocument(text))
+        if not self._has_loop_pictures:
+            self._has_loop_pictures = True
+            self._stream.send_blueprint(self._blueprint())
+
+    def settle_loops(self, t_ns: int, decided: Mapping[tuple[int, int], LoopDecision]) -> None:
+        """Draw all loop candidates, by their keyframes, as they were decided in the end, from a time on."""
+        self._set_time(t_ns)
+        for decision in LoopDecision:
+            pairs = [pair for pair, final in decided.items() if final is decision]
+            had_some = bool(self._loops.get(decision))
+            self._loops[decision] = pairs
+            if pairs:
+                self._log_loops(decision)
+            elif had_some:
+                self._stream.log(f"world/loops/{decision.value}", rr.LineStrips3D([]))
 
     def log_scalars(self, t_ns: int, values: Mapping[str, float]) -> None:
         """Log numbers named `group/name`; each group becomes one plot."""
@@ -266,6 +288,9 @@ class RunViewer:
         ]
         if plots:
             side.append(rrb.Tabs(*plots))
+        if self._has_loop_pictures:
+            pair = rrb.Spatial2DView(origin="loop/pair", name="loop candidate")
+            side.append(rrb.Horizontal(pair, rrb.TextDocumentView(origin="loop/why", name="why")))
         side.append(rrb.TextLogView(origin="notes", name="notes"))
         world = rrb.Spatial3DView(
             origin="world",
@@ -276,7 +301,7 @@ class RunViewer:
         )
         return rrb.Blueprint(
             rrb.Horizontal(
-                world, rrb.Vertical(*side, row_shares=[4, 1.2, 2.5, 1.5][: len(side)]), column_shares=[2.2, 1]
+                world, rrb.Vertical(*side, row_shares=[4, 1.2, *[2.5] * (len(side) - 3), 1.5]), column_shares=[2.2, 1]
             ),
             rrb.TimePanel(state="collapsed"),
             collapse_panels=True,

@@ -1,0 +1,198 @@
+"""How good the loops of a finished run are, stage by stage, against its truth: `loops_eval.json` and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.config import LoopTruthConfig
+from vislam.errors import DataError
+from vislam.factor_log import rig_from
+from vislam.loop.evaluation import (
+    DOUBTFUL,
+    RIGHT,
+    WRONG,
+    Detections,
+    TruePlaces,
+    bootstrap_interval,
+    precision_recall,
+    true_places,
+)
+from vislam.loop.table import LoopRow, read_loops, read_retrieved
+from vislam.messages import Array, LoopDecision
+from vislam.runfolder import write_json
+from vislam.session import Session, StoredKeyframe
+from vislam.trajectory import Trajectory, associate, read_trajectory
+
+EVALUATION = "loops_eval.json"
+_MAX_POINTS = 400  # of a curve that is stored
+_MAX_WORST = 20  # edges that are listed
+_TEMPORAL = 1  # keyframes before that must have pointed at the same place
+
+Answer = tuple[int, float, int]  # row of the keyframe, score, verdict
+
+
+def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> dict[str, Any]:
+    """Compare the loops of a run with the truth and write `loops_eval.json` into its folder.
+
+    Stages: what retrieval alone answers (`appearance`), of that the places that persisted from the keyframe before
+    (`temporal`), verified relative poses (`geometry`), those that the detector accepted (`checks`), and those that are
+    in the graph at the end (`graph`). One answer per keyframe and stage: its best; scores are similarity for the first
+    two, inliers for the others. Raises DataError when the folder lacks what is needed.
+    """
+    truth_path = reference or run / "trajectory_truth.tum"
+    if not truth_path.is_file():
+        raise DataError(f"{run} has no true trajectory; give --reference FILE")
+    places = _places(run / "session.db", read_trajectory(truth_path), rule)
+    rows = [row for row in read_loops(run / "loops.csv") if _rows_of(places, row) is not None]
+    stages = {
+        "appearance": _retrieved(run / "retrieved.csv", places, 0),
+        "temporal": _retrieved(run / "retrieved.csv", places, _TEMPORAL),
+        "geometry": _verified(rows, places, lambda row: True),
+        "checks": _verified(rows, places, lambda row: row.was_offered or row.decision == LoopDecision.ACCEPTED),
+        "graph": _verified(rows, places, lambda row: row.decision == LoopDecision.ACCEPTED),
+    }
+    revisits = places.revisits
+    answer = {
+        "rule": asdict(rule),
+        "keyframes": len(places.ids),
+        "revisits": int(revisits.sum()),
+        "stages": {name: _stage(found, revisits, rule) for name, found in stages.items()},
+        "edges": _edges(rows, places),
+    }
+    write_json(run / EVALUATION, answer)
+    return answer
+
+
+def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> TruePlaces:
+    """Return the keyframes that the truth covers."""
+    session = Session(session_path)
+    try:
+        rig = rig_from(session.info()["rig"])
+        stored = list(session.keyframes())
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{session_path} is damaged ({error}); run the recording again") from error
+    finally:
+        session.close()
+    t_ns = np.array([keyframe.t_ns for keyframe in stored], dtype=np.int64)
+    poses = np.array([keyframe.T_map_body for keyframe in stored]).reshape(-1, 4, 4)
+    pairs = associate(Trajectory(t_ns, poses), truth)
+    kept = [keyframe for keyframe, covered in zip(stored, np.isin(t_ns, pairs.t_ns), strict=True) if covered]
+    if not kept:
+        raise DataError(f"{session_path}: the truth covers none of {len(stored)} keyframes; do they use one clock?")
+    ids = np.array([keyframe.id for keyframe in kept], dtype=np.int64)
+    seen = [_seen(keyframe, rig, rule.nominal_depth_m) for keyframe in kept]
+    with_depth = np.array([_knows_depth(keyframe) for keyframe in kept], dtype=np.bool_)
+    return true_places(ids, pairs.t_ns, pairs.reference, seen, with_depth, rig, rule)
+
+
+def _knows_depth(keyframe: StoredKeyframe) -> bool:
+    return keyframe.points_body_m is not None and bool(np.isfinite(keyframe.points_body_m).any())
+
+
+def _seen(keyframe: StoredKeyframe, rig: Any, nominal_depth_m: float) -> Array:
+    """Return points [P, 3] in the body frame that a keyframe sees; without depth, features pushed to a nominal one."""
+    if keyframe.points_body_m is not None:
+        known = np.isfinite(keyframe.points_body_m).all(axis=1)
+        if known.any():
+            return np.asarray(keyframe.points_body_m[known], dtype=np.float64)
+    rays = rig.cameras[0].unproject(keyframe.keypoints_px)
+    T = rig.T_body_cams[0]
+    points = rays[np.isfinite(rays).all(axis=1)] * nominal_depth_m
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3], dtype=np.float64)
+
+
+def _rows_of(places: TruePlaces, pair: Any) -> tuple[int, int] | None:
+    a, b = places.row(pair.from_id), places.row(pair.to_id)
+    return None if a is None or b is None else (a, b)
+
+
+def _retrieved(path: Path, places: TruePlaces, persistence: int) -> Detections:
+    """Return the best answer of retrieval; with `persistence`, of the places that lasted for so many keyframes."""
+    answers: list[Answer] = []
+    for found in read_retrieved(path):
+        pair = _rows_of(places, found)
+        if pair is not None and places.apart[pair] and found.consistency >= persistence:
+            score = found.score if persistence == 0 else found.island_score
+            answers.append((pair[1], score, places.image_verdict(*pair)))
+    return _best(answers, len(places.ids))
+
+
+def _verified(rows: list[LoopRow], places: TruePlaces, chosen: Callable[[LoopRow], bool]) -> Detections:
+    """Return the best verified answer among the chosen rows: the one with most inliers, judged by its pose."""
+    answers: list[Answer] = []
+    for row in rows:
+        pair = _rows_of(places, row)
+        if pair is not None and row.T_from_to is not None and places.apart[pair] and chosen(row):
+            gross = places.is_gross(places.pose_error(*pair, row.T_from_to))
+            answers.append((pair[1], row.inliers, WRONG if gross else RIGHT))
+    return _best(answers, len(places.ids))
+
+
+def _best(answers: Iterable[Answer], count: int) -> Detections:
+    score, verdict = np.full(count, np.nan), np.full(count, DOUBTFUL, dtype=np.int64)
+    for k, value, judged in answers:
+        if not score[k] >= value:
+            score[k], verdict[k] = value, judged
+    return Detections(score, verdict)
+
+
+def _stage(found: Detections, revisits: Any, rule: LoopTruthConfig) -> dict[str, Any]:
+    curve = precision_recall(found, revisits)
+    low, high = bootstrap_interval(found, revisits, rule)
+    step = max(1, -(-len(curve.recall) // _MAX_POINTS))
+    kept = np.unique(np.append(np.arange(0, len(curve.recall), step), len(curve.recall) - 1))[-_MAX_POINTS - 1 :]
+    kept = kept[kept >= 0]
+    return {
+        "answers": int(np.isfinite(found.score).sum()),
+        "wrong": int((found.verdict == WRONG).sum()),
+        "precision": float(curve.precision[-1]) if len(curve.precision) else None,
+        "recall": float(curve.recall[-1]) if len(curve.recall) else 0.0,
+        "recall_at_full_precision": curve.recall_at_full_precision,
+        "interval": [low, high],
+        "curve": {name: getattr(curve, name)[kept].tolist() for name in ("threshold", "precision", "recall")},
+    }
+
+
+def _edges(rows: list[LoopRow], places: TruePlaces) -> dict[str, Any]:
+    """Return the errors of all edges that are in the graph at the end, near ones included."""
+    accepted = [row for row in rows if row.decision == LoopDecision.ACCEPTED and row.T_from_to is not None]
+    pairs = [(places.row(row.from_id), places.row(row.to_id)) for row in accepted]
+    errors = [
+        places.pose_error(a, b, row.T_from_to)
+        for (a, b), row in zip(pairs, accepted, strict=True)
+        if a is not None and b is not None and row.T_from_to is not None
+    ]
+    metres, degrees = np.array(errors).reshape(-1, 2).T
+    gross = [places.is_gross(error) for error in errors]
+    worst = sorted(range(len(errors)), key=lambda k: (-gross[k], -errors[k][0], k))[:_MAX_WORST]
+
+    def spread(values: Array) -> dict[str, float | None]:
+        if not len(values):
+            return {"median": None, "p95": None, "max": None}
+        return {
+            "median": float(np.median(values)),
+            "p95": float(np.percentile(values, 95)),
+            "max": float(values.max()),
+        }
+
+    return {
+        "accepted": len(accepted),
+        "apart": sum(bool(places.apart[pair]) for pair in pairs),
+        "gross": sum(gross),
+        "error_m": spread(metres),
+        "error_deg": spread(degrees),
+        "errors_m": np.sort(metres)[:: -(-max(len(metres), 1) // _MAX_POINTS)].tolist(),
+        "worst": [
+            {
+                "from_id": accepted[k].from_id, "to_id": accepted[k].to_id, "error_m": errors[k][0],
+                "error_deg": errors[k][1], "inliers": accepted[k].inliers, "sigma_m": accepted[k].sigma_m,
+                "gross": gross[k], "reason": accepted[k].reason,
+            }
+            for k in worst
+        ],
+    }  # fmt: skip
