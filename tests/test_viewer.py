@@ -141,7 +141,7 @@ def test_loops_are_shown_in_the_end_as_they_were_decided_in_the_end(tmp_path):
         viewer.settle_loops(9_000_000_000, {(0, 2): LoopDecision.REJECTED})
     rejected = columns(tmp_path / "run.rrd", "/world/loops/rejected")["LineStrips3D:strips"]
     np.testing.assert_allclose(rejected[-1][0], [pose(0)[:3, 3], pose(20)[:3, 3]], atol=1e-5)
-    assert not columns(tmp_path / "run.rrd", "/world/loops/accepted")["LineStrips3D:strips"][-1]  # cleared
+    assert columns(tmp_path / "run.rrd", "/world/loops/accepted")["LineStrips3D:strips"][-1] == []
     assert columns(tmp_path / "run.rrd", "/loop/pair")["EncodedImage:media_type"] == [["image/jpeg"]]
     assert columns(tmp_path / "run.rrd", "/loop/why")["TextDocument:text"] == [
         ["0 - 2 rejected: out of the graph again"]
