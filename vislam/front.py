@@ -17,6 +17,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
 from vislam.frontend.stillness import Stillness
+from vislam.frontend.uniform_motion import UniformMotion
 from vislam.geometry import invert, level_rotation, transform
 from vislam.imu import ImuBuffer, ImuNoise, NoiseEnvelope, RestDetector, subtract_bias
 from vislam.messages import (
@@ -84,6 +85,7 @@ class Front:
         self.noise = self._noise_told = noise  # `noise` is gone by: raised where the samples show more
         self._has_imu = noise is not None
         self.camera_clock = CameraClock(config.init)
+        self.uniform = UniformMotion(config.init)
         self._ekf: Ekf | MsckfEkf | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu)
@@ -147,6 +149,8 @@ class Front:
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and still_image
         self._count(track, at_rest)
+        if self.frontend.mode == "mono":
+            self.uniform.add(span, before, at_rest)
         T_vo_keyframe_body = track.vo.T_keyframe_body if track.vo.has_scale else None
         if track.vo.T_keyframe_body is not None:
             self._T_vo_body = self._T_vo_keyframe @ scaled_motion(track.vo)
@@ -182,6 +186,8 @@ class Front:
     def all_counters(self) -> dict[str, dict[str, int]]:
         """Counters of this room and of those inside."""
         counters = {"front": dict(self.counters)}
+        if self.frontend.mode == "mono":
+            counters["front"]["frames_without_excitation"] = self.uniform.frames
         if self._has_imu:
             counters["imu"] = dict(self._buffer.counters)
             counters["initialisation refused"] = dict(self._initialiser.refusals)

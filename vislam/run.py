@@ -33,6 +33,8 @@ Progress = Callable[[int, int, str], None]  # frames done, frames in all, a shor
 
 _PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
 _LOST_SIGMA_M = 1.0  # of the filter's position: no controller can use it, and a user must be told
+_UNIFORM_S = 20.0  # after which the biases that hold the scale of one camera may have walked away
+_GATED_SHARE = 0.1  # of the visual motions that the filter refused: more than outliers explain
 _APART_M = 0.5  # rms between filter and graph that is no drift ...
 _APART_SHARE = 0.05  # ... and the share of the way that is none either
 _MIN_COMPARED = 10  # poses
@@ -230,6 +232,7 @@ class Run:
                     f"the filter's position was uncertain by {sigma_m:.1f} m (1 sigma) at its worst: too long without "
                     "vision, or without motion that shows scale"
                 )
+        self._doubt_filter(counters)
         self._compare_filter_and_graph(final)
         if self.noise is not None and found is None:
             self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.last_refusal}")
@@ -264,6 +267,29 @@ class Run:
             "coverage_frames": len(final) / max(len(self.log), 1),
             "warnings": self.warnings,
         }
+
+    def _doubt_filter(self, counters: dict[str, Any]) -> None:
+        """Warn where the filter's numbers hold less than they seem to."""
+        uniform_s = self.slam.front.uniform.longest_s
+        if uniform_s > _UNIFORM_S:
+            self.warnings.append(
+                f"uniform motion for {uniform_s:.0f} s: the scale of one camera is held by the IMU's biases alone "
+                "there, and may be off by more than its sigma; accelerate now and then, or use a second camera or depth"
+            )
+        ekf = counters.get("ekf", {})
+        resets, gated, opposed, taken = (
+            ekf.get(name, 0) for name in ("soft_resets", "vo_gated", "vo_opposed", "vo_accepted")
+        )
+        if resets:
+            self.warnings.append(
+                f"vision contradicted the filter for so long that its uncertainty was widened {resets} times: look at "
+                "tracking.csv for something that moves through the image, and check calibration and time offset"
+            )
+        if (refused := gated + opposed) > _GATED_SHARE * (refused + taken):
+            self.warnings.append(
+                f"the filter refused {refused} of {refused + taken} visual motions as impossible: its pose is mostly "
+                "inertial there; with one camera use --ekf.coupling tight"
+            )
 
     def _compare_filter_and_graph(self, final: Trajectory) -> None:
         """Warn when filter and graph went different ways by more than drift explains: one of them is wrong."""
