@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.config import LoopTruthConfig
 from vislam.errors import DataError
@@ -36,8 +37,38 @@ _TEMPORAL = 1  # keyframes before that must have pointed at the same place
 Answer = tuple[int, float, int]  # row of the keyframe, score, verdict
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedEdge:
+    """An edge that is in the graph at the end, and by how much it is off."""
+
+    row: LoopRow
+    error_m: float
+    error_deg: float
+    is_gross: bool
+    is_apart: bool  # far enough in time to be a loop
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedLoops:
+    """The loops of a run, or of several, each with its verdict."""
+
+    revisits: NDArray[np.bool_]  # [N] which keyframes see again what an earlier one saw
+    stages: dict[str, Detections]  # the best answer of each stage for each keyframe
+    edges: list[JudgedEdge]
+
+
 def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> dict[str, Any]:
-    """Compare the loops of a run with the truth and write `loops_eval.json` into its folder.
+    """Compare the loops of a run with the truth, write `loops_eval.json` into its folder and return what is in it.
+
+    Raises DataError when the folder lacks what is needed.
+    """
+    answer = summarise(judge_loops(run, rule, reference), rule)
+    write_json(run / EVALUATION, answer)
+    return answer
+
+
+def judge_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> JudgedLoops:
+    """Judge every stage of loop closing by the truth.
 
     Stages: what retrieval alone answers (`appearance`), of that the places that persisted from the keyframe before
     (`temporal`), verified relative poses (`geometry`), those that the detector accepted (`checks`), and those that are
@@ -56,16 +87,30 @@ def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = No
         "checks": _verified(rows, places, lambda row: row.was_offered or row.decision == LoopDecision.ACCEPTED),
         "graph": _verified(rows, places, lambda row: row.decision == LoopDecision.ACCEPTED),
     }
-    revisits = places.revisits
-    answer = {
-        "rule": asdict(rule),
-        "keyframes": len(places.ids),
-        "revisits": int(revisits.sum()),
-        "stages": {name: _stage(found, revisits, rule) for name, found in stages.items()},
-        "edges": _edges(rows, places),
+    return JudgedLoops(places.revisits, stages, _judged_edges(rows, places))
+
+
+def pooled(runs: Sequence[JudgedLoops]) -> JudgedLoops:
+    """Return several runs as one: their keyframes after each other."""
+    stages = {
+        name: Detections(
+            np.concatenate([run.stages[name].score for run in runs]),
+            np.concatenate([run.stages[name].verdict for run in runs]),
+        )
+        for name in runs[0].stages
     }
-    write_json(run / EVALUATION, answer)
-    return answer
+    return JudgedLoops(np.concatenate([run.revisits for run in runs]), stages, [e for run in runs for e in run.edges])
+
+
+def summarise(judged: JudgedLoops, rule: LoopTruthConfig) -> dict[str, Any]:
+    """Return the rule, the figures and curves of every stage, and the errors of the edges, as plain data."""
+    return {
+        "rule": asdict(rule),
+        "keyframes": len(judged.revisits),
+        "revisits": int(judged.revisits.sum()),
+        "stages": {name: _stage(found, judged.revisits, rule) for name, found in judged.stages.items()},
+        "edges": _edges(judged.edges),
+    }
 
 
 def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> TruePlaces:
@@ -158,18 +203,21 @@ def _stage(found: Detections, revisits: Any, rule: LoopTruthConfig) -> dict[str,
     }
 
 
-def _edges(rows: list[LoopRow], places: TruePlaces) -> dict[str, Any]:
-    """Return the errors of all edges that are in the graph at the end, near ones included."""
-    accepted = [row for row in rows if row.decision == LoopDecision.ACCEPTED and row.T_from_to is not None]
-    pairs = [(places.row(row.from_id), places.row(row.to_id)) for row in accepted]
-    errors = [
-        places.pose_error(a, b, row.T_from_to)
-        for (a, b), row in zip(pairs, accepted, strict=True)
-        if a is not None and b is not None and row.T_from_to is not None
-    ]
-    metres, degrees = np.array(errors).reshape(-1, 2).T
-    gross = [places.is_gross(error) for error in errors]
-    worst = sorted(range(len(errors)), key=lambda k: (-gross[k], -errors[k][0], k))[:_MAX_WORST]
+def _judged_edges(rows: list[LoopRow], places: TruePlaces) -> list[JudgedEdge]:
+    """Return all edges that are in the graph at the end, near ones included."""
+    out = []
+    for row in rows:
+        pair = _rows_of(places, row)
+        if row.decision == LoopDecision.ACCEPTED and row.T_from_to is not None and pair is not None:
+            error = places.pose_error(*pair, row.T_from_to)
+            out.append(JudgedEdge(row, *error, places.is_gross(error), bool(places.apart[pair])))
+    return out
+
+
+def _edges(edges: list[JudgedEdge]) -> dict[str, Any]:
+    """Return counts, the spread of the errors and the worst edges."""
+    metres = np.array([edge.error_m for edge in edges])
+    degrees = np.array([edge.error_deg for edge in edges])
 
     def spread(values: Array) -> dict[str, float | None]:
         if not len(values):
@@ -180,19 +228,20 @@ def _edges(rows: list[LoopRow], places: TruePlaces) -> dict[str, Any]:
             "max": float(values.max()),
         }
 
+    worst = sorted(edges, key=lambda edge: (-edge.is_gross, -edge.error_m))[:_MAX_WORST]
     return {
-        "accepted": len(accepted),
-        "apart": sum(bool(places.apart[pair]) for pair in pairs),
-        "gross": sum(gross),
+        "accepted": len(edges),
+        "apart": sum(edge.is_apart for edge in edges),
+        "gross": sum(edge.is_gross for edge in edges),
         "error_m": spread(metres),
         "error_deg": spread(degrees),
         "errors_m": np.sort(metres)[:: -(-max(len(metres), 1) // _MAX_POINTS)].tolist(),
         "worst": [
             {
-                "from_id": accepted[k].from_id, "to_id": accepted[k].to_id, "error_m": errors[k][0],
-                "error_deg": errors[k][1], "inliers": accepted[k].inliers, "sigma_m": accepted[k].sigma_m,
-                "gross": gross[k], "reason": accepted[k].reason,
+                "from_id": edge.row.from_id, "to_id": edge.row.to_id, "error_m": edge.error_m,
+                "error_deg": edge.error_deg, "inliers": edge.row.inliers, "sigma_m": edge.row.sigma_m,
+                "gross": edge.is_gross, "reason": edge.row.reason,
             }
-            for k in worst
+            for edge in worst
         ],
     }  # fmt: skip

@@ -1,0 +1,128 @@
+"""How far loop closing can be trusted: precision, recall and gross edges over worlds, recordings and seeds.
+
+    .venv/bin/python experiments/loop_precision_recall.py [--seeds 3] [--camera-hz 6] [--out FOLDER] [--reuse]
+        [--sources sim:aliased-halls tum:/data/tum_fr1_desk ...] [-- --loop.min-inliers 15 ...]
+
+Each run is a process of its own, as a user would start it, without map and viewer. A seed is that of the pipeline; of a
+simulated world also that of the place, the motion and the sensors. The runs of a source are pooled: one table
+(`table.md`), one row of pictures per source (`curves.png`), all numbers (`results.json`). What follows `--` goes to
+every `vislam run`. A run that fails stays in the table and says so; --reuse takes run folders that are there already.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from vislam.config import LoopTruthConfig
+from vislam.errors import VislamError
+from vislam.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
+from vislam.report import write_loop_plot
+from vislam.runfolder import write_json
+from vislam.trajectory import write_text
+
+WORLDS = ("workshop-cart", "corridor-loop", "aliased-halls")
+_START = "from vislam.cli import main; main()"
+_QUIET = ("--map.no-enabled", "--view.no-enabled", "--overwrite")
+_TIMEOUT_S = 3600.0
+
+
+def main() -> None:
+    """Run, judge, write."""
+    options, extra = _options()
+    rule = LoopTruthConfig()
+    answers: dict[str, dict[str, Any]] = {}
+    for source in options.sources:
+        name = source.partition(":")[2].rstrip("/").rpartition("/")[2].partition(",")[0]
+        judged, failures = [], []
+        for seed in range(options.first_seed, options.first_seed + options.seeds):
+            run = options.out / "runs" / f"{name}_{seed}"
+            is_there = options.reuse and (run / "metrics.json").is_file()
+            failure = "" if is_there else _run(source, seed, run, options, extra)
+            try:
+                judged.append(judge_loops(run, rule))
+                print(f"{source} seed {seed}: {_line(judged[-1])}", flush=True)
+            except VislamError as error:
+                failures.append(f"seed {seed}: {failure or error}")
+                print(f"{source} {failures[-1]}", flush=True)
+        found = summarise(pooled(judged), rule) if judged else {}
+        answers[name] = {**found, "runs": len(judged), "failures": failures}
+        _write(options.out, answers)
+
+
+def _options() -> tuple[argparse.Namespace, list[str]]:
+    given = sys.argv[1:]
+    end = given.index("--") if "--" in given else len(given)
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--sources", nargs="+", default=[f"sim:{world}" for world in WORLDS])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--camera-hz", type=float, default=None, help="of simulated worlds; rendering takes most time")
+    parser.add_argument("--out", type=Path, default=Path("results/loop_precision_recall"))
+    parser.add_argument("--reuse", action="store_true")
+    return parser.parse_args(given[:end]), given[end + 1 :]
+
+
+def _run(source: str, seed: int, run: Path, options: argparse.Namespace, extra: list[str]) -> str:
+    """Run a source; return why it failed, or an empty string."""
+    if source.startswith("sim:"):
+        source += f",world_seed={seed}" + ("" if options.camera_hz is None else f",camera_hz={options.camera_hz:g}")
+    run.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-c", _START, "run", source, "--seed", str(seed), "--out", str(run), *_QUIET, *extra]
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(
+            command, env={**os.environ, **threads}, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"not done after {_TIMEOUT_S:g} s"
+    return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+
+
+def _line(judged: JudgedLoops) -> str:
+    gross = sum(edge.is_gross for edge in judged.edges)
+    return f"{len(judged.edges)} edges, {gross} gross, {int(judged.revisits.sum())} revisits"
+
+
+def _write(out: Path, answers: dict[str, dict[str, Any]]) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "results.json", answers)
+    write_text(out / "table.md", _table(answers))
+    drawn = {name: answer for name, answer in answers.items() if answer["runs"]}
+    if drawn:
+        write_loop_plot(out / "curves.png", drawn)
+
+
+def _table(answers: dict[str, dict[str, Any]]) -> str:
+    """Return the table: per source the figures of every stage and of the edges."""
+    head = ["source", "runs", "revisits", "stage", "wrong", "precision", "recall", "recall at 100 %", "interval"]
+    head += ["edges", "gross", "median error"]
+    lines = [" | ".join(head), " | ".join(["---"] * len(head))]
+    for name, answer in answers.items():
+        first = [name, str(answer["runs"]), str(answer.get("revisits", "-"))]
+        edges = answer.get("edges")
+        for stage, entry in answer.get("stages", {}).items():
+            low, high = entry["interval"]
+            shares = [entry[key] for key in ("precision", "recall", "recall_at_full_precision")]
+            row = [*first, stage, str(entry["wrong"]), *(_number(value) for value in shares)]
+            row += [f"{low:.2f} to {high:.2f}"]
+            if stage == "graph" and edges:
+                row += [str(edges["accepted"]), str(edges["gross"]), f"{_number(edges['error_m']['median'])} m"]
+            else:
+                row += ["", "", ""]
+            lines.append(" | ".join(row))
+            first = ["", "", ""]
+        lines += [f"{name} | {failure}" for failure in answer["failures"]]
+    return "\n".join(f"| {line} |" for line in lines) + "\n"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+if __name__ == "__main__":
+    main()
