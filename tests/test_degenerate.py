@@ -59,6 +59,14 @@ def test_somebody_fills_half_of_the_image(tmp_path, coupling):
     assert errors["graph"]["ate_rmse_m"] < 0.15
 
 
+def test_somebody_fills_half_of_the_image_of_one_camera(tmp_path):
+    """Whenever tracking starts anew, nearly all tracks that are known by name are on the person."""
+    uri = f"points:laps,rig=mono,duration_s=20,moving_share=0.5,moving_begin_s=8,{CAMERA}"
+    _, errors, _ = run(tmp_path, uri)
+    assert errors["ekf"]["ate_rmse_m"] < 0.3
+    assert errors["graph"]["ate_rmse_m"] < 0.3
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_a_noise_model_ten_times_off(tmp_path, factor):
     uri = f"points:laps,rig=stereo,duration_s=14,imu_noise_factor={factor},{CAMERA}"

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, state_error
+from scipy.stats import chi2
 from window_world import MONO, RGBD, STEREO, World, packet, start_state
 
 from vislam.camera import Rig
@@ -13,7 +14,7 @@ from vislam.config import WindowConfig
 from vislam.errors import DataError, UsageError
 from vislam.geometry import invert, se3_log
 from vislam.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
-from vislam.window import SlidingWindow, WindowUpdate
+from vislam.window import SlidingWindow, WindowUpdate, gate
 
 HONEST = replace(WindowConfig(), imu_inflation=1.0, keyframes=8)  # the simulated sensor has no vibration
 
@@ -55,8 +56,6 @@ def test_error_of_the_newest_state_fits_its_covariance() -> None:
         error = state_error(truths[-1], updates[-1].newest)
         total += float(error @ np.linalg.solve(updates[-1].newest.covariance, error))
         count += 1
-    from scipy.stats import chi2
-
     low, high = chi2.ppf([0.0005, 0.9995], dof * count)
     print(f"NEES of {count} runs: {total / (dof * count):.2f} per degree of freedom")
     assert low < total < high
@@ -239,3 +238,60 @@ def test_an_empty_frame_is_no_error() -> None:
         update = window.add(packet(k, T0_NS + k * NS // 10, nothing, None))
     np.testing.assert_allclose(update.T_local_body[-1], np.eye(4), atol=1e-9)
     assert isinstance(update.newest, NavState | None)
+
+
+def with_a_crowd(packets: list[KeyframePacket], first: int, again: int) -> list[KeyframePacket]:
+    """Return packets in which a crowd of tracks that moved together is all that ties keyframe `again` to older ones."""
+    crowd, rng = np.arange(100_000, 100_040), np.random.default_rng(0)
+    places = rng.uniform(60.0, 420.0, (len(crowd), 2))
+    out = []
+    for k, p in enumerate(packets):
+        seen = p.observations
+        ids, pixels = seen.track_ids + (50_000 if k >= again else 0), seen.pixels_px
+        if k in (first, again):
+            ids = np.concatenate([ids, crowd])
+            pixels = np.vstack([pixels, places + (np.array([120.0, -40.0]) if k == again else 0.0)])
+        out.append(replace(p, observations=Observations(ids, pixels)))
+    return out
+
+
+def test_a_crowd_that_contradicts_the_expectation_does_not_take_over() -> None:
+    packets, truths = World(Motion.random(1), MONO, 1, duration_s=9.0).packets()
+    window = SlidingWindow(WindowConfig(), MONO, EUROC_NOISE, GRAVITY_M_S2)
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1001)))
+    updates = [window.add(p) for p in with_a_crowd(packets, 27, 30)]
+    assert updates[30].rejected_tracks >= 38
+    assert position_rmse(updates[30:], truths[30:]) < 0.1  # 0.67 m if they are only judged afterwards
+
+
+def test_a_wrong_expectation_gives_in() -> None:
+    """A turn that only the IMU felt: vision is refused at first, and believed when it keeps saying the same."""
+    packets, truths = World(Motion.random(1), STEREO, 1, duration_s=7.0).packets()
+    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, GRAVITY_M_S2)
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1001)))
+    wrong = packets[20].imu
+    assert wrong is not None
+    packets[20] = replace(packets[20], imu=replace(wrong, gyro_rad_s=wrong.gyro_rad_s + np.array([0.0, 0.0, 1.0])))
+    updates = [window.add(p) for p in packets]
+    assert updates[20].rejected_tracks > 50
+    assert all(u.rejected_tracks < 10 for u in updates[-5:])
+    assert np.linalg.norm(updates[-1].T_local_body[-1][:3, 3] - truths[-1][0][:3, 3]) < 0.8  # 0.56 m without a test
+
+
+def test_innovations_are_no_larger_than_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smaller they may be: the depth of a landmark that was seen once is chosen to fit."""
+    squares, plain = [], gate.innovations
+
+    def recorded(*arguments) -> None:
+        plain(*arguments)
+        squares.append(arguments[-1].copy())
+
+    monkeypatch.setattr(gate, "innovations", recorded)
+    for seed in range(2):
+        run(World(Motion.random(seed), MONO, seed, duration_s=6.0), seed=seed)
+    found = np.concatenate(squares)
+    found = found[~np.isnan(found)]
+    beyond = float(np.mean(found > chi2.ppf(0.999, 2)))
+    print(f"{len(found)} innovations, median {np.median(found):.2f}, {100 * beyond:.2f} % beyond the gate")
+    assert 0.9 < np.median(found) < 1.5  # 1.39 in theory
+    assert beyond < 0.003

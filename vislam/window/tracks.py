@@ -77,6 +77,15 @@ class TrackTable:
         wanted = (counts >= 2) | with_depth
         return self.arrange(order[np.repeat(wanted, counts)], ids)
 
+    def continued(self, ids: Ints) -> tuple[Selection, Selection]:
+        """Return all views of the landmarks that the newest keyframe saw again, and the older ones of them."""
+        all_views = self.select(ids)
+        views = all_views.views
+        newest = len(ids) - 1
+        again = (views.host < newest) & (views.keyframe[views.first[1:] - 1] == newest)
+        rows = all_views.rows[np.repeat(again, np.diff(views.first))]
+        return self.arrange(rows, ids), self.arrange(rows[self.keyframe[rows] != ids[newest]], ids)
+
     def arrange(self, rows: Ints, ids: Ints) -> Selection:
         """Return views of these rows [N] of the table, which are ordered by slot, keyframe, camera."""
         slot = self.slot[rows]

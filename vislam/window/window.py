@@ -19,7 +19,7 @@ from vislam.errors import DataError, UsageError
 from vislam.geometry import interpolate, invert
 from vislam.imu import ImuNoise
 from vislam.messages import Array, ImuSpan, KeyframePacket, NavState, Tracking
-from vislam.window import visual
+from vislam.window import gate, visual
 from vislam.window.layout import CALIBRATION, STATE, Camera, Ints, Prior
 from vislam.window.leaving import split
 from vislam.window.linear import joint_covariance, trailing_covariance
@@ -34,6 +34,8 @@ _RHO_START = 0.2  # 1/m: 5 m, where nothing is known
 _UNKNOWN_SPEED_M_S = 0.5  # a velocity less certain than this predicts worse than odometry does
 _SURE_SPEED_M_S = 0.3  # until velocity is known so well, the window is still finding its feet:
 _SURE_KEYFRAMES = 6  # nothing is rejected, calibration waits, and landmarks start afresh with each keyframe
+_CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of wrong tracks, ...
+_STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expectation
 _MAX_SPEED_M_S = 300.0  # a prediction that is faster is nonsense to restart from
 _UNSURE_EFFORT = 5  # times the iterations
 _MAX_OFFSET_S = 0.1  # a residual time offset beyond this is a wrong clock, not a late camera
@@ -77,6 +79,7 @@ class SlidingWindow:
         self._T_start: Array | None = None
         self._initialised = False
         self._scale_sigma = 0.0 if self._measures_scale else float("inf")
+        self._known: Array | None = None  # covariance of newest velocity and biases, poses, calibration
         self._clear()
 
     def initialise(self, state: NavState | None, T_local_body: Array | None = None) -> None:
@@ -111,6 +114,7 @@ class SlidingWindow:
         """
         self._check(packet, T_odom_body)
         self._push(packet, T_odom_body)
+        doubted = self._doubt_newest()
         selection = self._select()
         solution = self._optimise(selection)
         if not solution.ok:
@@ -132,6 +136,7 @@ class SlidingWindow:
             settled, tilts, states = self._settle(solution, posterior, T_edges[0], P_edges[0])
             self._let_go()
             T_edges, P_edges = T_edges[1:], P_edges[1:]
+        self._known = self._still_known(posterior)
         provisional = [
             WindowEdge(int(a), int(b), T, P, False)
             for a, b, T, P in zip(self._ids[:-1], self._ids[1:], T_edges, P_edges, strict=True)
@@ -146,7 +151,7 @@ class SlidingWindow:
             states=tuple(states),
             calibration=calibration,
             scale_sigma=self._scale_sigma,
-            rejected_tracks=rejected,
+            rejected_tracks=rejected + doubted,
         )
 
     def _clear(self) -> None:
@@ -160,6 +165,8 @@ class SlidingWindow:
         self._T_odom: list[Array | None] = []
         self._calibration = np.zeros(CALIBRATION)
         self._prior: Prior | None = None
+        self._contradictions = 0  # keyframes in a row that saw hardly anything as expected
+        self._known = None
         self._speed_sigma_m_s = 0.0
         self._last_edges = []
         self._sure = False
@@ -322,6 +329,33 @@ class SlidingWindow:
             self._tracks.host[selection.slots] = hosts
         return selection
 
+    def _doubt_newest(self) -> int:
+        """Take out what the newest keyframe saw and the window did not expect; return of how many tracks.
+
+        If hardly anything is as expected, again and again, it is the expectation that is wrong, and all of it stays.
+        """
+        if self._known is None or not self._sure or self._at_rest or not self._links.arrays.inertial[-1]:
+            return 0
+        covariance = gate.predicted_covariance(self._known, self._X, self._links.arrays, self._gravity_m_s2)
+        views, older = self._tracks.continued(self._ids)
+        if covariance is None or len(views.slots) == 0:
+            return 0
+        points = self._tracks.points[views.slots]
+        fresh = self._tracks.host[views.slots] != self._ids[views.views.host]
+        camera = self._camera()
+        visual.start(self._X, self._calibration, older.views, camera, fresh, _RHO_START, points)
+        squares = np.empty(len(views.rows))
+        gate.innovations(self._X, points, self._calibration, views.views, camera, covariance, squares)
+        tested, bad = ~np.isnan(squares), squares > self._gate
+        contradicted = bad.sum() > (1.0 - _CONTRADICTED) * tested.sum()
+        self._contradictions = self._contradictions + 1 if contradicted else 0
+        if self._contradictions > _STUBBORN_KEYFRAMES:
+            return 0
+        gone = np.zeros(len(self._tracks), dtype=bool)
+        gone[views.rows[bad]] = True
+        self._tracks.remove(gone)
+        return int(bad.sum())
+
     def _optimise(self, selection: Selection) -> Solution:
         assert self._prior is not None
         self._links.refresh(self._X[:, 15:])
@@ -364,6 +398,14 @@ class SlidingWindow:
             np.ascontiguousarray(covariance[newest:calibration_at, newest:calibration_at]),
             covariance[calibration_at:, calibration_at:],
         )
+
+    def _still_known(self, posterior: _Posterior) -> Array | None:
+        """Return the covariance of newest velocity and biases, poses that are still held, and calibration."""
+        if not self._full:
+            return None
+        gone = 6 * (len(posterior.poses) // 6 - len(self._ids))
+        kept = np.concatenate([np.arange(9), np.arange(9 + gone, len(posterior.covariance))])
+        return np.ascontiguousarray(posterior.covariance[np.ix_(kept, kept)])
 
     def _newest(self, posterior: _Posterior) -> NavState | None:
         if not self._full:
