@@ -2,6 +2,7 @@
 
 import json
 import math
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from vislam.loop.evaluation import (
     true_places,
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
-from vislam.loop_evaluation import evaluate_loops
+from vislam.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
 from vislam.messages import (
     GraphUpdate,
     KeyframePacket,
@@ -248,3 +249,34 @@ def test_what_is_missing_is_named(finished: Path, tmp_path: Path) -> None:
     write_tum(late, tmp_path / "trajectory_truth.tum")
     with pytest.raises(DataError, match="covers none of"):
         evaluate_loops(tmp_path, RULE)
+
+
+def test_pooled_runs_are_their_keyframes_after_each_other(finished: Path) -> None:
+    one = judge_loops(finished, RULE)
+    alone, twice = summarise(one, RULE), summarise(pooled([one, one]), RULE)
+    assert twice["revisits"] == 2 * alone["revisits"]
+    assert twice["edges"]["accepted"] == 2 * alone["edges"]["accepted"]
+    for name, stage in twice["stages"].items():
+        assert stage["wrong"] == 2 * alone["stages"][name]["wrong"]
+        assert stage["recall_at_full_precision"] == alone["stages"][name]["recall_at_full_precision"]
+
+
+def test_the_experiment_writes_what_came_out_and_what_failed(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("made_0", "made_1"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "metrics.json").write_text("{}")
+    for path in finished.iterdir():
+        (tmp_path / "runs" / "made_0" / path.name).write_bytes(path.read_bytes())
+    script = Path(__file__).parents[2] / "experiments" / "loop_precision_recall.py"
+    arguments = ["--sources", "sim:made", "--seeds", "2", "--reuse", "--out", str(tmp_path), "--", "--seed", "1"]
+    monkeypatch.setattr("sys.argv", [str(script), *arguments])
+    runpy.run_path(str(script), run_name="__main__")
+    table = (tmp_path / "table.md").read_text().splitlines()
+    assert len(table) == 2 + 5 + 1
+    assert table[2].startswith("| made | 1 | ")
+    assert table[6].endswith(" m |")
+    assert "seed 1" in table[7] and "no true trajectory" in table[7]
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((tmp_path / "results.json").read_text())["made"]["runs"] == 1
