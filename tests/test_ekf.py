@@ -598,6 +598,66 @@ def test_zero_velocity_stops_the_drift_and_shows_the_gyro_bias() -> None:
     assert ekf.counters["zero_velocity_gated"] == 1
 
 
+def test_rest_holds_the_pose_at_which_it_began_through_keyframes_and_a_missed_frame() -> None:
+    """A minute, 5 keyframes a second, vision relative to each with its own error; every 50th frame is not told."""
+    rng = np.random.default_rng(21)
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    sigmas = np.repeat([0.01, 0.001, 0.05, 0.02, 0.1], 3)
+    ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
+    per_sample = np.sqrt(EUROC_NOISE.rate_hz) * np.repeat([3.0, 1.0], 3)
+    per_sample[:3] *= EUROC_NOISE.gyro_noise_density
+    per_sample[3:] *= EUROC_NOISE.accel_noise_density
+    vo_sigmas = np.repeat([np.deg2rad(0.05), 0.004], 3)
+    keyframe, at_begin = 0, None
+    assert ekf.add_keyframe(0, T0_NS).accepted
+    for k in range(1, 12001):
+        t_ns = T0_NS + k * 5_000_000
+        noise = rng.normal(0.0, per_sample)
+        ekf.predict(ImuSample(t_ns, noise[:3], noise[3:] + np.array([0.0, 0.0, GRAVITY_M_S2])))
+        if k % 20:
+            continue
+        if k % 40:
+            shared = rng.normal(0.0, vo_sigmas)
+        T = se3_exp(0.7 * (shared + rng.normal(0.0, vo_sigmas)))
+        ekf.update_vo(VoMeasurement(t_ns, keyframe, T, np.diag(vo_sigmas**2), True, Tracking.OK, 100))
+        if k % 1000 != 20:
+            ekf.update_zero_velocity(t_ns)
+        if k % 40 == 0:
+            keyframe += 1
+            ekf.add_keyframe(keyframe, t_ns)
+        if k == 200:
+            at_begin = ekf.state()
+    state = ekf.state()
+    assert at_begin is not None
+    moved = np.linalg.inv(at_begin.T_world_body) @ state.T_world_body
+    assert np.linalg.norm(moved[:3, 3]) < 0.004
+    assert np.rad2deg(np.linalg.norm(so3_log(moved[:3, :3].copy()))) < 0.15
+    assert np.sqrt(state.covariance[2, 2] - 0.01**2) < np.deg2rad(0.15)
+
+
+def test_rest_that_was_left_unseen_does_not_pull_back() -> None:
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    sigmas = np.repeat([0.01, 0.001, 0.05, 0.01, 0.1], 3)
+    ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
+    ekf.add_keyframe(0, T0_NS)
+    T = np.eye(4)
+    for k in range(1, 801):
+        t_ns, push = T0_NS + k * 5_000_000, 0.0
+        if 400 < k <= 440:  # 0.2 s there and away: 5 cm
+            push = 5.0 if k <= 420 else -5.0
+            T[0, 3] += 0.5 * push * 0.005**2 + 0.005 * 5.0 * 0.005 * (k - 401 if k <= 420 else 441 - k)
+        ekf.predict(ImuSample(t_ns, np.zeros(3), np.array([push, 0.0, GRAVITY_M_S2])))
+        if k % 20 == 0:
+            covariance = np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
+            ekf.update_vo(VoMeasurement(t_ns, 0 if k <= 200 else 1, T.copy(), covariance, True, Tracking.OK, 100))
+            if not 400 < k <= 440:
+                ekf.update_zero_velocity(t_ns)
+            if k == 200:
+                ekf.add_keyframe(1, t_ns)
+    assert ekf.state().T_world_body[0, 3] == pytest.approx(T[0, 3], abs=0.005)
+    assert ekf.counters["zero_velocity_gated"] >= 1
+
+
 def test_feedback_moves_biases_only(scene: Scene) -> None:
     ekf = scene.run(scene.ekf())
     before = ekf.state()

@@ -155,6 +155,8 @@ class EkfConfig:
     reset_accel_bias_m_s2: float = 0.2
     zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
+    rest_sigma_m: float = 0.002  # sway against the pose at which rest began
+    rest_sigma_deg: float = 0.05
     vision_delay_s: float = 0.0  # for experiments: vision reaches the filter so much later than it was seen
     piece_sigma_m: float = 5.0  # without vision, a way known no better ties nothing: a new piece of trajectory begins
     graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
@@ -176,8 +178,6 @@ class EkfConfig:
     tight_max_range_m: float = 200.0  # beyond, nothing but rotation is seen
     tight_still_px: float = 1.0  # image motion between clones below which the older one is kept instead of the newer
     tight_min_interval_s: float = 0.03  # between clones; a fast camera would leave a window too short for parallax
-    tight_rest_sigma_m: float = 0.002  # sway against the pose at which rest began
-    tight_rest_sigma_deg: float = 0.05
     tight_imu_inflation: float = 10.0  # on the white-noise sigmas; flying EuRoC: NEES of velocity 2.6 at 4, 0.6 here
     tight_time_offset: bool = True  # estimate what is to be added to the stamps of frames
     tight_time_offset_sigma_s: float = 0.01  # prior; USB cameras are stamped up to 30 ms late
@@ -288,7 +288,7 @@ class GraphConfig:
     lost_speed_sigma_m_s: float = 1.0  # without vision and IMU the body is assumed to go on as before, this loosely
     lost_rate_sigma_deg_s: float = 30.0
     rest_speed_sigma_m_s: float = 0.005
-    rest_sigma_m: float = 0.001  # motion between two keyframes at rest
+    rest_sigma_m: float = 0.001  # sway of a keyframe at rest against the one at which rest began
     rest_sigma_deg: float = 0.05
 
     loop_gate_probability: float = 0.999  # chi-square of a loop against the joint covariance of its two keyframes

@@ -147,7 +147,7 @@ class Front:
             track = self.frontend.track(frame, *self._without_bias(span, before), self._predicted(frame.t_ns, before))
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, before))
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
-        at_rest = self._has_imu and self._rest.add(span) and still_image
+        at_rest = self._has_imu and self._rest.add(span) and self._stillness.resting
         self._count(track, at_rest)
         if self.frontend.mode == "mono":
             self.uniform.add(span, before, at_rest)

@@ -101,6 +101,40 @@ def test_motion_that_cannot_be_told_is_no_rest() -> None:
     assert answers(late)[9:13] == [True, False, False, True]
 
 
+def resting(frames: list[tuple[int, Observations]]) -> list[bool]:
+    """Return whether `Stillness` sees a rest go on, at every frame."""
+    stillness, said = Stillness(InitConfig()), []
+    for frame in frames:
+        stillness.add(*frame)
+        said.append(stillness.resting)
+    return said
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 1.0])
+def test_a_long_rest_is_not_interrupted(sigma_px: float) -> None:
+    """Few tracks, many of which slip onto other corners on the way."""
+    frames = film(lambda t: np.eye(4), 30.0, sigma_px, 18, points=70, slipped=0.3, frame_ns=2 * FRAME_NS)
+    assert all(resting(frames)[2:])
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 1.0])
+def test_a_creep_too_slow_for_the_window_ends_the_rest(sigma_px: float) -> None:
+    frames = film(lambda t: transform(np.eye(3), np.array([0.004 * max(t - 2.0, 0.0), 0.0, 0.0])), 6.0, sigma_px, 19)
+    assert np.mean(answers(frames)[40:]) > 0.97, "no longer too slow for the window; take a slower one"
+    said = resting(frames)
+    assert all(said[2:40])
+    assert not all(said[40:])
+    left = 40 + said[40:].index(False)
+    assert not any(said[left : left + 10])
+
+
+def test_a_slow_start_ends_the_rest_no_later_than_a_centimetre_away() -> None:
+    frames = film(lambda t: transform(np.eye(3), np.array([0.025 * max(t - 2.0, 0.0) ** 2, 0.0, 0.0])), 5.0, 1.0, 20)
+    said = resting(frames)
+    assert all(said[2:40])
+    assert not any(said[53:])  # 0.65 s: 1.06 cm
+
+
 def test_numbers_behind_the_answer() -> None:
     stillness = Stillness(InitConfig())
     for frame in film(lambda t: transform(np.eye(3), np.array([0.0, 0.1 * t, 0.0])), 1.0, 0.7, 17):

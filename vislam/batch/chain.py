@@ -85,11 +85,10 @@ class Chain:
             if seen[k] < min_seen:
                 tied.append(k)
                 factors += self._odometry_factors(record, values, duration_s, has_imu)
-            if record.at_rest:
-                config = self._config
-                factors.append(motion.no_motion(k, np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m))
+            if record.rest_from is not None:
+                factors.append(motion.no_motion(record.rest_from, k, self._config))
                 if self.has_imu:
-                    factors.append(motion.zero_velocity(k, config.rest_speed_sigma_m_s))
+                    factors.append(motion.zero_velocity(k, self._config.rest_speed_sigma_m_s))
         return factors, tied
 
     def odometry_edges(self, scale_sigma: float) -> list[gtsam.BetweenFactorPose3]:

@@ -15,10 +15,11 @@ from vislam.ekf.measurements import (
     biases,
     chi_square_limit,
     relative_motion,
+    where_rest_began,
     with_shared_error,
     zero_velocity,
 )
-from vislam.ekf.timeline import reset_sigmas
+from vislam.ekf.timeline import REST_PAUSE_NS, reset_sigmas
 from vislam.imu import ImuNoise
 from vislam.messages import Array, VoMeasurement
 
@@ -31,7 +32,7 @@ class Corrector:
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
         per_sample = config.imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
         self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
-        self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 7)]
+        self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)]
         self._reset_sigmas = reset_sigmas(config)
 
     def apply(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
@@ -44,9 +45,7 @@ class Corrector:
         if event.kind is Kind.VO:
             return self._apply_vo(event, x, P, ledger)
         if event.kind is Kind.ZERO_VELOCITY:
-            at_rest = zero_velocity(x, gyro_rad_s, self._config.zero_velocity_sigma_m_s, self._zero_rate_sigma)
-            self._correct(event, at_rest, x, P, "zero_velocity")
-            return ledger
+            return self._apply_rest(event, x, P, ledger, gyro_rad_s)
         assert event.bias is not None
         known = biases(x, event.bias[:3], event.bias[3:6], event.bias[6:])
         self._correct(event, known, x, P, "bias", only=slice(9, 15))
@@ -54,11 +53,27 @@ class Corrector:
 
     def _begin_keyframe(self, event: Event, x: Array, P: Array, ledger: Ledger) -> Ledger:
         if self._config.vision == "relative":
+            rests = ledger.rested_t_ns == event.t_ns
+            if rests and ledger.clone_rests:  # it stands where the clone does; a new clone would add its own error
+                return replace(ledger, clone_id=event.keyframe_id, shared=None)
             kernels.clone(x, P)
-            return replace(ledger, clone_id=event.keyframe_id, shared=np.zeros((6, 6)))
+            return replace(ledger, clone_id=event.keyframe_id, shared=np.zeros((6, 6)), clone_rests=rests)
         chained = ledger.T_odom_vo if ledger.vo_t_ns == event.t_ns else None  # vision was lost there: start over
         T_odom_keyframe = kernels.pose(x, 0, 6) if chained is None else chained
         return replace(ledger, clone_id=event.keyframe_id, T_odom_keyframe=T_odom_keyframe)
+
+    def _apply_rest(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
+        """Use that the body is at rest; once a keyframe was taken at rest, the body is where that one is."""
+        config = self._config
+        goes_on = ledger.rested_t_ns is not None and event.t_ns - ledger.rested_t_ns <= REST_PAUSE_NS
+        holds = ledger.clone_rests and goes_on
+        at_rest = zero_velocity(x, gyro_rad_s, config.zero_velocity_sigma_m_s, self._zero_rate_sigma)
+        if holds:
+            at_rest = where_rest_began(x, at_rest, np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m)
+        self._correct(event, at_rest, x, P, "zero_velocity")
+        if not event.accepted:
+            return replace(ledger, clone_rests=False, rested_t_ns=None)
+        return replace(ledger, clone_rests=holds, rested_t_ns=event.t_ns)
 
     def _apply_vo(self, event: Event, x: Array, P: Array, ledger: Ledger) -> Ledger:
         assert event.vo is not None
@@ -71,6 +86,9 @@ class Corrector:
         if config.vision == "accumulated":
             return self._apply_accumulated(event, event.vo, x, P, ledger)
         measurement = relative_motion(x, P, event.vo, self._lever, config.vo_inflation)
+        if ledger.shared is None:
+            self._correct(event, measurement, x, P, "vo")
+            return self._after_vo(event, P, ledger)
         white, more, shared = with_shared_error(measurement, config.vo_shared_fraction, ledger.shared)
         widened = P.copy()
         widened[15:, 15:] += more

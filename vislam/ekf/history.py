@@ -64,7 +64,10 @@ class Ledger:
     """What the filter knows besides x and P."""
 
     clone_id: int | None = None
-    shared: Array = field(default_factory=lambda: np.zeros((6, 6)))  # added to the clone for shared landmark errors
+    # added to the clone for shared landmark errors; None: several keyframes stand there, each with its own
+    shared: Array | None = field(default_factory=lambda: np.zeros((6, 6)))
+    clone_rests: bool = False  # the clone was taken in the rest that goes on
+    rested_t_ns: int | None = None  # when the body was last seen at rest
     rejects: int = 0  # in a row
     rejects_since_ns: int = 0
     last_vo_t_ns: int = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import gammaincinv
 
 from vislam.ekf.kernels import ERRORS, pose
@@ -124,6 +125,17 @@ def zero_velocity(x: Array, gyro_rad_s: Array, sigma_m_s: float, sigma_rad_s: fl
     H[3:, 9:12] = np.eye(3)
     residual = np.concatenate([-x[3:6], gyro_rad_s - x[13:16]])
     return LinearMeasurement(residual, H, np.diag(np.repeat([sigma_m_s**2, sigma_rad_s**2], 3)))
+
+
+def where_rest_began(x: Array, at_rest: LinearMeasurement, sigma_rad: float, sigma_m: float) -> LinearMeasurement:
+    """Return "at rest" with six more rows: the body is where the clone is, but for its sway."""
+    residual, J_clone, J_body = metric_residual(pose(x, 16, 19), pose(x, 0, 6), np.eye(4))
+    noise = np.diag(np.repeat([sigma_rad**2, sigma_m**2], 3))
+    return LinearMeasurement(
+        np.concatenate([at_rest.residual, residual]),
+        np.vstack([at_rest.H, _spread(J_clone, J_body)]),
+        block_diag(at_rest.noise, noise),
+    )
 
 
 def biases(x: Array, gyro_bias_rad_s: Array, accel_bias_m_s2: Array, sigmas: Array) -> LinearMeasurement:

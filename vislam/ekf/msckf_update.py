@@ -28,7 +28,7 @@ from vislam.ekf.msckf_state import (
     without_points,
 )
 from vislam.ekf.msckf_tracks import FrameTracks, image_motion_px, marked, ripe_tracks
-from vislam.ekf.timeline import reset_sigmas
+from vislam.ekf.timeline import REST_PAUSE_NS, reset_sigmas
 from vislam.geometry import invert, skew, so3_log
 from vislam.imu import ImuNoise
 from vislam.messages import Array
@@ -130,7 +130,7 @@ class Updater:
         they are apart, and one linear step would take the wrong parallax for knowledge.
         """
         R = np.ascontiguousarray(pose(x, 0, 6)[:3, :3])
-        if window.frames and window.frames[-1].t_ns > window.rested_t_ns:  # nobody said that this one rested
+        if frame.t_ns - window.rested_t_ns > REST_PAUSE_NS:
             window = replace(window, rest_t_ns=None)
         prior = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
         leaving = self._leaving(prior)
@@ -169,7 +169,8 @@ class Updater:
         kept, candidate = window.frames[-3], window.frames[-2]
         still = image_motion_px(kept, candidate) < self._config.tight_still_px
         still = still or candidate.t_ns - kept.t_ns < self._config.tight_min_interval_s * 1e9
-        if (still or window.rest_t_ns is not None) and candidate.t_ns != window.rest_t_ns:
+        rests = window.rest_t_ns is not None and window.rested_t_ns >= candidate.t_ns
+        if (still or rests) and candidate.t_ns != window.rest_t_ns:
             return count - 2
         oldest = 0 if window.frames[0].t_ns != window.rest_t_ns else 1
         return oldest
@@ -339,7 +340,7 @@ class Updater:
 
     def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
         config = self._config
-        sigmas = np.repeat([np.deg2rad(config.tight_rest_sigma_deg), config.tight_rest_sigma_m], 3)
+        sigmas = np.repeat([np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m], 3)
         T = pose(x, 0, 6)
         H = np.zeros((6, len(window.P)))
         at = CLONES + 6 * index

@@ -15,6 +15,8 @@ from vislam.geometry import interpolate
 from vislam.imu import ImuSeries
 from vislam.messages import Array
 
+REST_PAUSE_NS = 300_000_000  # frames at rest this far apart are of one rest: either looked back on all that is between
+
 
 class Timed(Protocol):
     """Something that happened at a time."""

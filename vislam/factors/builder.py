@@ -98,8 +98,10 @@ class Builder:
             factors.append(motion.loose_motion(record.id, T, loose_rad, loose_m))
         if record.T_previous_body is None:
             notes.append("vision lost, bridged by " + ("IMU" if integrated is not None else "constant motion"))
-        if record.at_rest:
-            factors += self._rest(record.id, has_imu)
+        if record.rest_from is not None:
+            factors.append(motion.no_motion(record.rest_from, record.id, config))
+            if has_imu:
+                factors.append(motion.zero_velocity(record.id, config.rest_speed_sigma_m_s))
         if record.covariance is None or not record.has_scale:
             variances = (loose_rad**2, loose_m**2)
         else:
@@ -143,15 +145,6 @@ class Builder:
         sigma_m_s = self._config.piece_speed_sigma_m_s if record.begins_piece else self._config.lost_speed_sigma_m_s
         speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, sigma_m_s)
         return [speed, motion.bias_walk(record.id, walk)]
-
-    def _rest(self, k: int, has_imu: bool) -> list[gtsam.NonlinearFactor]:
-        config = self._config
-        factors: list[gtsam.NonlinearFactor] = [
-            motion.no_motion(k, np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m)
-        ]
-        if has_imu:
-            factors.append(motion.zero_velocity(k, config.rest_speed_sigma_m_s))
-        return factors
 
     def _guess(
         self,

@@ -42,7 +42,7 @@ class KeyframeRecord:
     has_scale: bool
     degraded: bool
     imu: ImuSpan | None
-    at_rest: bool
+    rest_from: int | None  # the keyframe since which the body has not moved; None: it may have
     begins_piece: bool = False  # nothing was measured; then the motion above is a guess, with sigmas that say so
 
 
@@ -88,6 +88,7 @@ class WindowRecord:
     edges: tuple[EdgeRecord, ...]  # that of this keyframe (none for the first), and those that replace older ones
     tilts: tuple[TiltRecord, ...]
     note: str
+    rest_from: int | None = None  # see KeyframeRecord
 
 
 Record = StartRecord | KeyframeRecord | LoopRecord | WindowRecord
@@ -120,9 +121,9 @@ def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> 
     if keyframe.id != expected:
         raise DataError(f"{what}: ids must be dense, expected {expected}")
     if previous is None:
-        return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, packet.at_rest)
+        return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, None)
     if packet.begins_piece:  # of another recording perhaps, whose clock began anew
-        return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, packet.at_rest, True)
+        return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, None, True)
     if keyframe.t_ns <= previous.t_ns:
         raise DataError(f"{what}: time must increase, the previous keyframe is at {previous.t_ns} ns")
     T: Array | None = None
@@ -136,7 +137,10 @@ def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> 
             T = covariance = None
     imu = None if packet.imu is None else _checked_span(packet.imu, previous.t_ns, keyframe.t_ns, what)
     degraded = vo.tracking is Tracking.DEGRADED
-    return KeyframeRecord(keyframe.id, keyframe.t_ns, T, covariance, vo.has_scale, degraded, imu, packet.at_rest)
+    rest_from = None
+    if packet.at_rest:
+        rest_from = previous.id if previous.rest_from is None else previous.rest_from
+    return KeyframeRecord(keyframe.id, keyframe.t_ns, T, covariance, vo.has_scale, degraded, imu, rest_from)
 
 
 def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from vislam.config import GraphConfig
 from vislam.factors.keys import B, V, X
 from vislam.factors.noise import sigmas
 from vislam.messages import Array
@@ -15,9 +16,13 @@ def zero_velocity(k: int, sigma_m_s: float) -> gtsam.PriorFactorVector:
     return gtsam.PriorFactorVector(V(k), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma_m_s))
 
 
-def no_motion(k: int, sigma_rad: float, sigma_m: float) -> gtsam.BetweenFactorPose3:
-    """Return the factor that the body did not move between keyframes k - 1 and k."""
-    return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), sigmas(np.repeat([sigma_rad, sigma_m], 3)))
+def no_motion(rest_from: int, k: int, config: GraphConfig) -> gtsam.BetweenFactorPose3:
+    """Return the factor that keyframe k is where rest began.
+
+    From one keyframe of a rest to the next, as many small errors as there are keyframes would add up.
+    """
+    spread = np.repeat([np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m], 3)
+    return gtsam.BetweenFactorPose3(X(rest_from), X(k), gtsam.Pose3(), sigmas(spread))
 
 
 def loose_motion(k: int, T_guess: Array, sigma_rad: float, sigma_m: float) -> gtsam.BetweenFactorPose3:

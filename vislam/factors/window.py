@@ -11,6 +11,7 @@ from vislam.config import GraphConfig
 from vislam.factors.builder import Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, EdgeRecord, StartRecord, TiltRecord, WindowRecord
 from vislam.factors.keys import X, bias_of, nearest_rigid
+from vislam.factors.motion import no_motion
 from vislam.factors.noise import gaussian, huber, inflated
 from vislam.factors.priors import pose_covariance
 from vislam.factors.visual import pose_factor
@@ -32,6 +33,7 @@ class WindowOdometry:
         self._t_ns: list[int] = []
         self._edges: list[EdgeRecord | None] = []  # by the newer keyframe
         self._tilts: dict[int, TiltRecord] = {}
+        self._rest_from: list[int | None] = []
 
     @property
     def has_imu(self) -> bool:
@@ -47,6 +49,7 @@ class WindowOdometry:
         self._newest = record
         self._t_ns.append(record.t_ns)
         self._edges.append(None)
+        self._rest_from.append(record.rest_from)
         for edge in record.edges:
             self._edges[edge.to_id] = edge
         self._tilts |= {tilt.id: tilt for tilt in record.tilts}
@@ -85,9 +88,12 @@ class WindowOdometry:
         named: dict[Label, gtsam.NonlinearFactor] = {("edge", k): self._edge_factor(edge, vo_scale)}
         if k in self._tilts:
             named["tilt", k] = self._tilt_factor(self._tilts[k])
+        rest_from, still = self._rest_from[k], list[gtsam.NonlinearFactor]()
+        if rest_from is not None:
+            still.append(no_motion(rest_from, k, self._config))
         note = self._newest.note if k == self._newest.id else ""
         guess = Guess(T, before.velocity_map_m_s, before.bias)
-        return Step([], guess, *self._variances(edge, vo_scale), note=note, named=named)
+        return Step(still, guess, *self._variances(edge, vo_scale), note=note, named=named)
 
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """Return older keyframes whose edge changed with the newest one, with its variances in rad^2 and m^2."""

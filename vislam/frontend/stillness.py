@@ -3,6 +3,9 @@
 From one frame to the next, slow motion shifts corners by less than their noise. Over half a second it does not: each
 track's pixels are fitted by a straight line in time, and what the lines have in common (shift, turn, zoom) and how far
 they differ beyond noise (parallax) tell motion from rest. Noise is that of the pixels about their lines.
+
+A rest that lasts is judged by where its tracks were all the time, too: their mean since it began is known far better
+than a line through half a second. So it ends with a creep that is too slow for the line, and not with a noisy frame.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
 _MAX_INTERVAL_NS = _NS  # tracks that bridge a longer pause say nothing about what was in it
 _MIN_FRAMES = 3  # a line through two leaves no residual
 _MIN_TRACKS = 10  # fewer say nothing about the motion of the camera
+_HOLD = 1.5  # times the limits over the window, as long as the tracks are where they were when rest began
 _SIGNIFICANT = 3.0  # standard deviations
 _WIDEST = 4.0  # of the threshold: noise that hides more than this many of them excuses nothing
 _ROBUST_STEPS = 4
@@ -31,6 +35,8 @@ class Stillness:
     """Owns the tracks of the last half second and answers for the newest frame.
 
     Attributes:
+        resting: whether a rest goes on, up to the newest frame; for those who already know their state. It bears a
+            frame that noise moves a little beyond the limit, and ends when the tracks have left their places.
         moved_px: common motion over the window, median over the tracks; NaN where it could not be told.
         parallax_px: motion in which tracks differ, beyond noise; NaN where it could not be told.
         noise_px: standard deviation of one coordinate of a pixel about its line; NaN where it could not be told.
@@ -40,6 +46,10 @@ class Stillness:
         """Start empty; `config.still_px` is the limit for motion over the window and from frame to frame."""
         self._limit_px = config.still_px
         self._frames: deque[tuple[int, NDArray[np.int64], Array]] = deque()  # time, ascending ids, pixels
+        self.resting = False
+        self._places = _Places()  # of frames of this rest that are older than the window
+        self._unsteady = np.zeros(0, dtype=np.int64)  # tracks that jumped within the window
+        self._left_t_ns: int | None = None  # when tracks were found elsewhere
         self.moved_px = self.parallax_px = self.noise_px = np.nan
 
     def add(self, t_ns: int, seen: Observations) -> bool:
@@ -50,21 +60,41 @@ class Stillness:
         frames = self._frames
         if frames and not 0 < t_ns - frames[-1][0] <= _MAX_INTERVAL_NS:
             frames.clear()
+            self.resting = False
         order = np.argsort(seen.track_ids, kind="stable")
         frames.append((t_ns, seen.track_ids[order], seen.pixels_px[order]))
         while len(frames) > _MIN_FRAMES and t_ns - frames[0][0] > _WINDOW_NS + _WINDOW_NS // 16:
-            frames.popleft()
+            _, ids, pixels = frames.popleft()
+            steady = ~np.isin(ids, self._unsteady)
+            self._places.add(ids[steady], pixels[steady], np.unique(np.concatenate([f[1] for f in frames])))
         self.moved_px = self.parallax_px = self.noise_px = np.nan
-        if len(frames) < _MIN_FRAMES:
-            return False
-        t_s = np.array([(at_ns - t_ns) / _NS for at_ns, _, _ in frames])
-        pixels = self._pixels()
-        if pixels.shape[1] < _MIN_TRACKS:
-            return False
-        return self._over_window(t_s, pixels) and self._in_last_step(pixels)
+        times_limit = self._times_limit(t_ns)
+        self._follow_rest(t_ns, times_limit)
+        return times_limit < 1.0
 
-    def _pixels(self) -> Array:
-        """Return pixels [frames, N, 2] of the newest frame's tracks that were seen in most frames; NaN: not seen."""
+    def _times_limit(self, t_ns: int) -> float:
+        """Return the largest motion over the window in units of its limit; infinite where it cannot be told."""
+        if len(self._frames) < _MIN_FRAMES:
+            return np.inf
+        t_s = np.array([(at_ns - t_ns) / _NS for at_ns, _, _ in self._frames])
+        ids, pixels = self._pixels()
+        if len(ids) < _MIN_TRACKS:
+            return np.inf
+        return max(self._over_window(t_s, ids, pixels), self._in_last_step(pixels))
+
+    def _follow_rest(self, t_ns: int, times_limit: float) -> None:
+        """Begin a rest, go on with it or end it; one that ends by displacement begins again after a whole window."""
+        if self._left_t_ns is not None and t_ns - self._left_t_ns < _WINDOW_NS:
+            return
+        begins = not self.resting
+        self.resting = times_limit < (1.0 if begins else _HOLD)
+        if begins:
+            self._places = _Places()
+        elif self.resting and self._since_rest_began() >= 1.0:
+            self.resting, self._left_t_ns = False, t_ns
+
+    def _pixels(self) -> tuple[NDArray[np.int64], Array]:
+        """Return the newest frame's tracks [N] that were seen in most frames; pixels [frames, N, 2], NaN: not seen."""
         wanted, places = self._frames[-1][1], []
         for _, ids, pixels in self._frames:
             at = np.minimum(np.searchsorted(ids, wanted), max(len(ids) - 1, 0))
@@ -73,10 +103,10 @@ class Stillness:
             places[-1][found] = pixels[at[found]]
         stacked = np.array(places)
         often = np.isfinite(stacked[..., 0]).sum(axis=0) >= max(_MIN_FRAMES, 0.6 * len(places))
-        return np.asarray(stacked[:, often])
+        return wanted[often], np.asarray(stacked[:, often])
 
-    def _over_window(self, t_s: Array, pixels: Array) -> bool:
-        """Judge the motion along the lines, over the length of the window."""
+    def _over_window(self, t_s: Array, ids: NDArray[np.int64], pixels: Array) -> float:
+        """Return the motion along the lines, over the length of the window, in units of its limit."""
         here = np.isfinite(pixels[..., 0])
         count = here.sum(axis=0)
         middle = np.where(here, t_s[:, None], 0.0).sum(axis=0) / count
@@ -87,32 +117,87 @@ class Stillness:
         flow = (tau[..., None] * (filled - centre)).sum(axis=0) / spread[:, None]
         rest = np.where(here[..., None], filled - centre - tau[..., None] * flow, 0.0)
         noise_px, steady = _noise((rest**2).sum(axis=(0, 2)), 2 * (count - 2))
+        self._unsteady = ids[~steady]
         if steady.sum() < _MIN_TRACKS:
-            return False
-        centre, flow, spread = centre[steady], flow[steady], spread[steady]
-        variance = noise_px**2 * float(np.median(1.0 / spread))  # of a coordinate of the flow
-        common, differing = _common_motion(centre, flow)
+            return np.inf
+        variance = noise_px**2 * float(np.median(1.0 / spread[steady]))  # of a coordinate of the flow
         self.noise_px = noise_px
-        self.moved_px = float(np.median(np.linalg.norm(common, axis=1)))
-        excess = float(np.median((differing**2).sum(axis=1))) / _MEDIAN_SQUARE - variance
-        self.parallax_px = float(np.sqrt(max(excess, 0.0)))
-        chance = _SIGNIFICANT * variance / (np.log(2.0) * np.sqrt(len(flow)))  # of a median that is a variance
-        return self._is_small(self.moved_px, 2.0 * np.sqrt(variance / len(flow))) and excess < min(
-            max(self._limit_px**2, chance), (_WIDEST * self._limit_px) ** 2
-        )
+        times_limit, self.moved_px, self.parallax_px = self._judge(centre[steady], flow[steady], variance)
+        return times_limit
 
-    def _in_last_step(self, pixels: Array) -> bool:
-        """Judge the motion since the frame before: shaking comes back to where it was within the window."""
+    def _since_rest_began(self) -> float:
+        """Return how far the tracks are from their places in units of the limit; 0 where it cannot be told."""
+        ids, pixels = self._pixels()
+        places, count = self._places.of(ids)
+        now = pixels[-_MIN_FRAMES:]
+        known = (count >= _MIN_FRAMES) & np.isfinite(now[..., 0]).any(axis=0) & ~np.isin(ids, self._unsteady)
+        if known.sum() < _MIN_TRACKS:
+            return 0.0
+        moved = np.nanmean(now[:, known], axis=0) - places[known]
+        near = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < _WIDEST * self._limit_px
+        if near.mean() < 0.5:
+            return np.inf
+        self._places.forget(ids[known][~near])  # slipped onto other corners
+        known[known] = near
+        here = np.isfinite(now[:, known, 0]).sum(axis=0)
+        variance = self.noise_px**2 * float(np.median(1.0 / here + 1.0 / count[known]))
+        return self._judge(places[known], moved[near], variance)[0]
+
+    def _judge(self, centre: Array, flow: Array, variance: float) -> tuple[float, float, float]:
+        """Return a flow [N, 2] at places [N, 2] in units of its limit, its common motion and its parallax.
+
+        `variance` is that of a coordinate of the flow.
+        """
+        common, differing = _common_motion(centre, flow)
+        moved_px = float(np.median(np.linalg.norm(common, axis=1)))
+        excess = float(np.median((differing**2).sum(axis=1))) / _MEDIAN_SQUARE - variance
+        chance = _SIGNIFICANT * variance / (np.log(2.0) * np.sqrt(len(flow)))  # of a median that is a variance
+        parallax_px = float(np.sqrt(max(excess, 0.0)))
+        limit_px = min(max(self._limit_px, float(np.sqrt(chance))), _WIDEST * self._limit_px)
+        moved = self._in_limits(moved_px, 2.0 * np.sqrt(variance / len(flow)))
+        return max(moved, parallax_px / limit_px), moved_px, parallax_px
+
+    def _in_last_step(self, pixels: Array) -> float:
+        """Return the motion since the frame before, in units of its limit: shaking comes back within the window."""
         step = pixels[-1] - pixels[-2]
         both = np.isfinite(step[:, 0])
         if both.sum() < _MIN_TRACKS:
-            return False
+            return np.inf
         common, _ = _common_motion(pixels[-1][both], step[both])
         moved_px = float(np.median(np.linalg.norm(common, axis=1)))
-        return self._is_small(moved_px, 2.0 * np.sqrt(2.0 / both.sum()) * self.noise_px)
+        return self._in_limits(moved_px, 2.0 * np.sqrt(2.0 / both.sum()) * self.noise_px)
 
-    def _is_small(self, moved_px: float, sigma_px: float) -> bool:
-        return moved_px < min(max(self._limit_px, _SIGNIFICANT * sigma_px), _WIDEST * self._limit_px)
+    def _in_limits(self, moved_px: float, sigma_px: float) -> float:
+        return moved_px / min(max(self._limit_px, _SIGNIFICANT * sigma_px), _WIDEST * self._limit_px)
+
+
+class _Places:
+    """Where tracks were on average."""
+
+    def __init__(self) -> None:
+        self._ids = np.zeros(0, dtype=np.int64)  # ascending
+        self._sums = np.zeros((0, 3))  # of the pixels, and how many
+
+    def add(self, ids: NDArray[np.int64], pixels: Array, alive: NDArray[np.int64]) -> None:
+        """Take pixels [N, 2] of tracks [N]; tracks that are not among those alive [M] (ascending) are forgotten."""
+        sums = np.zeros((len(alive), 3))
+        for tracks, values in ((self._ids, self._sums), (ids, np.column_stack((pixels, np.ones(len(ids)))))):
+            _, at, row = np.intersect1d(alive, tracks, return_indices=True)
+            sums[at] += values[row]
+        self._ids, self._sums = alive, sums
+
+    def forget(self, ids: NDArray[np.int64]) -> None:
+        """Drop tracks [N]."""
+        kept = ~np.isin(self._ids, ids)
+        self._ids, self._sums = self._ids[kept], self._sums[kept]
+
+    def of(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return the mean pixels [N, 2] of tracks [N] and of how many frames [N]; NaN and 0 where unknown."""
+        sums = np.zeros((len(ids), 3))
+        _, at, row = np.intersect1d(ids, self._ids, return_indices=True)
+        sums[at] = self._sums[row]
+        with np.errstate(invalid="ignore"):
+            return sums[:, :2] / sums[:, 2:], sums[:, 2]
 
 
 def _noise(squares: Array, freedom: Array) -> tuple[float, NDArray[np.bool_]]:

@@ -224,7 +224,8 @@ class WindowSource:
             for tilt in update.tilts
             if tilt.id % self._config.tilt_every == 0 and _is_direction(tilt.up_body) and np.isfinite(tilt.sigma_rad)
         )
-        return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, "; ".join(n for n in notes if n))
+        note = "; ".join(n for n in notes if n)
+        return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, note, record.rest_from)
 
     def _begins_piece(self, k: int, newest: KeyframeRecord) -> bool:
         """Return whether keyframe k begins a piece: what a window makes of its motion is no edge."""

@@ -18,6 +18,7 @@ _SPACING_S = 0.05  # of control points: designed motion is smoothed over about t
 _REST_S = 3.0  # before anything moves
 _SPEED_M_S = 1.0
 _RAMP_S = 2.0
+_SLOW_START_M_S2 = 0.05
 _TURN_RAD_S = np.deg2rad(40.0)
 _TURN_S = 9.0  # one way: a whole circle
 _LAP_HEIGHT_M = 1.4
@@ -52,6 +53,16 @@ def straight(_rng: np.random.Generator, duration_s: float) -> BodySpline:
         u = np.clip((t - _REST_S) / _RAMP_S, 0.0, 1.0)
         ramp = _RAMP_S * (u**6 - 3.0 * u**5 + 2.5 * u**4)  # the integral of the smoothstep
         x = _SPEED_M_S * (ramp + np.maximum(t - _REST_S - _RAMP_S, 0.0))
+        return np.column_stack([x, np.zeros(len(t)), np.ones(len(t))]), np.zeros((len(t), 3))
+
+    return BodySpline.from_design(design, duration_s, _SPACING_S)
+
+
+def slow_start(_rng: np.random.Generator, duration_s: float) -> BodySpline:
+    """Return a body that rests, then goes along x, faster by 0.05 m/s every second: its start is hard to see."""
+
+    def design(t: Array) -> tuple[Array, Array]:
+        x = 0.5 * _SLOW_START_M_S2 * np.maximum(t - _REST_S, 0.0) ** 2
         return np.column_stack([x, np.zeros(len(t)), np.ones(len(t))]), np.zeros((len(t), 3))
 
     return BodySpline.from_design(design, duration_s, _SPACING_S)
@@ -96,6 +107,9 @@ POINT_WORLDS: dict[str, PointWorld] = {
     ),
     "straight": PointWorld(
         "3 s of rest, then straight ahead at a constant 1 m/s", straight, 60.0, _HOURS_S, (0.05, 0.02, 0.03)
+    ),
+    "slow-start": PointWorld(
+        "3 s of rest, then straight ahead, faster by 0.05 m/s every second", slow_start, 20.0, 60.0, (0.05, 0.02, 0.03)
     ),
     "laps": PointWorld(
         "3 s of rest, then laps of 36 m, carried by hand", laps, 120.0, _HOURS_S, (0.05, 0.02, 0.03)
