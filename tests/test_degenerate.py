@@ -54,7 +54,7 @@ def test_a_slow_start_is_not_held_back(tmp_path, coupling):
     _, errors, found = run(tmp_path, uri, ekf__coupling=coupling)
     for name, trajectory in found.items():
         assert trajectory.path_m > 1.8, name  # 2 m
-        assert errors[name]["ate_max_m"] < 0.03, name
+        assert errors[name]["ate_rmse_m"] < 0.03, name
 
 
 def test_no_texture_for_three_seconds(tmp_path):

@@ -80,7 +80,7 @@ class Stillness:
         ids, pixels = self._pixels()
         if len(ids) < _MIN_TRACKS:
             return np.inf
-        return max(self._over_window(t_s, ids, pixels), self._in_last_step(pixels))
+        return float(max(self._over_window(t_s, ids, pixels), self._in_last_step(pixels)))
 
     def _follow_rest(self, t_ns: int, times_limit: float) -> None:
         """Begin a rest, go on with it or end it; one that ends by displacement begins again after a whole window."""
