@@ -104,7 +104,7 @@ def test_like_images_score_higher_than_unlike_ones() -> None:
 def test_an_image_without_features_is_an_empty_bag(vocabulary: Vocabulary) -> None:
     bag = vocabulary.transform(np.empty((0, 32), dtype=np.uint8))
     assert len(bag.words) == 0
-    assert bag.score(BagOfWords(np.array([1], np.int32), np.array([1.0]))) == 0.0
+    assert bag.score(BagOfWords(np.array([1], np.int32), np.array([1], np.int32), np.array([1.0]), 1.0)) == 0.0
 
 
 def test_saved_is_loaded_and_bytes_repeat(vocabulary: Vocabulary, tmp_path: Path) -> None:
@@ -112,6 +112,9 @@ def test_saved_is_loaded_and_bytes_repeat(vocabulary: Vocabulary, tmp_path: Path
     vocabulary.save(tmp_path / "b.npz")
     loaded = Vocabulary.load(tmp_path / "a.npz")
     assert loaded.hash == vocabulary.hash
+    assert Vocabulary.from_bytes(vocabulary.to_bytes(), "kept in a session").hash == vocabulary.hash
+    with pytest.raises(DataError, match="kept in a session"):
+        Vocabulary.from_bytes(vocabulary.to_bytes()[:-30], "kept in a session")
     image = some_images(8)[0]
     np.testing.assert_array_equal(loaded.words(image), vocabulary.words(image))
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()

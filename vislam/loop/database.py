@@ -55,7 +55,7 @@ class PlaceDatabase:
         self.vocabulary = train(
             images, config.vocabulary_branching, depth, self._seed + self.trainings, config.training_descriptors
         )
-        self._index = InvertedIndex(self.vocabulary.word_count)
+        self._index = InvertedIndex(self.vocabulary.idf)
         for view in self._views:
             self._index.add(view.id, self.vocabulary.transform(view.descriptors))
         self.trainings += 1

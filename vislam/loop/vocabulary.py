@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from vislam.errors import DataError, StorageError
 from vislam.loop.hamming import packed
-from vislam.loop.tree import descend, grow, similarity, weigh
+from vislam.loop.tree import MAX_CHILDREN, descend, grow, similarity, walk_table, weigh
 
 _FORMAT = 1
 _MAX_FILE_BYTES = 512 * 1024 * 1024  # ten million nodes; a file that claims more is damaged or hostile
@@ -34,7 +34,9 @@ class BagOfWords:
     """An image as weighted words: ascending, unique; the weights are positive and sum to 1 (or there are none)."""
 
     words: NDArray[np.int32]  # [M]
-    weights: NDArray[np.float64]  # [M]
+    counts: NDArray[np.int32]  # [M] how many features are this word, >= 1
+    weights: NDArray[np.float64]  # [M] count * idf / total
+    total: float  # of count * idf
 
     def score(self, other: BagOfWords) -> float:
         """Return the similarity 0..1: 1 - |a - b|_1 / 2, as DBoW2's L1 score."""
@@ -56,9 +58,8 @@ class Vocabulary:
         return len(self.idf)
 
     @cached_property
-    def _word_of(self) -> NDArray[np.int32]:
-        leaf = self.child_count == 0
-        return np.where(leaf, np.cumsum(leaf) - 1, -1).astype(np.int32)
+    def _table(self) -> NDArray[np.uint64]:
+        return walk_table(self.nodes, self.first_child, self.child_count)
 
     @cached_property
     def hash(self) -> str:
@@ -70,19 +71,14 @@ class Vocabulary:
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
         """Return the word [N] of each descriptor [N, 32]."""
-        return np.asarray(
-            descend(packed(descriptors), self.nodes, self.first_child, self.child_count, self._word_of), dtype=np.int32
-        )
+        return np.asarray(descend(packed(descriptors), self._table), dtype=np.int32)
 
     def transform(self, descriptors: NDArray[np.uint8]) -> BagOfWords:
         """Return the bag of words of an image's descriptors [N, 32]."""
         return BagOfWords(*weigh(self.words(descriptors), self.idf))
 
-    def save(self, path: Path) -> None:
-        """Write the vocabulary as a compressed npz; the file appears whole or not at all.
-
-        Raises StorageError when it cannot be written.
-        """
+    def to_bytes(self) -> bytes:
+        """Return the vocabulary as a compressed npz, for `from_bytes`; the same vocabulary gives the same bytes."""
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
@@ -92,9 +88,30 @@ class Vocabulary:
             child_count=self.child_count,
             idf=self.idf,
         )
+        return buffer.getvalue()
+
+    @staticmethod
+    def from_bytes(data: bytes, name: str) -> Vocabulary:
+        """Read what `to_bytes` gave; raises DataError, which calls it by `name`, when it is no sound vocabulary."""
+        arrays = _read_arrays(data, name)
+        if int(arrays["format"]) != _FORMAT:
+            raise DataError(
+                f"vocabulary {name} has format {int(arrays['format'])}, this version reads {_FORMAT}; train it again"
+            )
+        vocabulary = Vocabulary(arrays["nodes"], arrays["first_child"], arrays["child_count"], arrays["idf"])
+        fault = _fault(vocabulary)
+        if fault:
+            raise DataError(f"vocabulary {name} is damaged: {fault}; train it again")
+        return vocabulary
+
+    def save(self, path: Path) -> None:
+        """Write the vocabulary to a file, which appears whole or not at all.
+
+        Raises StorageError when it cannot be written.
+        """
         unfinished = path.with_name(path.name + ".part")
         try:
-            unfinished.write_bytes(buffer.getvalue())
+            unfinished.write_bytes(self.to_bytes())
             os.replace(unfinished, path)
         except OSError as error:
             unfinished.unlink(missing_ok=True)
@@ -105,16 +122,14 @@ class Vocabulary:
     @staticmethod
     def load(path: Path) -> Vocabulary:
         """Read a vocabulary that `save` wrote; raises DataError when the file is not a sound one."""
-        arrays = _read_arrays(path)
-        if int(arrays["format"]) != _FORMAT:
-            raise DataError(
-                f"vocabulary {path} has format {int(arrays['format'])}, this version reads {_FORMAT}; train it again"
-            )
-        vocabulary = Vocabulary(arrays["nodes"], arrays["first_child"], arrays["child_count"], arrays["idf"])
-        fault = _fault(vocabulary)
-        if fault:
-            raise DataError(f"vocabulary {path} is damaged: {fault}; train it again")
-        return vocabulary
+        try:
+            size = path.stat().st_size
+            if size > _MAX_FILE_BYTES:
+                raise DataError(f"vocabulary {path} has {size} bytes, the limit is {_MAX_FILE_BYTES}")
+            data = path.read_bytes()
+        except OSError as error:
+            raise DataError(f"vocabulary {path} cannot be read: {error.strerror}; give one that exists") from error
+        return Vocabulary.from_bytes(data, str(path))
 
 
 def train(
@@ -126,10 +141,10 @@ def train(
     Raises DataError when there is nothing to train on.
     """
     filled = [image for image in images if len(image)]
-    if not filled or branching < 2 or depth < 1 or max_descriptors < 1:
+    if not filled or not 2 <= branching <= MAX_CHILDREN or depth < 1 or max_descriptors < 1:
         raise DataError(
-            f"training a vocabulary needs descriptors, branching >= 2, depth >= 1; got {len(filled)} images with any, "
-            f"branching {branching}, depth {depth}, at most {max_descriptors} descriptors"
+            f"training a vocabulary needs descriptors, branching 2 to {MAX_CHILDREN}, depth >= 1; got {len(filled)} "
+            f"images with any, branching {branching}, depth {depth}, at most {max_descriptors} descriptors"
         )
     total = sum(len(image) for image in filled)
     stride = -(-total // max_descriptors)
@@ -143,23 +158,23 @@ def train(
     return Vocabulary(nodes, first_child, child_count, idf)
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _read_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
     """Read the npz with bounds on what it may claim; nothing in it is ever executed."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
             claimed = sum(member.file_size for member in archive.infolist())
         if claimed > _MAX_FILE_BYTES:
-            raise DataError(f"vocabulary {path} would unpack to {claimed} bytes, the limit is {_MAX_FILE_BYTES}")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in _DTYPES}
+            raise DataError(f"vocabulary {name} would unpack to {claimed} bytes, the limit is {_MAX_FILE_BYTES}")
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {key: file[key] for key in _DTYPES}
     except DataError:
         raise
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
-        raise DataError(f"vocabulary {path} cannot be read: {error}; train it again") from error
-    for name, array in arrays.items():
-        expected = np.dtype(_DTYPES[name])
-        if array.dtype != expected or array.ndim != (0 if name == "format" else 2 if name == "nodes" else 1):
-            raise DataError(f"vocabulary {path}: '{name}' is {array.dtype} {list(array.shape)}, expected {expected}")
+        raise DataError(f"vocabulary {name} cannot be read: {error}; train it again") from error
+    for key, array in arrays.items():
+        expected = np.dtype(_DTYPES[key])
+        if array.dtype != expected or array.ndim != (0 if key == "format" else 2 if key == "nodes" else 1):
+            raise DataError(f"vocabulary {name}: '{key}' is {array.dtype} {list(array.shape)}, expected {expected}")
     return arrays
 
 
@@ -170,7 +185,12 @@ def _fault(vocabulary: Vocabulary) -> str:
     if not (len(nodes) == len(first) == len(count) >= 1) or nodes.shape[1] != 4:
         return f"its arrays disagree in length ({len(nodes)}, {len(first)}, {len(count)} nodes)"
     inner = np.flatnonzero(count)
-    if np.any(count < 0) or np.any(first[inner] <= inner) or np.any(first[inner] + count[inner] > len(nodes)):
+    if (
+        np.any(count < 0)
+        or np.any(count > MAX_CHILDREN)
+        or np.any(first[inner] <= inner)
+        or np.any(first[inner] + count[inner] > len(nodes))
+    ):
         return "a node points at children that cannot be its own"
     if len(idf) != len(nodes) - len(inner):
         return f"{len(idf)} word weights for {len(nodes) - len(inner)} leaves"
