@@ -80,9 +80,11 @@ class Chain:
         factors: Factors = list(start_factors(self.start, self._config))
         tied = []
         for before, record in pairwise(self.records):
-            k, duration_s = record.id, (record.t_ns - before.t_ns) * 1e-9
+            k, duration_s = record.id, _duration_s(before, record)
             has_imu = self.has_imu and self._inertial(factors, record, before, values, duration_s)
-            if seen[k] < min_seen:
+            if record.begins_piece:
+                factors.append(self._weak_link(k))
+            elif seen[k] < min_seen:
                 tied.append(k)
                 factors += self._odometry_factors(record, values, duration_s, has_imu)
             if record.rest_from is not None:
@@ -95,8 +97,11 @@ class Chain:
         """Return the run's odometry as metric edges; `scale_sigma` is the relative one where vision had no scale."""
         edges = []
         for record in self.records[1:]:
-            duration_s = (record.t_ns - self.records[record.id - 1].t_ns) * 1e-9
+            duration_s = _duration_s(self.records[record.id - 1], record)
             T = self._odometry[record.id - 1]
+            if record.begins_piece:
+                edges.append(self._weak_link(record.id))
+                continue
             if record.T_previous_body is None or record.covariance is None:
                 edges.append(motion.loose_motion(record.id, T, *self._loose(duration_s)))
                 continue
@@ -153,17 +158,31 @@ class Chain:
             floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=scale_sigma,
         )  # fmt: skip
 
+    def _weak_link(self, k: int) -> gtsam.BetweenFactorPose3:
+        """Return what keeps a piece of trajectory near where the run had it, should no loop tie it."""
+        config = self._config
+        T = nearest_rigid(invert(self.poses[k - 1]) @ self.poses[k])
+        return motion.loose_motion(k, T, np.deg2rad(config.piece_sigma_deg), config.piece_sigma_m)
+
     def _loose(self, duration_s: float) -> tuple[float, float]:
         config = self._config
         return np.deg2rad(config.lost_rate_sigma_deg_s) * duration_s, config.lost_speed_sigma_m_s * duration_s
 
     def _slope(self, k: int) -> Array:
         """Return the velocity [3] of keyframe k in map by differences of the run's poses."""
-        a, b = max(k - 1, 0), min(k + 1, len(self.poses) - 1)
+        last = len(self.poses) - 1
+        a = k if k == 0 or self.records[k].begins_piece else k - 1
+        b = k if k == last or self.records[k + 1].begins_piece else k + 1
         if a == b:
             return self.start.velocity_map_m_s
         duration_s = (self.records[b].t_ns - self.records[a].t_ns) * 1e-9
         return np.asarray((self.poses[b, :3, 3] - self.poses[a, :3, 3]) / duration_s)
+
+
+def _duration_s(before: KeyframeRecord, record: KeyframeRecord) -> float:
+    """Return the seconds between two keyframes; before a new piece, whose clock may have begun anew, at least one."""
+    duration_s = (record.t_ns - before.t_ns) * 1e-9
+    return max(duration_s, 1.0) if record.begins_piece else duration_s
 
 
 def _rigid(T: Array, what: str) -> Array:

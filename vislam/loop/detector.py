@@ -235,21 +235,22 @@ class LoopDetector:
             for witness in self._witnesses + (fresh or []):
                 if self._can_witness(witness, measured, joined):
                     says_the_same = agree(measured, witness, self._poses, self._config)
-                    agreeing += says_the_same
+                    agreeing += says_the_same and (joined or witness.to_id != measured.to_id)
                     disagreeing += not says_the_same
         return judge(trial.found, trial.tilt_rad, agreeing, disagreeing, self._config, joined)
 
     def _can_witness(self, witness: Measured, measured: Measured, joined: bool) -> bool:
         """Return whether a measurement can tell about another one: if the way between them is known on both sides.
 
-        Between pieces that are not joined one image is one witness, however many old keyframes it resembles.
+        Between pieces that are not joined one image can only contradict itself: two places that look alike.
         """
         apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
         reach = self._config.neighbour_keyframes
         if joined:
             return apart != (0, 0) and max(apart) <= reach
         return (
-            0 < apart[1] <= reach
+            apart != (0, 0)
+            and apart[1] <= reach
             and self._pieces.are_joined(witness.to_id, measured.to_id)
             and self._pieces.are_joined(witness.from_id, measured.from_id)
         )

@@ -1,0 +1,209 @@
+"""Relocalisation in a saved map: how often a camera that knows nothing finds its place, how well, and how soon.
+
+    .venv/bin/python experiments/relocalisation.py [--world NAME ...] [--every SECONDS] [--out results/relocalisation]
+
+One simulated recording is the map. The second one goes the same way with other motion, noise and exposure, and the
+light goes off and on every five seconds (two stops). Each query begins at another time of the second recording with a
+new visual odometry and a new piece of trajectory, and lasts one second; what it knows is its images and which way is
+up, as an IMU would tell. The answer is the pose at the keyframe with which the graph joins the piece to the map; right
+is one within 5 cm and 2 degrees of the truth, wrong one off by more than 0.5 m or 10 degrees. Map and truth are aligned
+on the map's own keyframes (SE(3)).
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vislam.clock import StageClock
+from vislam.config import Config, load
+from vislam.front import Front
+from vislam.geometry import align_points, invert, level_rotation, so3_log, transform
+from vislam.graph import PoseGraph
+from vislam.loop.detector import LoopDetector
+from vislam.messages import Array, Frame, Keyframe, KeyframePacket, Observations, Tracking, VoMeasurement
+from vislam.sim import open_world
+from vislam.sim.simulation import Simulation
+from vislam.slam import Slam
+from vislam.trajectory import write_text
+
+WORLDS = ("handheld-room", "workshop-cart", "corridor-loop")
+LIGHT = {"light_every_s": 5.0, "light_stops": 2.0}
+QUERY_S = 1.0
+RIGHT_M, RIGHT_DEG = 0.05, 2.0
+WRONG_M, WRONG_DEG = 0.5, 10.0
+MAP_SIGMAS = np.repeat([np.deg2rad(0.05), 0.002], 3)  # between keyframes of the map, which is held fixed anyway
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """What a run leaves: keyframes that loop detection knows, and where they are."""
+
+    detector: LoopDetector
+    T_map_body: Array  # [M, 4, 4]
+    T_truth_map: Array  # [4, 4]
+    ate_m: float
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of one query."""
+
+    begin_ns: int
+    answered_after_s: float | None  # None: no answer
+    keyframes: int
+    error_m: float | None
+    error_deg: float | None
+    cpu_ms: list[float]  # of loop detection, per keyframe
+
+
+def make_map(recording: Simulation, config: Config) -> SavedMap:
+    """Run the whole pipeline over a recording."""
+    slam = Slam(config, recording.rig, recording.imu_noise)
+    t_ns = []
+    for value in recording.events():
+        for step in slam.feed(value):
+            t_ns += [k.odometry.packet.keyframe.t_ns for k in step.keyframes]
+    slam.finish()
+    assert slam.back is not None and slam.back.loops is not None
+    poses = slam.back.graph.poses()
+    truth = recording.truth().at(np.array(t_ns, dtype=np.int64))
+    T_truth_map = align_points(poses[:, :3, 3], truth[:, :3, 3])
+    moved = np.array([T_truth_map @ T for T in poses])
+    ate_m = float(np.sqrt(np.mean(np.sum((moved[:, :3, 3] - truth[:, :3, 3]) ** 2, axis=1))))
+    return SavedMap(slam.back.loops, poses, T_truth_map, ate_m)
+
+
+def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGraph:
+    """Return a graph with the map's keyframes, held where they are."""
+    graph = PoseGraph(replace(config.graph, coupling="loose"), None, 9.81, recording.rig, config.window)
+    graph.initialise(None, known.T_map_body[0])
+    for k, T in enumerate(known.T_map_body):
+        moved = np.eye(4) if k == 0 else invert(known.T_map_body[k - 1]) @ T
+        t_ns = k * 1_000_000_000
+        vo = VoMeasurement(t_ns, max(k - 1, 0), moved, np.diag(MAP_SIGMAS**2), True, Tracking.OK, 0)
+        frame = Frame(t_ns, k, ())
+        bare = Keyframe(k, t_ns, frame, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
+        graph.add(KeyframePacket(bare, vo, Observations(np.empty(0, np.int64), np.empty((0, 2))), None), [], T)
+    graph.hold()
+    return graph
+
+
+def ask(known: SavedMap, recording: Simulation, first: int, config: Config) -> Answer:
+    """Begin at a frame of the second recording and go on until the place is found, or the time is up."""
+    detector, graph = copy.deepcopy(known.detector), graph_of(known, config, recording)
+    front = Front(config, recording.rig, None, StageClock())
+    count, T_map_odom, T_up, cpu_ms = len(known.T_map_body), np.eye(4), None, []
+    begin_ns = recording.render(first).t_ns
+    for index in range(first, recording.frame_count):
+        frame = recording.render(index)
+        after_s = (frame.t_ns - begin_ns) * 1e-9
+        if after_s > QUERY_S:
+            break
+        for found in front.process(frame).keyframes:
+            T_truth = recording.truth().at(np.array([frame.t_ns]))[0]
+            if T_up is None:  # nothing but which way is up
+                T_up = transform(level_rotation(T_truth[2, :3]), np.zeros(3)) @ invert(found.T_odom_body)
+            packet, T_odom_body = renumbered(found.packet, count), T_up @ found.T_odom_body
+            start = time.process_time()
+            edges = detector.detect(packet.keyframe, T_map_odom @ T_odom_body, packet.begins_piece)[0]
+            cpu_ms.append(1e3 * (time.process_time() - start))
+            update = graph.add(packet, edges, T_odom_body)
+            detector.move(update)
+            T_map_odom = update.T_map_odom
+            if update.pieces.are_joined(0, packet.keyframe.id):
+                error = invert(T_truth) @ known.T_truth_map @ T_map_odom @ T_odom_body
+                turn = so3_log(np.ascontiguousarray(error[:3, :3]))
+                metres, degrees = float(np.linalg.norm(error[:3, 3])), float(np.rad2deg(np.linalg.norm(turn)))
+                return Answer(begin_ns, after_s, len(cpu_ms), metres, degrees, cpu_ms)
+    return Answer(begin_ns, None, len(cpu_ms), None, None, cpu_ms)
+
+
+def renumbered(packet: KeyframePacket, by: int) -> KeyframePacket:
+    """Return a packet whose keyframe comes after those of the map."""
+    first = packet.keyframe.id == 0
+    keyframe = replace(packet.keyframe, id=packet.keyframe.id + by)
+    vo = replace(packet.vo, keyframe_id=packet.vo.keyframe_id + by)
+    return replace(packet, keyframe=keyframe, vo=vo, begins_piece=first or packet.begins_piece)
+
+
+def measure(world: str, every_s: float, width_px: int) -> dict[str, Any]:
+    """Return what a world gave: its map, its answers and their summary."""
+    config = load(None, {"map.enabled": False, "view.enabled": False})
+    # a query begins as a piece does after a loss: keyframes come as soon as they may
+    quick = replace(config.frontend, keyframe_max_interval_s=config.frontend.keyframe_min_interval_s)
+    known = make_map(open_world(world, 1, image_width_px=width_px), config)
+    print(f"{world}: a map of {len(known.T_map_body)} keyframes, ATE {1e3 * known.ate_m:.0f} mm", flush=True)
+    again = open_world(world, 2, image_width_px=width_px, **LIGHT)
+    hz = (again.frame_count - 1) / again.duration_s
+    firsts = range(0, round(again.frame_count - QUERY_S * hz), round(every_s * hz))
+    answers = [ask(known, again, first, replace(config, frontend=quick)) for first in firsts]
+    found = [a for a in answers if a.error_m is not None and a.error_deg is not None]
+    right = [a for a in found if a.error_m <= RIGHT_M and a.error_deg <= RIGHT_DEG]
+    wrong = [a for a in found if a.error_m > WRONG_M or a.error_deg > WRONG_DEG]
+    summary = {
+        "world": world,
+        "keyframes": len(known.T_map_body),
+        "map_ate_mm": 1e3 * known.ate_m,
+        "queries": len(answers),
+        "answered": len(found),
+        "right": len(right),
+        "right_share": len(right) / len(answers),
+        "wrong": len(wrong),
+        "error_mm": _percentiles([1e3 * a.error_m for a in found]),
+        "error_deg": _percentiles([a.error_deg for a in found]),
+        "answered_after_s": _percentiles([a.answered_after_s for a in found]),
+        "cpu_ms_per_keyframe": _percentiles([ms for a in answers for ms in a.cpu_ms]),
+    }
+    return {"summary": summary, "answers": [asdict(a) for a in answers]}
+
+
+def _percentiles(values: list[float]) -> dict[str, float]:
+    if not values:
+        return {}
+    return {f"p{q}": float(np.percentile(values, q)) for q in (50, 95, 100)}
+
+
+def _row(s: dict[str, Any]) -> str:
+    def three(name: str, digits: int) -> str:
+        return " / ".join(f"{v:.{digits}f}" for v in s[name].values()) or "-"
+
+    return (
+        f"| {s['world']} | {s['keyframes']} ({s['map_ate_mm']:.0f} mm) | {s['queries']} | {s['answered']} "
+        f"| {s['right']} ({s['right_share']:.1%}) | {s['wrong']} | {three('error_mm', 0)} | {three('error_deg', 2)} "
+        f"| {three('answered_after_s', 2)} | {three('cpu_ms_per_keyframe', 0)} |"
+    )
+
+
+def main() -> None:
+    """Measure the worlds that the command line names and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--world", nargs="+", default=list(WORLDS))
+    parser.add_argument("--every", type=float, default=0.5, help="seconds between the begins of queries")
+    parser.add_argument("--width", type=int, default=640, help="of the images, in pixels")
+    parser.add_argument("--out", type=Path, default=Path("results/relocalisation"))
+    asked = parser.parse_args()
+    cv2.setNumThreads(1)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for world in asked.world:
+        result = measure(world, asked.every, asked.width)
+        write_text(asked.out / f"{world}.json", json.dumps(result, indent=1))
+        rows.append(_row(result["summary"]))
+    titles = (
+        "world", "map", "queries", "answered", "right", "wrong", "error p50 / p95 / max [mm]", "[deg]",
+        "answered after [s]", "CPU of loop detection per keyframe [ms]",
+    )  # fmt: skip
+    print("\n".join([f"| {' | '.join(titles)} |", "|---" * len(titles) + "|", *rows]))
+
+
+if __name__ == "__main__":
+    main()
