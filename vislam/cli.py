@@ -264,7 +264,8 @@ def _print_loops(answer: dict[str, Any]) -> None:
     for name, stage in answer["stages"].items():
         numbers = [_number(stage[key], 3) for key in ("precision", "recall", "recall_at_full_precision")]
         low, high = stage["interval"]
-        table.add_row(name, str(stage["answers"]), str(stage["wrong"]), *numbers, f"{low:.2f} to {high:.2f}")
+        interval = f"{_number(low, 2)} to {_number(high, 2)}" if answer["revisits"] else "-"
+        table.add_row(name, str(stage["answers"]), str(stage["wrong"]), *numbers, interval)
     edges, rule = answer["edges"], answer["rule"]
     errors = [_number(edges[part][key], 3) for part in ("error_m", "error_deg") for key in ("median", "max")]
     console = Console()

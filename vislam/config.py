@@ -332,6 +332,7 @@ class LoopTruthConfig:
     gross_m: float = 0.5  # an edge whose translation is off by more would ruin a map
     gross_deg: float = 10.0  # or whose rotation is
     nominal_depth_m: float = 3.0  # of features without depth, to know what two views share
+    max_truth_gap_s: float = 0.3  # true poses are interpolated over less: a few millimetres by hand or on wheels
     resamples: int = 1000  # of the bootstrap
     block_keyframes: int = 10  # drawn together, because what follows each other errs alike
     confidence: float = 0.95

@@ -125,7 +125,7 @@ def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> Tru
         session.close()
     t_ns = np.array([keyframe.t_ns for keyframe in stored], dtype=np.int64)
     poses = np.array([keyframe.T_map_body for keyframe in stored]).reshape(-1, 4, 4)
-    pairs = associate(Trajectory(t_ns, poses), truth)
+    pairs = associate(Trajectory(t_ns, poses), truth, max_gap_s=rule.max_truth_gap_s)
     kept = [keyframe for keyframe, covered in zip(stored, np.isin(t_ns, pairs.t_ns), strict=True) if covered]
     if not kept:
         raise DataError(f"{session_path}: the truth covers none of {len(stored)} keyframes; do they use one clock?")

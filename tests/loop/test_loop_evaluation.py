@@ -1,5 +1,6 @@
 """Precision, recall and edge errors against the truth, and the tables that they are computed from."""
 
+import itertools
 import json
 import math
 import runpy
@@ -14,7 +15,7 @@ from landmark_world import LandmarkWorld, lap_poses, room
 
 from vislam.config import LoopConfig, LoopTruthConfig
 from vislam.errors import DataError
-from vislam.geometry import invert, se3_exp
+from vislam.geometry import interpolate, invert, se3_exp
 from vislam.loop.detector import LoopDetector
 from vislam.loop.evaluation import (
     DOUBTFUL,
@@ -37,7 +38,7 @@ from vislam.messages import (
     VoMeasurement,
 )
 from vislam.session import SessionWriter
-from vislam.trajectory import Trajectory, write_tum
+from vislam.trajectory import Trajectory, read_tum, write_tum
 
 PER_LAP = 30
 RULE = replace(LoopTruthConfig(), min_apart_s=3.0, min_apart_keyframes=20)  # keyframes come every 0.2 s here
@@ -217,6 +218,20 @@ def test_a_run_is_judged_stage_by_stage(finished: Path) -> None:
     assert low <= stages["graph"]["recall_at_full_precision"] <= high
     assert answer["edges"]["gross"] == 0
     assert answer["edges"]["error_m"]["median"] < 0.05
+
+
+def test_a_truth_with_few_poses_is_interpolated(finished: Path, tmp_path: Path) -> None:
+    for path in finished.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    truth = read_tum(finished / "trajectory_truth.tum")
+    halfway = [interpolate(a, b, 0.5) for a, b in itertools.pairwise(truth.T_world_body)]
+    between = Trajectory(truth.t_ns[:-1] + 100_000_000, np.array(halfway))
+    write_tum(between, tmp_path / "trajectory_truth.tum")
+    answer = evaluate_loops(tmp_path, RULE)
+    assert answer["keyframes"] == 2 * PER_LAP - 2  # all but the ends
+    assert answer["edges"]["gross"] == 0
+    with pytest.raises(DataError, match="covers none of"):
+        evaluate_loops(tmp_path, replace(RULE, max_truth_gap_s=0.1))
 
 
 def test_a_wrong_edge_is_counted_where_it_is(finished: Path, tmp_path: Path) -> None:

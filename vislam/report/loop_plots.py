@@ -64,7 +64,8 @@ def _draw_curves(axes: Any, answer: dict[str, Any], colors: Mapping[str, str]) -
     axes.set(xlabel="recall of true revisits", ylabel="precision")
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(0.0, 1.09)
-    axes.legend(loc="best")
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="best")
 
 
 def _draw_errors(axes: Any, answer: dict[str, Any], colors: Mapping[str, str]) -> None:
