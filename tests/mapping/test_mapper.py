@@ -13,7 +13,7 @@ from vislam.geometry import se3_exp, transform
 from vislam.mapping import _open3d
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.occupancy import Occupancy
-from vislam.mapping.octomap_io import encode_ot, read_bt
+from vislam.mapping.octomap_io import encode_ot, read_octree
 from vislam.mapping.ply import read_ply
 from vislam.messages import Frame, GraphUpdate, Keyframe
 
@@ -236,7 +236,7 @@ def test_export_is_whole_and_the_same_every_time(tmp_path):
         digests.append({k: hashlib.sha256(p.read_bytes()).hexdigest() for k, p in written.items()})
     assert digests[0] == digests[1]
     assert set(digests[0]) == {"cloud", "octomap", "grid", "grid_yaml"}
-    octree = read_bt(tmp_path / "a" / "octomap.bt")
+    octree = read_octree(tmp_path / "a" / "octomap.bt")
     assert octree.resolution_m == CONFIG.resolution_m
     assert len(read_ply(tmp_path / "a" / "cloud.ply")[0]) == len(mapper_at(TRUE).cloud())
 
@@ -244,7 +244,7 @@ def test_export_is_whole_and_the_same_every_time(tmp_path):
 def test_an_empty_map_exports_valid_files(tmp_path):
     written = Mapper(replace(CONFIG, mesh=True), RIG).export(tmp_path / "map")
     assert len(read_ply(written["cloud"])[0]) == 0
-    assert len(read_bt(written["octomap"])) == 0
+    assert len(read_octree(written["octomap"])) == 0
     assert "mesh" not in written
 
 

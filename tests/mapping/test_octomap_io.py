@@ -2,14 +2,19 @@ import re
 import shutil
 import subprocess
 import tracemalloc
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pyoctomap
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from needs import missing
 
 from vislam.errors import DataError
 from vislam.mapping.occupancy import OccupancyMap
-from vislam.mapping.octomap_io import encode_bt, encode_ot, read_bt
+from vislam.mapping.octomap_io import encode_bt, encode_ot, read_octree
 
 
 def sample_map(seed=11, scans=3):
@@ -30,7 +35,7 @@ def test_round_trip(tmp_path, bt_bytes):
     octree = sample_map().max_likelihood_octree()
     path = tmp_path / "a.bt"
     path.write_bytes(bt_bytes)
-    back = read_bt(path)
+    back = read_octree(path)
     assert back.resolution_m == octree.resolution_m
     np.testing.assert_array_equal(back.starts, octree.starts)
     np.testing.assert_array_equal(back.levels, octree.levels)
@@ -40,7 +45,7 @@ def test_round_trip(tmp_path, bt_bytes):
 
 def test_reads_a_map_of_octomap_itself(data_root):
     path = data_root / "octomap" / "geb079.bt"
-    octree = read_bt(path)
+    octree = read_octree(path)
     content = path.read_bytes()
     assert octree.resolution_m == 0.08
     data = content.index(b"data\n") + 5
@@ -65,7 +70,7 @@ def test_octomaps_own_tools_draw_the_same_boxes(tmp_path, bt_bytes):
     path.write_bytes(bt_bytes)
     run_tool("bt2vrml", path)
     boxes = (tmp_path / "a.bt.wrl").read_text().count("Box")
-    assert boxes == int((read_bt(path).log_odds >= 0).sum())
+    assert boxes == int((read_octree(path).log_odds >= 0).sum())
 
 
 def test_octomaps_own_tools_find_no_difference(tmp_path, bt_bytes):
@@ -84,22 +89,137 @@ def test_an_empty_map_is_a_valid_file(tmp_path):
     path = tmp_path / "empty.bt"
     path.write_bytes(encode_bt(OccupancyMap(0.05).max_likelihood_octree()))
     assert b"size 0\n" in path.read_bytes()
-    octree = read_bt(path)
+    octree = read_octree(path)
     assert len(octree) == 0
     assert np.isnan(octree.log_odds_at(np.zeros((1, 3)))).all()
 
 
-def test_every_truncation_is_an_error(tmp_path, bt_bytes):
-    path = tmp_path / "cut.bt"
-    data = bt_bytes.index(b"data\n") + 5
-    for length in [*range(0, data + 12), *range(data + 12, len(bt_bytes), 101), len(bt_bytes) - 1, len(bt_bytes) - 2]:
-        path.write_bytes(bt_bytes[:length])
+@pytest.mark.parametrize("kind", ["bt", "ot"])
+def test_every_truncation_is_an_error(tmp_path, kind):
+    octree = sample_map().max_likelihood_octree()
+    content = encode_bt(octree) if kind == "bt" else encode_ot(octree)
+    path = tmp_path / f"cut.{kind}"
+    data = content.index(b"data\n") + 5
+    for length in [*range(0, data + 12), *range(data + 12, len(content), 101), len(content) - 1, len(content) - 2]:
+        path.write_bytes(content[:length])
         with pytest.raises(DataError):
-            read_bt(path)
+            read_octree(path)
+
+
+@pytest.fixture
+def color_tree():
+    """A ColorOcTree of OctoMap's own with coloured, white and pruned voxels, inner nodes up to date."""
+    rng = np.random.default_rng(4)
+    tree = pyoctomap.ColorOcTree(0.1)
+    block = np.stack(np.meshgrid(*[np.arange(0.05, 0.8, 0.1)] * 3), axis=-1).reshape(-1, 3)
+    for point in np.vstack([rng.uniform(-2, 2, (400, 3)), block]):
+        tree.updateNode(point, bool(point[0] > -1.0))
+        if point[1] > -1.0:
+            tree.setNodeColor(tree.coordToKey(point), *rng.integers(0, 255, 3).tolist())
+    tree.updateInnerOccupancy()
+    tree.prune()
+    return tree
+
+
+def test_colour_trees_of_octomap_are_read_and_written_byte_for_byte(tmp_path, color_tree):
+    path = tmp_path / "color.ot"
+    color_tree.write(str(path))
+    octree = read_octree(path)
+    assert encode_ot(octree) == path.read_bytes()
+    assert (octree.levels > 0).any()
+    assert (octree.colors == 255).all(axis=1).any()
+    for centre, value, color in zip(octree.centres_m()[0], octree.log_odds, octree.colors, strict=True):
+        node = color_tree.search(centre)
+        assert (node.getLogOdds(), node.getColor()) == (value, tuple(color.tolist()))
+
+
+def test_the_binary_file_of_a_tree_for_colours_is_read(tmp_path):
+    tree = pyoctomap.ColorOcTree(0.1)
+    points = np.array([[1.05, 1.05, 1.05], [1.05, 2.05, 1.05], [-3.05, 0.05, 0.05]])
+    for point, is_occupied in zip(points, (True, False, True), strict=True):
+        tree.updateNode(point, is_occupied)
+    tree.writeBinary(str(tmp_path / "a.bt"))
+    octree = read_octree(tmp_path / "a.bt")
+    assert len(octree) == 3
+    assert (octree.log_odds_at(points) > 0).tolist() == [True, False, True]
+
+
+def test_octomap_reads_our_colours(tmp_path):
+    octree = sample_map().octree()
+    centres = octree.centres_m()[0]
+    rng = np.random.default_rng(8)
+    places, colors = np.repeat(centres[::2], 3, axis=0), rng.integers(0, 255, (3 * len(centres[::2]), 3), np.uint8)
+    coloured = octree.with_colors(np.vstack([places, [[np.nan, 0.0, 0.0]]]), np.vstack([colors, [[1, 2, 3]]]))
+    mean = colors.reshape(-1, 3, 3).sum(axis=1) // 3
+    np.testing.assert_array_equal(coloured.colors[::2], mean)
+    assert (coloured.colors[1::2] == 255).all()
+    (tmp_path / "a.ot").write_bytes(encode_ot(coloured))
+    theirs = pyoctomap.ColorOcTree(0.1).read(str(tmp_path / "a.ot"))
+    for centre, color in zip(centres[:50], coloured.colors[:50], strict=True):
+        assert theirs.search(centre).getColor() == tuple(color.tolist())
+    theirs.write(str(tmp_path / "b.ot"))
+    assert (tmp_path / "b.ot").read_bytes() == encode_ot(coloured)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.booleans())
+def test_any_octree_survives_writing_and_reading(seed, count, is_coloured):
+    rng = np.random.default_rng(seed)
+    grid = OccupancyMap(0.1)
+    grid.insert(rng.uniform(-1, 1, (count, 3)) ** 3 * 1000, np.array([500.0, 0.0, 0.0]), 3.0, "full")
+    octree = grid.octree()
+    if is_coloured:
+        octree = octree.with_colors(octree.centres_m()[0], rng.integers(0, 256, (len(octree), 3)).astype(np.uint8))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.ot"
+        path.write_bytes(encode_ot(octree))
+        back = read_octree(path)
+    np.testing.assert_array_equal(back.starts, octree.starts)
+    np.testing.assert_array_equal(back.levels, octree.levels)
+    np.testing.assert_array_equal(back.log_odds, octree.log_odds)
+    assert (back.colors is None) == (not is_coloured)
+    assert encode_ot(back) == encode_ot(octree)
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=400), st.sampled_from(["bt", "ot"]), st.sampled_from(["OcTree", "ColorOcTree"]))
+def test_whatever_follows_a_header_is_read_or_refused(data, kind, tree):
+    title = b"# Octomap OcTree binary file\n" if kind == "bt" else b"# Octomap OcTree file\n"
+    sizes = {len(data) // 5, len(data) // 8, 1}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"a.{kind}"
+        for size in sizes:
+            path.write_bytes(bt_file(data, size, title, tree))
+            try:
+                octree = read_octree(path)
+            except DataError:
+                continue
+            assert (np.diff(octree.starts) > 0).all()
+            assert np.isfinite(octree.log_odds).all()
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6), st.integers(0, 255), st.booleans())
+def test_a_changed_byte_never_does_worse_than_an_error(place, value, is_binary):
+    octree = sample_map(scans=1).octree()
+    content = bytearray(encode_bt(octree) if is_binary else encode_ot(octree))
+    content[place % len(content)] = value
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        path.write_bytes(content)
+        try:
+            back = read_octree(path)
+        except DataError:
+            return
+    assert len(back) <= len(content)
 
 
 def bt_file(data, size, head=b"# Octomap OcTree binary file\n", tree="OcTree", resolution="0.1"):
     return head + f"id {tree}\nsize {size}\nres {resolution}\ndata\n".encode() + data
+
+
+def ot_file(data, size, **changes):
+    return bt_file(data, size, b"# Octomap OcTree file\n", **changes)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +228,14 @@ def bt_file(data, size, head=b"# Octomap OcTree binary file\n", tree="OcTree", r
         (b"", "start with"),
         (b"ply\n" * 100, "start with"),
         (b"# Octomap OcTree binary file\n" + b"# padding\n" * 10**5, "no 'data' line"),
-        (bt_file(b"", 0, tree="ColorOcTree"), "ColorOcTree"),
+        (bt_file(b"", 0, tree="CountingOcTree"), "CountingOcTree"),
+        (ot_file(b"\0" * 5, 10**12), "promises"),
+        (ot_file(b"\0" * 4, 1), "promises"),
+        (ot_file(b"\0" * 5, 1, tree="ColorOcTree"), "promises"),
+        (ot_file(b"\0\0\0\0\1" * 40, 40), "16th level"),
+        (ot_file(b"\0\0\0\0\1" * 4, 4), "ends inside"),
+        (ot_file(b"\0\0\0\0\0" * 2, 2), "bytes follow"),
+        (ot_file(b"\0\0\xc0\x7f\0", 1), "finite"),
         (bt_file(b"", 0, resolution="-1"), "impossible header"),
         (bt_file(b"", 0, resolution="nan"), "impossible header"),
         (bt_file(b"", "many"), "'res' or 'size'"),
@@ -121,17 +248,17 @@ def test_damaged_and_hostile_files_are_errors(tmp_path, content, words):
     path = tmp_path / "bad.bt"
     path.write_bytes(content)
     with pytest.raises(DataError, match=words):
-        read_bt(path)
+        read_octree(path)
 
 
 def test_random_bytes_neither_crash_nor_take_memory(tmp_path):
     rng = np.random.default_rng(5)
     path = tmp_path / "noise.bt"
-    for count in (2, 64, 4096, 65536):
-        path.write_bytes(bt_file(rng.integers(0, 256, count, dtype=np.uint8).tobytes(), 1))
+    for count, write in ((2, bt_file), (64, bt_file), (65536, bt_file), (5 * 4096, ot_file), (5 * 65536, ot_file)):
+        path.write_bytes(write(rng.integers(0, 256, count, dtype=np.uint8).tobytes(), count // 5))
         tracemalloc.start()
         with pytest.raises(DataError):
-            read_bt(path)
+            read_octree(path)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 100_000 + 80 * count
@@ -140,7 +267,7 @@ def test_random_bytes_neither_crash_nor_take_memory(tmp_path):
 def test_huge_leaves_cost_nothing_until_taken_apart(tmp_path):
     path = tmp_path / "huge.bt"
     path.write_bytes(bt_file(b"\xaa\xaa", 9))  # eight occupied leaves: the whole key range
-    octree = read_bt(path)
+    octree = read_octree(path)
     assert (octree.log_odds_at(np.array([[0.0, 0.0, 0.0], [-3000.0, 3000.0, 1.0]])) > 0).all()
     with pytest.raises(DataError, match="voxels"):
         octree.occupied_voxels()
@@ -148,4 +275,4 @@ def test_huge_leaves_cost_nothing_until_taken_apart(tmp_path):
 
 def test_a_missing_file_is_an_error(tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
-        read_bt(tmp_path / "none.bt")
+        read_octree(tmp_path / "none.bt")

@@ -7,7 +7,7 @@ and no pointers, a point is found by binary search, and files are written and re
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -34,14 +34,20 @@ class Octree:
     starts: NDArray[np.int64]  # [N] Morton code of the leaf's lowest voxel, increasing
     levels: NDArray[np.uint8]  # [N] edge length 2**level voxels
     log_odds: NDArray[np.float32]  # [N] occupied from 0 on
+    colors: NDArray[np.uint8] | None = None  # [N, 3] RGB; white where there is no colour
 
     def __len__(self) -> int:
         return len(self.starts)
 
     def log_odds_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite."""
+        leaf = self.leaves_at(points_map_m)
+        return np.append(self.log_odds, np.float32(np.nan))[leaf]
+
+    def leaves_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Return the index [N] of the leaf around each point [N, 3]; -1 where there is none."""
         points = np.asarray(points_map_m, dtype=np.float64).reshape(-1, 3)
-        out = np.full(len(points), np.nan, np.float32)
+        out = np.full(len(points), -1, np.int64)
         scaled = np.floor(points * (1.0 / self.resolution_m))
         inside = (
             np.isfinite(scaled).all(axis=1) & (scaled >= -KEY_ORIGIN).all(axis=1) & (scaled < KEY_ORIGIN).all(axis=1)
@@ -51,9 +57,18 @@ class Octree:
         codes = morton_encode(scaled[inside].astype(np.int64) + KEY_ORIGIN)
         leaf = np.searchsorted(self.starts, codes, side="right") - 1
         ends = self.starts[leaf] + (np.int64(1) << (3 * self.levels[leaf].astype(np.int64)))
-        found = (leaf >= 0) & (codes < ends)
-        out[inside] = np.where(found, self.log_odds[leaf], np.float32(np.nan))
+        out[inside] = np.where((leaf >= 0) & (codes < ends), leaf, -1)
         return out
+
+    def with_colors(self, points_map_m: NDArray[np.floating], colors: NDArray[np.uint8]) -> Octree:
+        """Return the octree whose leaves have the mean RGB colour [N, 3] of the points [N, 3] in them, else white."""
+        leaf = self.leaves_at(points_map_m)
+        counts = np.bincount(leaf[leaf >= 0], minlength=len(self))
+        mean = np.full((len(self), 3), 255, np.uint8)
+        for channel in range(3):
+            sums = np.bincount(leaf[leaf >= 0], colors[leaf >= 0, channel], len(self))
+            mean[counts > 0, channel] = sums[counts > 0] / counts[counts > 0]
+        return replace(self, colors=mean)
 
     def boxes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return lowest voxel [N, 3] (0 at the map's origin) and edge length in voxels [N] of every leaf."""
