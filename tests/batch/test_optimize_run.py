@@ -14,8 +14,9 @@ from vislam.frames import LoggedFrames
 from vislam.geometry import invert, so3_log
 from vislam.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
 
-CONFIG = Config()
-QUICK = Config(batch=BatchConfig(rounds=3, covariances=False))
+NO_VIBRATION = BatchConfig(imu_inflation=1.0)  # the simulated IMU is as white as its model says
+CONFIG = Config(batch=NO_VIBRATION)
+QUICK = Config(batch=replace(NO_VIBRATION, rounds=3, covariances=False))
 
 
 def changed(log, ids, change):
