@@ -1,4 +1,4 @@
-"""How good the loops of a finished run are, stage by stage, against its truth: `loops_eval.json` and its picture."""
+"""How good the loops of a finished run are, stage by stage, against its truth."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from vislam.loop.evaluation import (
     precision_recall,
     true_places,
 )
-from vislam.loop.table import LoopRow, read_loops, read_retrieved
+from vislam.loop.table import LoopRow, csv_text, read_loops, read_retrieved
 from vislam.messages import Array, LoopDecision
 from vislam.runfolder import write_json
 from vislam.session import Session, StoredKeyframe
-from vislam.trajectory import Trajectory, associate, read_trajectory
+from vislam.trajectory import Trajectory, associate, read_trajectory, write_text
 
-EVALUATION = "loops_eval.json"
+EVALUATION, EDGE_ERRORS = "loops_eval.json", "loops_eval.csv"
 _MAX_POINTS = 400  # of a curve that is stored
 _MAX_WORST = 20  # edges that are listed
 _TEMPORAL = 1  # keyframes before that must have pointed at the same place
@@ -58,12 +58,19 @@ class JudgedLoops:
 
 
 def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> dict[str, Any]:
-    """Compare the loops of a run with the truth, write `loops_eval.json` into its folder and return what is in it.
+    """Compare the loops of a run with the truth, write what came out into its folder and return the summary.
 
-    Raises DataError when the folder lacks what is needed.
+    `loops_eval.json` holds the summary, `loops_eval.csv` the error of every edge. Raises DataError when the folder
+    lacks what is needed.
     """
-    answer = summarise(judge_loops(run, rule, reference), rule)
+    judged = judge_loops(run, rule, reference)
+    answer = summarise(judged, rule)
     write_json(run / EVALUATION, answer)
+    rows = [
+        [e.row.from_id, e.row.to_id, f"{e.error_m:.6g}", f"{e.error_deg:.6g}", int(e.is_gross), int(e.is_apart)]
+        for e in judged.edges
+    ]
+    write_text(run / EDGE_ERRORS, csv_text(("from_id", "to_id", "error_m", "error_deg", "gross", "apart"), rows))
     return answer
 
 

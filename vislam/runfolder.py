@@ -31,10 +31,10 @@ _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
 _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
 _RUN_FILES = (
     "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "loops_eval.json",
-    "loops_eval.png", "session.db", "session.db-wal", "session.db-shm", "run.rrd", "report.html", "states_ekf.csv",
-    "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum", "trajectory_batch.tum",
-    "trajectory_truth.tum", "states_batch.csv", "map/cloud.ply", "map/mesh.ply", "map/octomap.bt", "map/grid.pgm",
-    "map/grid.yaml", "map/picture_cloud.png", "map/picture_octree.png",
+    "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal", "session.db-shm", "run.rrd", "report.html",
+    "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum",
+    "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/cloud.ply", "map/mesh.ply",
+    "map/octomap.bt", "map/grid.pgm", "map/grid.yaml", "map/picture_cloud.png", "map/picture_octree.png",
 )  # fmt: skip
 _TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
 

@@ -218,6 +218,10 @@ def test_a_run_is_judged_stage_by_stage(finished: Path) -> None:
     assert low <= stages["graph"]["recall_at_full_precision"] <= high
     assert answer["edges"]["gross"] == 0
     assert answer["edges"]["error_m"]["median"] < 0.05
+    lines = (finished / "loops_eval.csv").read_text().splitlines()
+    assert lines[0] == "from_id,to_id,error_m,error_deg,gross,apart"
+    assert len(lines) == 1 + answer["edges"]["accepted"]
+    assert max(float(line.split(",")[2]) for line in lines[1:]) == pytest.approx(answer["edges"]["error_m"]["max"])
 
 
 def test_a_truth_with_few_poses_is_interpolated(finished: Path, tmp_path: Path) -> None:
