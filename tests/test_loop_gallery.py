@@ -11,7 +11,8 @@ import pytest
 from vislam import loop_gallery
 from vislam.loop.table import LoopRow, caption
 from vislam.loop_gallery import LoopGallery, chosen
-from vislam.messages import Frame, Keyframe, LoopCandidate, LoopDecision
+from vislam.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
+from vislam.runfolder import RunLog
 
 
 def row(from_id, to_id, decision="rejected", reason="9 inliers, needs 12", **changes):
@@ -104,3 +105,29 @@ def test_a_picture_that_cannot_be_written_says_so(tmp_path):
     (tmp_path / "loops").write_text("in the way")
     with pytest.raises(Exception, match="cannot be written"):
         gallery.write(tmp_path, [row(0, 2)])
+
+
+def test_what_an_accepted_loop_moved_is_told_with_it():
+    def keyframe_step(k, x_m, moved, accepted=(), edges=(), candidates=()):
+        pose = np.eye(4)
+        pose[0, 3] = x_m
+        poses = np.tile(np.eye(4), (len(moved), 1, 1))
+        poses[:, 0, 3] = list(moved.values())
+        update = GraphUpdate(k, np.array(list(moved), np.int64), poses, np.eye(4), None, accepted)
+        told = step(k, candidates)
+        told.odometry.packet.imu, told.odometry.T_odom_body = None, pose
+        told.update, told.edges, told.retrieved = update, list(edges), []
+        return told
+
+    accepted = replace(candidate(0, 2), decision=LoopDecision.ACCEPTED)
+    edge = LoopEdge(7, 0, 2, np.eye(4), np.eye(6), True, 30, 0.5)
+    log = RunLog()
+    log.add_keyframe(keyframe_step(0, 0.0, {0: 0.0}))
+    log.add_keyframe(keyframe_step(1, 1.0, {}))  # where odometry put it
+    log.add_keyframe(keyframe_step(2, 2.0, {1: 1.3, 2: 2.5}, (7,), [edge], [accepted, candidate(1, 2)]))
+    report = SimpleNamespace(chi2=3.0, weight=0.9, decision=LoopDecision.ACCEPTED, reason="inside the gate")
+    taken, other = log.loop_rows({7: report})
+    assert taken.moved_max_m == pytest.approx(0.3)
+    assert taken.moved_rms_m == pytest.approx(np.sqrt(0.3**2 / 2))  # of the two that were there before
+    assert (taken.chi2, taken.weight, taken.was_offered) == (3.0, 0.9, True)
+    assert math.isnan(other.moved_max_m) and not other.was_offered
