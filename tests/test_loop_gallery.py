@@ -94,8 +94,12 @@ def test_memory_is_bounded(monkeypatch):
 
 def test_a_caption_says_what_is_known_and_leaves_out_the_rest():
     assert caption(row(3, 9)) == "3 – 9 rejected: 9 inliers, needs 12"
-    known = row(3, 9, "accepted", "fits", chi2=4.24, weight=0.5, moved_rms_m=0.012, moved_max_m=0.1)
-    assert caption(known) == ("3 – 9 accepted: fits, χ² 4.2, weight 0.50, moved the map by 1.2 cm rms, 10.0 cm at most")
+    known = row(
+        3, 9, "accepted", "30 inliers; chi2 4.2 within 22.5", chi2=4.24, weight=0.5, moved_rms_m=0.012, moved_max_m=0.1
+    )
+    assert caption(known) == (
+        "3 – 9 accepted: 30 inliers; chi2 4.2 within 22.5, weight 0.50, moved the map by 1.2 cm rms, 10.0 cm at most"
+    )
 
 
 def test_a_picture_that_cannot_be_written_says_so(tmp_path):

@@ -118,10 +118,9 @@ def read_retrieved(path: Path) -> list[RetrievedKeyframe]:
 
 
 def caption(row: LoopRow) -> str:
-    """Return what is known about a candidate in one line."""
+    """Return what is known about a candidate in one line; the reason holds inliers, sigma and chi-square."""
     parts = [f"{row.from_id} – {row.to_id} {row.decision}: {row.reason}"]
     for text, value, factor in (
-        ("χ² {:.1f}", row.chi2, 1.0),
         ("weight {:.2f}", row.weight, 1.0),
         ("moved the map by {:.1f} cm rms", row.moved_rms_m, 100.0),
         ("{:.1f} cm at most", row.moved_max_m, 100.0),
