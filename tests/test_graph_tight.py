@@ -15,12 +15,13 @@ from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError
 from vislam.factors import estimator
 from vislam.factors.estimator import Estimator
-from vislam.factors.journal import KeyframeRecord, StartRecord, WindowRecord
+from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.loop import LoopModel
 from vislam.factors.window import WindowOdometry
 from vislam.geometry import invert, so3_log
 from vislam.graph import PoseGraph
 from vislam.graph.source import in_map
+from vislam.memory import WindowRecord
 from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision
 from vislam.window.messages import WindowUpdate
 

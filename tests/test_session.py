@@ -8,11 +8,13 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from session_world import decided, start_facts
 
 from vislam.camera import Camera, Rig
 from vislam.errors import DataError, StorageError
 from vislam.geometry import se3_exp
 from vislam.imu import ImuNoise
+from vislam.memory import FrameEntry, GraphNews, KeyframeEntry
 from vislam.messages import (
     Frame,
     GraphUpdate,
@@ -65,9 +67,13 @@ def state(t_ns):
     return NavState(t_ns, se3_exp(np.full(6, 0.3)), np.ones(3), np.full(3, 1e-3), np.full(3, 0.1), np.eye(15) / 3.0)
 
 
-def update(revision, ids, poses, accepted=(), rejected=(), newest=None):
+def update(revision, ids, poses, newest=None):
     poses = np.array(poses).reshape(-1, 4, 4)
-    return GraphUpdate(revision, np.array(ids, np.int64), poses, np.eye(4), newest, accepted, rejected)
+    return GraphUpdate(revision, np.array(ids, np.int64), poses, np.eye(4), newest)
+
+
+def news(accepted=(), rejected=()):
+    return GraphNews(loops=tuple(decided(i, i in accepted) for i in (*accepted, *rejected)))
 
 
 def write_three(path, count=3):
@@ -79,10 +85,11 @@ def write_three(path, count=3):
     refused = LoopEdge(6, 1, 2, poses[1], np.eye(6), True, 12, 0.1)
     for i in range(count):
         edges, accepted, rejected = ([edge, refused], (5,), (6,)) if i == 2 else ([], (), ())
-        writer.add_frame(1000 * i - 500, i - 1, None if i == 0 else poses[0])
-        writer.add_frame(1000 * i, i, np.eye(4))
-        change = update(i + 1, [i], [poses[i]], accepted, rejected, state(1000 * i))
-        writer.add(packets[i], poses[i], change, edges, state(0) if i == 0 else None)
+        writer.add_frame(FrameEntry(1000 * i - 500, i - 1, None if i == 0 else poses[0]))
+        writer.add_frame(FrameEntry(1000 * i, i, np.eye(4)))
+        change = update(i + 1, [i], [poses[i]], state(1000 * i))
+        start = start_facts(state(0), NOISE)
+        writer.add(KeyframeEntry(packets[i], poses[i], change, news(accepted, rejected), edges, start=start))
     return writer, packets, poses, edge
 
 
@@ -98,7 +105,7 @@ def test_a_session_gives_back_what_was_stored(tmp_path):
     writer, packets, poses, edge = write_three(tmp_path / "session.db")
     frames = [p.keyframe for p in packets]
     moved = se3_exp(np.full(6, 0.1))
-    writer.move(update(4, [1], [moved]))
+    writer.move(update(4, [1], [moved]), news())
     writer.close()
     session = Session(tmp_path / "session.db")
     stored = list(session.keyframes())
@@ -124,7 +131,7 @@ def test_a_session_gives_back_what_was_stored(tmp_path):
 def test_the_factor_log_gives_back_every_measurement(tmp_path):
     print("seed", SEED)
     writer, packets, poses, edge = write_three(tmp_path / "session.db")
-    writer.add_frame(2500, 2, poses[2])
+    writer.add_frame(FrameEntry(2500, 2, poses[2]))
     writer.close()
     log = Session(tmp_path / "session.db").factor_log()
     assert log.rig.cameras == RIG.cameras
@@ -149,7 +156,7 @@ def test_the_factor_log_gives_back_every_measurement(tmp_path):
 
 def test_a_loop_decided_later_changes_its_decision(tmp_path):
     writer, *_ = write_three(tmp_path / "session.db")
-    writer.move(update(4, [], [], accepted=(6,), rejected=(5,)))
+    writer.move(update(4, [], []), news(accepted=(6,), rejected=(5,)))
     writer.close()
     session = Session(tmp_path / "session.db")
     assert [e.id for e in session.edges()] == [6]
@@ -159,10 +166,10 @@ def test_a_loop_decided_later_changes_its_decision(tmp_path):
 def test_a_failed_commit_leaves_no_half_keyframe(tmp_path):
     """Whatever breaks in the middle of a keyframe, packet, edges and frames of it are all absent."""
     writer, packets, poses, edge = write_three(tmp_path / "session.db", count=2)
-    bad = update(3, [2], [poses[2]], accepted=(("not", "an id"),))
-    writer.add_frame(1500, 1, None)
+    bad = GraphNews(loops=(decided(("not", "an id"), True),))
+    writer.add_frame(FrameEntry(1500, 1, None))
     with pytest.raises(StorageError):
-        writer.add(packets[2], poses[2], bad, [edge])
+        writer.add(KeyframeEntry(packets[2], poses[2], update(3, [2], [poses[2]]), bad, [edge]))
     log = Session(tmp_path / "session.db").factor_log()
     assert len(log.keyframes) == 2
     assert log.edges == []
@@ -172,7 +179,7 @@ def test_a_failed_commit_leaves_no_half_keyframe(tmp_path):
 def test_a_killed_writer_leaves_every_committed_keyframe(tmp_path):
     path = tmp_path / "session.db"
     script = textwrap.dedent(f"""
-        import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
+        import sys; sys.path[:0] = [{os.path.dirname(__file__)!r}, {os.path.join(os.path.dirname(__file__), "batch")!r}]
         from pathlib import Path
         from test_session import write_three
         writer, *_ = write_three(Path({str(path)!r}))
@@ -241,7 +248,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
     database = sqlite3.connect(tmp_path / "session.db")
     database.execute("PRAGMA user_version=1")
     database.close()
-    with pytest.raises(DataError, match="format 1, this vislam reads 2; run the recording again"):
+    with pytest.raises(DataError, match="format 1, this vislam reads 3; run the recording again"):
         Session(tmp_path / "session.db")
 
 

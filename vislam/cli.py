@@ -106,6 +106,9 @@ def _run(arguments: list[str]) -> int:
     from vislam.options import RunOptions, run_options
 
     command = ["vislam", "run", *arguments]
+    resumed = _take_option(arguments, "--resume")
+    if resumed is not None:
+        return _resume(Path(resumed), arguments, command)
     config_path = _take_option(arguments, "--config")
     base = load(Path(config_path) if config_path else None)
     options = _parse(RunOptions, arguments, "run", run_options(base))
@@ -113,25 +116,54 @@ def _run(arguments: list[str]) -> int:
         print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
         return 0
     metrics = _run_source(options.source, options.settings, options.out, options.overwrite, command)
-    if options.json:
-        print(json.dumps(metrics))
-    else:
-        _print_summary(metrics, options.out)
+    _show(metrics, options.out, options.json)
     return 0
+
+
+def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
+    """Go on with the run in a folder, whatever ended it."""
+    from vislam.options import ResumeOptions
+    from vislam.run import resume
+    from vislam.runfolder import read_setup
+    from vislam.sources import open_source
+
+    options = _parse(ResumeOptions, arguments, "run")
+    source, config = read_setup(out)
+    recording = open_source(source, config.seed)
+    with _written_up(out), _progress(recording.name) as progress:
+        metrics = resume(recording, config, out, source, command, progress)
+    _show(metrics, out, options.json)
+    return 0
+
+
+def _show(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
+    from vislam.runfolder import plain
+
+    if as_json:
+        print(json.dumps(plain(metrics)))
+    else:
+        _print_summary(metrics, out)
 
 
 def _run_source(source: str, settings: Config, out: Path, overwrite: bool, command: list[str]) -> dict[str, Any]:
     """Run a source into a folder and write its report, whatever happened on the way."""
-    from vislam.report import write_report
     from vislam.run import execute
     from vislam.runfolder import prepare
     from vislam.sources import open_source
 
     recording = open_source(source, settings.seed)
     prepare(out, overwrite)
+    with _written_up(out), _progress(recording.name) as progress:
+        return execute(recording, settings, out, source=source, command=command, progress=progress)
+
+
+@contextmanager
+def _written_up(out: Path) -> Iterator[None]:
+    """Write the report of a run afterwards, whatever happened on the way."""
+    from vislam.report import write_report
+
     try:
-        with _progress(recording.name) as progress:
-            return execute(recording, settings, out, source=source, command=command, progress=progress)
+        yield
     finally:
         if (out / "metrics.json").is_file():
             write_report(out)
@@ -396,7 +428,9 @@ def _report(arguments: list[str]) -> int:
 
 _VERBS = {
     "demo": _Verb(_demo, "simulate a cart in a workshop and run everything on it", "vislam demo"),
-    "run": _Verb(_run, "run the pipeline on a recording", "vislam run tum:PATH --out runs/desk"),
+    "run": _Verb(
+        _run, "run the pipeline on a recording; --resume RUN goes on with one", "vislam run tum:PATH --out runs/desk"
+    ),
     "simulate": _Verb(_simulate, "record a simulated world", "vislam simulate corridor-loop --out recordings/corridor"),
     "eval": _Verb(_eval, "compare a trajectory with the truth", "vislam eval runs/desk"),
     "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),

@@ -11,21 +11,24 @@ import numpy as np
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
-from vislam.ekf import Ekf, MsckfEkf, make_ekf
+from vislam.ekf import CameraCalibration, Ekf, MsckfEkf, make_ekf
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
+from vislam.frontend.result import identity_motion, lost_motion
 from vislam.frontend.stillness import Stillness
 from vislam.frontend.uniform_motion import UniformMotion
 from vislam.geometry import invert, level_rotation, transform
 from vislam.imu import ImuBuffer, ImuNoise, NoiseEnvelope, RestDetector, subtract_bias
+from vislam.memory import FrontMemory, FrontNews, StartFacts
 from vislam.messages import (
     Array,
     Frame,
     GraphUpdate,
     ImuSample,
     ImuSpan,
+    Keyframe,
     KeyframePacket,
     MagSample,
     NavState,
@@ -118,6 +121,54 @@ class Front:
         self._T_odom_body: Array | None = None
         self._T_vo_body = self._T_vo_keyframe.copy()
         self._waiting: list[OdometryKeyframe] = []  # in frame `vo`, until gravity is known
+        self._resumed: FrontMemory | None = None  # until its keyframe was seen again
+
+    def resume(self, memory: FrontMemory) -> None:
+        """Go on where an earlier run was, before the first sample and frame: the first frame is its newest keyframe.
+
+        That keyframe comes out again, with its old id and pose, as it is seen now.
+        """
+        self._resumed = memory
+        self.frontend.begin_at(memory.keyframe_id, memory.news)
+        self._T_vo_keyframe, self._T_vo_body = memory.T_odom_body, memory.T_odom_body.copy()
+        start, state, camera = memory.start, memory.state, memory.news.filter_camera
+        if start is None or state is None or self._ekf is None:
+            return
+        self.camera_clock.start_at(memory.time_offset_s, memory.news.time_offset_sigma_s)
+        self.first_state, self.last_refusal = start.first_state, start.reason
+        self.initialisation = Initialisation(
+            start.status, start.reason, start.first_state, start.last, scale_sigma=start.scale_sigma,
+            excitation_m_s2=start.excitation_m_s2,
+        )  # fmt: skip
+        self.noise = start.noise
+        ekf = self._ekf = self._make_ekf(noise=start.noise)
+        if isinstance(ekf, MsckfEkf) and camera is not None:
+            found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
+            ekf.initialise(state, None, found)
+        else:
+            ekf.initialise(state, identity_motion(memory.t_ns, memory.keyframe_id, True, 0))
+
+    @property
+    def start(self) -> StartFacts | None:
+        """How gravity was found; None until then, or without an IMU."""
+        found = self.initialisation
+        if found is None or found.last is None or self.noise is None or self.first_state is None:
+            return None
+        return StartFacts(
+            found.status, found.reason, found.last, found.scale_sigma, found.excitation_m_s2, self.noise,
+            self.first_state,
+        )  # fmt: skip
+
+    @property
+    def news(self) -> FrontNews:
+        """What was learned so far, beside the filter's state."""
+        camera = None
+        if isinstance(self._ekf, MsckfEkf):
+            found = self._ekf.calibration
+            camera = np.array([
+                found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
+            ])  # fmt: skip
+        return replace(self.frontend.news, time_offset_sigma_s=self.camera_clock.sigma_s, filter_camera=camera)
 
     def add(self, value: ImuSample | MagSample) -> None:
         """Take a sample of an inertial sensor; the filter predicts at once."""
@@ -145,6 +196,7 @@ class Front:
         before = self._ekf.state() if self._ekf is not None and self._ekf.initialised else None
         with self._clock.measure("track"):
             track = self.frontend.track(frame, *self._without_bias(span, before), self._predicted(frame.t_ns, before))
+            track = self._linked(frame, track)
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, before))
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and self._stillness.resting
@@ -200,6 +252,19 @@ class Front:
     def nis_statistics(self) -> dict[str, tuple[int, float, int]]:
         """Innovations that the filter accepted, by measurement: count, sum of NIS, sum of degrees of freedom."""
         return {} if self._ekf is None else self._ekf.nis_statistics
+
+    def _linked(self, frame: Frame, track: TrackResult) -> TrackResult:
+        """Return the track, tied to the keyframes of an earlier run where it begins anew."""
+        memory, self._resumed = self._resumed, None
+        if memory is not None and track.keyframe is None:  # too little to see there for a start: a lost keyframe
+            self.frontend.begin_at(memory.keyframe_id + 1, memory.news)
+            bare = np.empty((0, 2)), np.empty((0, 32), np.uint8)
+            keyframe = Keyframe(memory.keyframe_id, frame.t_ns, frame, *bare, None)
+            vo = identity_motion(frame.t_ns, memory.keyframe_id, track.vo.has_scale, 0)
+            return replace(track, keyframe=keyframe, vo=vo)
+        if memory is None and track.keyframe is not None and track.vo.keyframe_id == track.keyframe.id > 0:
+            return replace(track, vo=lost_motion(frame.t_ns, self._keyframe_id, track.vo.has_scale))
+        return track
 
     def _span(self, from_t_ns: int | None, to_t_ns: int) -> ImuSpan | None:
         if not self._has_imu or from_t_ns is None:

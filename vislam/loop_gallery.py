@@ -38,6 +38,10 @@ class LoopGallery:
         self._matches: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=_MAX_MATCHED)
         self._candidates = 0
 
+    def skip(self, candidates: int) -> None:
+        """Leave out candidates of an earlier process, whose pictures are gone."""
+        self._candidates += candidates
+
     def add(self, step: KeyframeStep) -> None:
         """Remember a keyframe's picture, and the matches of its candidates; those come in the order of loops.csv."""
         keyframe = step.odometry.packet.keyframe

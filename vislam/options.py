@@ -31,6 +31,14 @@ class RunOptions:
 
 
 @dataclass(frozen=True)
+class ResumeOptions:
+    """Options of `vislam run --resume RUN`; source and settings are those that the run began with."""
+
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+@dataclass(frozen=True)
 class DemoOptions:
     """Options of `vislam demo`."""
 

@@ -24,8 +24,11 @@ class Recording(Protocol):
     frame_count: int  # frames that `events` will yield if nothing is damaged
     problems: dict[str, int]  # what was skipped so far, by kind, for the report
 
-    def events(self) -> Iterator[ImuSample | MagSample | Frame]:
-        """Yield samples and frames in time order; can be called again for a second pass."""
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        """Yield samples and frames in time order; can be called again for a second pass.
+
+        Frames before `from_ns` may be left out, where reading them takes time.
+        """
         ...
 
     def truth(self) -> Trajectory | None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from vislam.config import Config, ImuConfig
-from vislam.errors import DataError, TrackingLostError, VislamError
+from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.loop_gallery import LoopGallery
@@ -21,13 +23,17 @@ from vislam.mapping.cloud import Cloud
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.picture import Line, render_cloud, render_octree
 from vislam.mapping.ply import read_ply
-from vislam.messages import LoopDecision, Tracking
+from vislam.memory import FrontMemory, GraphNews, KeyframeEntry
+from vislam.messages import Frame, ImuSample, LoopDecision, MagSample, Tracking
 from vislam.recording import Recording
 from vislam.runfolder import RunLog, storage, write_json, write_setup
-from vislam.session import SessionWriter
+from vislam.session import Session, SessionWriter, has_begun, recall
 from vislam.slam import KeyframeStep, Slam, Step
 from vislam.trajectory import Trajectory, align, associate, evaluate
-from vislam.viewer import open_viewer
+from vislam.viewer import NullViewer, open_viewer
+
+if TYPE_CHECKING:
+    from vislam.viewer.recording import RunViewer
 
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
@@ -38,6 +44,7 @@ _GATED_SHARE = 0.1  # of the visual motions that the filter refused: more than o
 _APART_M = 0.5  # rms between filter and graph that is no drift ...
 _APART_SHARE = 0.05  # ... and the share of the way that is none either
 _MIN_COMPARED = 10  # poses
+_INERTIAL_BEFORE_NS = 1_000_000_000  # given again before the keyframe at which a run is resumed
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
@@ -52,22 +59,51 @@ def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
 class Run:
     """Drives the pipeline over one recording and keeps the run folder."""
 
-    def __init__(self, recording: Recording, config: Config, out: Path, source: str, command: list[str]) -> None:
-        """Open the outputs in an existing, empty folder."""
+    def __init__(self, recording: Recording, config: Config, out: Path, session: SessionWriter) -> None:
+        """Open the outputs in an existing folder; `session` is a new one, or that of a run to `resume`."""
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
         self.recording = recording
         self.config = config
         self.out = out
-        write_setup(out, config, source, command)
         self.noise = imu_noise(config.imu, recording.imu_noise)
         self.slam = Slam(config, recording.rig, self.noise)
         self.log = RunLog()
         self.gallery = LoopGallery()
-        info = {"source": source, "config": asdict(config)}
-        gravity_m_s2 = config.imu.gravity_m_s2
-        self.session = SessionWriter(out / "session.db", info, recording.rig, self.noise, gravity_m_s2)
-        self.viewer = open_viewer(out / "run.rrd", config.view.enabled, recording.rig, config.view)
+        self.session = session
+        self.resumed: list[dict[str, Any]] = []
+        self._first_frame = 0  # that was not remembered from an earlier process
+        self._from: FrontMemory | None = None
+        self.viewer: RunViewer | NullViewer = NullViewer()
         self.warnings: list[str] = []
+
+    def resume(self, stored: Session) -> bool:
+        """Go on where a run ended, before `execute`; False when there is nothing yet to go on from.
+
+        Raises UsageError when the run is finished or began with other settings.
+        """
+        info = stored.info()
+        if info.get("finished"):
+            raise UsageError(f"the run in {self.out} came to its end; there is nothing to resume")
+        if info.get("config") != json.loads(json.dumps(asdict(self.config))):
+            raise UsageError(f"{self.out / 'config.json'} was changed since the run began; start a new run")
+        memory = recall(stored)
+        if memory is None:
+            return False
+        update = self.slam.resume(memory)
+        self.log.restore(stored, memory)
+        self.gallery.skip(self.log.candidates)
+        front = memory.front
+        self._first_frame, self._from = len(self.log), front
+        t_s = (front.t_ns - int(self.log.stamps_ns[0])) * 1e-9
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        self.resumed = [*info.get("resumed", []), {"keyframe": front.keyframe_id, "t_s": t_s, "utc": now}]
+        self.session.tell({"resumed": self.resumed})
+        self.session.move(update, GraphNews())
+        self.warnings.append(
+            f"resumed {len(self.resumed)} times, last at keyframe {front.keyframe_id}: timings, counters and "
+            "real-time factor are those of the part since then"
+        )
+        return True
 
     def execute(self, progress: Progress | None = None) -> dict[str, Any]:
         """Process the whole recording and write every file; return the metrics.
@@ -76,6 +112,7 @@ class Run:
         fewer than half of the frames got a pose.
         """
         start = time.perf_counter()
+        self._open_viewer()
         failure: BaseException | None = None
         try:
             self._feed(progress)
@@ -84,6 +121,7 @@ class Run:
             self.warnings.append(f"stopped early: {error or 'interrupted'}")
         try:
             metrics = self._finish(start)
+            self.session.close(finished=failure is None)
         except VislamError as error:
             raise failure or error from error
         if failure is not None:
@@ -91,9 +129,18 @@ class Run:
         self._judge(metrics)
         return metrics
 
+    def _open_viewer(self) -> None:
+        """Open the Rerun recording; that of a run that is resumed goes on in another file."""
+        rig, view, back = self.recording.rig, self.config.view, self.slam.back
+        part = "" if not self.resumed else f"_{len(self.resumed) + 1}"
+        self.viewer = open_viewer(self.out / f"run{part}.rrd", view.enabled, rig, view)
+        if self._from is not None and back is not None:
+            poses = dict(zip(back.graph.ids.tolist(), back.graph.poses(), strict=True))
+            self.viewer.go_on(int(self.log.stamps_ns[0]), poses)
+
     def _feed(self, progress: Progress | None) -> None:
         clock = self.slam.clock
-        values = iter(self.recording.events())
+        values = iter(self._values())
         while True:
             with clock.measure("read"):
                 value = next(values, None)
@@ -104,9 +151,30 @@ class Run:
                 if progress is not None:
                     progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
 
+    def _values(self) -> Iterator[ImuSample | MagSample | Frame]:
+        """Yield the recording, or what is left of it."""
+        if self._from is None:
+            yield from self.recording.events()
+            return
+        begin_ns = self._from.camera_t_ns
+        samples_ns = min(begin_ns, self._from.t_ns) - _INERTIAL_BEFORE_NS
+        begun = False
+        for value in self.recording.events(begin_ns):
+            if value.t_ns < (begin_ns if isinstance(value, Frame) else samples_ns):
+                continue
+            if isinstance(value, Frame) and not begun:
+                if value.t_ns != begin_ns:
+                    raise DataError(
+                        f"{self.recording.name} has no frame at {begin_ns} ns, where the last keyframe of {self.out} "
+                        "is; give the recording that the run began with"
+                    )
+                begun = True
+            yield value
+
     def _take(self, step: Step) -> None:
-        self.log.add(step)
-        self.session.add_frame(step.front.frame.t_ns, step.front.keyframe_id, step.front.T_keyframe_body)
+        if self._from is not None and step.front.frame.t_ns <= self._from.t_ns:
+            return  # the keyframe at which the run is resumed is remembered already
+        self.session.add_frame(self.log.add(step))
         for keyframe in step.keyframes:
             self._store(keyframe)
         with self.slam.clock.measure("view"):
@@ -114,9 +182,13 @@ class Run:
 
     def _store(self, step: KeyframeStep) -> None:
         with self.slam.clock.measure("store"):
-            odometry = step.odometry
-            first_state = self.slam.front.first_state
-            self.session.add(odometry.packet, odometry.T_odom_body, step.update, step.edges, first_state)
+            packet, front = step.odometry.packet, self.slam.front
+            entry = KeyframeEntry(
+                packet, step.odometry.T_odom_body, step.update, step.news, step.edges, step.candidates, step.retrieved,
+                self.log.shifts(step.update.accepted_loop_ids), step.scan, step.words, step.tags, front.start,
+                front.news, self.log.filter_state(packet.keyframe.id),
+            )  # fmt: skip
+            self.session.add(entry)
             self.gallery.add(step)
 
     def _show(self, step: Step) -> None:
@@ -144,10 +216,9 @@ class Run:
         for keyframe in finish.keyframes:
             self.log.add_keyframe(keyframe)
             self._store(keyframe)
-        if finish.update is not None:
-            self.session.move(finish.update)
+        if finish.update is not None and finish.news is not None:
+            self.session.move(finish.update, finish.news)
             self.viewer.move(finish.update)
-        self.session.close()
         final, rows, loops = self._write_estimates()
         self._explain(rows)
         truth = self._truth()
@@ -219,6 +290,8 @@ class Run:
         front, back = self.slam.front, self.slam.back
         stamps = self.log.stamps_ns
         duration_s = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
+        part = stamps[self._first_frame :]
+        part_s = float(part[-1] - part[0]) * 1e-9 if len(part) else 0.0
         counters: dict[str, Any] = {**front.all_counters}
         if back is not None:
             rooms = {"loop": back.loops, "map": back.mapper}
@@ -249,7 +322,8 @@ class Run:
             "keyframes": self.log.keyframes,
             "duration_s": duration_s,
             "wall_s": wall_s,
-            "realtime_factor": duration_s / wall_s if wall_s > 0.0 else None,
+            "realtime_factor": part_s / wall_s if wall_s > 0.0 else None,
+            "resumed": self.resumed,
             "initialisation": {
                 "status": "none" if found is None else str(found.status),
                 "reason": front.last_refusal if found is None else found.reason,
@@ -343,4 +417,34 @@ def execute(
     recording: Recording, config: Config, out: Path, source: str, command: list[str], progress: Progress | None = None
 ) -> dict[str, Any]:
     """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`."""
-    return Run(recording, config, out, source, command).execute(progress)
+    write_setup(out, config, source, command)
+    info = {"source": source, "config": asdict(config)}
+    noise = imu_noise(config.imu, recording.imu_noise)
+    session = SessionWriter(out / "session.db", info, recording.rig, noise, config.imu.gravity_m_s2)
+    return Run(recording, config, out, session).execute(progress)
+
+
+def resume(
+    recording: Recording, config: Config, out: Path, source: str, command: list[str], progress: Progress | None = None
+) -> dict[str, Any]:
+    """Go on with the run in `out` after its last stored keyframe and return the metrics of the whole.
+
+    A run that had no keyframe yet, or had not found gravity, begins again. Raises UsageError when it is finished or
+    `config` is not what it began with, DataError when its session is damaged or the recording is another one.
+    """
+    path = out / "session.db"
+    if has_begun(path):
+        session = SessionWriter.reopen(path)
+        run = Run(recording, config, out, session)
+        stored = Session(path)
+        try:
+            is_begun = run.resume(stored)
+        finally:
+            stored.close()
+        if is_begun:
+            return run.execute(progress)
+        session.close()
+    with storage(path):
+        for name in ("session.db", "session.db-wal", "session.db-shm"):
+            (out / name).unlink(missing_ok=True)
+    return execute(recording, config, out, source, command, progress)

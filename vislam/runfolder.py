@@ -8,7 +8,7 @@ import math
 import platform
 import subprocess
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import metadata
@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import Config, ImuConfig, dump
-from vislam.errors import StorageError, UsageError
+from vislam.config import Config, ImuConfig, dump, from_data
+from vislam.errors import DataError, StorageError, UsageError
 from vislam.frames import LoggedFrames
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
+from vislam.memory import FrameEntry, SlamMemory
 from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDecision, NavState, RetrievedKeyframe
+from vislam.session import Session
 from vislam.slam import KeyframeStep, Step
 from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
 
@@ -49,10 +51,41 @@ def prepare(out: Path, overwrite: bool) -> None:
         with storage(out):
             # batch estimates choose their names, and the pictures of loops are named after them
             named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv"), *out.glob("loops/*.jpg")]
+            named += out.glob("run_*.rrd")  # of a run that was resumed
             for path in [*(out / name for name in _RUN_FILES), *named]:
                 path.unlink(missing_ok=True)
     with storage(out):
         out.mkdir(parents=True, exist_ok=True)
+
+
+def read_setup(out: Path) -> tuple[str, Config]:
+    """Return source and settings of the run in a folder.
+
+    Raises UsageError when there is no run, DataError when its recording is not what it was.
+    """
+    manifest, settings = (_read_json(out / name) for name in ("manifest.json", "config.json"))
+    source = manifest.get("source")
+    if not isinstance(source, str):
+        raise UsageError(f"{out / 'manifest.json'} names no source; start the run anew with --overwrite")
+    if fingerprint(_path_of(source)) != manifest.get("data_sha256"):
+        raise DataError(f"{source} is not the recording that {out} began with; start a new run")
+    return source, from_data(settings, str(out / "config.json"))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return an object of a run folder."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise UsageError(
+            f"{path.parent} holds no run to resume ({path.name} is missing); `vislam run SOURCE --out {path.parent}` "
+            "starts one, with --overwrite if the folder exists"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be read: {error}; start the run anew with --overwrite") from error
+    if not isinstance(data, dict):
+        raise DataError(f"{path} holds no object; start the run anew with --overwrite")
+    return data
 
 
 @contextmanager
@@ -66,14 +99,15 @@ def storage(path: Path) -> Iterator[None]:
 
 def write_json(path: Path, data: Any) -> None:
     """Write plain data as JSON, atomically; numbers that are not finite become null."""
-    write_text(path, json.dumps(_finite(data), indent=1) + "\n")
+    write_text(path, json.dumps(plain(data), indent=1) + "\n")
 
 
-def _finite(data: Any) -> Any:
+def plain(data: Any) -> Any:
+    """Return data as JSON has it: no numpy, and null for numbers that are not finite."""
     if isinstance(data, dict):
-        return {str(key): _finite(value) for key, value in data.items()}
+        return {str(key): plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
-        return [_finite(value) for value in data]
+        return [plain(value) for value in data]
     if isinstance(data, (float, np.floating)):
         return float(data) if np.isfinite(data) else None
     return data.item() if isinstance(data, np.generic) else data
@@ -83,7 +117,7 @@ def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
     """Return what identifies a run: code, packages, data, seed, command, machine."""
     return {
         "source": source,
-        "data_sha256": fingerprint(Path(source.partition(":")[2] or source)),
+        "data_sha256": fingerprint(_path_of(source)),
         "command": command,
         "seed": config.seed,
         "code_revision": code_revision(),
@@ -91,6 +125,10 @@ def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
     }
+
+
+def _path_of(source: str) -> Path:
+    return Path(source.partition(":")[2] or source)
 
 
 def fingerprint(path: Path) -> str | None:
@@ -135,12 +173,7 @@ class RunLog:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._t_ns: list[int] = []
-        self._keyframe_ids: list[int] = []
-        self._since_keyframe: list[Array | None] = []
-        self._odom: list[Array | None] = []
-        self._live: list[Array | None] = []
-        self._tracking: list[tuple[Any, ...]] = []
+        self._frames: list[FrameEntry] = []
         self._ekf_states: dict[int, NavState] = {}
         self._keyframe_t_ns: dict[int, int] = {}
         self._spans: dict[int, ImuSpan] = {}  # between a keyframe and the one before
@@ -152,12 +185,12 @@ class RunLog:
         self.revisions = 0
 
     def __len__(self) -> int:
-        return len(self._t_ns)
+        return len(self._frames)
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
         """Times [N] of the frames so far."""
-        return np.array(self._t_ns, dtype=np.int64)
+        return np.array([frame.t_ns for frame in self._frames], dtype=np.int64)
 
     @property
     def worst_position_sigma_m(self) -> float:
@@ -165,25 +198,50 @@ class RunLog:
         variances = [np.trace(state.covariance[3:6, 3:6]) for state in self._ekf_states.values()]
         return float(np.sqrt(max(variances, default=0.0)))
 
+    def filter_state(self, keyframe_id: int) -> NavState | None:
+        """Return the filter's state at a keyframe, None where it had none."""
+        return self._ekf_states.get(keyframe_id)
+
+    @property
+    def candidates(self) -> int:
+        """How many loop candidates there were."""
+        return len(self._candidates)
+
+    def shifts(self, edge_ids: Iterable[int]) -> dict[int, tuple[float, float]]:
+        """Return the rms and largest shift in metres of the update that took in each of these loop edges."""
+        return {i: self._shifts[i] for i in edge_ids if i in self._shifts}
+
     @property
     def keyframes(self) -> int:
         """How many keyframes reached the back end."""
         return len(self._keyframe_t_ns)
 
-    def add(self, step: Step) -> None:
-        """Remember one step."""
-        front = step.front
-        self._t_ns.append(front.frame.t_ns)
-        self._keyframe_ids.append(front.keyframe_id)
-        self._since_keyframe.append(front.T_keyframe_body)
-        self._odom.append(front.T_odom_body)
-        self._live.append(step.T_map_body)
-        vo = front.track.vo
-        self._tracking.append((front.frame.t_ns, str(vo.tracking), vo.inliers, vo.keyframe_id, front.track.reason))
+    def restore(self, session: Session, memory: SlamMemory) -> None:
+        """Take over what a run remembered up to its last keyframe."""
+        self._frames = session.frames()
+        self._ekf_states = session.states("filter")
+        for packet in memory.graph.packets:
+            self._keyframe_t_ns[packet.keyframe.id] = packet.keyframe.t_ns
+            if packet.imu is not None:
+                self._spans[packet.keyframe.id] = packet.imu
+        self._candidates, self._retrieved, self._shifts = session.candidates(), session.retrieved(), session.shifts()
+        self._positions = {k: T[:3, 3] for k, T in enumerate(memory.graph.T_map_body)}
+        self._edge_ids = {(loop.edge.from_id, loop.edge.to_id): loop.edge.id for loop in memory.graph.loops}
+        self.revisions = memory.graph.revision
+
+    def add(self, step: Step) -> FrameEntry:
+        """Remember one step; return what is remembered of its frame."""
+        front, vo = step.front, step.front.track.vo
+        entry = FrameEntry(
+            front.frame.t_ns, front.keyframe_id, front.T_keyframe_body, front.T_odom_body, step.T_map_body,
+            vo.tracking, vo.inliers, vo.keyframe_id, front.track.reason,
+        )  # fmt: skip
+        self._frames.append(entry)
         if front.state is not None and front.track.keyframe is not None:
             self._ekf_states[front.track.keyframe.id] = front.state
         for keyframe in step.keyframes:
             self.add_keyframe(keyframe)
+        return entry
 
     def add_keyframe(self, step: KeyframeStep) -> None:
         """Remember what the back end did with a keyframe."""
@@ -217,20 +275,21 @@ class RunLog:
         Frames whose motion since their keyframe is unknown are carried by the IMU between `states` (of the keyframes,
         empty without an IMU), or interpolated between those that are known.
         """
-        frames = LoggedFrames(self.stamps_ns, np.array(self._keyframe_ids, dtype=np.int64), self._since_keyframe)
+        keyframe_ids = np.array([frame.keyframe_id for frame in self._frames], dtype=np.int64)
+        frames = LoggedFrames(self.stamps_ns, keyframe_ids, [frame.T_keyframe_body for frame in self._frames])
         frames = frames.carried_by_imu(states, self._spans, imu.gravity_m_s2, imu.max_gap_s)
         return frames.placed(self._keyframe_t_ns, dict(zip(ids, T_map_body, strict=True)))
 
     def odometry_trajectory(self) -> Trajectory:
         """Return the causal poses in odom: those of the filter, or of visual odometry without an IMU."""
-        return self._causal(self._odom)
+        return self._causal([frame.T_odom_body for frame in self._frames])
 
     def live_trajectory(self) -> Trajectory:
         """Return the causal best estimates in map."""
-        return self._causal(self._live)
+        return self._causal([frame.T_map_body for frame in self._frames])
 
     def _causal(self, poses: list[Array | None]) -> Trajectory:
-        known = [(t, T) for t, T in zip(self._t_ns, poses, strict=True) if T is not None]
+        known = [(frame.t_ns, T) for frame, T in zip(self._frames, poses, strict=True) if T is not None]
         t_ns = np.array([t for t, _ in known], dtype=np.int64)
         return Trajectory(t_ns, np.array([T for _, T in known]).reshape(-1, 4, 4))
 
@@ -286,7 +345,8 @@ class RunLog:
 
     def write_tables(self, out: Path, loops: list[LoopRow]) -> dict[str, int]:
         """Write the tables of tracking and loops; return how many candidates were accepted, parked and rejected."""
-        write_text(out / "tracking.csv", csv_text(_TRACKING_HEADER, self._tracking))
+        tracking = [(f.t_ns, str(f.tracking), f.inliers, f.vo_keyframe_id, f.reason) for f in self._frames]
+        write_text(out / "tracking.csv", csv_text(_TRACKING_HEADER, tracking))
         write_text(out / "retrieved.csv", retrieved_text(self._retrieved))
         write_text(out / "loops.csv", loops_text(loops))
         decisions = Counter(row.decision for row in loops)

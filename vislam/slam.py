@@ -8,7 +8,7 @@ keyframe        -> loop detector -> graph -> mapper     -> poses in map, T_map_o
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,6 +21,7 @@ from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
 from vislam.mapping.mapper import Mapper
+from vislam.memory import GraphNews, PackedScan, SlamMemory, TagSighting, WordsMemory
 from vislam.messages import (
     Array,
     Frame,
@@ -43,7 +44,11 @@ class KeyframeStep:
     update: GraphUpdate
     edges: list[LoopEdge]
     candidates: list[LoopCandidate]
-    retrieved: list[RetrievedKeyframe] = field(default_factory=list)
+    retrieved: list[RetrievedKeyframe]
+    news: GraphNews  # what the graph has to remember
+    scan: PackedScan | None  # what the map keeps of it
+    words: WordsMemory | None  # the vocabulary, when it is new
+    tags: tuple[TagSighting, ...]  # that it saw
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +67,7 @@ class Finish:
     steps: list[Step]
     keyframes: list[KeyframeStep]  # those that had waited for gravity until the end
     update: GraphUpdate | None  # None: not one keyframe reached the back end
+    news: GraphNews | None
 
 
 class Back:
@@ -86,6 +92,20 @@ class Back:
         self.mapper = Mapper(config.map, rig) if config.map.enabled else None
         self.clock = clock
         self.T_map_odom = np.eye(4)
+        self._trainings = 0
+
+    def restore(self, memory: SlamMemory) -> GraphUpdate:
+        """Take over an earlier run; return all its poses."""
+        graph = memory.graph
+        update = self.graph.restore(graph)
+        if self.loops is not None:
+            self.loops.restore(memory.places)
+            self._trainings = self.loops.trainings
+        if self.mapper is not None:
+            ids = [packet.keyframe.id for packet in graph.packets]
+            self.mapper.restore(memory.scans, dict(zip(ids, graph.T_map_body, strict=True)))
+        self._follow(update)
+        return update
 
     def add(self, odometry: OdometryKeyframe) -> KeyframeStep:
         """Take one keyframe in: find its loops, optimise, follow with the map."""
@@ -103,8 +123,10 @@ class Back:
         if self.mapper is not None:
             with self.clock.measure("map"):
                 self.mapper.add(keyframe, self.T_map_odom @ odometry.T_odom_body)
-        retrieved = [] if self.loops is None else self.loops.retrieved
-        return KeyframeStep(odometry, update, edges, candidates, retrieved)
+        scan = None if self.mapper is None else self.mapper.packed(keyframe.id)
+        retrieved, tags = ([], ()) if self.loops is None else (self.loops.retrieved, self.loops.tags(keyframe.id))
+        news, words = self.graph.take_news(), self._new_words()
+        return KeyframeStep(odometry, update, edges, candidates, retrieved, news, scan, words, tags)
 
     def finish(self) -> GraphUpdate:
         """Optimise to convergence and bring the map to the final poses."""
@@ -115,6 +137,13 @@ class Back:
             with self.clock.measure("map finish"):
                 self.mapper.finish()
         return update
+
+    def _new_words(self) -> WordsMemory | None:
+        """Return the vocabulary if it was trained since the last call."""
+        if self.loops is None or self.loops.trainings == self._trainings:
+            return None
+        self._trainings = self.loops.trainings
+        return self.loops.words()
 
     def _follow(self, update: GraphUpdate) -> None:
         self.T_map_odom = update.T_map_odom
@@ -135,6 +164,18 @@ class Slam:
         self.back: Back | None = None  # begins with the first keyframe, when gravity is known
         self._make_back = partial(Back, config, rig)
         self._frames: deque[Frame] = deque()
+        self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
+
+    def resume(self, memory: SlamMemory) -> GraphUpdate:
+        """Go on where an earlier run was, before the first value; return all its poses.
+
+        The first frame has to be that of its newest keyframe, `memory.front.camera_t_ns`, with the inertial samples
+        around it. Raises DataError when the memory contradicts itself.
+        """
+        self.front.resume(memory.front)
+        self.back = self._make_back(self.front.noise, self.clock, self.front.first_state, memory.T_start)
+        self._seen_again = memory.front.keyframe_id
+        return self.back.restore(memory)
 
     def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
         """Take one measurement; return a step for every frame that could be processed with it.
@@ -153,10 +194,22 @@ class Slam:
     def finish(self) -> Finish:
         """Process the frames that still wait and optimise a last time."""
         steps = [self._step(self._frames.popleft()) for _ in range(len(self._frames))]
-        keyframes = [self._add(odometry) for odometry in self.front.give_up_waiting()]
-        return Finish(steps, keyframes, None if self.back is None else self.back.finish())
+        keyframes = self._add(self.front.give_up_waiting())
+        if self.back is None:
+            return Finish(steps, keyframes, None, None)
+        return Finish(steps, keyframes, self.back.finish(), self.back.graph.take_news())
 
-    def _add(self, odometry: OdometryKeyframe) -> KeyframeStep:
+    def _add(self, keyframes: list[OdometryKeyframe]) -> list[KeyframeStep]:
+        """Hand keyframes to the back end; the one at which an earlier run is resumed is there already."""
+        steps = []
+        for odometry in keyframes:
+            if odometry.packet.keyframe.id == self._seen_again and self.back is not None:
+                self.back.graph.go_on(odometry.packet, odometry.T_odom_body)
+            else:
+                steps.append(self._add_new(odometry))
+        return steps
+
+    def _add_new(self, odometry: OdometryKeyframe) -> KeyframeStep:
         if self.back is None:
             self.back = self._make_back(self.front.noise, self.clock, self.front.first_state, odometry.T_odom_body)
         step = self.back.add(odometry)
@@ -165,7 +218,7 @@ class Slam:
 
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)
-        keyframes = [self._add(odometry) for odometry in front.keyframes]
+        keyframes = self._add(front.keyframes)
         if self.back is None or front.T_odom_body is None:
             return Step(front, None, keyframes)
         return Step(front, self.back.T_map_odom @ front.T_odom_body, keyframes)

@@ -19,7 +19,9 @@ from vislam.factor_log import FactorLog, LoggedEdge, LoggedKeyframe
 from vislam.factors.keys import X
 from vislam.frames import LoggedFrames
 from vislam.geometry import invert, se3_exp, se3_log, transform, transform_points
-from vislam.messages import Array, GraphUpdate, KeyframePacket, Observations
+from vislam.imu import ImuNoise
+from vislam.memory import FrameEntry, GraphNews, KeyframeEntry, LoopPlace, LoopState, StartFacts
+from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Observations
 from vislam.session import SessionWriter
 
 CAMERA = Camera(640, 480, 400.0, 398.0, 321.0, 238.0, 0.0, "radtan", (-0.2, 0.05, 2e-4, -1e-4))
@@ -177,14 +179,26 @@ class _Eyes:
         return pixels
 
 
+def decided(loop_id: int, accepted: bool) -> LoopState:
+    """Return a loop that was accepted, or rejected."""
+    decision = LoopDecision.ACCEPTED if accepted else LoopDecision.REJECTED
+    return LoopState(loop_id, decision, "", 1.5, LoopPlace.GRAPH if accepted else LoopPlace.OUT, None)
+
+
+def start_facts(state: NavState, noise: ImuNoise) -> StartFacts:
+    """Return a start at rest with a first state."""
+    return StartFacts("static", "at rest", state, 0.0, 0.0, noise, state)
+
+
 def store(log: FactorLog, path: Path, info: dict | None = None, upto: int | None = None) -> SessionWriter:
     """Write a log as the session of a run; the caller closes it, or does not."""
     writer = SessionWriter(path, info or {"config": {}}, log.rig, log.noise, log.gravity_m_s2)
     for k, keyframe in enumerate(log.keyframes[:upto]):
         packet: KeyframePacket = keyframe.packet
-        writer.add_frame(packet.keyframe.t_ns, k, np.eye(4))
-        edges = [e.edge for e in log.edges if e.edge.to_id == k]
-        accepted = tuple(e.edge.id for e in log.edges if e.edge.to_id == k and e.accepted)
-        change = GraphUpdate(k + 1, np.array([k]), keyframe.T_map_body[None], np.eye(4), None, accepted)
-        writer.add(packet, keyframe.T_odom_body, change, edges, log.first_state if k == 0 else None)
+        writer.add_frame(FrameEntry(packet.keyframe.t_ns, k, np.eye(4)))
+        edges = [e for e in log.edges if e.edge.to_id == k]
+        change = GraphUpdate(k + 1, np.array([k]), keyframe.T_map_body[None], np.eye(4), None)
+        news = GraphNews(loops=tuple(decided(e.edge.id, e.accepted) for e in edges))
+        start = None if log.first_state is None else start_facts(log.first_state, log.noise)
+        writer.add(KeyframeEntry(packet, keyframe.T_odom_body, change, news, [e.edge for e in edges], start=start))
     return writer

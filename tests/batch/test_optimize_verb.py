@@ -90,9 +90,10 @@ def test_a_killed_run_can_be_optimised_up_to_its_last_keyframe(tmp_path):
         import sys, time; sys.path[:0] = [{str(here)!r}, {str(here.parent)!r}]
         from pathlib import Path
         from session_world import simulate, store
+        from vislam.memory import FrameEntry
         log = simulate("stereo", duration_s=8.0, true_loops=0).log
         writer = store(log, Path({str(path)!r}), upto=20)
-        writer.add_frame(10**12, 19, None)
+        writer.add_frame(FrameEntry(10**12, 19, None))
         print("committed", flush=True)
         time.sleep(60)
     """)

@@ -116,14 +116,15 @@ class FileRecording:
             raise DataError(f"{survey.root} has no frame: {names} share no image within {STEREO_TOLERANCE_NS} ns")
         self._check_first_images()
 
-    def events(self) -> Generator[ImuSample | MagSample | Frame, None, None]:
-        """Yield samples and frames in time order, inertial ones first when stamps are equal.
+    def events(self, from_ns: int | None = None) -> Generator[ImuSample | MagSample | Frame, None, None]:
+        """Yield samples and frames in time order, inertial ones first when stamps are equal; no frame before `from_ns`.
 
         A second call starts over, also the counts. Raises DataError when an image is not of the calibrated size, or
         when most rows of a file are unusable.
         """
         self._counter.restart(self._known)
-        with closing(self._read_frames()) as frames, closing(self._read_imu()) as imu, closing(self._read_mag()) as mag:
+        reading = self._read_frames(from_ns)
+        with closing(reading) as frames, closing(self._read_imu()) as imu, closing(self._read_mag()) as mag:
             streams: list[Iterator[ImuSample | MagSample | Frame]] = [imu, mag, frames]
             yield from heapq.merge(*streams, key=lambda event: event.t_ns)
 
@@ -150,12 +151,12 @@ class FileRecording:
                 except UnreadableImageError:
                     continue
 
-    def _read_frames(self) -> Generator[Frame, None, None]:
+    def _read_frames(self, from_ns: int | None) -> Generator[Frame, None, None]:
         gaps = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter)
         with closing(open_loader(self._survey, self.rig, self._frames)) as loader:
-            index = 0
-            with closing(decode_ahead(range(self.frame_count), loader.load, loader.workers)) as decoded:
-                for t_ns, loaded in zip(self._frames.t_ns.tolist(), decoded, strict=False):
+            index = 0 if from_ns is None else int(np.searchsorted(self._frames.t_ns, from_ns))
+            with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers)) as decoded:
+                for t_ns, loaded in zip(self._frames.t_ns[index:].tolist(), decoded, strict=False):
                     if loaded.trouble is not None:
                         self._counter.count(loaded.trouble.kind, self._place(loaded.trouble.path))
                     if loaded.images:

@@ -24,7 +24,7 @@ from vislam.ekf.msckf_state import MOUNT, TIME, Window, propagated
 from vislam.ekf.msckf_tracks import prepare
 from vislam.ekf.msckf_update import Outcome, Updater
 from vislam.ekf.timeline import bias_measurement, keep_track, pose_between, stretch
-from vislam.geometry import quaternion_wxyz, so3_log
+from vislam.geometry import quaternion_wxyz, so3_exp, so3_log
 from vislam.imu import ImuNoise, ImuSeries
 from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 
@@ -140,12 +140,15 @@ class MsckfEkf:
         turned = so3_log(np.ascontiguousarray(self._R_configured.T @ window.R_body_cam))
         return CameraCalibration(window.time_offset_s, float(sigmas[TIME]), turned, sigmas[MOUNT].copy())
 
-    def initialise(self, state: NavState, vo: VoMeasurement | None = None) -> None:
+    def initialise(
+        self, state: NavState, vo: VoMeasurement | None = None, camera: CameraCalibration | None = None
+    ) -> None:
         """Set the state, at any time, and run it through the samples that are already here. Forgets the past.
 
         Args:
             state: pose in `odom`, with its covariance.
             vo: not needed here; tracks begin with the frames that follow.
+            camera: what an earlier run found out about the camera; None: what is configured.
 
         Raises:
             ValueError: the state is not finite.
@@ -165,7 +168,12 @@ class MsckfEkf:
             P[TIME, TIME] = config.tight_time_offset_sigma_s**2
         if config.tight_extrinsic_rotation:
             P[MOUNT, MOUNT] = np.eye(3) * np.deg2rad(config.tight_extrinsic_sigma_deg) ** 2
-        self._window = Window(P, 0.0, self._R_configured, last_vision_t_ns=state.t_ns)
+        time_offset_s, R_body_cam = 0.0, self._R_configured
+        if camera is not None:
+            P[TIME, TIME] = camera.time_offset_sigma_s**2
+            P[MOUNT, MOUNT] = np.diag(camera.rotation_sigma_rad**2)
+            time_offset_s, R_body_cam = camera.time_offset_s, R_body_cam @ so3_exp(camera.rotation_rad)
+        self._window = Window(P, time_offset_s, R_body_cam, last_vision_t_ns=state.t_ns)
         self._Phi, self._Q = np.eye(kernels.INERTIAL), np.zeros((kernels.INERTIAL, kernels.INERTIAL))
         self._t_ns, self._applied = state.t_ns, 0
         self._series.extra[:] = np.nan

@@ -76,9 +76,9 @@ class TimedRecording:
         """Note that the value that was taken last finished a frame; fits `vislam.run.Progress`."""
         self._finished += 1
 
-    def events(self) -> Iterator[ImuSample | MagSample | Frame]:
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
         """Yield the recording's values."""
-        for value in self._recording.events():
+        for value in self._recording.events(from_ns):
             if isinstance(value, Frame):
                 self.span_ns = (self.span_ns[0] if self.span_ns else value.t_ns, value.t_ns)
             before, taken_s = self._finished, time.perf_counter()

@@ -20,7 +20,7 @@ from vislam.errors import VislamError
 from vislam.experiment.identity import environment
 from vislam.experiment.measures import output_measures, run_measures
 from vislam.experiment.recordings import TimedRecording, open_cached
-from vislam.run import Run
+from vislam.run import execute
 from vislam.runfolder import prepare, write_json
 
 _ORPHANED = 70
@@ -53,7 +53,7 @@ def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -
     prepare(out, overwrite=False)
     cpu_s = time.process_time()
     try:
-        Run(recording, config, out, spec["source"], ["vislam", "compare"]).execute(recording.frame_done)
+        execute(recording, config, out, spec["source"], ["vislam", "compare"], recording.frame_done)
     finally:
         cpu_s = time.process_time() - cpu_s
         metrics_file = out / "metrics.json"

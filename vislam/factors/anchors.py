@@ -3,19 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
 
 from vislam.config import GraphConfig
-from vislam.messages import Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tied:
-    """A keyframe that a loop ties to an anchor, or an anchor itself."""
-
-    id: int
-    anchor_id: int
-    covariance: Array  # [6, 6] of its pose relative to the anchor when it was tied; later it is known better
+from vislam.memory import Tied
 
 
 class Anchors:
@@ -31,6 +21,7 @@ class Anchors:
         self._reach = config.anchor_reach
         self._tied: dict[int, Tied] = {}
         self._ids: list[int] = []  # keys of the above, ascending
+        self._fresh: list[Tied] = []  # since `take_news`
 
     def near(self, k: int) -> Tied | None:
         """Return the tied keyframe nearest to k along the run; None when there is none in reach."""
@@ -47,3 +38,9 @@ class Anchors:
         if tied.id not in self._tied:
             self._tied[tied.id] = tied
             self._ids.insert(bisect_left(self._ids, tied.id), tied.id)
+            self._fresh.append(tied)
+
+    def take_news(self) -> tuple[Tied, ...]:
+        """Return what was tied since the last call."""
+        fresh, self._fresh = tuple(self._fresh), []
+        return fresh

@@ -115,6 +115,26 @@ class Estimator(Generic[L]):
         self._reach_m[0] = np.inf
         return self._extend(factors, {}, guess)
 
+    def restore(self, guesses: list[Guess], loops: list[L], spare: list[L], vo_scale: float) -> tuple[list[Step], str]:
+        """Start with all keyframes of the odometry at their last estimates, and with loops that were accepted.
+
+        Returns the steps between the keyframes and what went wrong, normally nothing.
+        """
+        self._count = len(guesses)
+        self._buffer = np.array([guess.T_map_body for guess in guesses])
+        self._reach_m = np.array([np.inf, *(self._odometry.reach_m(k) for k in range(1, len(guesses)))])
+        self.vo_scale = vo_scale
+        self.loops, self.spare = {loop.id: loop for loop in loops}, {loop.id: loop for loop in spare}
+        values = gtsam.Values()
+        for k, guess in enumerate(guesses):
+            insert_guess(values, k, guess, self.has_imu)
+        steps = [self._step(k, values) for k in range(1, len(guesses))]
+        try:
+            self._restart(values, [], self._new_solver(), from_batch=False)
+        except FAILURES as error:
+            return steps, self._recover(values, [], error)
+        return steps, ""
+
     def extend(self) -> tuple[Step, str]:
         """Take the next keyframe of the odometry; return its step and what went wrong, normally nothing."""
         k = self._count

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vislam.errors import DataError
 from vislam.factors.keys import nearest_rigid
 from vislam.factors.noise import checked_covariance
+from vislam.memory import WindowRecord
 from vislam.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
 
 _RIGID = 1e-4  # how far R^T R may be from identity
@@ -57,38 +58,6 @@ class LoopRecord:
     covariance: Array  # [6, 6]
     has_scale: bool
     offered_with: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeRecord:
-    """Motion between two consecutive keyframes, summarised by the window of tight coupling."""
-
-    to_id: int  # from the keyframe before it
-    T_previous_body: Array  # [4, 4]
-    covariance: Array  # [6, 6] perturbed on the newer keyframe's side
-    settled: bool  # no later one will replace it
-    begins_piece: bool = False  # nothing was measured: a guess, with sigmas that say so
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TiltRecord:
-    """Which way is up for a keyframe, summarised by the window of tight coupling."""
-
-    id: int
-    up_body: Array  # [3] unit
-    sigma_rad: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WindowRecord:
-    """What the window of tight coupling said with one keyframe, as far as the graph took it."""
-
-    id: int
-    t_ns: int
-    edges: tuple[EdgeRecord, ...]  # that of this keyframe (none for the first), and those that replace older ones
-    tilts: tuple[TiltRecord, ...]
-    note: str
-    rest_from: int | None = None  # see KeyframeRecord
 
 
 Record = StartRecord | KeyframeRecord | LoopRecord | WindowRecord

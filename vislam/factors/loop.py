@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -20,18 +18,10 @@ from vislam.factors.visual import (
     pose_factor,
 )
 from vislam.geometry import invert, se3_adjoint, se3_log
+from vislam.memory import Tie
 from vislam.messages import Array
 
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tie:
-    """A loop as it was put into the graph, with another older keyframe that stands for its own."""
-
-    from_id: int
-    T_from_to: Array  # [4, 4]
-    covariance: Array  # [6, 6]
 
 
 class LoopModel:

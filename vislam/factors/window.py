@@ -9,13 +9,14 @@ import numpy as np
 
 from vislam.config import GraphConfig
 from vislam.factors.builder import Guess, Label, Step
-from vislam.factors.journal import SPEED_MAX_M_S, EdgeRecord, StartRecord, TiltRecord, WindowRecord
+from vislam.factors.journal import SPEED_MAX_M_S, StartRecord
 from vislam.factors.keys import X, bias_of, nearest_rigid
 from vislam.factors.motion import no_motion
 from vislam.factors.noise import gaussian, huber, inflated
 from vislam.factors.priors import pose_covariance
 from vislam.factors.visual import pose_factor
 from vislam.geometry import se3_log
+from vislam.memory import EdgeRecord, TiltRecord, WindowRecord
 from vislam.messages import Array
 
 _SPREAD = 1.5  # a provisional edge is worth replacing when its variance changed by more than this factor

@@ -57,6 +57,11 @@ class CameraClock:
         """How far the applied offset may be off."""
         return self._offset.sigma_s
 
+    def start_at(self, applied_s: float, sigma_s: float) -> None:
+        """Take the offset that an earlier run applied and how well it knew that."""
+        self.applied_ns = self._keyframe_ns = round(applied_s * _NS)
+        self._offset.tell(applied_s, sigma_s)
+
     def in_imu_time(self, frame: Frame) -> Frame:
         """Return the frame with its stamp in the IMU's time."""
         if self._last_t_ns is not None:

@@ -20,6 +20,7 @@ from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no
 from vislam.frontend.shutter import Shutter
 from vislam.frontend.tracker import Tracker
 from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
+from vislam.memory import FrontNews
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
 Bools = NDArray[np.bool_]
@@ -73,6 +74,7 @@ class MetricFrontEnd:
         self._landmarks = Landmarks()
         self._keyframe: Keyframe | None = None
         self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
+        self._first_id = 0
         self._keyframe_tracks = 0
         self._keyframe_twist: Array = np.zeros(6)
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
@@ -110,6 +112,17 @@ class MetricFrontEnd:
         self._t_placed_ns = frame.t_ns
         self._learn_shutter(attempt)
         return self._report(frame, self._keyframe, attempt)
+
+    def begin_at(self, keyframe_id: int, news: FrontNews) -> None:
+        """See FrontEnd.begin_at."""
+        self._first_id, self._tracker.next_id = keyframe_id, news.next_track_id
+        if news.readout_s is not None:
+            self._shutter.start_at(news.readout_s)
+
+    @property
+    def news(self) -> FrontNews:
+        """See FrontEnd.news."""
+        return FrontNews(self._tracker.next_id, readout_s=self._shutter.readout_s if self._shutter.learns else None)
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
@@ -325,7 +338,7 @@ class MetricFrontEnd:
         keyframe = self._install(frame, np.zeros(6))
         observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
         if last_id < 0:
-            vo = identity_motion(frame.t_ns, 0, True, count)
+            vo = identity_motion(frame.t_ns, keyframe.id, True, count)
             return TrackResult(vo, observations, keyframe, 0.0, "first keyframe")
         self._since_restart = 0
         vo = lost_motion(frame.t_ns, last_id, True)
@@ -390,7 +403,7 @@ class MetricFrontEnd:
             xy = self._camera.normalise(pixels)
             return self._depth.measure(frame, pixels, xy, self._landmarks.expected_rho(xy), ids).depth_m
 
-        new_id = self._keyframe.id + 1 if self._keyframe is not None else 0
+        new_id = self._keyframe.id + 1 if self._keyframe is not None else self._first_id
         features = self._config.described_features
         keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, measure_depth)
         self._keyframe = keyframe

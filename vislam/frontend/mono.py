@@ -23,6 +23,7 @@ from vislam.frontend.refine import refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
 from vislam.frontend.tracker import Tracker
 from vislam.geometry import invert, so3_log, transform
+from vislam.memory import FrontNews
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
 _RANSAC_PX = 1.5
@@ -77,6 +78,7 @@ class MonoFrontEnd:
         self._min_parallax_px = config.mono_min_parallax_px
         self._keyframe: Keyframe | None = None
         self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
+        self._first_id = 0
         self._keyframe_tracks = 0
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
@@ -119,6 +121,15 @@ class MonoFrontEnd:
         self._lost = False
         self._t_placed_ns = frame.t_ns
         return self._report(frame, self._keyframe, motion)
+
+    def begin_at(self, keyframe_id: int, news: FrontNews) -> None:
+        """See FrontEnd.begin_at."""
+        self._first_id, self._tracker.next_id = keyframe_id, news.next_track_id
+
+    @property
+    def news(self) -> FrontNews:
+        """See FrontEnd.news."""
+        return FrontNews(self._tracker.next_id)
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
@@ -312,7 +323,7 @@ class MonoFrontEnd:
         self._lost = False
         keyframe = self._install(frame)
         if last_id < 0:
-            vo = identity_motion(frame.t_ns, 0, False, count)
+            vo = identity_motion(frame.t_ns, keyframe.id, False, count)
             return TrackResult(vo, self._observations(), keyframe, 0.0, "first keyframe")
         self._since_restart = 0
         vo = lost_motion(frame.t_ns, last_id, False)
@@ -322,7 +333,7 @@ class MonoFrontEnd:
         return Observations(self._tracker.ids.copy(), self._tracker.pixels.copy())
 
     def _install(self, frame: Frame) -> Keyframe:
-        new_id = self._keyframe.id + 1 if self._keyframe is not None else 0
+        new_id = self._keyframe.id + 1 if self._keyframe is not None else self._first_id
         features = self._config.described_features
         keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, None)
         self._keyframe = keyframe

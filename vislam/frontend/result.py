@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from vislam.memory import FrontNews
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
 _NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement that says nothing
@@ -43,6 +44,15 @@ class FrontEnd(Protocol):
 
         Raises DataError when the images do not fit the rig or time does not advance.
         """
+        ...
+
+    def begin_at(self, keyframe_id: int, news: FrontNews) -> None:
+        """Number the first keyframe and new tracks as given, and know what is known; before the first frame."""
+        ...
+
+    @property
+    def news(self) -> FrontNews:
+        """Return what was learned so far, as `begin_at` takes it; what others learn is left out."""
         ...
 
 

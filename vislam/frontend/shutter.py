@@ -43,6 +43,12 @@ class Shutter:
         """Whether the readout is estimated."""
         return not self._known
 
+    def start_at(self, readout_s: float) -> None:
+        """Take the readout that an earlier run had learned, to be learned further."""
+        if not self._known:
+            self._estimate_s = min(max(readout_s, 0.0), _MAX_S)
+            self._information = 1.0 / _FRAME_SIGMA_S**2
+
     def learn(self, change_s: float, information: float) -> None:
         """Take in one frame's estimate: the applied readout plus `change_s`, with `information` in 1/s^2."""
         weight = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)

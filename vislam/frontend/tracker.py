@@ -29,7 +29,7 @@ class Tracker:
             window_px=config.flow_window_px, levels=config.flow_levels, max_back_px=config.max_back_px
         )
         self._image: ImageU8 | None = None
-        self._next_id = 0
+        self.next_id = 0
         self.ids: NDArray[np.int64] = np.empty(0, dtype=np.int64)
         self.pixels: Array = np.empty((0, 2))  # [N, 2] in the keyframe
         self.misses: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # [N] frames in a row without a good match
@@ -86,8 +86,8 @@ class Tracker:
             image, config.max_tracks - len(self.ids), config.cell_px, config.min_distance_px, self.pixels,
             config.min_corner_response,
         )  # fmt: skip
-        ids = np.arange(self._next_id, self._next_id + len(fresh), dtype=np.int64)
-        self._next_id += len(fresh)
+        ids = np.arange(self.next_id, self.next_id + len(fresh), dtype=np.int64)
+        self.next_id += len(fresh)
         return ids, fresh
 
     def _take(self, given: Observations) -> tuple[NDArray[np.int64], Array]:

@@ -45,6 +45,11 @@ class Waiting:
         self._limit = float(chi2_distribution.ppf(config.loop_gate_probability, 6))
         self._edges: list[LoopModel] = []
 
+    @property
+    def edges(self) -> list[LoopModel]:
+        """Return the loops that wait, oldest first."""
+        return list(self._edges)
+
     def add(self, edge: LoopModel) -> LoopModel | None:
         """Take a loop; return the oldest when it has to leave for this one."""
         self._edges.append(edge)

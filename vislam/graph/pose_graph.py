@@ -11,16 +11,26 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError, UsageError
-from vislam.factors.anchors import Anchors, Tied
+from vislam.factors.anchors import Anchors
 from vislam.factors.estimator import Estimator
 from vislam.factors.gate import CarPark, EdgeReport, Travel
-from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe_record, loop_record, start_record
+from vislam.factors.journal import (
+    KeyframeRecord,
+    LoopRecord,
+    Record,
+    StartRecord,
+    keyframe_record,
+    loop_record,
+    start_record,
+)
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.geometry import invert, se3_adjoint
 from vislam.graph.joining import Placement, Waiting, relinked, weak_link
+from vislam.graph.restore import edge_report, restored_journal, sort_loops
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.imu import ImuNoise
+from vislam.memory import GraphMemory, GraphNews, LoopPlace, LoopState, Tied, WindowRecord
 from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Pieces
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
@@ -64,6 +74,9 @@ class PoseGraph:
         self._pieces = Pieces()
         self._waiting = Waiting(config)
         self._T_odom_last: Array | None = None
+        self._changed: dict[int, None] = {}  # ids of reports since `take_news`
+        self._said: WindowRecord | None = None
+        self._newest: NavState | None = None
         self._published: Array = np.zeros((0, 4, 4))
         self._T_map_odom: Array = np.eye(4)
         self._revision = 0
@@ -109,6 +122,66 @@ class PoseGraph:
         """Hold the keyframes that are there where they are: those to come are found in a map that does not change."""
         self._estimator.hold(self.ids)
 
+    def restore(self, memory: GraphMemory) -> GraphUpdate:
+        """Take over the keyframes, loops and last estimate of an earlier run; return all poses.
+
+        `initialise` comes before, with the first state of that run, and `go_on` or a new piece after.
+        Raises DataError, and the graph cannot be used, when the memory contradicts itself.
+        """
+        if self._start is None or self._keyframes:
+            raise UsageError("a graph is restored once, after initialise(...) and before the first keyframe")
+        has_gravity = self._noise is not None
+        self._keyframes, self._journal = restored_journal(memory, self._config, has_gravity, self._start)
+        guesses = self._source.restore(self._keyframes, memory)
+        for k in [record.id for record in self._keyframes if record.begins_piece]:
+            self._pieces = self._pieces.begun(k)
+            self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
+        models = [LoopModel(r, self._config, self._lever_m) for r in self._journal if isinstance(r, LoopRecord)]
+        by_place = sort_loops(memory.loops, {m.id: m for m in models})
+        steps, note = self._estimator.restore(
+            guesses, by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE], memory.vo_scale
+        )
+        poses = self._estimator.poses
+        for step, moved_m in zip(steps, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), strict=True):
+            self._travel.append(step.variance_rad2, step.variance_m2, float(moved_m))
+        for tied in memory.ties:
+            self._anchors.tie(tied)
+        for model in by_place[LoopPlace.PARKED]:
+            self._park.park(model, poses, self._travel)
+        for model in by_place[LoopPlace.WAITING]:
+            self._waiting.add(model)
+        self._count_joined()
+        self._reports = {loop.state.id: edge_report(loop) for loop in memory.loops}
+        self._revision, self._T_odom_last = memory.revision, memory.T_odom_body
+        self._T_map_odom = poses[-1] @ invert(memory.T_odom_body)
+        update = self._publish([], [], note, everything=True)
+        self.take_news()
+        return update
+
+    def go_on(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> None:
+        """Begin anew at the newest keyframe of `restore`, seen again: its packet, without inertial data."""
+        if not self._keyframes or packet.keyframe.id != self._keyframes[-1].id:
+            raise UsageError(f"keyframe {packet.keyframe.id} is not the newest of the graph")
+        self._source.go_on(packet, self._estimator.poses[-1], T_odom_body)
+
+    def take_news(self) -> GraphNews:
+        """Return what `restore` will need of the last keyframe, beside what was measured and the poses."""
+        apart = {model.record.id: LoopPlace.PARKED for model in self._park.edges}
+        apart |= {model.record.id: LoopPlace.WAITING for model in self._waiting.edges}
+        loops = tuple(self._loop_state(n, apart) for n in self._changed)
+        self._changed = {}
+        states = self._source.take_states(self._newest)
+        return GraphNews(self._said, states, loops, self._anchors.take_news(), self._estimator.vo_scale)
+
+    def _loop_state(self, loop_id: int, apart: dict[int, LoopPlace]) -> LoopState:
+        report, estimator = self._reports[loop_id], self._estimator
+        place, tie = apart.get(loop_id, LoopPlace.OUT), None
+        if loop_id in estimator.loops:
+            place, tie = LoopPlace.GRAPH, estimator.loops[loop_id].tie
+        elif loop_id in estimator.spare:
+            place = LoopPlace.SPARE
+        return LoopState(loop_id, report.decision, report.reason, report.chi2, place, tie)
+
     def add(
         self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None
     ) -> GraphUpdate:
@@ -131,6 +204,7 @@ class PoseGraph:
         said = self._source.add(packet, record, T_odom_body)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
+        self._said = said[-1] if said else None
         self._journal += [self._start, record, *said] if previous is None else [record, *said]
         if previous is None:
             notes = [self._estimator.begin()]
@@ -233,10 +307,9 @@ class PoseGraph:
     def _wait(self, model: LoopModel) -> list[int]:
         """Let a loop between pieces that are not joined wait for other frames; return the ids of those that left."""
         record = model.record
-        self._reports[record.id] = EdgeReport(
-            record.id, record.from_id, record.to_id, float("nan"), 0.0, LoopDecision.PARKED,
-            "between pieces that are not joined, waits for loops of other frames that agree",
-        )  # fmt: skip
+        reason = "between pieces that are not joined, waits for loops of other frames that agree"
+        ends = record.from_id, record.to_id
+        self._set_report(EdgeReport(record.id, *ends, float("nan"), 0.0, LoopDecision.PARKED, reason))
         gone = self._waiting.add(model)
         if gone is None:
             return []
@@ -296,7 +369,8 @@ class PoseGraph:
             bad = EdgeReport(
                 edge.id, edge.from_id, edge.to_id, float("nan"), 0.0, LoopDecision.REJECTED, str(error)
             )  # fmt: skip
-            self._reports.setdefault(edge.id, bad)
+            if edge.id not in self._reports:
+                self._set_report(bad)
             return None
         self._journal.append(record)
         return LoopModel(record, self._config, self._lever_m)
@@ -318,9 +392,7 @@ class PoseGraph:
         inside = bool(chi2 <= model.threshold)
         decision = LoopDecision.ACCEPTED if inside else LoopDecision.PARKED
         reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
-        self._reports[record.id] = EdgeReport(
-            record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason
-        )  # fmt: skip
+        self._set_report(EdgeReport(record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason))
         gain = model.gain(known)
         if inside and self._estimator.is_long and gain < self._config.loop_gain_min:
             self._estimator.spare[record.id] = model
@@ -329,7 +401,11 @@ class PoseGraph:
 
     def _report(self, model: LoopModel, decision: LoopDecision, reason: str) -> None:
         old = self._reports[model.record.id]
-        self._reports[model.record.id] = replace(old, decision=decision, reason=f"{old.reason}; {reason}")
+        self._set_report(replace(old, decision=decision, reason=f"{old.reason}; {reason}"))
+
+    def _set_report(self, report: EdgeReport) -> None:
+        self._reports[report.loop_id] = report
+        self._changed[report.loop_id] = None
 
     def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> list[LoopModel]:
         """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
@@ -455,7 +531,7 @@ class PoseGraph:
         known[moved] = poses[moved]
         self._published = known
         self._revision += 1
-        newest = self._state(len(poses) - 1) if self._noise is not None else None
+        newest = self._newest = self._state(len(poses) - 1) if self._noise is not None else None
         details = {
             "solver": self._estimator.solver_name,
             "parked": len(self._park.edges),

@@ -8,22 +8,16 @@ import numpy as np
 
 from vislam.config import GraphConfig
 from vislam.errors import DataError
-from vislam.factors.builder import Builder
+from vislam.factors.builder import Builder, Guess
 from vislam.factors.estimator import Estimator
-from vislam.factors.journal import (
-    EdgeRecord,
-    KeyframeRecord,
-    StartRecord,
-    TiltRecord,
-    WindowRecord,
-    checked_pose,
-)
-from vislam.factors.keys import B, V, X
+from vislam.factors.journal import KeyframeRecord, StartRecord, checked_pose
+from vislam.factors.keys import B, V, X, bias_of
 from vislam.factors.loop import LoopModel
 from vislam.factors.noise import checked_covariance, conditioned
 from vislam.factors.odometry import MotionOdometry, Odometry
 from vislam.factors.window import WindowOdometry
 from vislam.imu import ImuNoise
+from vislam.memory import EdgeRecord, GraphMemory, TiltRecord, WindowRecord, at_pose
 from vislam.messages import Array, KeyframePacket, NavState
 from vislam.window.messages import WindowEdge, WindowUpdate
 
@@ -63,6 +57,15 @@ class Source(Protocol):
         Raises DataError, and changes nothing, on observations that cannot be used.
         """
 
+    def restore(self, records: list[KeyframeRecord], memory: GraphMemory) -> list[Guess]:
+        """Take all keyframes of an earlier run, after `begin`; return the last estimate of each."""
+
+    def go_on(self, packet: KeyframePacket, T_map_body: Array, T_odom_body: Array | None) -> None:
+        """Begin anew at the newest keyframe that `restore` brought: as it is in map, and as it is seen now."""
+
+    def take_states(self, newest: NavState | None) -> tuple[tuple[int, NavState], ...]:
+        """Return the states of keyframes that are to be remembered since the last call; `newest` is that in map."""
+
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
 
@@ -79,6 +82,7 @@ class MotionSource:
     def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, lever_m: Array) -> None:
         """Start empty."""
         self._odometry = MotionOdometry(Builder(config, noise, gravity_m_s2, lever_m))
+        self._newest_id = -1
 
     @property
     def odometry(self) -> Odometry:
@@ -100,7 +104,29 @@ class MotionSource:
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
         """See Source."""
         self._odometry.append(record)
+        self._newest_id = record.id
         return []
+
+    def restore(self, records: list[KeyframeRecord], memory: GraphMemory) -> list[Guess]:
+        """See Source; a velocity turns with what loops have turned since it was the newest."""
+        out = []
+        for k, (record, T) in enumerate(zip(records, memory.T_map_body, strict=True)):
+            self._odometry.append(record)
+            state = memory.states.get(k)
+            velocity, bias = np.zeros(3), bias_of(np.zeros(3), np.zeros(3))
+            if state is not None:
+                velocity = T[:3, :3] @ state.T_world_body[:3, :3].T @ state.velocity_world_m_s
+                bias = bias_of(state.gyro_bias_rad_s, state.accel_bias_m_s2)
+            out.append(Guess(T, velocity, bias))
+        self._newest_id = len(records) - 1
+        return out
+
+    def go_on(self, packet: KeyframePacket, T_map_body: Array, T_odom_body: Array | None) -> None:
+        """See Source; motions are relative, so there is nothing to do."""
+
+    def take_states(self, newest: NavState | None) -> tuple[tuple[int, NavState], ...]:
+        """See Source."""
+        return () if newest is None else ((self._newest_id, newest),)
 
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """See Source."""
@@ -135,6 +161,7 @@ class WindowSource:
         self._odometry = WindowOdometry(config)
         self._window = window
         self._local: list[NavState | None] = []  # of each keyframe in the window's frame, settled or as it was newest
+        self._fresh: dict[int, NavState] = {}  # of those, since `take_states`
         self._details: dict[str, Any] = {}
 
     @property
@@ -162,14 +189,34 @@ class WindowSource:
         said = self._record(update, record)
         self._odometry.append(said)
         self._local.append(update.newest)
+        if update.newest is not None:
+            self._fresh[record.id] = update.newest
         for k, state in update.states:
-            self._local[k] = state
+            self._local[k] = self._fresh[k] = state
         self._details = {
             "calibration": update.calibration,
             "scale_sigma": update.scale_sigma,
             "rejected_tracks": update.rejected_tracks,
         }
         return [said]
+
+    def restore(self, records: list[KeyframeRecord], memory: GraphMemory) -> list[Guess]:
+        """See Source."""
+        for said in memory.windows:
+            self._odometry.append(said)
+        self._local = [memory.states.get(k) for k in range(len(records))]
+        nothing = bias_of(np.zeros(3), np.zeros(3))
+        return [Guess(T, np.zeros(3), nothing) for T in memory.T_map_body]
+
+    def go_on(self, packet: KeyframePacket, T_map_body: Array, T_odom_body: Array | None) -> None:
+        """See Source; a new window starts from the state that the old one had at its newest keyframe."""
+        self._window.initialise(self._local[-1], T_map_body)
+        self._window.add(packet, T_odom_body)
+
+    def take_states(self, newest: NavState | None) -> tuple[tuple[int, NavState], ...]:
+        """See Source; in the window's frame."""
+        fresh, self._fresh = tuple(self._fresh.items()), {}
+        return fresh
 
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """See Source."""
@@ -251,10 +298,8 @@ def in_map(local: NavState, T_map_body: Array, pose_covariance: Array | None) ->
     The window says how velocity and biases depend on the pose, the graph how well the pose is known: `pose_covariance`
     [6, 6] in NavState's axes takes the place of the window's own, and what depends on it follows.
     """
-    R = T_map_body[:3, :3] @ local.T_world_body[:3, :3].T
-    turn = np.eye(15)
-    turn[3:6, 3:6] = turn[6:9, 6:9] = R
-    covariance = turn @ local.covariance @ turn.T
+    state = at_pose(local, T_map_body)
+    covariance = state.covariance
     if pose_covariance is not None and np.all(np.isfinite(covariance)):
         own = conditioned(covariance[:6, :6], _RATIO_MAX)
         gain = np.linalg.solve(own, covariance[:6, 6:]).T
@@ -263,8 +308,7 @@ def in_map(local: NavState, T_map_body: Array, pose_covariance: Array | None) ->
         covariance[6:, :6] = gain @ pose_covariance
         covariance[:6, 6:] = covariance[6:, :6].T
         covariance[6:, 6:] = rest + gain @ pose_covariance @ gain.T
-    velocity = R @ local.velocity_world_m_s
-    return NavState(local.t_ns, T_map_body, velocity, local.gyro_bias_rad_s, local.accel_bias_m_s2, covariance)
+    return state
 
 
 def _edge_record(edge: WindowEdge) -> EdgeRecord:

@@ -15,6 +15,7 @@ from vislam.config import LoopConfig
 from vislam.loop.index import InvertedIndex
 from vislam.loop.view import View
 from vislam.loop.vocabulary import Vocabulary, train
+from vislam.memory import WordsMemory
 
 _DEEP_FROM = 60_000  # descriptors; fewer do not fill a fifth level
 
@@ -38,6 +39,20 @@ class PlaceDatabase:
         ids, scores = self._index.query(self.vocabulary.transform(view.descriptors), k, excluded)
         return ids.tolist(), scores.tolist()
 
+    def words(self) -> WordsMemory | None:
+        """Return the vocabulary as `restore` takes it; None before the first training."""
+        if self.vocabulary is None:
+            return None
+        return WordsMemory(self.vocabulary.to_bytes(), self._train_at // 2, self.trainings)
+
+    def restore(self, views: list[View], words: WordsMemory | None) -> None:
+        """Take over the views of an earlier run and the vocabulary it had; raises DataError when that is damaged."""
+        self._views = list(views)
+        if words is not None:
+            self.vocabulary = Vocabulary.from_bytes(words.data, "of the session")
+            self._train_at, self.trainings = 2 * words.trained_at, words.trainings
+            self._rebuild()
+
     def add(self, view: View) -> None:
         """Add a view (ids ascend) and train again when it is time."""
         self._views.append(view)
@@ -55,7 +70,12 @@ class PlaceDatabase:
         self.vocabulary = train(
             images, config.vocabulary_branching, depth, self._seed + self.trainings, config.training_descriptors
         )
+        self._rebuild()
+        self.trainings += 1
+
+    def _rebuild(self) -> None:
+        """Index all views anew."""
+        assert self.vocabulary is not None
         self._index = InvertedIndex(self.vocabulary.idf)
         for view in self._views:
             self._index.add(view.id, self.vocabulary.transform(view.descriptors))
-        self.trainings += 1

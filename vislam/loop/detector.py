@@ -18,6 +18,7 @@ from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verifier import Verification, Verifier
 from vislam.loop.view import View, make_view
 from vislam.loop.vocabulary import Vocabulary
+from vislam.memory import PlacesMemory, TagSighting, WordsMemory
 from vislam.messages import (
     Array,
     GraphUpdate,
@@ -73,6 +74,33 @@ class LoopDetector:
     def vocabulary(self) -> Vocabulary | None:
         """The vocabulary in use; None before the first training."""
         return self._database.vocabulary
+
+    @property
+    def trainings(self) -> int:
+        """How often the vocabulary was trained: when this grows, `words` is new."""
+        return self._database.trainings
+
+    def words(self) -> WordsMemory | None:
+        """Return the vocabulary as `restore` takes it; None before the first training."""
+        return self._database.words()
+
+    def tags(self, keyframe_id: int) -> tuple[TagSighting, ...]:
+        """Return the tags that a keyframe saw."""
+        return self._tags.of(keyframe_id)
+
+    def restore(self, memory: PlacesMemory) -> None:
+        """Take over the keyframes of an earlier run; edges that it had parked here are forgotten.
+
+        Raises DataError when features or vocabulary are damaged.
+        """
+        views = [make_view(keyframe, self._rig) for keyframe in memory.keyframes]
+        self._views = {view.id: view for view in views}
+        for view, T_map_body in zip(views, memory.T_map_body, strict=True):
+            self._poses.add(view.id, T_map_body)
+        for keyframe_id, sightings in memory.tags.items():
+            self._tags.add(keyframe_id, sightings)
+        self._database.restore(views, memory.words)
+        self._next_edge_id = memory.next_edge_id
 
     def detect(
         self, keyframe: Keyframe, T_map_body: Array, begins_piece: bool = False

@@ -7,8 +7,6 @@ plane: where both fit the corners, none is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -18,21 +16,12 @@ from vislam.features import find_tags
 from vislam.geometry import invert, se3_adjoint, skew
 from vislam.loop.candidates import Candidate
 from vislam.loop.verifier import Verification
+from vislam.memory import TagSighting
 from vislam.messages import Array, Frame
 
 _CORNER_SIGMA_PX = 0.5  # 0.1 to 0.6 px measured on rendered tags of 88 down to 30 px
 _MIN_SIDE_PX = 30.0  # smaller tags are read, but their corners are off by more
 _MIN_CHI2_APART = 25.0  # of the two solutions' residuals; nearer, and noise may decide between them
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TagSighting:
-    """A tag in one image; `T_cam_tag` [4, 4] and its covariance [6, 6] only where size and view determine them."""
-
-    tag_id: int
-    side_px: float  # mean length of its sides
-    T_cam_tag: Array | None  # z towards the camera, x to the right as printed
-    covariance: Array | None  # perturbed on the tag's side, rotation first
 
 
 def sight_tags(frame: Frame, camera: Camera, config: LoopConfig) -> tuple[TagSighting, ...]:
@@ -85,6 +74,10 @@ class TagBook:
     def __init__(self) -> None:
         self._sightings: dict[int, tuple[TagSighting, ...]] = {}  # by keyframe
         self._seen_in: dict[int, list[int]] = {}  # by tag
+
+    def of(self, keyframe_id: int) -> tuple[TagSighting, ...]:
+        """Return what a keyframe saw."""
+        return self._sightings.get(keyframe_id, ())
 
     def add(self, keyframe_id: int, sightings: tuple[TagSighting, ...]) -> None:
         """Take note of what a keyframe saw."""

@@ -48,6 +48,10 @@ class CorrectedOccupancy:
         self._integrate(self._current, scan, T_map_body)
         self._current_poses[keyframe_id] = T_map_body
 
+    def restore(self, keyframe_id: int, T_map_body: Array) -> None:
+        """Note a keyframe of an earlier run, which is in the store already; `advance` and `finish` integrate it."""
+        self._poses[keyframe_id] = T_map_body
+
     def move(self, keyframe_ids: NDArray[np.int64], T_map_body: Array) -> None:
         """Note new poses [M, 4, 4] of keyframes; those that are not in the map are ignored."""
         for keyframe_id, T in zip(keyframe_ids.tolist(), T_map_body, strict=True):
@@ -73,7 +77,7 @@ class CorrectedOccupancy:
 
     def finish(self) -> None:
         """Bring every keyframe to exactly its newest pose."""
-        if all(np.array_equal(self._poses[i], self._current_poses[i]) for i in self._poses):
+        if self._is_complete() and all(np.array_equal(self._poses[i], self._current_poses[i]) for i in self._poses):
             self._next = None
             return
         self._next, self._next_poses = _new_map(self._config), {}
@@ -83,12 +87,17 @@ class CorrectedOccupancy:
         """Return whether a keyframe is farther from where it was integrated than the limits allow."""
         if not self._poses:
             return False
+        if not self._is_complete():
+            return True
         old = np.array([self._current_poses[i] for i in self._poses])
         new = np.array(list(self._poses.values()))
         far_m = self._config.move_voxels * self._config.resolution_m
         moved = np.linalg.norm(new[:, :3, 3] - old[:, :3, 3], axis=1) > far_m
         trace = np.einsum("nij,nij->n", old[:, :3, :3], new[:, :3, :3])  # 1 + 2 cos(angle) of the turn between them
         return bool((moved | (trace < 1.0 + 2.0 * np.cos(np.deg2rad(self._config.move_deg)))).any())
+
+    def _is_complete(self) -> bool:
+        return len(self._current_poses) == len(self._poses)
 
     def _integrate(self, occupancy: OccupancyMap, scan: Scan, T_map_body: Array) -> None:
         config = self._config

@@ -22,6 +22,7 @@ from vislam.mapping.occupancy import Occupancy, OccupancyMap
 from vislam.mapping.octomap_io import encode_bt
 from vislam.mapping.ply import write_ply
 from vislam.mapping.store import KeyframeStore, Scan
+from vislam.memory import PackedScan
 from vislam.messages import GraphUpdate, Keyframe
 
 Array = NDArray[np.float64]
@@ -62,6 +63,24 @@ class Mapper:
             return
         self._store.add(keyframe.id, keyframe.t_ns, scan)
         self._occupancy.add(keyframe.id, scan, T)
+
+    def packed(self, keyframe_id: int) -> PackedScan | None:
+        """Return what is kept of a keyframe's geometry, None if there was none."""
+        return self._store.packed(keyframe_id)
+
+    def restore(self, scans: dict[int, PackedScan], T_map_body: dict[int, Array]) -> None:
+        """Take over keyframes of an earlier run at their poses; they come into the map little by little, with `move`.
+
+        Raises DataError when one has no pose, or one that is not rigid.
+        """
+        ids = sorted(scans)
+        unplaced = [i for i in ids if i not in T_map_body]
+        if unplaced:
+            raise DataError(f"keyframe {unplaced[0]} has a scan, but no pose; run the recording again")
+        _check_rigid(np.array([T_map_body[i] for i in ids]), np.array(ids))
+        for i in ids:
+            self._store.put(i, scans[i])
+            self._occupancy.restore(i, T_map_body[i])
 
     def move(self, update: GraphUpdate) -> None:
         """Take over corrected poses, and re-integrate a bounded number of keyframes if some moved by a voxel.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.errors import DataError
+from vislam.memory import PackedScan
 
 ImageU8 = NDArray[np.uint8]
 _JPEG_QUALITY = 90
@@ -31,23 +32,11 @@ class Scan:
     colors: ImageU8  # RGB [h, w, 3] of the depth image, or [N, 3] of the points
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Packed:
-    t_ns: int
-    depth_png: bytes
-    points: bytes
-    colors: bytes
-
-    @property
-    def nbytes(self) -> int:
-        return len(self.depth_png) + len(self.points) + len(self.colors)
-
-
 class KeyframeStore:
     """Keyframe id -> compressed scan; memory per keyframe is bounded by the size of a depth image."""
 
     def __init__(self) -> None:
-        self._packed: dict[int, _Packed] = {}
+        self._packed: dict[int, PackedScan] = {}
 
     def __len__(self) -> int:
         return len(self._packed)
@@ -69,6 +58,14 @@ class KeyframeStore:
         """Return the time of a stored keyframe."""
         return self._packed[keyframe_id].t_ns
 
+    def packed(self, keyframe_id: int) -> PackedScan | None:
+        """Return a keyframe's scan as it is stored, None if it has none."""
+        return self._packed.get(keyframe_id)
+
+    def put(self, keyframe_id: int, packed: PackedScan) -> None:
+        """Keep a scan that `packed` gave."""
+        self._packed[keyframe_id] = packed
+
     def add(self, keyframe_id: int, t_ns: int, scan: Scan) -> None:
         """Keep the scan of a new keyframe; depth is kept exactly. Raises DataError on an id that is there already."""
         if keyframe_id in self._packed:
@@ -77,11 +74,11 @@ class KeyframeStore:
             depth_png = _encode(".png", scan.depth, _PNG_OPTIONS)
             bgr = np.ascontiguousarray(scan.colors[..., ::-1])
             colors = _encode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-            self._packed[keyframe_id] = _Packed(t_ns, depth_png, b"", colors)
+            self._packed[keyframe_id] = PackedScan(t_ns, depth_png, b"", colors)
         elif scan.points_body_m is not None:
             points = np.ascontiguousarray(scan.points_body_m[:_MAX_SPARSE_POINTS], dtype=np.float32)
             colors = np.ascontiguousarray(scan.colors[:_MAX_SPARSE_POINTS]).tobytes()
-            self._packed[keyframe_id] = _Packed(t_ns, b"", zlib.compress(points.tobytes(), 1), colors)
+            self._packed[keyframe_id] = PackedScan(t_ns, b"", zlib.compress(points.tobytes(), 1), colors)
 
     def scan(self, keyframe_id: int) -> Scan:
         """Return the scan of a stored keyframe; depth is exactly what was added."""

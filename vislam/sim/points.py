@@ -194,8 +194,11 @@ class PointRecording:
 
     # -- the recording -----------------------------------------------------------------------------------------------
 
-    def events(self) -> Iterator[ImuSample | Frame]:
-        """Yield samples and frames in order of their stamps; can be called again and yields the same again."""
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | Frame]:
+        """Yield samples and frames in order of their stamps; can be called again and yields the same again.
+
+        Tracks depend on what was followed before, so nothing is left out before `from_ns`.
+        """
         streams: list[Iterator[ImuSample | Frame]] = [self._imu.samples(), self._frames()]
         yield from heapq.merge(*streams, key=lambda event: event.t_ns)
 

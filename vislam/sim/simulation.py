@@ -144,9 +144,9 @@ class Simulation:
         camera = self.rig.cameras[0]
         return Imager(camera.width, camera.height, self.options.image_noise)
 
-    def events(self) -> Iterator[Event]:
-        """Yield samples and frames in time order; can be called again and yields the same again."""
-        frames = self._frames()
+    def events(self, from_ns: int | None = None) -> Iterator[Event]:
+        """Yield samples and frames in time order, no frame before `from_ns`; each call yields the same again."""
+        frames = self._frames(0 if from_ns is None else int(np.searchsorted(_ns(self._frame_s), from_ns)))
         try:
             streams: list[Iterator[Event]] = [self._imu_samples(), self._mag_samples(), frames]
             yield from heapq.merge(*streams, key=_stamp)
@@ -163,12 +163,12 @@ class Simulation:
         for t_ns, field_ut in zip(_ns(self._mag_s).tolist(), self._field_ut, strict=True):
             yield MagSample(t_ns, field_ut)
 
-    def _frames(self) -> Generator[Frame, None, None]:
+    def _frames(self, first: int) -> Generator[Frame, None, None]:
         """Yield frames rendered ahead by worker threads; closing the generator ends the threads."""
         pool = ThreadPoolExecutor(self.options.workers, thread_name_prefix="vislam-render")
         waiting: deque[Future[Frame]] = deque()
         try:
-            for index in range(self.frame_count):
+            for index in range(first, self.frame_count):
                 while len(waiting) < self.options.workers * _AHEAD and index + len(waiting) < self.frame_count:
                     waiting.append(pool.submit(self.render, index + len(waiting)))
                 yield waiting.popleft().result()

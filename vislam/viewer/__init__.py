@@ -24,6 +24,9 @@ class NullViewer:
         """Remember why there is no viewer, so that a run can say it."""
         self.reason = reason
 
+    def go_on(self, zero_ns: int, T_map_body: Mapping[int, Array]) -> None:
+        """Ignore where an earlier recording ended."""
+
     def log_frame(self, frame: Frame, observations: Observations, tracking: Tracking) -> None:
         """Ignore a frame."""
 

@@ -81,6 +81,18 @@ class RunViewer:
         self._has_loop_pictures = False
         self._log_static()
 
+    def go_on(self, zero_ns: int, T_map_body: Mapping[int, Array]) -> None:
+        """Begin where an earlier recording of the same run ended: its time zero, and its keyframes [4, 4] by id.
+
+        Opened together with it, the two are shown as one.
+        """
+        self._zero_ns = zero_ns
+        self._set_time(zero_ns)
+        for keyframe_id, T in T_map_body.items():
+            self._write_pose(keyframe_id, T)
+        if self._poses:
+            self._log_keyframe_path(list(self._poses))
+
     def log_frame(self, frame: Frame, observations: Observations, tracking: Tracking) -> None:
         """Log the tracking state, and for one frame in `every_frames` the picture with its tracks coloured by age."""
         self._set_time(frame.t_ns)
