@@ -27,8 +27,10 @@ class FakeWindow:
         self.errors: list[Array] = []  # settled error of each edge, in sigmas
         self.first: Array = np.eye(4)
         self.count = 0
+        self.begin: int | None = None  # the first keyframe after `initialise`
 
     def initialise(self, state: NavState | None, T_local_body: Array | None = None) -> None:
+        self.begin = None
         self.first = (
             state.T_world_body if state is not None else T_local_body if T_local_body is not None else np.eye(4)
         )
@@ -44,16 +46,18 @@ class FakeWindow:
     def add(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> WindowUpdate:
         k = packet.keyframe.id
         self.count = k + 1
-        self.errors.append(self.rng.normal(size=6))
+        self.begin = k if self.begin is None else self.begin
+        while len(self.errors) <= k:
+            self.errors.append(self.rng.normal(size=6))
         left = k - self.keyframes  # the keyframe that leaves now
-        edges = [self.edge(left + 1, True)] if left >= 0 else []
-        first = max(left + 1, 0)
+        edges = [self.edge(left + 1, True)] if left >= self.begin else []
+        first = max(left + 1, self.begin)
         ids = np.arange(first, k + 1)
         edges += [self.edge(j, False) for j in range(first + 1, k + 1)]
         T_local = self.world.truth[ids]  # good enough: the graph takes edges, not these
         tilts, states = (), ()
         newest = self.state(k) if self.imu else None
-        if self.imu and left >= 0:
+        if self.imu and left >= self.begin:
             tilts, states = (self.tilt(left),), ((left, self.state(left)),)
         return WindowUpdate(ids, T_local, newest, tuple(edges), tilts, states, _EXACT, 0.0, 0)
 

@@ -8,7 +8,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from session_world import decided, start_facts
+from session_entries import decided, start_facts
 
 from vislam.camera import Camera, Rig
 from vislam.errors import DataError, StorageError
@@ -179,7 +179,7 @@ def test_a_failed_commit_leaves_no_half_keyframe(tmp_path):
 def test_a_killed_writer_leaves_every_committed_keyframe(tmp_path):
     path = tmp_path / "session.db"
     script = textwrap.dedent(f"""
-        import sys; sys.path[:0] = [{os.path.dirname(__file__)!r}, {os.path.join(os.path.dirname(__file__), "batch")!r}]
+        import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
         from pathlib import Path
         from test_session import write_three
         writer, *_ = write_three(Path({str(path)!r}))

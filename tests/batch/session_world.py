@@ -9,6 +9,7 @@ from typing import Literal
 import gtsam
 import numpy as np
 from graph_world import LAP_S, T_BODY_CAM0, World
+from session_entries import decided, start_facts
 
 from vislam.batch.adjust import solve
 from vislam.batch.chain import Chain
@@ -19,9 +20,8 @@ from vislam.factor_log import FactorLog, LoggedEdge, LoggedKeyframe
 from vislam.factors.keys import X
 from vislam.frames import LoggedFrames
 from vislam.geometry import invert, se3_exp, se3_log, transform, transform_points
-from vislam.imu import ImuNoise
-from vislam.memory import FrameEntry, GraphNews, KeyframeEntry, LoopPlace, LoopState, StartFacts
-from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Observations
+from vislam.memory import FrameEntry, GraphNews, KeyframeEntry
+from vislam.messages import Array, GraphUpdate, KeyframePacket, Observations
 from vislam.session import SessionWriter
 
 CAMERA = Camera(640, 480, 400.0, 398.0, 321.0, 238.0, 0.0, "radtan", (-0.2, 0.05, 2e-4, -1e-4))
@@ -177,17 +177,6 @@ class _Eyes:
             delay = (pixels[i, 1] / (CAMERA.height - 1) - 0.5) * self.readout_s
             pixels[i] = CAMERA.project(transform_points(se3_exp(-twist * delay), points_cam[i : i + 1]))[0]
         return pixels
-
-
-def decided(loop_id: int, accepted: bool) -> LoopState:
-    """Return a loop that was accepted, or rejected."""
-    decision = LoopDecision.ACCEPTED if accepted else LoopDecision.REJECTED
-    return LoopState(loop_id, decision, "", 1.5, LoopPlace.GRAPH if accepted else LoopPlace.OUT, None)
-
-
-def start_facts(state: NavState, noise: ImuNoise) -> StartFacts:
-    """Return a start at rest with a first state."""
-    return StartFacts("static", "at rest", state, 0.0, 0.0, noise, state)
 
 
 def store(log: FactorLog, path: Path, info: dict | None = None, upto: int | None = None) -> SessionWriter:
