@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
+import resource
+import shutil
+import sqlite3
+import subprocess
+import sys
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,16 +19,22 @@ from fake_window import FakeWindow
 from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
 from session_entries import start_facts
 
-from vislam.config import GraphConfig, WindowConfig
+from vislam.cli import run_verb
+from vislam.config import GraphConfig, WindowConfig, load
 from vislam.graph import PoseGraph
 from vislam.memory import KeyframeEntry
 from vislam.messages import LoopDecision
+from vislam.run import execute
+from vislam.runfolder import prepare
 from vislam.session import Session, SessionWriter, recall
+from vislam.sources import open_source
+from vislam.trajectory import read_tum
 
 LOOSE = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)
 TIGHT = GraphConfig(coupling="tight", window_inflation=1.0)
-SOURCE = "points:corridor-loop,duration_s=20"
+SOURCE = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=100"
 KILLS = 20
+SEED = 1
 
 
 # ---- the graph
@@ -107,3 +122,172 @@ def test_the_newest_state_of_the_window_is_that_of_the_last_commit(tmp_path, mon
     for a, b in zip(new.states(), graph.states(), strict=True):
         assert np.allclose(a.velocity_world_m_s, b.velocity_world_m_s, atol=0.02)
         assert np.array_equal(a.accel_bias_m_s2, b.accel_bias_m_s2)
+
+
+# ---- the whole run
+
+
+def folder_of(path: Path) -> dict:
+    """Return what a test looks at in a run folder."""
+    metrics = json.loads((path / "metrics.json").read_text())
+    session = Session(path / "session.db")
+    ids = [keyframe.id for keyframe in session.keyframes()]
+    session.close()
+    return {"metrics": metrics, "ids": ids, "trajectory": read_tum(path / "trajectory_graph.tum")}
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments_lose_at_most_the_last_keyframe_each(tmp_path):
+    """The script checks each time what is left; here the run that came to its end is compared with an undisturbed."""
+    print("seed", SEED)
+    command = [sys.executable, str(Path(__file__).parent / "killed_runs.py"), str(tmp_path), str(SEED), str(KILLS)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    print(done.stdout[-6000:], done.stderr[-3000:])
+    assert done.returncode == 0
+    facts = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"kill"')]
+    assert facts[-1]["kill"] == KILLS
+    assert sum(fact["begun"] for fact in facts) > 0
+    whole, resumed = folder_of(tmp_path / "whole"), folder_of(tmp_path / "killed0")
+    assert resumed["metrics"]["resumed"]
+    assert resumed["ids"] == list(range(resumed["metrics"]["keyframes"]))
+    assert abs(len(resumed["ids"]) - len(whole["ids"])) <= 0.2 * len(whole["ids"])
+    assert resumed["metrics"]["frames"] == whole["metrics"]["frames"]
+    assert np.array_equal(resumed["trajectory"].t_ns, whole["trajectory"].t_ns)
+    errors_m = [run["metrics"]["accuracy"]["graph"]["ate_rmse_m"] for run in (whole, resumed)]
+    print("ATE [m]: undisturbed, resumed", errors_m)
+    assert errors_m[1] < 2.0 * errors_m[0] + 0.01
+    for name in ("tracking.csv", "trajectory_live.tum"):
+        lines = [(tmp_path / run / name).read_text().splitlines() for run in ("whole", "killed0")]
+        assert len(lines[0]) == len(lines[1]), name
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """A run that was interrupted in the middle, to copy and to resume."""
+    out = tmp_path_factory.mktemp("runs") / "ended"
+    prepare(out, overwrite=False)
+    config = load(None, {"view.enabled": False})
+    recording = open_source(SOURCE)
+
+    def stop(done: int, total: int, note: str) -> None:
+        if done == total // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        execute(recording, config, out, SOURCE, [], stop)
+    return out
+
+
+@pytest.fixture
+def copied(ended, tmp_path):
+    shutil.copytree(ended, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_an_interrupted_run_is_resumed_once_and_then_finished(copied, capsys):
+    assert json.loads((copied / "metrics.json").read_text())["warnings"]
+    before = Session(copied / "session.db")
+    assert before.info()["finished"] is False
+    count = len(list(before.keyframes()))
+    assert run_verb(["run", "--resume", str(copied), "--json"]) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    (resumed,) = metrics["resumed"]
+    assert resumed["keyframe"] == count - 1
+    assert metrics["frames"] == metrics["frames_expected"]
+    assert metrics["coverage_frames"] > 0.9
+    assert run_verb(["run", "--resume", str(copied)]) == 2
+    assert "nothing to resume" in capsys.readouterr().err
+
+
+def test_two_resumed_runs_give_identical_bytes(ended, tmp_path):
+    digests = []
+    for name in ("a", "b"):
+        shutil.copytree(ended, tmp_path / name)
+        assert run_verb(["run", "--resume", str(tmp_path / name)]) == 0
+        files = ("trajectory_graph.tum", "trajectory_ekf.tum", "loops.csv", "states_graph.csv", "states_ekf.csv")
+        digests.append([hashlib.sha256((tmp_path / name / f).read_bytes()).hexdigest() for f in files])
+    assert digests[0] == digests[1]
+
+
+def edit_config(out: Path) -> None:
+    config = json.loads((out / "config.json").read_text())
+    config["loop"]["min_inliers"] += 1
+    (out / "config.json").write_text(json.dumps(config))
+
+
+def edit_manifest(out: Path) -> None:
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["data_sha256"] = "0" * 64
+    (out / "manifest.json").write_text(json.dumps(manifest))
+
+
+def edit_session(out: Path, statement: str) -> None:
+    with sqlite3.connect(out / "session.db") as database:
+        database.execute(statement)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "message"),
+    [
+        (lambda out: (out / "manifest.json").unlink(), 2, "holds no run to resume"),
+        (lambda out: (out / "config.json").write_text("{"), 3, "cannot be read"),
+        (edit_config, 2, "was changed since the run began"),
+        (edit_manifest, 3, "is not the recording"),
+        (lambda out: (out / "session.db").write_bytes(b"no database at all " * 400), 3, "cannot be read"),
+        (lambda out: edit_session(out, "PRAGMA user_version=2"), 3, "format 2, this vislam reads 3"),
+        (lambda out: edit_session(out, "DELETE FROM windows WHERE id = 3"), 3, "run the recording again"),
+        (lambda out: edit_session(out, "DELETE FROM keyframes WHERE id = 3"), 3, "run the recording again"),
+        (lambda out: edit_session(out, "UPDATE states SET state = x'00'"), 3, "run the recording again"),
+        (
+            lambda out: edit_session(out, "UPDATE keyframes SET T_map_body = zeroblob(128)"),
+            3,
+            "run the recording again",
+        ),
+        (lambda out: edit_session(out, "UPDATE newest SET value = '[]'"), 3, "run the recording again"),
+        (lambda out: edit_session(out, "UPDATE keyframes SET t_ns = t_ns + 7 WHERE id = 5"), 3, "has no frame at"),
+    ],
+)
+def test_what_cannot_be_resumed_is_told_in_one_line(copied, spoil, code, message, capsys):
+    spoil(copied)
+    assert run_verb(["run", "--resume", str(copied)]) == code
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("left", ["nothing", "empty", "no keyframe"])
+def test_a_run_that_had_not_begun_begins_again(copied, left, capsys):
+    for path in copied.glob("session.db*"):
+        path.unlink()
+    if left == "empty":
+        sqlite3.connect(copied / "session.db").execute("PRAGMA journal_mode=WAL")
+    if left == "no keyframe":
+        recording, config = open_source(SOURCE), json.loads((copied / "config.json").read_text())
+        SessionWriter(copied / "session.db", {"config": config}, recording.rig, recording.imu_noise, 9.81)
+    assert run_verb(["run", "--resume", str(copied), "--json"]) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["resumed"] == []
+    assert metrics["frames"] == metrics["frames_expected"]
+
+
+def test_a_full_disk_is_a_storage_error_and_the_run_goes_on_when_there_is_room(copied, capsys):
+    """The limit on the size of a file stands for the disk."""
+    size = (copied / "session.db").stat().st_size
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size // 8, limits[1]))
+        assert run_verb(["run", "--resume", str(copied)]) == 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "free disk space" in capsys.readouterr().err
+    assert run_verb(["run", "--resume", str(copied)]) == 0
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_a_storage_error(copied, capsys):
+    copied.chmod(0o500)
+    try:
+        assert run_verb(["run", "--resume", str(copied)]) == 3
+    finally:
+        copied.chmod(0o700)
+    assert "cannot be written" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -164,9 +164,12 @@ def _written_up(out: Path) -> Iterator[None]:
 
     try:
         yield
-    finally:
-        if (out / "metrics.json").is_file():
-            write_report(out)
+    except BaseException:
+        with suppress(VislamError):  # what went wrong first is what is told
+            if (out / "metrics.json").is_file():
+                write_report(out)
+        raise
+    write_report(out)
 
 
 @contextmanager

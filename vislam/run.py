@@ -97,7 +97,7 @@ class Run:
         t_s = (front.t_ns - int(self.log.stamps_ns[0])) * 1e-9
         now = datetime.now(UTC).isoformat(timespec="seconds")
         self.resumed = [*info.get("resumed", []), {"keyframe": front.keyframe_id, "t_s": t_s, "utc": now}]
-        self.session.tell({"resumed": self.resumed})
+        self.session.tell({"resumed": self.resumed, "finished": False})
         self.session.move(update, GraphNews())
         self.warnings.append(
             f"resumed {len(self.resumed)} times, last at keyframe {front.keyframe_id}: timings, counters and "

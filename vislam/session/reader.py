@@ -111,7 +111,12 @@ class Session:
         """Return the small facts of the last commit; empty before the first."""
         with readable(self.path):
             row = self._db.execute("SELECT value FROM newest").fetchone()
-            return {} if row is None else dict(json.loads(row[0]))
+            if row is None and self._db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0] == 0:
+                return {}
+            newest: dict[str, Any] = json.loads(row[0])
+            if not newest:
+                raise ValueError("the last commit says nothing")
+            return newest
 
     def rows(self, query: str) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query."""

@@ -26,6 +26,8 @@ from vislam.messages import Array, Frame, Keyframe, NavState
 from vislam.session.reader import Session
 from vislam.session.schema import maybe_numbers, numbers, readable, window_of
 
+_RIGID = 1e-4  # how far R R^T may be from identity
+
 
 def recall(session: Session) -> SlamMemory | None:
     """Return what a pipeline goes on from; None when the session has nothing worth going on from.
@@ -43,6 +45,7 @@ def recall(session: Session) -> SlamMemory | None:
         states = session.states("graph")
         loops = session.loops()
         T_map_body = np.array([k.T_map_body for k in stored])
+        _check_rigid(T_map_body)
         last = stored[-1]
         graph = GraphMemory(
             packets=packets,
@@ -75,6 +78,15 @@ def recall(session: Session) -> SlamMemory | None:
             news=_front(newest["front"]),
         )
         return SlamMemory(front, stored[0].T_odom_body, graph, places, _scans(session))
+
+
+def _check_rigid(T: Array) -> None:
+    """Raise ValueError where one of the poses [M, 4, 4] is no rigid motion."""
+    R = T[:, :3, :3]
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    sound = (error <= _RIGID) & np.isfinite(T).all(axis=(1, 2)) & (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    if not sound.all():
+        raise ValueError(f"the pose of keyframe {int(np.flatnonzero(~sound)[0])} is no rigid motion")
 
 
 def _start(info: dict[str, Any]) -> StartFacts | None:

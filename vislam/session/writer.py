@@ -72,7 +72,6 @@ class SessionWriter:
             newest_id, newest_t_ns = db.execute("SELECT id, t_ns FROM keyframes ORDER BY id DESC").fetchone() or (-1, 0)
             db.execute("DELETE FROM frames WHERE t_ns > ? OR keyframe_id > ?", (newest_t_ns, newest_id))
             writer._edges = db.execute("SELECT COALESCE(MAX(number) + 1, 0) FROM edges").fetchone()[0]
-            writer._tell({"finished": False})
         return writer
 
     def _open(self, path: Path) -> None:

@@ -1,0 +1,120 @@
+"""Kills a run again and again with SIGKILL at random moments and resumes it; `python killed_runs.py FOLDER SEED KILLS`.
+
+Runs are forked from one process that has compiled everything, so that each starts within milliseconds and moments of
+the pipeline are hit, not those of importing. Every line on stdout is a fact as JSON; a failed check ends it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+from vislam import slam
+from vislam.cli import run_verb
+from vislam.session import Session
+
+SOURCE = "points:corridor-loop,duration_s=16,camera_hz=10,tracks=100"
+SETTINGS = ("--view.no-enabled", "--json")
+PART = 0.25  # of the time that a whole run takes, within which one is killed
+
+
+def start(arguments: list[str], begun: int) -> int:
+    """Fork a run; it writes a byte to the pipe `begun` for each keyframe that reaches its back end."""
+    child = os.fork()
+    if child:
+        return child
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    add = slam.Back.add
+
+    def told(self: slam.Back, odometry: object) -> object:
+        os.write(begun, b".")
+        return add(self, odometry)
+
+    slam.Back.add = told
+    os._exit(run_verb(arguments))
+
+
+def committed(session: Path, scratch: Path) -> int:
+    """Check a copy of what a killed run left, and return how many keyframes are in it."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    for name in ("session.db", "session.db-wal"):
+        if (session.parent / name).exists():
+            shutil.copy(session.parent / name, scratch / name)
+    copy = scratch / "session.db"
+    if not copy.exists():
+        return 0
+    with closing(sqlite3.connect(copy)) as db:
+        assert db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+        tables = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
+        if tables == 0:
+            return 0
+        counts = {}
+        for table in ("keyframes", "packets", "windows"):
+            ids = [row[0] for row in db.execute(f"SELECT id FROM {table} ORDER BY id")]
+            assert ids == list(range(len(ids))), f"{table}: {ids}"
+            counts[table] = len(ids)
+        assert len(set(counts.values())) == 1, counts
+    with closing(Session(copy)) as session_copy:
+        log = session_copy.factor_log()
+        assert len(log.keyframes) == counts["keyframes"]
+        newest = log.keyframes[-1].packet.keyframe.t_ns if log.keyframes else 0
+        assert not log.keyframes or newest in log.frames.t_ns
+    return counts["keyframes"]
+
+
+def killed(arguments: list[str], out: Path, before: int, delay_s: float) -> dict[str, object]:
+    """Start or resume a run, kill it after a while, and return what is left of it."""
+    read, write = os.pipe()
+    child = start(arguments, write)
+    os.close(write)
+    time.sleep(delay_s)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    with os.fdopen(read, "rb") as pipe:
+        begun = len(pipe.read())
+    ended = os.WIFEXITED(status)
+    assert not ended or os.WEXITSTATUS(status) == 0, f"{arguments} ended with {os.WEXITSTATUS(status)}"
+    left = committed(out / "session.db", out.parent / "scratch")
+    first_group = before == 0  # keyframes that waited for gravity come together
+    assert left >= (before if first_group else before + begun - 1), f"{before} + {begun} keyframes, {left} are left"
+    return {"delay_s": delay_s, "begun": begun, "left": left, "ended": ended}
+
+
+def main(folder: Path, seed: int, kills: int) -> None:
+    rng = random.Random(seed)
+    whole_s = time.perf_counter()
+    for name in ("warm", "whole"):  # the first compiles
+        whole_s = time.perf_counter()
+        assert run_verb(["run", SOURCE, "--out", str(folder / name), *SETTINGS]) == 0
+        whole_s = time.perf_counter() - whole_s
+    number, done, left = 0, 0, 0
+    out = folder / "killed0"
+    while done < kills:
+        begun = (out / "config.json").is_file()
+        arguments = ["run", "--resume", str(out), "--json"] if begun else ["run", SOURCE, "--out", str(out), *SETTINGS]
+        if not begun:
+            shutil.rmtree(out, ignore_errors=True)
+        fact = killed(arguments, out, left, rng.uniform(0.0, PART * whole_s))
+        left = int(str(fact["left"]))
+        if fact["ended"]:
+            number, left = number + 1, 0
+            out = folder / f"killed{number}"
+        else:
+            done += 1
+        print(json.dumps({"kill": done, "run": number, **fact}), flush=True)
+    if (out / "config.json").is_file():
+        assert run_verb(["run", "--resume", str(out), "--json"]) == 0
+    print(json.dumps({"runs": number + 1}), flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
