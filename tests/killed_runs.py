@@ -23,7 +23,8 @@ from vislam.session import Session
 
 SOURCE = "points:corridor-loop,duration_s=16,camera_hz=10,tracks=100"
 SETTINGS = ("--view.no-enabled", "--json")
-PART = 0.25  # of the time that a whole run takes, within which one is killed
+DONE = (0, 2)  # 2: all but the report had been written, and there was nothing to resume
+PART = 0.15  # of the time that a whole run takes, within which one is killed
 
 
 def start(arguments: list[str], begun: int) -> int:
@@ -82,7 +83,7 @@ def killed(arguments: list[str], out: Path, before: int, delay_s: float) -> dict
     with os.fdopen(read, "rb") as pipe:
         begun = len(pipe.read())
     ended = os.WIFEXITED(status)
-    assert not ended or os.WEXITSTATUS(status) == 0, f"{arguments} ended with {os.WEXITSTATUS(status)}"
+    assert not ended or os.WEXITSTATUS(status) in DONE, f"{arguments} ended with {os.WEXITSTATUS(status)}"
     left = committed(out / "session.db", out.parent / "scratch")
     first_group = before == 0  # keyframes that waited for gravity come together
     assert left >= (before if first_group else before + begun - 1), f"{before} + {begun} keyframes, {left} are left"
@@ -112,7 +113,7 @@ def main(folder: Path, seed: int, kills: int) -> None:
             done += 1
         print(json.dumps({"kill": done, "run": number, **fact}), flush=True)
     if (out / "config.json").is_file():
-        assert run_verb(["run", "--resume", str(out), "--json"]) == 0
+        assert run_verb(["run", "--resume", str(out), "--json"]) in DONE
     print(json.dumps({"runs": number + 1}), flush=True)
 
 

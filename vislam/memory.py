@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from types import MappingProxyType
 
 import numpy as np
 
@@ -267,7 +266,9 @@ class KeyframeEntry:
     edges: Sequence[LoopEdge] = ()
     candidates: Sequence[LoopCandidate] = ()
     retrieved: Sequence[RetrievedKeyframe] = ()
-    shifts: Mapping[int, tuple[float, float]] = MappingProxyType({})  # edge: rms and largest of what moved with it
+    shifts: Mapping[int, tuple[float, float]] = field(
+        default_factory=dict
+    )  # edge: rms and largest of what moved with it
     scan: PackedScan | None = None
     words: WordsMemory | None = None  # None: as before
     tags: tuple[TagSighting, ...] = ()

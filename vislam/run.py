@@ -83,7 +83,9 @@ class Run:
         """
         info = stored.info()
         if info.get("finished"):
-            raise UsageError(f"the run in {self.out} came to its end; there is nothing to resume")
+            raise UsageError(
+                f"the run in {self.out} came to its end; there is nothing to resume (`vislam report` writes its report)"
+            )
         if info.get("config") != json.loads(json.dumps(asdict(self.config))):
             raise UsageError(f"{self.out / 'config.json'} was changed since the run began; start a new run")
         memory = recall(stored)
