@@ -420,6 +420,22 @@ def _optimize(arguments: list[str]) -> int:
     return 0
 
 
+def _map(arguments: list[str]) -> int:
+    from vislam.mapping.describe import describe_octree, describe_place
+    from vislam.mapping.octomap_io import read_octree
+    from vislam.options import MapOptions
+
+    options = _parse(MapOptions, arguments, "map")
+    octree = read_octree(options.source)
+    answer: dict[str, Any] = {}
+    if options.info or options.query is None:
+        answer |= describe_octree(octree)
+    if options.query is not None:
+        answer |= describe_place(octree, options.query, options.level, options.window_m)
+    print(json.dumps(answer) if options.json else "\n".join(f"{name}: {value}" for name, value in answer.items()))
+    return 0
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -439,5 +455,6 @@ _VERBS = {
     "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
     "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
     "optimize": _Verb(_optimize, "estimate a run again in batch, from its factor log", "vislam optimize runs/desk"),
+    "map": _Verb(_map, "say what an OctoMap file holds, or what is at a place", "vislam map runs/desk/map/octomap.bt"),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

@@ -155,6 +155,24 @@ class OptimizeOptions:
 
 
 @dataclass(frozen=True)
+class MapOptions:
+    """Options of `vislam map`."""
+
+    source: Positional[Path]
+    """OctoMap file: .bt or .ot"""
+    info: bool = False
+    """Say how large the map is and what it holds; done too when nothing else is asked"""
+    query: tuple[float, float, float] | None = None
+    """Say what is at X Y Z (metres, map frame): occupied, free or unknown, and what is nearest"""
+    level: int = 0
+    """Query cubes of 2**level voxels"""
+    window_m: float = 5.0
+    """Look so far for the nearest obstacle and frontier"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
 class ReportOptions:
     """Options of `vislam report`."""
 

@@ -1,3 +1,4 @@
+import json
 import re
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needs import missing
 
+from vislam.cli import run_verb
 from vislam.errors import DataError
 from vislam.mapping.occupancy import OccupancyMap
 from vislam.mapping.octomap_io import encode_bt, encode_ot, read_octree
@@ -276,3 +278,33 @@ def test_huge_leaves_cost_nothing_until_taken_apart(tmp_path):
 def test_a_missing_file_is_an_error(tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
         read_octree(tmp_path / "none.bt")
+
+
+def test_the_map_verb_tells_what_a_file_holds(tmp_path, bt_bytes, capsys):
+    path = tmp_path / "a.bt"
+    path.write_bytes(bt_bytes)
+    octree = read_octree(path)
+    assert run_verb(["map", str(path), "--json"]) == 0
+    info = json.loads(capsys.readouterr().out)
+    assert (info["resolution_m"], info["leaves"]) == (0.1, len(octree))
+    voxels = len(octree.occupied_voxels())
+    assert abs(info["occupied_m3"] - voxels * 0.1**3) < 1e-3
+    centre = octree.centres_m()[0][np.flatnonzero(octree.log_odds >= 0)[0]]
+    assert run_verb(["map", str(path), "--json", "--query", *map(str, centre)]) == 0
+    place = json.loads(capsys.readouterr().out)
+    assert (place["state"], place["probability"], place["nearest_obstacle_m"]) == ("occupied", 0.971, 0.0)
+    assert run_verb(["map", str(path), "--query", "90", "0", "0", "--info"]) == 0
+    out = capsys.readouterr().out
+    assert "state: unknown" in out
+    assert "nearest_obstacle_m: None" in out
+    assert "leaves: " in out
+    path.write_bytes(bt_bytes[:-2])
+    assert run_verb(["map", str(path)]) == 3
+    assert "damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [["--query", "nan", "0", "0"], ["--query", "0", "0", "0", "--level", "17"]])
+def test_the_map_verb_refuses_what_makes_no_sense(tmp_path, bt_bytes, capsys, options):
+    (tmp_path / "a.bt").write_bytes(bt_bytes)
+    assert run_verb(["map", str(tmp_path / "a.bt"), *options]) == 3
+    assert capsys.readouterr().err.startswith("vislam: ")

@@ -48,22 +48,6 @@ def _rehash(table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.
         rows[slot] = row
 
 
-@njit(cache=True, nogil=True)
-def read_voxels(
-    keys: NDArray[np.int64], table: NDArray[np.int64], rows: NDArray[np.int32], values: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return the value of each voxel key [N, 3]; NaN where never seen or outside the key range."""
-    out = np.full(len(keys), np.float32(np.nan), np.float32)
-    for i in range(len(keys)):
-        x, y, z = keys[i, 0], keys[i, 1], keys[i, 2]
-        if min(x, y, z) < 0 or max(x, y, z) >= 2 * KEY_ORIGIN:
-            continue
-        slot = find_slot(table, pack_block(x >> 3, y >> 3, z >> 3))
-        if table[slot] != _EMPTY:
-            out[i] = values[rows[slot], (x & 7) | (y & 7) << 3 | (z & 7) << 6]
-    return out
-
-
 class BlockPool:
     """Growing storage of voxel blocks; `keys[:count]` and `values[:count]` are in order of first use."""
 
@@ -73,6 +57,11 @@ class BlockPool:
         self.values = np.empty((capacity, BLOCK_VOXELS), np.float32)
         self.table = np.full(4 * capacity, _EMPTY, np.int64)
         self.rows = np.zeros(4 * capacity, np.int32)
+
+    @property
+    def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+        """Hash table, rows and values, as compiled code takes them."""
+        return self.table, self.rows, self.values
 
     @property
     def nbytes(self) -> int:
@@ -98,10 +87,6 @@ class BlockPool:
             self.table = np.full(size, _EMPTY, np.int64)
             self.rows = np.zeros(size, np.int32)
             _rehash(self.table, self.rows, self.keys, self.count)
-
-    def read(self, voxel_keys: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the value at voxel keys [N, 3]; NaN where never seen."""
-        return np.asarray(read_voxels(voxel_keys, self.table, self.rows, self.values))
 
     def block_coordinates(self) -> NDArray[np.int64]:
         """Return the block coordinates [count, 3] (voxel keys divided by 8), in order of first use."""

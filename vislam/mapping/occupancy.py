@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from vislam.errors import DataError
 from vislam.mapping.blocks import KEY_ORIGIN, BlockPool
-from vislam.mapping.octree import Octree, log_odds, octree_from_blocks
+from vislam.mapping.levels import fill_from_octree, largest_log_odds
+from vislam.mapping.octree import TREE_LEVELS, Octree, log_odds, octree_from_blocks
 from vislam.mapping.scan import cast_rays, end_voxels, finite_points, marked_blocks, merge_blocks
 
 Array = NDArray[np.float64]
@@ -51,13 +52,13 @@ class OccupancyMap:
             raise DataError(f"map probabilities must lie between 0 and 1 with min below max, got {probabilities}")
         self.resolution_m = float(resolution_m)
         self._hit, self._miss, self._low, self._high = (log_odds(p) for p in probabilities)
-        self._pool = BlockPool()
+        self.pool = BlockPool()  # of log-odds
         self._words = np.zeros(1 << 12, np.uint64)  # the scan's grid, kept between scans, all zero
 
     @property
     def nbytes(self) -> int:
         """Memory of the voxels, in bytes."""
-        return self._pool.nbytes
+        return self.pool.nbytes
 
     def insert(
         self,
@@ -93,7 +94,7 @@ class OccupancyMap:
             ends = end_voxels(points, self.resolution_m, base, nx, nxy, grid)
         cast_rays(ends, origin, max_range_m, self.resolution_m, base, nx, nxy, grid)
         marked = marked_blocks(words, blocks)
-        pool = self._pool
+        pool = self.pool
         pool.reserve(len(marked))
         pool.count = merge_blocks(
             marked, grid, words, blocks, base, pool.table, pool.rows, pool.keys, pool.values, pool.count,
@@ -121,27 +122,42 @@ class OccupancyMap:
             )
         return base, blocks
 
-    def log_odds_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite."""
+    @classmethod
+    def from_octree(cls, octree: Octree) -> OccupancyMap:
+        """Return the map that an octree describes, to ask or to go on with, with OctoMap's sensor model.
+
+        Raises DataError when its leaves are more voxels than fit in memory.
+        """
+        grid = cls(octree.resolution_m)
+        fill_from_octree(grid.pool, octree)
+        return grid
+
+    def log_odds_at(self, points_map_m: NDArray[np.floating], level: int = 0) -> NDArray[np.float32]:
+        """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite.
+
+        At level n it is that of OctoMap's cube of 2**n voxels around the point: the largest in it.
+        """
+        if not 0 <= level <= TREE_LEVELS:
+            raise DataError(f"an octree has the levels 0 (voxels) to {TREE_LEVELS} (all), asked for {level}")
         points = np.asarray(points_map_m, dtype=np.float64).reshape(-1, 3)
         scaled = np.floor(points * (1.0 / self.resolution_m))
-        inside = np.isfinite(scaled).all(axis=1) & (np.abs(scaled) < KEY_ORIGIN).all(axis=1)
+        inside = ((scaled >= -KEY_ORIGIN) & (scaled < KEY_ORIGIN)).all(axis=1)
         keys = np.full(points.shape, -1, dtype=np.int64)
         keys[inside] = scaled[inside].astype(np.int64) + KEY_ORIGIN
-        return self._pool.read(keys)
+        return largest_log_odds(self.pool, keys, level)
 
-    def state_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.int8]:
-        """Return the `Occupancy` [N] at points [N, 3]."""
-        return states(self.log_odds_at(points_map_m))
+    def state_at(self, points_map_m: NDArray[np.floating], level: int = 0) -> NDArray[np.int8]:
+        """Return the `Occupancy` [N] at points [N, 3], of voxels or of the cubes of a level: see `log_odds_at`."""
+        return states(self.log_odds_at(points_map_m, level))
 
     def octree(self) -> Octree:
         """Return the map as a pruned octree: a copy that later scans do not change."""
-        pool = self._pool
+        pool = self.pool
         return octree_from_blocks(self.resolution_m, pool.block_coordinates(), pool.values[: pool.count])
 
     def max_likelihood_octree(self) -> Octree:
         """Return the octree whose leaves are at the clamping thresholds, occupied or free: what a .bt file holds."""
-        pool = self._pool
+        pool = self.pool
         values = pool.values[: pool.count]
         sure = np.where(values >= 0.0, self._high, np.where(values < 0.0, self._low, np.float32(np.nan)))
         return octree_from_blocks(self.resolution_m, pool.block_coordinates(), sure.astype(np.float32))
