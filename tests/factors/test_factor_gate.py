@@ -3,9 +3,12 @@ import pytest
 from graph_world import T_BODY_CAM0, World
 
 from vislam.config import GraphConfig
-from vislam.factors.gate import CarPark, Travel
+from vislam.factors.gate import CarPark
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
+from vislam.factors.travel import Travel
+from vislam.factors.witnesses import Witnesses, confirming, log_volume
+from vislam.geometry import invert, se3_adjoint, se3_exp
 from vislam.messages import LoopEdge
 
 
@@ -21,8 +24,7 @@ def _model(edge: LoopEdge) -> LoopModel:
 def _travel(world: World) -> Travel:
     travel = Travel()
     for k in range(1, world.count):
-        step = float(np.linalg.norm(world.truth[k, :3, 3] - world.truth[k - 1, :3, 3]))
-        travel.append(world.vo_sigma_rad**2, world.vo_sigma_m**2, step)
+        travel.append(world.vo_sigma_rad**2, world.vo_sigma_m**2, invert(world.truth[k - 1]) @ world.truth[k])
     return travel
 
 
@@ -41,57 +43,63 @@ def test_a_graph_that_knows_nothing_lets_a_loop_pass(world: World) -> None:
     assert model.chi2(world.truth[5], world.truth[105], ignorant) < model.threshold
 
 
-def test_group_forms_only_from_loops_that_agree(world: World) -> None:
-    park, travel = CarPark(GraphConfig()), _travel(world)
-    true = [_model(world.loop(n, 5 + 4 * n, 105 + 4 * n)) for n in range(3)]
-    false = [_model(world.false_loop(10 + n, 5 + 4 * n, 107 + 4 * n)) for n in range(3)]
-    for pair in zip(true, false, strict=True):
-        for model in pair:
-            park.park(model, world.truth, travel)
-    assert park.group_of(true[2]) == true
-    assert park.group_of(false[2]) == []
-    park.remove(true)
-    assert park.edges == false
+def test_loops_about_the_same_two_places_are_one_witness(world: World) -> None:
+    witnesses, travel = Witnesses(GraphConfig()), _travel(world)
+    loops = [(5, 105), (8, 108), (9, 107), (40, 140), (5, 105)]
+    models = [_model(world.loop(n, i, j)) for n, (i, j) in enumerate(loops)]
+    lie = _model(world.false_loop(9, 6, 106))
+    for model in [*models, lie]:
+        witnesses.add(model, travel)
+    assert witnesses.loops() == [[*models[:3], models[4]], [models[3]], [lie]]
 
 
-def test_two_witnesses_are_too_few_and_one_image_is_one_witness(world: World) -> None:
-    park, travel = CarPark(GraphConfig()), _travel(world)
-    pair = [_model(world.loop(n, 5 + 4 * n, 105 + 4 * n)) for n in range(2)]
-    for model in pair:
-        park.park(model, world.truth, travel)
-    assert park.group_of(pair[1]) == []
-    park = CarPark(GraphConfig())
-    same = [_model(world.loop(n, 5 + n, 105)) for n in range(4)]
-    for model in same:
-        park.park(model, world.truth, travel)
-    assert park.group_of(same[3]) == []
-
-
-def test_loose_odometry_between_loops_proves_nothing(world: World) -> None:
+def test_loops_confirm_one_another_only_where_odometry_can_tell(world: World) -> None:
     travel = _travel(world)
+    true = [_model(world.loop(n, 5 + 8 * n, 105 + 8 * n)) for n in range(4)]
+    false = [_model(world.false_loop(10 + n, 5 + 8 * n, 107 + 8 * n)) for n in range(4)]
+    chain = travel.chain()
+    assert confirming([*false, *true], chain, 11.0, log_volume(chain)) == [4, 5, 6, 7]
     travel.scale(100.0)
-    park = CarPark(GraphConfig())
-    true = [_model(world.loop(n, 5 + 4 * n, 105 + 4 * n)) for n in range(3)]
-    for model in true:
-        park.park(model, world.truth, travel)
-    assert park.group_of(true[2]) == []
+    chain = travel.chain()
+    assert confirming([*false, *true], chain, 11.0, log_volume(chain)) == []
+
+
+def test_covariance_between_any_two_keyframes_is_that_of_the_steps_composed(world: World) -> None:
+    travel, rng = Travel(), np.random.default_rng(4)
+    poses, steps = [np.eye(4)], []
+    for _ in range(12):
+        T, variances = se3_exp(rng.normal(size=6) * 0.5), rng.uniform(1e-4, 1e-3, 2)
+        travel.append(*variances, T)
+        poses.append(poses[-1] @ T)
+        steps.append(np.diag(np.repeat(variances, 3)))
+    T, covariance = travel.chain().motion(3, 10)
+    expected = np.zeros((6, 6))
+    for k in range(4, 11):
+        carry = se3_adjoint(invert(poses[10]) @ poses[k])
+        expected += carry @ steps[k - 1] @ carry.T
+    np.testing.assert_allclose(T, invert(poses[3]) @ poses[10], atol=1e-12)
+    np.testing.assert_allclose(covariance, expected, atol=1e-9)
 
 
 def test_travel_takes_better_variances_of_the_newest_motions() -> None:
     travel, again = Travel(), Travel()
     for k in range(1, 8):
-        travel.append(9.0 if k in (5, 6) else float(k), 0.1 * k, 1.0)
-        again.append(float(k), 0.5 if k == 5 else 0.1 * k, 1.0)
-    travel.amend(6, 6.0, 0.6)
-    travel.amend(5, 5.0, 0.5)
+        step = se3_exp(np.full(6, 0.1 * k))
+        travel.append(9.0 if k in (5, 6) else float(k), 0.1 * k, np.eye(4) if k in (5, 6) else step)
+        again.append(float(k), 0.5 if k == 5 else 0.1 * k, step)
+    travel.amend(6, 6.0, 0.6, se3_exp(np.full(6, 0.6)))
+    travel.amend(5, 5.0, 0.5, se3_exp(np.full(6, 0.5)))
     for i, j in ((0, 7), (4, 5), (5, 6), (6, 7), (0, 4)):
         np.testing.assert_allclose(travel.between(i, j), again.between(i, j))
+    np.testing.assert_allclose(travel.poses, again.poses, atol=1e-12)
 
 
 def test_full_park_gives_up_its_oldest(world: World) -> None:
-    park, travel = CarPark(GraphConfig(parked_max=2)), _travel(world)
+    park = CarPark(GraphConfig(parked_max=2))
     models = [_model(world.false_loop(n, n, 100 + n)) for n in range(3)]
-    assert park.park(models[0], world.truth, travel) is None
-    assert park.park(models[1], world.truth, travel) is None
-    assert park.park(models[2], world.truth, travel) is models[0]
+    assert park.park(models[0]) is None
+    assert park.park(models[1]) is None
+    assert park.park(models[2]) is models[0]
     assert park.edges == models[1:]
+    park.remove([models[1], models[0]])
+    assert park.edges == models[2:]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
+import numpy as np
+
 from vislam.config import GraphConfig
 from vislam.memory import Tied
 
@@ -39,6 +41,11 @@ class Anchors:
             self._tied[tied.id] = tied
             self._ids.insert(bisect_left(self._ids, tied.id), tied.id)
             self._fresh.append(tied)
+
+    def forget(self) -> None:
+        """Let every keyframe stand for itself again: a loop was wrong, and nobody knows how far that went."""
+        self._tied = {k: Tied(k, k, np.zeros((6, 6))) for k in self._ids}
+        self._fresh = list(self._tied.values())
 
     def take_news(self) -> tuple[Tied, ...]:
         """Return what was tied since the last call."""

@@ -222,19 +222,14 @@ class Estimator(Generic[L]):
             return self._recover(self._values, [], error)
         return ""
 
-    def snapshot(self) -> tuple[gtsam.Values, float]:
-        """Return the current estimate, for `revert`."""
-        return gtsam.Values(self._values), self.vo_scale
-
-    def revert(self, snapshot: tuple[gtsam.Values, float], edges: list[L]) -> str:
-        """Go back to an earlier estimate of the same keyframes, without some loops."""
-        values, self.vo_scale = snapshot
-        for edge in edges:
+    def revise(self, out: list[L], fresh: list[L]) -> str:
+        """Take loops out and others in, and begin again from a batch solution; return what went wrong."""
+        for edge in out:
             self.loops.pop(edge.id, None)
         try:
-            self._restart(values, [], self._new_solver(), from_batch=False)
+            self._restart(self._values, fresh, self._new_solver(), from_batch=True)
         except FAILURES as error:
-            return self._recover(values, [], error)
+            return self._recover(self._values, fresh, error)
         return ""
 
     def converge(self) -> str:

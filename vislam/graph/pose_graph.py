@@ -12,8 +12,10 @@ from vislam.camera import Rig
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError, UsageError
 from vislam.factors.anchors import Anchors
+from vislam.factors.builder import Step
+from vislam.factors.consensus import Consensus, Verdict
 from vislam.factors.estimator import Estimator
-from vislam.factors.gate import CarPark, EdgeReport, Travel
+from vislam.factors.gate import CarPark, EdgeReport
 from vislam.factors.journal import (
     KeyframeRecord,
     LoopRecord,
@@ -25,6 +27,7 @@ from vislam.factors.journal import (
 )
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.travel import Travel
 from vislam.geometry import invert, se3_adjoint
 from vislam.graph.joining import Placement, Waiting, relinked, weak_link
 from vislam.graph.restore import edge_report, restored_journal, sort_loops
@@ -35,7 +38,7 @@ from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, Lo
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
-_COLLAPSED = 0.1  # weight below which an older loop counts as torn by newer ones
+_UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new piece: no loop may be tested against it
 _NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 
 
@@ -69,6 +72,8 @@ class PoseGraph:
         self._keyframes: list[KeyframeRecord] = []
         self._travel = Travel()
         self._park = CarPark(config)
+        self._consensus = Consensus(config)
+        self._beyond_help: set[int] = set()  # loops that a review brought in and the graph contradicted
         self._anchors = Anchors(config)
         self._reports: dict[int, EdgeReport] = {}
         self._pieces = Pieces()
@@ -142,12 +147,16 @@ class PoseGraph:
             guesses, by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE], memory.vo_scale
         )
         poses = self._estimator.poses
-        for step, moved_m in zip(steps, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), strict=True):
-            self._travel.append(step.variance_rad2, step.variance_m2, float(moved_m))
+        for record, step in zip(self._keyframes[1:], steps, strict=True):
+            T_map_before = memory.T_map_body[record.id - 1]
+            self._travel.append(*_variances(record, step), invert(T_map_before) @ step.guess.T_map_body)
         for tied in memory.ties:
             self._anchors.tie(tied)
         for model in by_place[LoopPlace.PARKED]:
-            self._park.park(model, poses, self._travel)
+            self._park.park(model)
+        waiting = {model.id for model in by_place[LoopPlace.WAITING]}
+        for model in (m for m in models if m.id not in waiting):
+            self._consensus.offer(model, model.id not in self._held, self._travel)
         for model in by_place[LoopPlace.WAITING]:
             self._waiting.add(model)
         self._count_joined()
@@ -210,10 +219,9 @@ class PoseGraph:
             notes = [self._estimator.begin()]
         else:
             step, note = self._estimator.extend()
-            moved = invert(self._estimator.poses[-2]) @ self._estimator.poses[-1]
-            self._travel.append(step.variance_rad2, step.variance_m2, float(np.linalg.norm(moved[:3, 3])))
+            self._travel.append(*_variances(record, step), self._motion(record.id))
             for older, variance_rad2, variance_m2 in self._source.amended(self._estimator.vo_scale):
-                self._travel.amend(older, variance_rad2, variance_m2)
+                self._travel.amend(older, variance_rad2, variance_m2, self._motion(older))
             notes = [step.note, note]
         self._keyframes.append(record)
         if record.begins_piece:
@@ -230,9 +238,13 @@ class PoseGraph:
         if not self._keyframes:
             return GraphUpdate(self._revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
         before = self._estimator.poses[-1].copy()
-        note = self._estimator.converge()
+        notes: list[str] = []
+        self._look_for_doubts()
+        verdict = self._consensus.finish(self._travel, self._scale_left, self._held)
+        decided = [] if verdict is None else self._apply(verdict, notes)
+        notes.append(self._estimator.converge())
         self._T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._T_map_odom
-        return self._publish([], [], note, everything=True)
+        return self._publish(*self._split(decided), "; ".join(n for n in notes if n), everything=True)
 
     def poses(self) -> Array:
         """Return T_map_body [M, 4, 4] of all keyframes, each as it was last read back from the solver."""
@@ -265,12 +277,26 @@ class PoseGraph:
                 "give the state at the time of keyframe 0"
             )
 
+    def _motion(self, k: int) -> Array:
+        """Return the motion [4, 4] to keyframe k from the one before."""
+        return invert(self._estimator.poses[k - 1]) @ self._estimator.poses[k]
+
+    @property
+    def _scale_left(self) -> float:
+        """Return by how much the sigmas of odometry may still be inflated."""
+        return self._config.vo_scale_max / self._estimator.vo_scale
+
+    @property
+    def _held(self) -> set[int]:
+        """Return the ids of the loops that the graph holds, with a factor or in spare."""
+        return self._estimator.loops.keys() | self._estimator.spare.keys()
+
     def _ends(self, edge: LoopModel) -> tuple[Array, Array]:
         poses = self._estimator.poses
         return poses[edge.record.from_id], poses[edge.record.to_id]
 
     def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
-        """Gate loops, accept or park them, and promote parked groups; return accepted and refused ids."""
+        """Gate loops, accept or park them, and let the review work; return accepted and refused ids."""
         passed: list[LoopModel] = []
         parked: list[LoopModel] = []
         touched: list[int] = []
@@ -283,23 +309,25 @@ class PoseGraph:
             if not self._pieces.are_joined(edge.from_id, edge.to_id):
                 touched += self._wait(model)
             else:
-                (passed if self._gate(model) else parked).append(model)
+                (passed if self._test(model) else parked).append(model)
         for model in self._join(touched, notes):
-            (passed if self._gate(model) else parked).append(model)
+            (passed if self._test(model) else parked).append(model)
         if passed:
             parked += self._accept(passed, notes, "inside the gate")
-            touched += self._retest(notes)
         for model in parked:
-            evicted = self._park.park(model, self._estimator.poses, self._travel)
+            evicted = self._park.park(model)
             if evicted is not None:
                 self._report(evicted, LoopDecision.REJECTED, "left the full car park")
                 touched.append(evicted.record.id)
-        for model in parked:
-            group = self._park.group_of(model) if any(model is p for p in self._park.edges) else []
-            if group:
-                touched += [g.record.id for g in group]
-                self._promote(group, notes)
-                touched += self._retest(notes)
+        if self._consensus.is_due:
+            self._look_for_doubts()
+        verdict = self._consensus.step(self._travel, self._scale_left, self._held)
+        if verdict is not None:
+            touched += self._apply(verdict, notes)
+        return self._split(touched)
+
+    def _split(self, touched: list[int]) -> tuple[list[int], list[int]]:
+        """Return the ids of accepted and of refused loops among those about which something was decided."""
         decided = sorted(set(touched))
         accepted = [n for n in decided if self._reports[n].decision is LoopDecision.ACCEPTED]
         return accepted, [n for n in decided if n not in accepted]
@@ -324,6 +352,8 @@ class PoseGraph:
             witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"
             for model in self._accept(found.agreeing, notes, f"joins two pieces, as {witnesses} say"):
                 self._report(model, LoopDecision.REJECTED, "though it was to join two pieces")
+            for model in found.agreeing:
+                self._consensus.offer(model, False, self._travel)
             kept = [m for m in found.agreeing if m.record.id in self._estimator.loops]
             if len({m.record.to_id for m in kept}) < self._config.join_frames:
                 for model in kept:
@@ -375,6 +405,12 @@ class PoseGraph:
         self._journal.append(record)
         return LoopModel(record, self._config, self._lever_m)
 
+    def _test(self, model: LoopModel) -> bool:
+        """Test an edge against the current estimate, and give it to the next review."""
+        inside = self._gate(model)
+        self._consensus.offer(model, not inside, self._travel)
+        return inside
+
     def _gate(self, model: LoopModel) -> bool:
         """Test an edge against the current estimate and note the chi-square.
 
@@ -407,34 +443,39 @@ class PoseGraph:
         self._reports[report.loop_id] = report
         self._changed[report.loop_id] = None
 
-    def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str, promoted: bool = False) -> list[LoopModel]:
+    def _accept(self, fresh: list[LoopModel], notes: list[str], reason: str) -> list[LoopModel]:
         """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
         fresh = [m for m in fresh if m.record.id not in self._estimator.spare]
         if not fresh:
             return []
-        far = promoted or any(self._is_far(m) for m in fresh)
+        far = any(self._is_far(m) for m in fresh)
         fits = not far and all(m.weight(*self._ends(m)) >= _FITS for m in fresh)
         notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._estimator.is_long))
+        contradicted = self._judge(fresh, reason)
+        if contradicted:
+            notes.append(self._estimator.drop(contradicted))
+        return contradicted
+
+    def _judge(self, fresh: list[LoopModel], reason: str, reviewed: bool = False) -> list[LoopModel]:
+        """Report on loops that were put into the graph; return those that the optimised graph contradicts."""
         contradicted = []
         for model in fresh:
             if model.record.id not in self._estimator.loops:
                 self._report(model, LoopDecision.REJECTED, "the solver refused it")
-                continue
-            weight = model.weight(*self._ends(model))
-            if weight < self._config.loop_min_weight:
+            elif self._is_torn(model):
                 contradicted.append(model)
-                decision = LoopDecision.REJECTED if promoted else LoopDecision.PARKED
+                decision = LoopDecision.REJECTED if reviewed else LoopDecision.PARKED
+                weight = model.weight(*self._ends(model))
                 self._report(model, decision, f"contradicted by the graph, weight {weight:.3f}")
             else:
-                self._report(
-                    model,
-                    LoopDecision.ACCEPTED,
-                    reason + ("" if model.tie is None else f", by way of keyframe {model.tie.from_id}"),
-                )
+                way = "" if model.tie is None else f", by way of keyframe {model.tie.from_id}"
+                self._report(model, LoopDecision.ACCEPTED, reason + way)
                 self._remember(model)
-        if contradicted:
-            notes.append(self._estimator.drop(contradicted))
         return contradicted
+
+    def _is_torn(self, model: LoopModel) -> bool:
+        """Return whether the graph contradicts a loop that is in it."""
+        return model.weight(*self._ends(model)) < self._config.loop_min_weight
 
     def _remember(self, model: LoopModel) -> None:
         """Take note of which anchor an accepted loop ties its newer end to."""
@@ -475,40 +516,49 @@ class PoseGraph:
         turn = float(np.linalg.norm(residual[:3])) > np.deg2rad(self._config.loop_batch_deg)
         return turn or (model.record.has_scale and float(np.linalg.norm(residual[3:])) > self._config.loop_batch_m)
 
-    def _retest(self, notes: list[str]) -> list[int]:
-        """Gate the best fitting parked loops again, after the estimate changed; return the accepted ids."""
-        ranked = sorted(self._park.edges, key=lambda m: m.chi2(*self._ends(m)))
-        passed = [m for m in ranked[: self._config.parked_retest] if self._gate(m)]
-        if not passed:
-            return []
-        self._park.remove(passed)
-        for model in self._accept(passed, notes, "inside the gate after another loop"):
-            self._report(model, LoopDecision.REJECTED, "twice")
-        return [m.record.id for m in passed]
+    def _apply(self, verdict: Verdict, notes: list[str]) -> list[int]:
+        """Do as a review of all loops says; return the ids about which it decided something else than before."""
+        estimator, newest, held = self._estimator, len(self._keyframes) - 1, self._held
+        out = [m for m, _ in verdict.put_out if m.id in held]
+        back = [m for m in verdict.let_in if m.id not in held and m.id not in self._beyond_help]
+        for model, chi2 in verdict.put_out:
+            if model.id in held:
+                estimator.spare.pop(model.id, None)
+                says = f"{verdict.places} places say otherwise, chi2 {chi2:.1f}"
+                self._report(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {says}")
+        if verdict.scale > 1.0 and back:  # several witnesses against the odometry say that it knows less than it says
+            estimator.distrust_odometry(verdict.scale)
+            self._travel.scale(verdict.scale)
+        self._park.remove(back)
+        self._rebuild(out, back, notes)
+        torn = self._judge(back, f"let in at keyframe {newest}: it agrees with {verdict.places} places", True)
+        self._beyond_help |= {m.id for m in torn}
+        if torn:
+            notes.append(estimator.drop(torn))
+        return [m.id for m in (*out, *back)]
 
-    def _promote(self, group: list[LoopModel], notes: list[str]) -> None:
-        """Accept a consistent group of parked loops, unless that tears more loops than it brings.
+    def _look_for_doubts(self) -> None:
+        """Tell the next review if loops that were let in do not fit any more: the kernel keeps them without a say."""
+        if any(m.chi2(*self._ends(m)) > m.threshold for m in self._estimator.loops.values()):
+            self._consensus.doubt()
 
-        Several witnesses against the odometry say how much too small its covariance is: it is inflated to fit them.
+    def _rebuild(self, out: list[LoopModel], back: list[LoopModel], notes: list[str]) -> None:
+        """Take loops out of the graph and others into it.
+
+        Where one is out, places may have been tied together that are not the same: all loops are as measured again.
         """
-        self._park.remove(group)
-        older = list(self._estimator.loops.values())
-        sound = [m for m in older if m.weight(*self._ends(m)) >= 0.5]
-        snapshot = self._estimator.snapshot()
-        misfit = float(np.median([self._reports[m.record.id].chi2 for m in group])) / 6.0
-        room = self._config.vo_scale_max / self._estimator.vo_scale
-        factor = float(np.clip(np.sqrt(misfit), 1.0, max(room, 1.0)))
-        self._estimator.distrust_odometry(factor)
-        self._travel.scale(factor)
-        for model in group:
-            self._tie(model)
-        self._accept(group, notes, f"one of {len(group)} parked loops that agree", promoted=True)
-        torn = [m for m in sound if m.weight(*self._ends(m)) < _COLLAPSED]
-        if len(torn) >= len(group):
-            notes.append(self._estimator.revert(snapshot, group))
-            self._travel.scale(1.0 / factor)
-            for model in group:
-                self._report(model, LoopDecision.REJECTED, f"its group tore {len(torn)} older loops")
+        estimator = self._estimator
+        tied = [m for m in (*estimator.loops.values(), *back) if m.tie is not None]
+        for model in tied if out or back else []:
+            model.tie = None
+            self._changed[model.id] = None
+        if out:
+            self._anchors.forget()
+        held = [m for m in out if m.id in estimator.loops]
+        if back or (held and tied):
+            notes.append(estimator.revise(held, back))
+        elif held:
+            notes.append(estimator.drop(held))
 
     def _state(self, k: int) -> NavState:
         return self._source.state(k, self._keyframes[k].t_ns, self._estimator)
@@ -550,3 +600,8 @@ class PoseGraph:
             details,
             self._pieces,
         )
+
+
+def _variances(record: KeyframeRecord, step: Step) -> tuple[float, float]:
+    """Return the variances in rad^2 and m^2 of the motion to a keyframe."""
+    return _UNKNOWN if record.begins_piece else (step.variance_rad2, step.variance_m2)

@@ -156,7 +156,7 @@ class SessionWriter:
             said = news.window
             self._replace("windows", [(said.id, *window_bytes(said), said.note, said.rest_from)])
         self._put_states("graph", news.states)
-        self._insert("ties", [(tied.id, tied.anchor_id, to_bytes(tied.covariance, "<f8")) for tied in news.ties])
+        self._replace("ties", [(tied.id, tied.anchor_id, to_bytes(tied.covariance, "<f8")) for tied in news.ties])
 
     def _add_edges(self, edges: Iterable[LoopEdge], offered_with: int) -> None:
         """Add offered edges; an id that was used before is refused by the graph, and the first edge of it stays."""
