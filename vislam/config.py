@@ -421,6 +421,17 @@ class LoopConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DriveConfig:
+    """Where the cart can stand and drive, from the octree."""
+
+    body_length_m: float = 0.60  # of the cart, whose middle is the body's origin
+    body_width_m: float = 0.50
+    max_step_m: float = 0.05  # between neighbouring cells; less than a voxel is taken for one, which is what is seen
+    max_slope_deg: float = 10.0  # what a cart with small wheels and a load brakes on
+    slope_window_m: float = 0.40  # slope is that of a plane through the ground within it: a voxel's step is no slope
+
+
+@dataclass(frozen=True, slots=True)
 class MapConfig:
     """Clouds, the occupancy octree, the navigation grid and the mesh."""
 
@@ -452,6 +463,7 @@ class MapConfig:
     grid_floor_m: float | None = None  # height of the floor in map; None: the lowest large horizontal surface
     grid_low_m: float = 0.10  # above the floor: lower things are driven over or are the floor's own noise
     grid_high_m: float = 1.60  # above the floor: higher things are driven under
+    drive: DriveConfig = field(default_factory=DriveConfig)
     mesh: bool = False  # TSDF mesh by Open3D; a few seconds at export
     mesh_voxel_m: float = 0.02  # about the noise of depth at 3 m
 
