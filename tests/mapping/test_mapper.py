@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from box_world import CAMERA, CONFIG, RIG, ROOM_HIGH, ROOM_LOW, T_BODY_CAM0, depth_image, keyframe, pose
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from needs import missing
 
 from vislam.camera import Rig
@@ -22,7 +24,7 @@ def mapper_at(poses, config=CONFIG):
     """A mapper whose keyframes saw the room from `pose(k)` and are believed to be at `poses[k]`."""
     mapper = Mapper(config, RIG)
     for k, T in enumerate(poses):
-        mapper.add(keyframe(k), T)
+        mapper.add(SEEN[k], T)
     return mapper
 
 
@@ -34,6 +36,7 @@ def digest(mapper):
     return hashlib.sha256(encode_ot(mapper.occupancy.octree())).hexdigest()
 
 
+SEEN = [keyframe(k) for k in range(10)]
 TRUE = [pose(k) for k in range(10)]
 DRIFTED = [T @ se3_exp(np.array([0.0, 0.0, 0.01 * k, 0.03 * k, -0.02 * k, 0.0])) for k, T in enumerate(TRUE)]
 
@@ -106,6 +109,49 @@ def test_keyframes_and_corrections_that_arrive_during_a_rebuild_are_not_lost():
     assert digest(mapper) == digest(mapper_at(TRUE))
     mapper.finish()
     assert digest(mapper) == digest(mapper_at(TRUE))
+
+
+@pytest.mark.parametrize(
+    ("first", "again", "max_mb"),
+    [(0, 10, 32.0), (2, 10, 32.0), (6, 4, 32.0), (8, 4, 32.0), (9, 1, 32.0), (9, 10, 0.0)],
+)
+def test_a_correction_of_the_newest_begins_at_a_kept_state_and_gives_the_same_map(first, again, max_mb):
+    config = replace(CONFIG, checkpoint_keyframes=3, checkpoints=2, checkpoint_max_mb=max_mb)
+    believed = TRUE[:first] + DRIFTED[first:]
+    mapper = mapper_at(believed, config)
+    held = mapper.occupancy
+    before = digest(mapper)
+    moved = [T @ se3_exp(np.array([0.0, 0.0, 0.05, 0.1, 0.0, 0.0])) for T in TRUE[first:]]
+    for poses in (moved, TRUE[first:]):  # the second correction finds the states that the first left
+        done = mapper.counters["keyframes_integrated_again"]
+        mapper.move(update(range(first, 10), poses))
+        mapper.move(update([], []))
+        assert digest(mapper) == digest(mapper_at(TRUE[:first] + poses))
+        mapper.finish()
+        assert mapper.counters["keyframes_integrated_again"] == done + again
+    assert digest(mapper) == digest(mapper_at(TRUE))
+    assert hashlib.sha256(encode_ot(held.octree())).hexdigest() == before
+
+
+@settings(max_examples=15)
+@given(st.lists(st.tuples(st.sampled_from(["add", "move", "advance", "finish"]), st.integers(0, 9)), max_size=25))
+def test_any_sequence_of_keyframes_and_corrections_ends_in_the_map_from_scratch(steps):
+    config = replace(CONFIG, checkpoint_keyframes=2, checkpoints=2, rebuild_keyframes_per_call=2)
+    mapper, poses = Mapper(config, RIG), []
+    for number, (step, k) in enumerate(steps):
+        if step == "add" and len(poses) < 8:
+            mapper.add(SEEN[len(poses)], DRIFTED[len(poses)])
+            poses.append(DRIFTED[len(poses)])
+        elif step == "move" and k < len(poses):
+            poses[k] = TRUE[k] @ se3_exp(np.array([0.0, 0.0, 0.0, 0.06 * (number % 3), 0.0, 0.0]))
+            mapper.move(update([k], [poses[k]]))
+        elif step == "finish":
+            mapper.finish()
+            assert digest(mapper) == digest(mapper_at(poses))
+        else:
+            mapper.move(update([], []))
+    mapper.finish()
+    assert digest(mapper) == digest(mapper_at(poses))
 
 
 def test_a_reader_keeps_the_map_it_holds():

@@ -88,6 +88,14 @@ class BlockPool:
             self.rows = np.zeros(size, np.int32)
             _rehash(self.table, self.rows, self.keys, self.count)
 
+    def copy(self) -> BlockPool:
+        """Return a pool of the same blocks, without spare room."""
+        out = BlockPool(0)
+        out.count = self.count
+        out.keys, out.values = self.keys[: self.count].copy(), self.values[: self.count].copy()
+        out.table, out.rows = self.table.copy(), self.rows.copy()
+        return out
+
     def block_coordinates(self) -> NDArray[np.int64]:
         """Return the block coordinates [count, 3] (voxel keys divided by 8), in order of first use."""
         keys = self.keys[: self.count]

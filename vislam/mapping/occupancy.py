@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from enum import IntEnum
 from typing import Literal
@@ -131,6 +132,13 @@ class OccupancyMap:
         grid = cls(octree.resolution_m)
         fill_from_octree(grid.pool, octree)
         return grid
+
+    def copy(self) -> OccupancyMap:
+        """Return a map of the same voxels that goes its own way from here on."""
+        out = copy.copy(self)
+        out.pool = self.pool.copy()
+        out._words = np.zeros(1 << 12, np.uint64)
+        return out
 
     def log_odds_at(self, points_map_m: NDArray[np.floating], level: int = 0) -> NDArray[np.float32]:
         """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite.
