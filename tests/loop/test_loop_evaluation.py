@@ -28,6 +28,7 @@ from vislam.loop.evaluation import (
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
 from vislam.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
+from vislam.memory import GraphNews, KeyframeEntry
 from vislam.messages import (
     GraphUpdate,
     KeyframePacket,
@@ -189,7 +190,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         vo = VoMeasurement(keyframe.t_ns, max(0, k - 1), np.eye(4), np.eye(6), True, Tracking.OK, 100)
         seen = Observations(np.empty(0, np.int64), np.empty((0, 2)))
         update = GraphUpdate(k, np.array([k]), pose[None], np.eye(4), None)
-        writer.add(KeyframePacket(keyframe, vo, seen, None), pose, update, edges)
+        writer.add(KeyframeEntry(KeyframePacket(keyframe, vo, seen, None), pose, update, GraphNews(), edges))
         for c in candidates:
             weight = 1.0 if c.decision is LoopDecision.ACCEPTED else math.nan
             judged = {"decision": str(c.decision), "reason": c.reason, "source": c.source, "weight": weight}
