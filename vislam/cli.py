@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets.inspect import Inspection
     from vislam.options import EvalOptions
+    from vislam.runfolder import MapChoice
 
 # the matrices here are small: threads cost more than they bring, and replay must not depend on them
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -104,6 +105,7 @@ def _take_option(arguments: list[str], name: str) -> str | None:
 def _run(arguments: list[str]) -> int:
     from vislam.config import dump, load
     from vislam.options import RunOptions, run_options
+    from vislam.runfolder import MapChoice
 
     command = ["vislam", "run", *arguments]
     resumed = _take_option(arguments, "--resume")
@@ -115,7 +117,10 @@ def _run(arguments: list[str]) -> int:
     if options.dry_run:
         print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
         return 0
-    metrics = _run_source(options.source, options.settings, options.out, options.overwrite, command)
+    if options.localize_only and options.map is None:
+        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    begun_in = None if options.map is None else MapChoice(options.map, options.localize_only)
+    metrics = _run_source(options.source, options.settings, options.out, options.overwrite, command, begun_in)
     _show(metrics, options.out, options.json)
     return 0
 
@@ -128,10 +133,10 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     from vislam.sources import open_source
 
     options = _parse(ResumeOptions, arguments, "run")
-    source, config = read_setup(out)
+    source, config, base = read_setup(out)
     recording = open_source(source, config.seed)
     with _written_up(out), _progress(recording.name) as progress:
-        metrics = resume(recording, config, out, source, command, progress)
+        metrics = resume(recording, config, out, source, command, progress, base)
     _show(metrics, out, options.json)
     return 0
 
@@ -145,7 +150,9 @@ def _show(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
         _print_summary(metrics, out)
 
 
-def _run_source(source: str, settings: Config, out: Path, overwrite: bool, command: list[str]) -> dict[str, Any]:
+def _run_source(
+    source: str, settings: Config, out: Path, overwrite: bool, command: list[str], base: MapChoice | None = None
+) -> dict[str, Any]:
     """Run a source into a folder and write its report, whatever happened on the way."""
     from vislam.run import execute
     from vislam.runfolder import prepare
@@ -154,7 +161,7 @@ def _run_source(source: str, settings: Config, out: Path, overwrite: bool, comma
     recording = open_source(source, settings.seed)
     prepare(out, overwrite)
     with _written_up(out), _progress(recording.name) as progress:
-        return execute(recording, settings, out, source=source, command=command, progress=progress)
+        return execute(recording, settings, out, source=source, command=command, progress=progress, base=base)
 
 
 @contextmanager

@@ -122,6 +122,7 @@ class Front:
         self._T_vo_body = self._T_vo_keyframe.copy()
         self._waiting: list[OdometryKeyframe] = []  # in frame `vo`, until gravity is known
         self._resumed: FrontMemory | None = None  # until its keyframe was seen again
+        self._first_id = 0  # of the keyframes of this recording
 
     def resume(self, memory: FrontMemory) -> None:
         """Go on where an earlier run was, before the first sample and frame: the first frame is its newest keyframe.
@@ -147,6 +148,11 @@ class Front:
             ekf.initialise(state, None, found)
         else:
             ekf.initialise(state, identity_motion(memory.t_ns, memory.keyframe_id, True, 0))
+
+    def begin_in_map(self, keyframe_id: int, next_track_id: int) -> None:
+        """Number keyframes and tracks on from those of a map, before the first frame; the first begins a new piece."""
+        self._first_id = keyframe_id
+        self.frontend.begin_at(keyframe_id, FrontNews(next_track_id))
 
     @property
     def start(self) -> StartFacts | None:
@@ -262,7 +268,8 @@ class Front:
             keyframe = Keyframe(memory.keyframe_id, frame.t_ns, frame, *bare, None)
             vo = identity_motion(frame.t_ns, memory.keyframe_id, track.vo.has_scale, 0)
             return replace(track, keyframe=keyframe, vo=vo)
-        if memory is None and track.keyframe is not None and track.vo.keyframe_id == track.keyframe.id > 0:
+        is_alone = track.keyframe is not None and track.vo.keyframe_id == track.keyframe.id
+        if memory is None and is_alone and self._keyframe_id >= 0:
             return replace(track, vo=lost_motion(frame.t_ns, self._keyframe_id, track.vo.has_scale))
         return track
 
@@ -436,6 +443,7 @@ class Front:
         at_rest = self._rested_since_keyframe and self._keyframe_id >= 0
         variance_m2 = np.inf if state is None else float(np.trace(state.covariance[3:6, 3:6]))
         begins_piece = track.vo.tracking is Tracking.LOST and not self._bridged(keyframe.t_ns, imu, variance_m2)
+        begins_piece = begins_piece or keyframe.id == self._first_id > 0
         self.counters["pieces"] += begins_piece
         packet = KeyframePacket(
             keyframe, track.vo, track.observations, imu, self._mag, at_rest, self.camera_clock.applied_s, begins_piece

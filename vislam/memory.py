@@ -234,10 +234,12 @@ class SlamMemory:
     """A whole pipeline after its newest keyframe."""
 
     front: FrontMemory
+    first_state: NavState | None  # of keyframe 0; None without an IMU
     T_start: Array  # [4, 4] where keyframe 0 was put in map
     graph: GraphMemory
     places: PlacesMemory
     scans: dict[int, PackedScan]  # by keyframe
+    held: int = 0  # so many of the first keyframes belong to a map that is not to change
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,10 @@ class RunOptions:
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     overwrite: bool = False
     """Replace the run that the folder holds"""
+    map: Path | None = None
+    """Session (RUN/session.db or RUN) of an earlier run in whose map this one begins; it is not written"""
+    localize_only: bool = False
+    """With --map: find the way in it, and leave its keyframes and clouds as they are"""
     dry_run: bool = False
     """Only print the resolved configuration as JSON"""
     json: bool = False

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ import numpy as np
 
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
+from vislam.factor_log import rig_data
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.loop_gallery import LoopGallery
@@ -23,10 +24,10 @@ from vislam.mapping.cloud import Cloud
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.picture import Line, render_cloud, render_octree
 from vislam.mapping.ply import read_ply
-from vislam.memory import FrontMemory, GraphNews, KeyframeEntry
+from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
 from vislam.messages import Frame, ImuSample, LoopDecision, MagSample, Tracking
 from vislam.recording import Recording
-from vislam.runfolder import RunLog, storage, write_json, write_setup
+from vislam.runfolder import MapChoice, RunLog, storage, write_json, write_setup
 from vislam.session import Session, SessionWriter, has_begun, recall
 from vislam.slam import KeyframeStep, Slam, Step
 from vislam.trajectory import Trajectory, align, associate, evaluate
@@ -74,6 +75,8 @@ class Run:
         self._first_frame = 0  # that was not remembered from an earlier process
         self._from: FrontMemory | None = None
         self.viewer: RunViewer | NullViewer = NullViewer()
+        self.base: dict[str, Any] | None = None  # the map in which the run began
+        self.joined_t_ns: int | None = None  # when the recording was found in it
         self.warnings: list[str] = []
 
     def resume(self, stored: Session) -> bool:
@@ -92,7 +95,8 @@ class Run:
         if memory is None:
             return False
         update = self.slam.resume(memory)
-        self.log.restore(stored, memory)
+        self.base = info.get("map")
+        self.log.restore(stored, memory, 0 if self.base is None else int(self.base["keyframes"]))
         self.gallery.skip(self.log.candidates)
         front = memory.front
         self._first_frame, self._from = len(self.log), front
@@ -106,6 +110,13 @@ class Run:
             "real-time factor are those of the part since then"
         )
         return True
+
+    def begin_in_map(self, memory: SlamMemory) -> None:
+        """Begin in the map of another session, before `execute`."""
+        update = self.slam.begin_in_map(memory)
+        self.log.begin_in_map(memory)
+        self.base = self.session.base()
+        self.session.move(update, GraphNews())
 
     def execute(self, progress: Progress | None = None) -> dict[str, Any]:
         """Process the whole recording and write every file; return the metrics.
@@ -192,6 +203,8 @@ class Run:
             )  # fmt: skip
             self.session.add(entry)
             self.gallery.add(step)
+        if self.base is not None and self.joined_t_ns is None and step.update.pieces.group(packet.keyframe.id) == 0:
+            self.joined_t_ns = packet.keyframe.t_ns
 
     def _show(self, step: Step) -> None:
         """Log a step for the viewer: the image with its tracks, the poses, what the back end did."""
@@ -326,6 +339,7 @@ class Run:
             "wall_s": wall_s,
             "realtime_factor": part_s / wall_s if wall_s > 0.0 else None,
             "resumed": self.resumed,
+            "map": self._found_in_map(),
             "initialisation": {
                 "status": "none" if found is None else str(found.status),
                 "reason": front.last_refusal if found is None else found.reason,
@@ -366,6 +380,15 @@ class Run:
                 f"the filter refused {refused} of {refused + taken} visual motions as impossible: its pose is mostly "
                 "inertial there; with one camera use --ekf.coupling tight"
             )
+
+    def _found_in_map(self) -> dict[str, Any] | None:
+        """Return in which map the run began, and when it was found there."""
+        if self.base is None:
+            return None
+        if self.joined_t_ns is None:
+            self.warnings.append(f"the recording was not found in the map {self.base['path']}: its poses begin anew")
+            return {**self.base, "found_t_s": None}
+        return {**self.base, "found_t_s": (self.joined_t_ns - int(self.log.stamps_ns[0])) * 1e-9}
 
     def _compare_filter_and_graph(self, final: Trajectory) -> None:
         """Warn when filter and graph went different ways by more than drift explains: one of them is wrong."""
@@ -416,23 +439,74 @@ def _plotted(step: Step) -> dict[str, float]:
 
 
 def execute(
-    recording: Recording, config: Config, out: Path, source: str, command: list[str], progress: Progress | None = None
+    recording: Recording,
+    config: Config,
+    out: Path,
+    source: str,
+    command: list[str],
+    progress: Progress | None = None,
+    base: MapChoice | None = None,
 ) -> dict[str, Any]:
-    """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`."""
-    write_setup(out, config, source, command)
+    """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`.
+
+    With `base` it begins in the map of another session, which stays as it is. Raises UsageError when that does not fit.
+    """
     info = {"source": source, "config": asdict(config)}
     noise = imu_noise(config.imu, recording.imu_noise)
-    session = SessionWriter(out / "session.db", info, recording.rig, noise, config.imu.gravity_m_s2)
-    return Run(recording, config, out, session).execute(progress)
+    path = out / "session.db"
+    if base is None:
+        write_setup(out, config, source, command)
+        session = SessionWriter(path, info, recording.rig, noise, config.imu.gravity_m_s2)
+        return Run(recording, config, out, session).execute(progress)
+    stored = Session(base.path / "session.db" if base.path.is_dir() else base.path)
+    try:
+        memory = _map_of(stored, recording, config, noise)
+        memory = replace(memory, held=len(memory.graph.packets) if base.localize_only else 0)
+        write_setup(out, config, source, command, base)
+        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only)
+    finally:
+        stored.close()
+    run = Run(recording, config, out, session)
+    run.begin_in_map(memory)
+    if not memory.scans and config.map.enabled:
+        run.warnings.append(
+            f"{stored.path} brings no clouds, or of another shape (--map.*): the map holds new ones only"
+        )
+    return run.execute(progress)
+
+
+def _map_of(stored: Session, recording: Recording, config: Config, noise: ImuNoise | None) -> SlamMemory:
+    """Return the map of a session; raises UsageError when a recording cannot go on in it, DataError without one."""
+    info = stored.info()
+    settings, sensors = info.get("config") or {}, json.loads(json.dumps(rig_data(recording.rig)))
+    if settings.get("graph", {}).get("coupling") != "tight" or config.graph.coupling != "tight":
+        raise UsageError("a map is made and continued with tight coupling only; use --graph.coupling tight for both")
+    if info.get("rig") != sensors:
+        raise UsageError(f"{stored.path} was made with other cameras, or another calibration, than {recording.name}")
+    if (info.get("imu_noise") is None) != (noise is None):
+        raise UsageError(f"{stored.path} and {recording.name} must both have an IMU, or both none")
+    memory = recall(stored)
+    if memory is None:
+        raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
+    if settings.get("map") != json.loads(json.dumps(asdict(config.map))):
+        return replace(memory, scans={})  # of another shape
+    return memory
 
 
 def resume(
-    recording: Recording, config: Config, out: Path, source: str, command: list[str], progress: Progress | None = None
+    recording: Recording,
+    config: Config,
+    out: Path,
+    source: str,
+    command: list[str],
+    progress: Progress | None = None,
+    base: MapChoice | None = None,
 ) -> dict[str, Any]:
     """Go on with the run in `out` after its last stored keyframe and return the metrics of the whole.
 
-    A run that had no keyframe yet, or had not found gravity, begins again. Raises UsageError when it is finished or
-    `config` is not what it began with, DataError when its session is damaged or the recording is another one.
+    A run that had no keyframe yet, or had not found gravity, begins again, in the map `base` if it began there. Raises
+    UsageError when it is finished or `config` is not what it began with, DataError when its session is damaged or the
+    recording is another one.
     """
     path = out / "session.db"
     if has_begun(path):
@@ -449,4 +523,4 @@ def resume(
     with storage(path):
         for name in ("session.db", "session.db-wal", "session.db-shm"):
             (out / name).unlink(missing_ok=True)
-    return execute(recording, config, out, source, command, progress)
+    return execute(recording, config, out, source, command, progress, base)

@@ -10,7 +10,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -58,8 +58,8 @@ def prepare(out: Path, overwrite: bool) -> None:
         out.mkdir(parents=True, exist_ok=True)
 
 
-def read_setup(out: Path) -> tuple[str, Config]:
-    """Return source and settings of the run in a folder.
+def read_setup(out: Path) -> tuple[str, Config, MapChoice | None]:
+    """Return source, settings and map of the run in a folder.
 
     Raises UsageError when there is no run, DataError when its recording is not what it was.
     """
@@ -69,7 +69,12 @@ def read_setup(out: Path) -> tuple[str, Config]:
         raise UsageError(f"{out / 'manifest.json'} names no source; start the run anew with --overwrite")
     if fingerprint(_path_of(source)) != manifest.get("data_sha256"):
         raise DataError(f"{source} is not the recording that {out} began with; start a new run")
-    return source, from_data(settings, str(out / "config.json"))
+    base = manifest.get("map")
+    try:
+        choice = None if base is None else MapChoice(Path(base["path"]), bool(base["localize_only"]))
+    except (KeyError, TypeError) as error:
+        raise DataError(f"{out / 'manifest.json'} names no sound map; start the run anew with --overwrite") from error
+    return source, from_data(settings, str(out / "config.json")), choice
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -168,6 +173,14 @@ def code_revision() -> str | None:
         return None
 
 
+@dataclass(frozen=True, slots=True)
+class MapChoice:
+    """The session in whose map a run begins."""
+
+    path: Path
+    localize_only: bool  # the map stays as it is
+
+
 class RunLog:
     """Remembers of every frame what the trajectories and tables need, and writes them."""
 
@@ -183,6 +196,7 @@ class RunLog:
         self._positions: dict[int, Array] = {}  # of the keyframes in the map, in order of their ids
         self._shifts: dict[int, tuple[float, float]] = {}  # edge: rms and largest shift of the update that took it in
         self.revisions = 0
+        self._first_id = 0  # of the keyframes of this recording; those before are a map's
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -216,18 +230,27 @@ class RunLog:
         """How many keyframes reached the back end."""
         return len(self._keyframe_t_ns)
 
-    def restore(self, session: Session, memory: SlamMemory) -> None:
-        """Take over what a run remembered up to its last keyframe."""
+    def restore(self, session: Session, memory: SlamMemory, first_id: int = 0) -> None:
+        """Take over what a run remembered up to its last keyframe; those before `first_id` are a map's."""
+        self._first_id = first_id
         self._frames = session.frames()
         self._ekf_states = session.states("filter")
-        for packet in memory.graph.packets:
+        for packet in memory.graph.packets[self._first_id :]:
             self._keyframe_t_ns[packet.keyframe.id] = packet.keyframe.t_ns
             if packet.imu is not None:
                 self._spans[packet.keyframe.id] = packet.imu
         self._candidates, self._retrieved, self._shifts = session.candidates(), session.retrieved(), session.shifts()
-        self._positions = {k: T[:3, 3] for k, T in enumerate(memory.graph.T_map_body)}
+        self._place(memory)
         self._edge_ids = {(loop.edge.from_id, loop.edge.to_id): loop.edge.id for loop in memory.graph.loops}
         self.revisions = memory.graph.revision
+
+    def begin_in_map(self, memory: SlamMemory) -> None:
+        """Number keyframes on from those of a map."""
+        self._first_id = len(memory.graph.packets)
+        self._place(memory)
+
+    def _place(self, memory: SlamMemory) -> None:
+        self._positions = {k: T[:3, 3] for k, T in enumerate(memory.graph.T_map_body)}
 
     def add(self, step: Step) -> FrameEntry:
         """Remember one step; return what is remembered of its frame."""
@@ -278,7 +301,8 @@ class RunLog:
         keyframe_ids = np.array([frame.keyframe_id for frame in self._frames], dtype=np.int64)
         frames = LoggedFrames(self.stamps_ns, keyframe_ids, [frame.T_keyframe_body for frame in self._frames])
         frames = frames.carried_by_imu(states, self._spans, imu.gravity_m_s2, imu.max_gap_s)
-        return frames.placed(self._keyframe_t_ns, dict(zip(ids, T_map_body, strict=True)))
+        poses = dict(zip(ids, T_map_body, strict=True))
+        return frames.placed(self._keyframe_t_ns, {i: poses[i] for i in ids if i in self._keyframe_t_ns})
 
     def odometry_trajectory(self) -> Trajectory:
         """Return the causal poses in odom: those of the filter, or of visual odometry without an IMU."""
@@ -303,8 +327,8 @@ class RunLog:
 
     def write_states(self, out: Path, ids: list[int], states: list[NavState]) -> None:
         """Write keyframe states with covariances, of the filter and of the graph."""
-        if states:
-            write_states_csv(out / "states_graph.csv", ids, states)
+        if states[self._first_id :]:
+            write_states_csv(out / "states_graph.csv", ids[self._first_id :], states[self._first_id :])
         if self._ekf_states:
             write_states_csv(out / "states_ekf.csv", list(self._ekf_states), list(self._ekf_states.values()))
 
@@ -353,7 +377,10 @@ class RunLog:
         return {"candidates": len(loops), **{str(decision): decisions[str(decision)] for decision in LoopDecision}}
 
 
-def write_setup(out: Path, config: Config, source: str, command: list[str]) -> None:
+def write_setup(out: Path, config: Config, source: str, command: list[str], base: MapChoice | None = None) -> None:
     """Write manifest.json and config.json, before anything is computed."""
-    write_json(out / "manifest.json", manifest(source, command, config))
+    data = manifest(source, command, config)
+    if base is not None:
+        data["map"] = {"path": str(base.path.resolve()), "localize_only": base.localize_only}
+    write_json(out / "manifest.json", data)
     write_json(out / "config.json", dump(config))

@@ -93,6 +93,7 @@ class Back:
         self.clock = clock
         self.T_map_odom = np.eye(4)
         self._trainings = 0
+        self._held = 0  # keyframes of a map that is not to change
 
     def restore(self, memory: SlamMemory) -> GraphUpdate:
         """Take over an earlier run; return all its poses."""
@@ -105,7 +106,15 @@ class Back:
             ids = [packet.keyframe.id for packet in graph.packets]
             self.mapper.restore(memory.scans, dict(zip(ids, graph.T_map_body, strict=True)))
         self._follow(update)
+        self._held = memory.held
+        if memory.held:
+            self.graph.hold(memory.held)
         return update
+
+    def begin_recording(self, state: NavState | None, T_odom_body: Array) -> None:
+        """Prepare for the first keyframe of a new recording, whose axes are those of map until loops say otherwise."""
+        self.graph.begin_recording(state, T_odom_body)
+        self.T_map_odom = np.eye(4)
 
     def add(self, odometry: OdometryKeyframe) -> KeyframeStep:
         """Take one keyframe in: find its loops, optimise, follow with the map."""
@@ -120,7 +129,7 @@ class Back:
         with self.clock.measure("graph"):
             update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
         self._follow(update)
-        if self.mapper is not None:
+        if self.mapper is not None and not self._held:
             with self.clock.measure("map"):
                 self.mapper.add(keyframe, self.T_map_odom @ odometry.T_odom_body)
         scan = None if self.mapper is None else self.mapper.packed(keyframe.id)
@@ -165,6 +174,7 @@ class Slam:
         self._make_back = partial(Back, config, rig)
         self._frames: deque[Frame] = deque()
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
+        self._begins_recording = False  # in a map, with the next keyframe
 
     def resume(self, memory: SlamMemory) -> GraphUpdate:
         """Go on where an earlier run was, before the first value; return all its poses.
@@ -173,8 +183,19 @@ class Slam:
         around it. Raises DataError when the memory contradicts itself.
         """
         self.front.resume(memory.front)
-        self.back = self._make_back(self.front.noise, self.clock, self.front.first_state, memory.T_start)
+        self.back = self._make_back(self.front.noise, self.clock, memory.first_state, memory.T_start)
         self._seen_again = memory.front.keyframe_id
+        return self.back.restore(memory)
+
+    def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
+        """Begin in the map of earlier runs, before the first value; return its poses.
+
+        What is recorded now is a new piece of trajectory until loops join it with the map. Raises DataError when the
+        memory contradicts itself.
+        """
+        self.front.begin_in_map(memory.front.keyframe_id + 1, memory.front.news.next_track_id)
+        self.back = self._make_back(self.front.noise, self.clock, memory.first_state, memory.T_start)
+        self._begins_recording = True
         return self.back.restore(memory)
 
     def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
@@ -212,6 +233,9 @@ class Slam:
     def _add_new(self, odometry: OdometryKeyframe) -> KeyframeStep:
         if self.back is None:
             self.back = self._make_back(self.front.noise, self.clock, self.front.first_state, odometry.T_odom_body)
+        if self._begins_recording:
+            self.back.begin_recording(self.front.first_state, odometry.T_odom_body)
+            self._begins_recording = False
         step = self.back.add(odometry)
         self.front.feed_back(step.update)
         return step

@@ -123,9 +123,9 @@ class PoseGraph:
         self._source.begin_piece(start, state)
         self._T_odom_last = self._estimator.poses[-1].copy()
 
-    def hold(self) -> None:
-        """Hold the keyframes that are there where they are: those to come are found in a map that does not change."""
-        self._estimator.hold(self.ids)
+    def hold(self, count: int | None = None) -> None:
+        """Hold the first keyframes, by default all there are, where they are: the map of what comes does not change."""
+        self._estimator.hold(self.ids[:count])
 
     def restore(self, memory: GraphMemory) -> GraphUpdate:
         """Take over the keyframes, loops and last estimate of an earlier run; return all poses.

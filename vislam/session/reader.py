@@ -253,6 +253,10 @@ class Session:
             [f.T_keyframe_body for f in frames],
         )
 
+    def copy_to(self, other: sqlite3.Connection) -> None:
+        """Copy the whole session into an empty database."""
+        self._db.backup(other)
+
     def close(self) -> None:
         """Close the file."""
         self._db.close()

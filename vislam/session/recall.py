@@ -32,15 +32,17 @@ _RIGID = 1e-4  # how far R R^T may be from identity
 def recall(session: Session) -> SlamMemory | None:
     """Return what a pipeline goes on from; None when the session has nothing worth going on from.
 
-    That is one without a keyframe, or one with an IMU whose gravity had not been found. Raises DataError when the
-    session is damaged.
+    That is one without a keyframe of its own, or one with an IMU whose gravity had not been found. Raises DataError
+    when the session is damaged.
     """
     info, newest = session.info(), session.newest()
     with readable(session.path):
-        start = _start(info)
+        start, base = _start(info), info.get("map") or {}
         if not newest or (start is None and info["imu_noise"] is not None):
             return None
         stored = list(session.keyframes())
+        if len(stored) <= base.get("keyframes", 0):
+            return None
         packets = session.packets(light=True)
         states = session.states("graph")
         loops = session.loops()
@@ -77,7 +79,16 @@ def recall(session: Session) -> SlamMemory | None:
             state=None if start is None else _filter_state(session, states, last.id, last.T_odom_body),
             news=_front(newest["front"]),
         )
-        return SlamMemory(front, stored[0].T_odom_body, graph, places, _scans(session))
+        first = info.get("first_state")
+        return SlamMemory(
+            front=front,
+            first_state=None if first is None else state_from(first),
+            T_start=stored[0].T_odom_body,
+            graph=graph,
+            places=places,
+            scans=_scans(session),
+            held=int(base["keyframes"]) if base.get("localize_only") else 0,
+        )
 
 
 def _check_rigid(T: Array) -> None:
@@ -95,7 +106,7 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
         return None
     return StartFacts(
         str(facts["status"]), str(facts["reason"]), state_from(facts["last"]), float(facts["scale_sigma"]),
-        float(facts["excitation_m_s2"]), ImuNoise(**facts["noise"]), state_from(info["first_state"]),
+        float(facts["excitation_m_s2"]), ImuNoise(**facts["noise"]), state_from(facts["first_state"]),
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -17,7 +18,7 @@ from vislam.imu import ImuNoise
 from vislam.memory import FrameEntry, FrontNews, GraphNews, KeyframeEntry, LoopPlace, LoopState, StartFacts, TagSighting
 from vislam.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
 from vislam.session.packets import packet_row
-from vislam.session.reader import check_version
+from vislam.session.reader import Session, check_version
 from vislam.session.schema import (
     APPLICATION_ID,
     SCHEMA,
@@ -71,17 +72,52 @@ class SessionWriter:
             db = writer._db
             newest_id, newest_t_ns = db.execute("SELECT id, t_ns FROM keyframes ORDER BY id DESC").fetchone() or (-1, 0)
             db.execute("DELETE FROM frames WHERE t_ns > ? OR keyframe_id > ?", (newest_t_ns, newest_id))
+            base = writer.base()
+            writer._first_id = 0 if base is None else int(base["keyframes"])
             writer._edges = db.execute("SELECT COALESCE(MAX(number) + 1, 0) FROM edges").fetchone()[0]
         return writer
+
+    @classmethod
+    def in_map(
+        cls, path: Path, base: Session, info: dict[str, Any], noise: ImuNoise | None, localize_only: bool
+    ) -> SessionWriter:
+        """Create the file of a run that begins in the map of another session, of which it holds a copy.
+
+        Raises StorageError when it cannot be written.
+        """
+        part = path.with_name(path.name + ".part")  # the file appears whole or not at all
+        writer = cls.__new__(cls)
+        with storage(path):
+            part.unlink(missing_ok=True)
+            writer._db = sqlite3.connect(part, isolation_level=None)
+            base.copy_to(writer._db)
+            with writer._transaction():
+                for table in ("frames", "candidates", "retrieved"):  # of another recording
+                    writer._db.execute(f"DELETE FROM {table}")
+                writer._db.execute("DELETE FROM states WHERE whose = 'filter'")
+                writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2')")
+                count = writer._db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
+                origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only}
+                sensors = {"imu_noise": None if noise is None else asdict(noise)}
+                writer._tell({**info, **sensors, "map": origin, "finished": False})
+            writer._db.close()
+            os.replace(part, path)
+        return cls.reopen(path)
 
     def _open(self, path: Path) -> None:
         self.path = path
         self._frames: list[FrameEntry] = []
         self._edges = 0
+        self._first_id = 0  # of the keyframes of this recording
         with storage(path):
             self._db = sqlite3.connect(path, isolation_level=None)
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
+
+    def base(self) -> dict[str, Any] | None:
+        """Return the map in which the run began, if it did: its path, its number of keyframes, whether it is held."""
+        row = self._db.execute("SELECT value FROM info WHERE key = 'map'").fetchone()
+        return None if row is None else dict(json.loads(row[0]))
 
     def tell(self, entries: dict[str, Any]) -> None:
         """Commit entries of the info table."""
@@ -105,7 +141,9 @@ class SessionWriter:
         )  # fmt: skip
         with storage(self.path), self._transaction():
             if keyframe.id == 0:
-                self._tell({"first_state": None, "start": None} if entry.start is None else _start_data(entry.start))
+                self._tell({"first_state": None if entry.start is None else state_data(entry.start.first_state)})
+            if keyframe.id == self._first_id and entry.start is not None:
+                self._tell({"start": _start_data(entry.start)})
             self._insert("keyframes", [row])
             self._insert("packets", [packet_row(packet, update.newest)])
             if entry.filter_state is not None:
@@ -199,11 +237,11 @@ class SessionWriter:
 
 
 def _start_data(start: StartFacts) -> dict[str, Any]:
-    facts = {
+    return {
         "status": start.status, "reason": start.reason, "last": state_data(start.last),
         "scale_sigma": start.scale_sigma, "excitation_m_s2": start.excitation_m_s2, "noise": asdict(start.noise),
+        "first_state": state_data(start.first_state),
     }  # fmt: skip
-    return {"first_state": state_data(start.first_state), "start": facts}
 
 
 def _front_data(front: FrontNews | None) -> dict[str, Any]:
