@@ -443,6 +443,46 @@ def _map(arguments: list[str]) -> int:
     return 0
 
 
+def _loops(arguments: list[str]) -> int:
+    from vislam.loop_undo import change_loops, list_loops
+    from vislam.options import LoopsOptions
+    from vislam.report import write_report
+
+    options = _parse(LoopsOptions, arguments, "loops")
+    if not (options.undo or options.redo):
+        loops = list_loops(options.run)
+        if options.json:
+            print(json.dumps(loops))
+        else:
+            _print_edges(loops)
+        return 0
+    answer = change_loops(options.run, options.undo, options.redo)
+    write_report(options.run)
+    if options.json:
+        print(json.dumps(answer))
+        return 0
+    undone = ", ".join(map(str, answer["undone"])) or "none"
+    print(f"undone: {undone}; keyframes moved {answer['moved_rms_m']:.4f} m rms, {answer['moved_max_m']:.4f} m at most")
+    if answer["changed_besides"]:
+        print(f"the review of all loops then decided otherwise about {', '.join(map(str, answer['changed_besides']))}")
+    print(f"written again: {', '.join(answer['written'])}, report.html; the trajectory with which the run itself ended")
+    print("is in trajectory_graph_first.tum. map/ and the causal trajectories are as they were.")
+    return 0
+
+
+def _print_edges(loops: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for title in ("id", "from", "to", "decision", "chi2", "weight", "reason"):
+        table.add_column(title, justify="left" if title in ("decision", "reason") else "right")
+    for loop in loops:
+        ends = [str(loop[name]) for name in ("id", "from", "to")]
+        table.add_row(*ends, loop["decision"], _number(loop["chi2"], 1), _number(loop["weight"], 2), loop["reason"])
+    Console().print(table)
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -463,5 +503,6 @@ _VERBS = {
     "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
     "optimize": _Verb(_optimize, "estimate a run again in batch, from its factor log", "vislam optimize runs/desk"),
     "map": _Verb(_map, "say what an OctoMap file holds, or what is at a place", "vislam map runs/desk/map/octomap.bt"),
+    "loops": _Verb(_loops, "list the loop edges of a run, or undo some", "vislam loops runs/desk --undo 7"),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

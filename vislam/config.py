@@ -418,6 +418,8 @@ class LoopConfig:
     training_descriptors: int = 200_000  # at most: bounds a training to about half a second
     vocabulary_branching: int = 10  # children of a node
     vocabulary_depth: int = 5  # levels; one less while there are few descriptors
+    inject_share: float = 0.0  # for experiments: share of false loops, made up, among those that the graph is offered
+    inject_group: int = 1  # how many of them agree among themselves, as from an object that is there twice
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,6 +94,7 @@ class LoopPlace(StrEnum):
     PARKED = "parked"
     WAITING = "waiting"  # between pieces that are not joined
     OUT = "out"
+    UNDONE = "undone"  # taken out by somebody, after the run; it stays out until they bring it back
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from vislam.config import BatchConfig, Config, from_data
 from vislam.errors import DataError, UsageError, VislamError
 from vislam.factor_log import FactorLog
 from vislam.messages import NavState
-from vislam.runfolder import write_json
+from vislam.runfolder import read_metrics, write_json
 from vislam.session import Session
 from vislam.trajectory import Trajectory, evaluate, read_tum, write_states_csv, write_tum
 
@@ -36,7 +35,7 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     log, settings = _read(run, config)
     result = optimize_run(log, settings)
     trajectory = _placed(log, result.states, settings.imu.max_gap_s)
-    metrics = _metrics(run)
+    metrics = read_metrics(run)
     entry = _entry(result, log, trajectory)
     accuracy = _accuracy(run, trajectory, log, entry["warnings"])
     entry |= {"accuracy": accuracy, "wall_s": time.perf_counter() - start, "config": asdict(config)}
@@ -84,20 +83,6 @@ def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config]:
         return log, from_data(data, source=str(run / "session.db"))
     except UsageError as error:
         raise DataError(f"{error}; the settings stored with the run are damaged, run the recording again") from error
-
-
-def _metrics(run: Path) -> dict[str, Any]:
-    """Return metrics.json of the run; a run that was killed has none."""
-    path = run / "metrics.json"
-    if not path.exists():
-        return {}
-    try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-        if not (isinstance(metrics, dict) and all(isinstance(metrics.get(k, {}), dict) for k in ("accuracy", "batch"))):
-            raise ValueError("it holds something else than metrics")
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be used: {error}; remove it, or run the recording again") from error
-    return metrics
 
 
 def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory) -> dict[str, Any]:

@@ -177,6 +177,20 @@ class MapOptions:
 
 
 @dataclass(frozen=True)
+class LoopsOptions:
+    """Options of `vislam loops`."""
+
+    run: Positional[Path]
+    """Run folder"""
+    undo: tyro.conf.UseAppendAction[tuple[int, ...]] = ()
+    """Id of an edge to optimise the run again without; may be given several times"""
+    redo: tyro.conf.UseAppendAction[tuple[int, ...]] = ()
+    """Id of an edge that was undone and is to come back; may be given several times"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
 class ReportOptions:
     """Options of `vislam report`."""
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from vislam.config import Config, ImuConfig, dump, from_data
 from vislam.errors import DataError, StorageError, UsageError
 from vislam.frames import LoggedFrames
+from vislam.loop.injection import SOURCE as INJECTED
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
 from vislam.memory import FrameEntry, SlamMemory
 from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDecision, NavState, RetrievedKeyframe
@@ -105,6 +106,20 @@ def storage(path: Path) -> Iterator[None]:
 def write_json(path: Path, data: Any) -> None:
     """Write plain data as JSON, atomically; numbers that are not finite become null."""
     write_text(path, json.dumps(plain(data), indent=1) + "\n")
+
+
+def read_metrics(run: Path) -> dict[str, Any]:
+    """Return metrics.json of a run, empty where it was killed; raises DataError when the file cannot be used."""
+    path = run / "metrics.json"
+    if not path.exists():
+        return {}
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        if not (isinstance(metrics, dict) and all(isinstance(metrics.get(k, {}), dict) for k in ("accuracy", "batch"))):
+            raise ValueError("it holds something else than metrics")
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be used: {error}; remove it, or run the recording again") from error
+    return metrics
 
 
 def plain(data: Any) -> Any:
@@ -374,7 +389,9 @@ class RunLog:
         write_text(out / "retrieved.csv", retrieved_text(self._retrieved))
         write_text(out / "loops.csv", loops_text(loops))
         decisions = Counter(row.decision for row in loops)
-        return {"candidates": len(loops), **{str(decision): decisions[str(decision)] for decision in LoopDecision}}
+        counts = {"candidates": len(loops), **{str(decision): decisions[str(decision)] for decision in LoopDecision}}
+        injected = [row.decision == LoopDecision.ACCEPTED for row in loops if row.source == INJECTED]
+        return counts | ({"injected": len(injected), "injected_kept": sum(injected)} if injected else {})
 
 
 def write_setup(out: Path, config: Config, source: str, command: list[str], base: MapChoice | None = None) -> None:

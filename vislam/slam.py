@@ -16,10 +16,12 @@ import numpy as np
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
+from vislam.errors import UsageError
 from vislam.front import Front, FrontStep
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
+from vislam.loop.injection import FalseLoops, as_candidate
 from vislam.mapping.mapper import Mapper
 from vislam.memory import GraphNews, PackedScan, SlamMemory, TagSighting, WordsMemory
 from vislam.messages import (
@@ -90,13 +92,18 @@ class Back:
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self.mapper = Mapper(config.map, rig) if config.map.enabled else None
+        self._false = None
+        if config.loop.inject_share > 0.0:
+            self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
         self.clock = clock
         self.T_map_odom = np.eye(4)
         self._trainings = 0
         self._held = 0  # keyframes of a map that is not to change
 
     def restore(self, memory: SlamMemory) -> GraphUpdate:
-        """Take over an earlier run; return all its poses."""
+        """Take over an earlier run; return all its poses. Raises UsageError where loops are made up on purpose."""
+        if self._false is not None:
+            raise UsageError("what loop.inject_share made up is not remembered: such a run cannot be gone on with")
         graph = memory.graph
         update = self.graph.restore(graph)
         if self.loops is not None:
@@ -126,6 +133,9 @@ class Back:
                 edges, candidates = self.loops.detect(
                     keyframe, self.T_map_odom @ odometry.T_odom_body, odometry.packet.begins_piece
                 )
+        if self._false is not None:
+            false = self._false.add(odometry.T_odom_body, edges)
+            edges, candidates = edges + false, candidates + [as_candidate(edge) for edge in false]
         with self.clock.measure("graph"):
             update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
         self._follow(update)

@@ -40,6 +40,7 @@ def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float], cpu_s: f
         "frames": metrics["frames"],
         "keyframes": metrics["keyframes"],
         "loops": metrics["loops"]["accepted"],
+        "injected_kept": metrics["loops"].get("injected_kept"),
         "initialisation": initialisation["status"],
         "initialisation_s": initialisation["t_s"],
         "latency_p50_ms": _plain(p50_ms),

@@ -52,6 +52,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("peak_memory_mb", "memory [MB]", "cost", 0),
     Metric("keyframes", "keyframes", "count", 0),
     Metric("loops", "loops", "count", 0),
+    Metric("injected_kept", "false loops kept", "count", 0),
 )
 BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 

@@ -154,8 +154,8 @@ class PoseGraph:
             self._anchors.tie(tied)
         for model in by_place[LoopPlace.PARKED]:
             self._park.park(model)
-        waiting = {model.id for model in by_place[LoopPlace.WAITING]}
-        for model in (m for m in models if m.id not in waiting):
+        apart = {model.id for place in (LoopPlace.WAITING, LoopPlace.UNDONE) for model in by_place[place]}
+        for model in (m for m in models if m.id not in apart):
             self._consensus.offer(model, model.id not in self._held, self._travel)
         for model in by_place[LoopPlace.WAITING]:
             self._waiting.add(model)

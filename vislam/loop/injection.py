@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vislam.errors import UsageError
 from vislam.geometry import invert, se3_exp
-from vislam.messages import Array, LoopEdge
+from vislam.messages import Array, LoopCandidate, LoopDecision, LoopEdge
 
+SOURCE = "injected"  # of candidates
 FIRST_ID = 1_000_000_000  # ids from here on are injected; those of the detector never get there
 _TRIES = 50  # to find two different places
 _APART_M = 1.0  # two keyframes nearer than this, or than a tenth of what was seen of the world, may be one place
@@ -25,7 +27,12 @@ class FalseLoops:
     """
 
     def __init__(self, share: float, group: int, seed: int, turn_sigma_rad: float = _TURN_SIGMA_RAD) -> None:
-        """Make false loops `share` of all that are offered, in groups of so many; 1: each for itself."""
+        """Make false loops `share` of all that are offered, in groups of so many; 1: each for itself.
+
+        Raises UsageError for a share that is none, or a group of nothing.
+        """
+        if not 0.0 < share < 1.0 or group < 1:
+            raise UsageError(f"loop.inject_share {share} must be below 1 and loop.inject_group {group} at least 1")
         self._per_true = share / (1.0 - share)
         self._group = group
         self._turn_sigma_rad = turn_sigma_rad
@@ -75,3 +82,11 @@ class FalseLoops:
         return LoopEdge(
             self._next_id - 1, old + step, newest, T, model.covariance, True, model.inliers, model.score
         )  # fmt: skip
+
+
+def as_candidate(edge: LoopEdge) -> LoopCandidate:
+    """Return the record of a false loop, which says what it is."""
+    return LoopCandidate(
+        edge.from_id, edge.to_id, SOURCE, edge.score, edge.inliers, LoopDecision.ACCEPTED, "false, injected on purpose",
+        sigma_m=float(np.sqrt(np.trace(edge.covariance[3:, 3:]) / 3.0)), T_from_to=edge.T_from_to,
+    )  # fmt: skip

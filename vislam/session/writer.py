@@ -104,6 +104,27 @@ class SessionWriter:
             os.replace(part, path)
         return cls.reopen(path)
 
+    @classmethod
+    def amend(cls, path: Path, update: GraphUpdate, news: GraphNews) -> None:
+        """Store in one transaction what was decided otherwise about a run that was ended, and what that moved.
+
+        Raises DataError when the file is missing, not ours or damaged, StorageError when it cannot be written.
+        """
+        writer = cls.__new__(cls)
+        writer.path = path
+        with storage(path):
+            writer._db = sqlite3.connect(path, isolation_level=None)
+        try:
+            with readable(path):
+                check_version(writer._db, path)
+                newest = json.loads(writer._db.execute("SELECT value FROM newest").fetchone()[0])
+            with storage(path), writer._transaction():
+                writer._move(update, news)
+                changed = {**newest, "revision": update.revision, "vo_scale": news.vo_scale}
+                writer._replace("newest", [(1, json.dumps(changed))])
+        finally:
+            writer._db.close()
+
     def _open(self, path: Path) -> None:
         self.path = path
         self._frames: list[FrameEntry] = []
