@@ -130,7 +130,7 @@ class Estimator(Generic[L]):
             insert_guess(values, k, guess, self.has_imu)
         steps = [self._step(k, values) for k in range(1, len(guesses))]
         try:
-            self._restart(values, [], self._new_solver(), from_batch=False)
+            self._restart(values, [], self._new_solver(), from_batch=False, steps=steps)
         except FAILURES as error:
             return steps, self._recover(values, [], error)
         return steps, ""
@@ -354,13 +354,23 @@ class Estimator(Generic[L]):
     def _new_solver(self) -> Solver:
         return IncrementalSolver(self._config, self._factorization)
 
-    def _restart(self, values: gtsam.Values, fresh: list[L], solver: Solver, from_batch: bool) -> None:
-        """Fill a new solver from the records, starting at `values`; nothing changes when it fails."""
+    def _restart(
+        self,
+        values: gtsam.Values,
+        fresh: list[L],
+        solver: Solver,
+        from_batch: bool,
+        steps: list[Step] | None = None,
+    ) -> None:
+        """Fill a new solver from the records, starting at `values`; nothing changes when it fails.
+
+        `steps` are those between the keyframes where they are at hand.
+        """
         loops = self.loops | {edge.id: edge for edge in fresh}
         if from_batch:
             plain = {edge.id for edge in fresh}
             values = optimize(self._whole(values, loops, plain)[0], values, _BATCH_ITERATIONS)
-        graph, labels = self._whole(values, loops)
+        graph, labels = self._whole(values, loops, steps=steps)
         slots = solver.update(graph, values, [])
         solver.iterate(self._config.loop_iterations)
         self._adopt(solver.estimate(), np.arange(self._count))
@@ -372,6 +382,7 @@ class Estimator(Generic[L]):
         loops: dict[int, L],
         plain: set[int] | None = None,
         as_measured: bool = False,
+        steps: list[Step] | None = None,
     ) -> tuple[gtsam.NonlinearFactorGraph, list[Label | None]]:
         """Build all factors at the biases of `values`, with their names; loops in `plain` without a kernel.
 
@@ -380,8 +391,7 @@ class Estimator(Generic[L]):
         factors, _ = self._odometry.start()
         factors += [held_pose(k, T, self._config) for k, T in self._held.items()]
         labels: list[Label | None] = [None] * len(factors)
-        for k in range(1, self._count):
-            step = self._step(k, values)
+        for step in steps or (self._step(k, values) for k in range(1, self._count)):
             factors += [*step.factors, *step.named.values()]
             labels += [*[None] * len(step.factors), *step.named]
         robust = {loop_id: loop_id not in (plain or set()) for loop_id in loops}
