@@ -19,7 +19,7 @@ from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
 if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets.inspect import Inspection
-    from vislam.options import EvalOptions
+    from vislam.options import EvalOptions, MapOptions
     from vislam.runfolder import MapChoice
 
 # the matrices here are small: threads cost more than they bring, and replay must not depend on them
@@ -428,11 +428,17 @@ def _optimize(arguments: list[str]) -> int:
 
 
 def _map(arguments: list[str]) -> int:
+    from vislam.config import MapConfig
     from vislam.mapping.describe import describe_octree, describe_place
     from vislam.mapping.octomap_io import read_octree
-    from vislam.options import MapOptions
+    from vislam.options import MapOptions, map_options
+    from vislam.rebuild import map_settings
 
-    options = _parse(MapOptions, arguments, "map")
+    run = next((Path(argument) for argument in arguments if Path(argument).is_dir()), None)
+    base = MapConfig() if run is None or "--help" in arguments else map_settings(run).map
+    options = _parse(MapOptions, arguments, "map", map_options(base))
+    if options.source.is_dir():
+        return _rebuild(options)
     octree = read_octree(options.source)
     answer: dict[str, Any] = {}
     if options.info or options.query is None:
@@ -466,7 +472,7 @@ def _loops(arguments: list[str]) -> int:
     if answer["changed_besides"]:
         print(f"the review of all loops then decided otherwise about {', '.join(map(str, answer['changed_besides']))}")
     print(f"written again: {', '.join(answer['written'])}, report.html; the trajectory with which the run itself ended")
-    print("is in trajectory_graph_first.tum. map/ and the causal trajectories are as they were.")
+    print(f"is in trajectory_graph_first.tum. Causal trajectories and map/ are as they were: vislam map {options.run}")
     return 0
 
 
@@ -481,6 +487,26 @@ def _print_edges(loops: list[dict[str, Any]]) -> None:
         ends = [str(loop[name]) for name in ("id", "from", "to")]
         table.add_row(*ends, loop["decision"], _number(loop["chi2"], 1), _number(loop["weight"], 2), loop["reason"])
     Console().print(table)
+
+
+def _rebuild(options: MapOptions) -> int:
+    """Make the maps of a run again."""
+    from vislam.rebuild import rebuild
+    from vislam.report import write_report
+
+    with _progress(options.source.name, "steps") as progress:
+        answer = rebuild(options.source, options.settings, options.out, options.poses, progress)
+    if options.out is None:
+        write_report(options.source)
+    if options.json:
+        print(json.dumps(answer))
+        return 0
+    print(f"{answer['keyframes']} keyframes, depth from the {answer['depth']}, poses of {answer['poses']}")
+    for name, path in answer["written"].items():
+        print(f"{name}: {path}")
+    for name, reason in answer["left_out"].items():
+        print(f"warning: no {name}: {reason}")
+    return 0
 
 
 def _report(arguments: list[str]) -> int:
@@ -502,7 +528,11 @@ _VERBS = {
     "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
     "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
     "optimize": _Verb(_optimize, "estimate a run again in batch, from its factor log", "vislam optimize runs/desk"),
-    "map": _Verb(_map, "say what an OctoMap file holds, or what is at a place", "vislam map runs/desk/map/octomap.bt"),
+    "map": _Verb(
+        _map,
+        "make the maps of a run again, or say what an OctoMap file holds",
+        "vislam map runs/desk --resolution-m 0.02 --products cloud octomap mesh",
+    ),
     "loops": _Verb(_loops, "list the loop edges of a run, or undo some", "vislam loops runs/desk --undo 7"),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

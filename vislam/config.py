@@ -433,6 +433,9 @@ class DriveConfig:
     slope_window_m: float = 0.40  # slope is that of a plane through the ground within it: a voxel's step is no slope
 
 
+MapProduct = Literal["cloud", "pcd", "octomap", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
+
+
 @dataclass(frozen=True, slots=True)
 class MapConfig:
     """Clouds, the occupancy octree, the navigation grid and the mesh."""
@@ -469,8 +472,12 @@ class MapConfig:
     grid_low_m: float = 0.10  # above the floor: lower things are driven over or are the floor's own noise
     grid_high_m: float = 1.60  # above the floor: higher things are driven under
     drive: DriveConfig = field(default_factory=DriveConfig)
-    mesh: bool = False  # TSDF mesh by Open3D; a few seconds at export
     mesh_voxel_m: float = 0.02  # about the noise of depth at 3 m
+    surfel_m: float = 0.02  # between surfels
+    surfel_min_views: int = 2  # keyframes that must have seen a surfel; what one alone saw may be noise
+    poisson_depth: int = 9  # levels of Poisson's octree: cells of 2 cm in a room of 10 m
+    # what is written into map/; mesh, glb, obj and poisson need Open3D and take seconds, surfels too
+    products: tuple[MapProduct, ...] = ("cloud", "octomap", "grid", "drive")
 
 
 @dataclass(frozen=True, slots=True)

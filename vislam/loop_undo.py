@@ -68,9 +68,7 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
         if memory is None:
             raise DataError(f"{run} has no keyframe with gravity yet; there is nothing to optimise")
         if (info.get("map") or {}).get("localize_only"):
-            raise UsageError(
-                f"{run} was only localised in a map, which it does not change; undo it there"
-            )
+            raise UsageError(f"{run} was only localised in a map, which it does not change; undo it there")
         changed = _changed(run, memory.graph.loops, undo, redo)
         memory = replace(memory, graph=replace(memory.graph, loops=changed))
         log = RunLog()

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from vislam.config import BatchConfig, Config, LoopTruthConfig
+from vislam.config import BatchConfig, Config, LoopTruthConfig, MapConfig
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,12 @@ class MapOptions:
     """Options of `vislam map`."""
 
     source: Positional[Path]
-    """OctoMap file: .bt or .ot"""
+    """Run folder, to make its maps again with these settings; or OctoMap file (.bt, .ot), to ask it"""
+    settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
+    out: Path | None = None
+    """Folder for the maps of a run; None: in the place of those it has"""
+    poses: str = "graph"
+    """Where the keyframes of a run are: graph, or the NAME of a trajectory_NAME.tum in it, such as batch"""
     info: bool = False
     """Say how large the map is and what it holds; done too when nothing else is asked"""
     query: tuple[float, float, float] | None = None
@@ -196,6 +201,11 @@ class ReportOptions:
 
     run: Positional[Path]
     """Run folder"""
+
+
+def map_options(base: MapConfig) -> MapOptions:
+    """Return the options of `vislam map` to parse into, with `base` for every setting that is not given."""
+    return MapOptions(source=tyro.MISSING, settings=base)
 
 
 def run_options(base: Config) -> RunOptions:

@@ -20,10 +20,7 @@ from vislam.factor_log import rig_data
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.loop_gallery import LoopGallery
-from vislam.mapping.cloud import Cloud
-from vislam.mapping.mapper import Mapper
-from vislam.mapping.picture import Line, render_cloud, render_octree
-from vislam.mapping.ply import read_ply
+from vislam.mapping.map_pictures import write_pictures
 from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
 from vislam.messages import Frame, ImuSample, LoopDecision, MagSample, Tracking
 from vislam.recording import Recording
@@ -38,7 +35,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
-_PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
 _LOST_SIGMA_M = 1.0  # of the filter's position: no controller can use it, and a user must be told
 _UNIFORM_S = 20.0  # after which the biases that hold the scale of one camera may have walked away
 _GATED_SHARE = 0.1  # of the visual motions that the filter refused: more than outliers explain
@@ -244,7 +240,8 @@ class Run:
         self._show_result(final, truth)
         wall_s = time.perf_counter() - start  # everything but pictures and report
         if self.slam.back is not None and self.slam.back.mapper is not None:
-            self._write_pictures(self.slam.back.mapper, final)
+            is_level = self.slam.front.first_state is not None
+            write_pictures(self.slam.back.mapper, self.out / "map", final.positions_m, is_level)
         metrics = self._metrics(final, truth, wall_s, loops)
         write_json(self.out / "metrics.json", metrics)
         return metrics
@@ -269,20 +266,6 @@ class Run:
         decided = {(row.from_id, row.to_id): LoopDecision(row.decision) for row in rows}  # the last word counts
         if decided:
             self.viewer.settle_loops(int(self.log.stamps_ns[-1]), decided)
-
-    def _write_pictures(self, mapper: Mapper, final: Trajectory) -> None:
-        """Write the pictures of the map that the report shows; an empty map has none."""
-        path = [Line(final.positions_m, _PATH_COLOR)]
-        points, colors = read_ply(self.out / "map" / "cloud.ply")
-        octree = mapper.occupancy.max_likelihood_octree()
-        pictures = {}
-        if len(points):
-            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path, octree=octree)
-        if len(octree.occupied_voxels()):
-            pictures["picture_octree.png"] = render_octree(octree, path)
-        for name, image in pictures.items():
-            with storage(self.out / "map" / name):
-                (self.out / "map" / name).write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
     def _show_result(self, final: Trajectory, truth: Trajectory | None) -> None:
         self.viewer.log_path("graph", final.positions_m)

@@ -23,6 +23,7 @@ from vislam.errors import DataError, StorageError, UsageError
 from vislam.frames import LoggedFrames
 from vislam.loop.injection import SOURCE as INJECTED
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
+from vislam.mapping.products import FILES as MAP_FILES
 from vislam.memory import FrameEntry, SlamMemory
 from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDecision, NavState, RetrievedKeyframe
 from vislam.session import Session
@@ -36,8 +37,8 @@ _RUN_FILES = (
     "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "loops_eval.json",
     "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal", "session.db-shm", "run.rrd", "report.html",
     "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum",
-    "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/cloud.ply", "map/mesh.ply",
-    "map/octomap.bt", "map/grid.pgm", "map/grid.yaml", "map/picture_cloud.png", "map/picture_octree.png",
+    "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml", "map/drive.yaml",
+    "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
 _TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
 
@@ -52,7 +53,7 @@ def prepare(out: Path, overwrite: bool) -> None:
         with storage(out):
             # batch estimates choose their names, and the pictures of loops are named after them
             named = [*out.glob("trajectory_*.tum"), *out.glob("states_*.csv"), *out.glob("loops/*.jpg")]
-            named += out.glob("run_*.rrd")  # of a run that was resumed
+            named += [*out.glob("run_*.rrd"), *out.glob("map/picture_*.png")]  # the first of a run that was resumed
             for path in [*(out / name for name in _RUN_FILES), *named]:
                 path.unlink(missing_ok=True)
     with storage(out):

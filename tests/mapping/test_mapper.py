@@ -281,14 +281,14 @@ def test_export_is_whole_and_the_same_every_time(tmp_path):
         assert sorted(p.name for p in (tmp_path / name).iterdir()) == sorted(p.name for p in written.values())
         digests.append({k: hashlib.sha256(p.read_bytes()).hexdigest() for k, p in written.items()})
     assert digests[0] == digests[1]
-    assert set(digests[0]) == {"cloud", "octomap", "grid", "grid_yaml"}
+    assert set(digests[0]) == {"cloud", "octomap", "grid", "grid_yaml", "drive", "drive_yaml"}
     octree = read_octree(tmp_path / "a" / "octomap.bt")
     assert octree.resolution_m == CONFIG.resolution_m
     assert len(read_ply(tmp_path / "a" / "cloud.ply")[0]) == len(mapper_at(TRUE).cloud())
 
 
 def test_an_empty_map_exports_valid_files(tmp_path):
-    written = Mapper(replace(CONFIG, mesh=True), RIG).export(tmp_path / "map")
+    written = Mapper(replace(CONFIG, products=(*CONFIG.products, "mesh")), RIG).export(tmp_path / "map")
     assert len(read_ply(written["cloud"])[0]) == 0
     assert len(read_octree(written["octomap"])) == 0
     assert "mesh" not in written
@@ -314,7 +314,7 @@ def test_mesh_of_the_room(tmp_path):
         missing("no open3d; pip install 'vislam[map]'")
     contents = []
     for name in ("a", "b"):
-        mapper = mapper_at(TRUE, replace(CONFIG, mesh=True, mesh_voxel_m=0.04, pixel_step=1))
+        mapper = mapper_at(TRUE, replace(CONFIG, products=("mesh",), mesh_voxel_m=0.04, pixel_step=1))
         written = mapper.export(tmp_path / name)
         assert "mesh" not in mapper.notes
         contents.append(written["mesh"].read_bytes())
@@ -328,7 +328,7 @@ def test_mesh_of_the_room(tmp_path):
 
 def test_without_open3d_the_mesh_is_left_out_with_a_reason(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    mapper = mapper_at(TRUE[:2], replace(CONFIG, mesh=True))
+    mapper = mapper_at(TRUE[:2], replace(CONFIG, products=(*CONFIG.products, "mesh")))
     written = mapper.export(tmp_path)
     assert "mesh" not in written
     assert "open3d" in mapper.notes["mesh"]

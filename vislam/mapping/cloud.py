@@ -44,7 +44,7 @@ def _rehash(table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _voxel(x: float, y: float, z: float, voxel_m: float) -> int:
+def voxel_key(x: float, y: float, z: float, voxel_m: float) -> int:
     """Return the packed key of a point's voxel, or -1 when it is not finite or absurdly far."""
     a, b, c = np.floor(x / voxel_m), np.floor(y / voxel_m), np.floor(z / voxel_m)
     if not (abs(a) < _KEY_HALF and abs(b) < _KEY_HALF and abs(c) < _KEY_HALF):
@@ -57,7 +57,7 @@ def _accumulate(points: Points, colors: Colors, weights: NDArray[np.float32], vo
                 table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.int64],
                 sums: NDArray[np.float64], count: int) -> int:  # fmt: skip
     for i in range(len(points)):
-        key = _voxel(np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]), voxel_m)
+        key = voxel_key(np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]), voxel_m)
         if key < 0:
             continue
         slot = find_slot(table, key)
@@ -80,7 +80,7 @@ def _coarsen(old: NDArray[np.float64], voxel_m: float, table: NDArray[np.int64],
     count = 0
     for i in range(len(old)):
         weight = old[i, 6]
-        key = _voxel(old[i, 0] / weight, old[i, 1] / weight, old[i, 2] / weight, voxel_m)
+        key = voxel_key(old[i, 0] / weight, old[i, 1] / weight, old[i, 2] / weight, voxel_m)
         slot = find_slot(table, key)
         if table[slot] < 0:
             table[slot], rows[slot], keys[count] = key, count, key

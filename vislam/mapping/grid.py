@@ -70,22 +70,22 @@ def _fill(cells: NDArray[np.int8], low: NDArray[np.int64], size: NDArray[np.int6
         cells[low[i, 1] : low[i, 1] + size[i], low[i, 0] : low[i, 0] + size[i]] = value
 
 
-def write_grid(folder: Path, grid: Grid) -> tuple[Path, Path]:
-    """Write `grid.pgm` and `grid.yaml` as nav2's map_server reads them; return both paths.
+def write_grid(folder: Path, grid: Grid, name: str = "grid") -> tuple[Path, Path]:
+    """Write `NAME.pgm` and `NAME.yaml` as nav2's map_server reads them; return both paths.
 
     The image's first row is the highest y. Raises StorageError when they cannot be written.
     """
     shades = np.full(grid.cells.shape, _UNKNOWN_SHADE, np.uint8)
     shades[grid.cells == 0] = _FREE_SHADE
     shades[grid.cells == 1] = _OCCUPIED_SHADE
-    image, description = folder / "grid.pgm", folder / "grid.yaml"
+    image, description = folder / f"{name}.pgm", folder / f"{name}.yaml"
     rows, columns = grid.cells.shape[0], grid.cells.shape[1]
     with replacing(image) as file:
         file.write(f"P5\n# vislam, {grid.resolution_m:g} m per pixel\n{columns} {rows}\n255\n".encode())
         file.write(np.ascontiguousarray(shades[::-1]).tobytes())
     # 0.196 and not nav2's usual 0.25: the unknown shade 205 is (255 - 205) / 255 = 0.19608, and must not pass for free
     text = (
-        f"image: grid.pgm\nmode: trinary\nresolution: {grid.resolution_m:g}\n"
+        f"image: {name}.pgm\nmode: trinary\nresolution: {grid.resolution_m:g}\n"
         f"origin: [{grid.origin_m[0]:.6f}, {grid.origin_m[1]:.6f}, 0.0]\n"
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import MapConfig
-from vislam.errors import DataError, StorageError
+from vislam.errors import DataError
 from vislam.mapping.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
 from vislam.mapping.correct import CorrectedOccupancy
 from vislam.mapping.depth import surface_points
+from vislam.mapping.drive import DriveGrid, DriveMap
 from vislam.mapping.extract import ScanExtractor
-from vislam.mapping.files import replacing
-from vislam.mapping.grid import Grid, floor_height_m, navigation_grid, write_grid
-from vislam.mapping.mesh import fuse_mesh
+from vislam.mapping.grid import Grid, floor_height_m, navigation_grid
+from vislam.mapping.mesh import Mesh, fuse_mesh
 from vislam.mapping.occupancy import Occupancy, OccupancyMap
-from vislam.mapping.octomap_io import encode_bt
-from vislam.mapping.ply import write_ply
+from vislam.mapping.products import write_products
 from vislam.mapping.store import KeyframeStore, Scan
+from vislam.mapping.surfels import SurfelMap, Surfels
 from vislam.memory import PackedScan
 from vislam.messages import GraphUpdate, Keyframe
 
@@ -39,6 +39,8 @@ class Mapper:
         self._extractor = ScanExtractor(config, rig)
         self._store = KeyframeStore()
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
+        self._drive = DriveMap(config)
+        self._surfels = SurfelMap(config.surfel_m)
         self.notes: dict[str, str] = {}  # what was left out of an export, and why
 
     @property
@@ -125,28 +127,33 @@ class Mapper:
         floor_m = floor_height_m(octree) if floor_m is None else floor_m
         return navigation_grid(octree, floor_m, self._config.grid_low_m, self._config.grid_high_m)
 
-    def export(self, folder: Path) -> dict[str, Path]:
-        """Write cloud.ply, octomap.bt, grid.pgm with grid.yaml and, if asked for, mesh.ply; return what was written.
+    def drive(self) -> DriveGrid:
+        """Return where a cart can drive; only columns of the map that changed since the last call are read again."""
+        return self._drive.update(self.occupancy)
 
-        Each file is replaced whole. Raises StorageError when one cannot be written.
+    def mesh(self) -> tuple[Mesh | None, str]:
+        """Return the mesh of all keyframes with dense depth, or None and the reason there is none."""
+        return fuse_mesh(self._scans(), self._extractor.view, self._config.mesh_voxel_m)
+
+    def surfels(self) -> Surfels:
+        """Return the surfels that enough keyframes saw, without what lies in free space.
+
+        Only keyframes that are new since the last call are looked at; those that were moved take their surfels along.
         """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"{folder} cannot be made: {error.strerror}; choose another folder") from error
-        cloud = self.cloud()
-        written = {"cloud": folder / "cloud.ply", "octomap": folder / "octomap.bt"}
-        write_ply(written["cloud"], cloud.points_m, cloud.colors)
-        with replacing(written["octomap"]) as file:
-            file.write(encode_bt(self.occupancy.max_likelihood_octree()))
-        written["grid"], written["grid_yaml"] = write_grid(folder, self.grid())
-        if self._config.mesh:
-            mesh, reason = fuse_mesh(self._scans(), self._extractor.view, self._config.mesh_voxel_m)
-            if mesh is None:
-                self.notes["mesh"] = reason
-            else:
-                written["mesh"] = folder / "mesh.ply"
-                write_ply(written["mesh"], mesh.points_m, mesh.colors, mesh.triangles)
+        for keyframe_id in self._store.ids:
+            if keyframe_id not in self._surfels:
+                self._surfels.add(keyframe_id, self._store.scan(keyframe_id), self._extractor.view)
+        surfels = self._surfels.surfels(self._occupancy.poses)
+        surfels = surfels.select(surfels.views >= self._config.surfel_min_views)
+        return surfels.select(self.occupancy.state_at(surfels.points_m) != Occupancy.FREE)
+
+    def export(self, folder: Path, step: Callable[[str], None] | None = None) -> dict[str, Path]:
+        """Write the configured products of the map; return what was written, and note what could not be.
+
+        Each file is replaced whole. `step` is told the name of each product before it is made. Raises StorageError
+        when one cannot be written.
+        """
+        written, self.notes = write_products(self, folder, self._config, step)
         return written
 
     def _scans(self) -> Iterator[tuple[Scan, Array]]:

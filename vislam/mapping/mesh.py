@@ -14,17 +14,21 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from vislam.geometry import invert
 from vislam.mapping._open3d import load_open3d
 from vislam.mapping.depth import DepthView
 from vislam.mapping.store import Scan
+from vislam.mapping.surfels import Surfels
 
 Array = NDArray[np.float64]
 
 _BLOCK_VOXELS = 8
 _FIRST_BLOCKS = 4096  # grows by itself
 _TRUNCATION_VOXELS = 4.0
+_MIN_POISSON_POINTS = 100
+_NEAR_RADII = 4.0  # of the nearest surfel; a surface farther from any is a guess
 _MIN_WEIGHT = 2.0  # a surface seen once is not yet one
 
 
@@ -60,6 +64,28 @@ def fuse_mesh(scans: Iterable[tuple[Scan, Array]], view: DepthView, voxel_m: flo
         return None, "no surface was seen more than once"
     colors = np.clip(np.round(mesh.vertex.colors.numpy() * 255.0), 0, 255).astype(np.uint8)
     return _sorted(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy()), ""
+
+
+def poisson_mesh(surfels: Surfels, depth: int) -> tuple[Mesh | None, str]:
+    """Return the closed surface that fits surfels best, and an empty string; or None and the reason there is none.
+
+    Screened Poisson reconstruction (Kazhdan and Hoppe, ACM Transactions on Graphics 2013) on an octree of `depth`
+    levels, by Open3D, cut away where no surfel is near: there it closes holes by guessing.
+    """
+    open3d, reason = load_open3d()
+    if open3d is None:
+        return None, reason
+    if len(surfels) < _MIN_POISSON_POINTS:
+        return None, f"{len(surfels)} surfels are too few for a surface"
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(surfels.points_m.astype(np.float64)))
+    cloud.normals = open3d.utility.Vector3dVector(surfels.normals.astype(np.float64))
+    cloud.colors = open3d.utility.Vector3dVector(surfels.colors.astype(np.float64) / 255.0)
+    # one thread: its sums depend on how the work is split
+    mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    distance, nearest = cKDTree(surfels.points_m).query(np.asarray(mesh.vertices))
+    mesh.remove_vertices_by_mask(np.asarray(distance) > _NEAR_RADII * surfels.radius_m[nearest])
+    colors = np.clip(np.round(np.asarray(mesh.vertex_colors) * 255.0), 0, 255).astype(np.uint8)
+    return _sorted(np.asarray(mesh.vertices, dtype=np.float32), colors, np.asarray(mesh.triangles, dtype=np.int64)), ""
 
 
 def _integrate(open3d: Any, grid: Any, K: Any, scan: Scan, view: DepthView, T_view_map: Array) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ Colors = NDArray[np.uint8]
 _CHUNK = 1 << 16
 _MAX_HEADER_LINES = 100
 _MAX_LINE_BYTES = 1024
-_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+_VERTEX: list[Any] = [("xyz", "<f4", 3), ("rgb", "u1", 3)]
 _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
@@ -27,31 +27,44 @@ _TYPES = {
 }  # fmt: skip
 
 
-def write_ply(path: Path, points_m: Points, colors: Colors, triangles: NDArray[np.int32] | None = None) -> None:
+def write_ply(
+    path: Path,
+    points_m: Points,
+    colors: Colors,
+    triangles: NDArray[np.int32] | None = None,
+    extra: Mapping[str, NDArray[np.float32]] | None = None,
+) -> None:
     """Write points [N, 3] with RGB colours [N, 3], and triangles [M, 3] of vertex indices if it is a mesh.
 
-    Raises StorageError when the file cannot be written.
+    `extra` are further float properties [N] by name, such as `nx`, `ny`, `nz` or `radius`. Raises StorageError when the
+    file cannot be written.
     """
+    extra = {} if extra is None else extra
+    vertex = np.dtype([*_VERTEX, *((name, "<f4") for name in extra)])
+    floats = "".join(f"property float {name}\n" for name in extra)
     faces = "" if triangles is None else f"element face {len(triangles)}\nproperty list uchar int vertex_indices\n"
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment vislam, metres in the map frame\n"
         f"element vertex {len(points_m)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"property uchar red\nproperty uchar green\nproperty uchar blue\n{faces}end_header\n"
+        f"property uchar red\nproperty uchar green\nproperty uchar blue\n{floats}{faces}end_header\n"
     )
     with replacing(path) as file:
         file.write(header.encode())
-        for chunk in _chunks(len(points_m)):
-            rows = np.empty(chunk.stop - chunk.start, _VERTEX)
+        for chunk in chunks(len(points_m)):
+            rows = np.empty(chunk.stop - chunk.start, vertex)
             rows["xyz"], rows["rgb"] = points_m[chunk], colors[chunk]
+            for name, values in extra.items():
+                rows[name] = values[chunk]
             file.write(rows.tobytes())
         if triangles is not None:
-            for chunk in _chunks(len(triangles)):
+            for chunk in chunks(len(triangles)):
                 faces_out = np.empty(chunk.stop - chunk.start, _FACE)
                 faces_out["corners"], faces_out["vertices"] = 3, triangles[chunk]
                 file.write(faces_out.tobytes())
 
 
-def _chunks(count: int) -> Iterator[slice]:
+def chunks(count: int) -> Iterator[slice]:
+    """Yield slices of at most 65,536 that cover `count` items: how large files are written in little memory."""
     for start in range(0, count, _CHUNK):
         yield slice(start, min(start + _CHUNK, count))
 

@@ -1,0 +1,220 @@
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from box_world import CONFIG, RIG, keyframe, pose
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from needs import missing
+
+from vislam.errors import DataError
+from vislam.mapping import _open3d
+from vislam.mapping._open3d import load_open3d
+from vislam.mapping.mapper import Mapper
+from vislam.mapping.mesh import Mesh
+from vislam.mapping.mesh_files import write_glb, write_obj
+from vislam.mapping.pcd import read_pcd, write_pcd
+from vislam.mapping.ply import read_ply, write_ply
+
+
+def some_points(count, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-5, 5, (count, 3)).astype(np.float32), rng.integers(0, 256, (count, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("count", [0, 1, 65_537, 140_000])
+def test_pcd_reads_back_what_was_written(tmp_path, count):
+    points, colors = some_points(count)
+    write_pcd(tmp_path / "a.pcd", points, colors)
+    got_points, got_colors = read_pcd(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(got_points, points)
+    np.testing.assert_array_equal(got_colors, colors)
+
+
+def test_open3d_reads_our_clouds(tmp_path):
+    open3d, reason = load_open3d()
+    if open3d is None:
+        missing(reason)
+    points, colors = some_points(70_000)
+    write_pcd(tmp_path / "a.pcd", points, colors)
+    write_ply(tmp_path / "a.ply", points, colors, extra={"nx": points[:, 0], "ny": points[:, 1], "nz": points[:, 2]})
+    for name in ("a.pcd", "a.ply"):
+        cloud = open3d.io.read_point_cloud(str(tmp_path / name))
+        np.testing.assert_allclose(np.asarray(cloud.points), points, atol=1e-6)
+        np.testing.assert_allclose(np.asarray(cloud.colors) * 255, colors, atol=0.51)
+    np.testing.assert_allclose(np.asarray(cloud.normals), points, atol=1e-6)
+
+
+def test_extra_properties_do_not_hide_the_rest(tmp_path):
+    points, colors = some_points(10)
+    write_ply(tmp_path / "a.ply", points, colors, extra={"radius": points[:, 0], "confidence": points[:, 1]})
+    got_points, got_colors = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(got_points, points)
+    np.testing.assert_array_equal(got_colors, colors)
+    assert b"property float radius\nproperty float confidence\nend_header" in (tmp_path / "a.ply").read_bytes()
+
+
+HEAD = b"VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\n"
+
+
+def header(**changes):
+    lines = {"FIELDS": b"x y z", "SIZE": b"4 4 4", "TYPE": b"F F F", "COUNT": b"1 1 1", "POINTS": b"1"}
+    lines |= changes
+    return b"".join(name.encode() + b" " + value + b"\n" for name, value in lines.items()) + b"DATA binary\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "header"),
+        (b"ply\n" * 1000, "header"),
+        (b"x" * 10**6, "header"),
+        (HEAD, "POINTS, DATA is missing"),
+        (HEAD + b"POINTS 2\nDATA ascii\n1 2 3 4\n", "only binary"),
+        (HEAD + b"POINTS 2\nDATA binary_compressed\n", "only binary"),
+        (HEAD + b"POINTS 2\nDATA binary\n" + b"\0" * 31, "is cut"),
+        (HEAD + b"POINTS 999999999999\nDATA binary\n" + b"\0" * 32, "is cut"),
+        (HEAD + b"POINTS " + b"9" * 500 + b"\nDATA binary\n", "POINTS must be"),
+        (HEAD + b"POINTS -4\nDATA binary\n", "POINTS must be"),
+        (HEAD + b"POINTS\nDATA binary\n", "POINTS must be"),
+        (header(FIELDS=b"x y"), "differ in length"),
+        (header(FIELDS=b"a " * 80, SIZE=b"4 " * 80, TYPE=b"F " * 80, COUNT=b"1 " * 80), "differ in length"),
+        (header(SIZE=b"4 4 99"), "cannot be read"),
+        (header(TYPE=b"F F Q"), "cannot be read"),
+        (header(COUNT=b"1 1 0"), "cannot be read"),
+        (header(COUNT=b"1 1 999999999"), "cannot be read"),
+        (header(COUNT=b"1 1 3"), "lack x, y, z"),
+        (header(FIELDS=b"x y w"), "lack x, y, z"),
+        (header(TYPE=b"F F U"), "lack x, y, z"),
+    ],
+)
+def test_damaged_and_hostile_pcd_files_are_errors(tmp_path, content, words):
+    path = tmp_path / "bad.pcd"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=words):
+        read_pcd(path)
+
+
+@pytest.mark.parametrize(("read", "write"), [(read_pcd, write_pcd), (read_ply, write_ply)])
+def test_any_damage_to_a_cloud_is_an_error_or_another_cloud(tmp_path, read, write):
+    path = tmp_path / "file"
+    write(path, *some_points(20))
+    whole = path.read_bytes()
+
+    @settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @given(st.integers(0, len(whole) - 1), st.binary(max_size=6), st.integers(0, len(whole)))
+    def damage(place, put, length):
+        path.write_bytes((whole[:place] + put + whole[place + len(put) :])[:length])
+        try:
+            points, colors = read(path)
+        except DataError:
+            return
+        assert points.shape == colors.shape
+        assert points.nbytes <= 12 * len(whole)
+
+    damage()
+
+
+def test_pcd_of_others_is_read(tmp_path):
+    fields = header(
+        FIELDS=b"_ x y z _ intensity _", SIZE=b"1 8 8 8 4 4 2", TYPE=b"U F F F F F U", COUNT=b"3 1 1 1 2 1 5"
+    )
+    row = struct.pack("<3x3d2ff10x", 1.5, -2.0, 3.0, 0.0, 0.0, 7.0)
+    (tmp_path / "a.pcd").write_bytes(b"# a comment\n\n" + fields + row)
+    points, colors = read_pcd(tmp_path / "a.pcd")
+    assert points.tolist() == [[1.5, -2.0, 3.0]]
+    assert colors.tolist() == [[128, 128, 128]]
+
+
+def square():
+    points = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0.5], [-1, 1, 0.5]], np.float32)
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [10, 20, 30]], np.uint8)
+    return Mesh(points, colors, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+def test_glb_holds_the_mesh_with_its_colours(tmp_path):
+    mesh = square()
+    write_glb(tmp_path / "a.glb", mesh)
+    data = (tmp_path / "a.glb").read_bytes()
+    magic, version, length, json_length, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    text = json.loads(data[20 : 20 + json_length])
+    binary = data[28 + json_length :]
+    assert struct.unpack("<I4s", data[20 + json_length : 28 + json_length]) == (len(binary), b"BIN\0")
+    assert [view["byteOffset"] % 4 for view in text["bufferViews"]] == [0, 0, 0]
+    dtypes = {5126: "<f4", 5121: "u1", 5125: "<u4"}
+    parts = [
+        np.frombuffer(binary, dtypes[text["accessors"][i]["componentType"]],
+                      view["byteLength"] // np.dtype(dtypes[text["accessors"][i]["componentType"]]).itemsize,
+                      view["byteOffset"])
+        for i, view in enumerate(text["bufferViews"])
+    ]  # fmt: skip
+    np.testing.assert_array_equal(parts[0].reshape(-1, 3), mesh.points_m)
+    np.testing.assert_array_equal(parts[1].reshape(-1, 4)[:, :3], mesh.colors)
+    np.testing.assert_array_equal(parts[2].reshape(-1, 3), mesh.triangles)
+    matrix = np.array(text["nodes"][0]["matrix"]).reshape(4, 4).T
+    assert (matrix @ [0, 0, 1, 0]).tolist() == [0, 1, 0, 0]  # up is up
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.obj"])
+def test_open3d_reads_our_meshes(tmp_path, name):
+    open3d, reason = load_open3d()
+    if open3d is None:
+        missing(reason)
+    mesh = square()
+    (write_glb if name.endswith("glb") else write_obj)(tmp_path / name, mesh)
+    got = open3d.io.read_triangle_mesh(str(tmp_path / name))
+    assert len(got.vertices) == 4
+    assert len(got.triangles) == 2
+    area = got.get_surface_area()
+    assert area == pytest.approx(2.0 * np.hypot(2.0, 0.5), rel=1e-5)
+    if name.endswith("obj"):
+        np.testing.assert_allclose(np.asarray(got.vertices), mesh.points_m, atol=1e-4)
+
+
+def room(products):
+    mapper = Mapper(replace(CONFIG, products=products, surfel_m=0.05, mesh_voxel_m=0.05, poisson_depth=5), RIG)
+    for k in range(8):
+        mapper.add(keyframe(k), pose(k))
+    return mapper
+
+
+def test_every_product_is_a_file(tmp_path):
+    if load_open3d()[0] is None:
+        missing("open3d")
+    products = ("cloud", "pcd", "octomap", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels")
+    mapper, told = room(products), []
+    written = mapper.export(tmp_path, told.append)
+    assert tuple(told) == products
+    assert set(written) == {*products, "grid_yaml", "drive_yaml"}
+    assert mapper.notes == {}
+    assert all(path.is_file() for path in written.values())
+    np.testing.assert_array_equal(read_pcd(written["pcd"])[0], read_ply(written["cloud"])[0])
+    surfels, _ = read_ply(written["surfels"])
+    poisson, _ = read_ply(written["poisson"])
+    for points in (surfels, poisson):
+        distance = np.minimum(np.abs(points - [-2.5, -2, 0]), np.abs(points - [2.5, 2, 2.4])).min(axis=1)
+        assert np.percentile(distance, 90) < 0.08
+    again = room(products).export(tmp_path / "again")
+    assert {name: path.read_bytes() for name, path in again.items()} == {
+        name: path.read_bytes() for name, path in written.items()
+    }
+
+
+def test_without_open3d_only_meshes_are_missing_and_said(tmp_path, monkeypatch):
+    def absent(_):
+        raise ImportError("No module named 'open3d'")
+
+    monkeypatch.setattr(_open3d.importlib, "import_module", absent)
+    mapper = room(("cloud", "surfels", "mesh", "glb", "poisson", "drive"))
+    assert set(mapper.export(tmp_path)) == {"cloud", "surfels", "drive", "drive_yaml"}
+    assert set(mapper.notes) == {"mesh", "glb", "poisson"}
+    assert all("open3d" in reason for reason in mapper.notes.values())
+
+
+def test_an_empty_map_says_what_it_cannot_give(tmp_path):
+    mapper = Mapper(replace(CONFIG, products=("surfels", "mesh", "poisson", "drive", "pcd")), RIG)
+    assert set(mapper.export(tmp_path)) == {"drive", "drive_yaml", "pcd"}
+    assert set(mapper.notes) == {"surfels", "mesh", "poisson"}

@@ -1,0 +1,43 @@
+"""The pictures of a map that the report shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.mapping.cloud import Cloud
+from vislam.mapping.drive import Drive
+from vislam.mapping.files import replacing
+from vislam.mapping.picture import Line, render_cloud, render_octree
+from vislam.mapping.plan_picture import render_drive
+from vislam.mapping.ply import read_ply
+from vislam.mapping.products import FILES, MapSource
+
+_PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
+
+
+def write_pictures(source: MapSource, folder: Path, path_m: NDArray[np.float64], is_level: bool) -> list[Path]:
+    """Write pictures of the map, with the path [N, 3] drawn in; an empty map has none, return what was written.
+
+    The cloud is that of the folder, if it is there. Where to drive is only shown of a map that is level, with z up.
+    Raises StorageError when one cannot be written.
+    """
+    path = [Line(path_m, _PATH_COLOR)]
+    octree = source.occupancy.max_likelihood_octree()
+    pictures = {}
+    if (folder / FILES["cloud"]).is_file():
+        points, colors = read_ply(folder / FILES["cloud"])
+        if len(points):
+            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path, octree=octree)
+    if len(octree.occupied_voxels()):
+        pictures["picture_octree.png"] = render_octree(octree, path)
+    drive = source.drive()
+    if is_level and (drive.states == Drive.FREE).any():
+        pictures["picture_where_to_drive.png"] = render_drive(drive, path)
+    for name, image in pictures.items():
+        with replacing(folder / name) as file:
+            file.write(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+    return [folder / name for name in pictures]

@@ -1,0 +1,116 @@
+"""The files of a map: which there are, what they are called, and how each is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Protocol
+
+from vislam.config import MapConfig
+from vislam.errors import StorageError
+from vislam.mapping.cloud import Cloud
+from vislam.mapping.drive import DriveGrid
+from vislam.mapping.files import replacing
+from vislam.mapping.grid import Grid, write_grid
+from vislam.mapping.mesh import Mesh, poisson_mesh
+from vislam.mapping.mesh_files import write_glb, write_obj
+from vislam.mapping.occupancy import OccupancyMap
+from vislam.mapping.octomap_io import encode_bt
+from vislam.mapping.pcd import write_pcd
+from vislam.mapping.ply import write_ply
+from vislam.mapping.surfels import Surfels
+
+FILES = {
+    "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "grid": "grid.pgm", "drive": "drive.pgm",
+    "mesh": "mesh.ply", "glb": "mesh.glb", "obj": "mesh.obj", "poisson": "poisson.ply", "surfels": "surfels.ply",
+}  # fmt: skip
+
+
+class MapSource(Protocol):
+    """What a map can be asked for."""
+
+    @property
+    def occupancy(self) -> OccupancyMap:
+        """The occupancy map."""
+
+    def cloud(self) -> Cloud:
+        """Return the cloud."""
+
+    def grid(self) -> Grid:
+        """Return the navigation grid."""
+
+    def drive(self) -> DriveGrid:
+        """Return the drive grid."""
+
+    def mesh(self) -> tuple[Mesh | None, str]:
+        """Return the mesh or why there is none."""
+
+    def surfels(self) -> Surfels:
+        """Return the surfels."""
+
+
+def write_products(
+    source: MapSource, folder: Path, config: MapConfig, step: Callable[[str], None] | None = None
+) -> tuple[dict[str, Path], dict[str, str]]:
+    """Write the configured products into a folder; return the files, and the reasons why some are missing.
+
+    Raises StorageError when one cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{folder} cannot be made: {error.strerror}; choose another folder") from error
+    cloud, mesh, surfels = cache(source.cloud), cache(source.mesh), cache(source.surfels)
+    writers: dict[str, Callable[[Path], object]] = {  # a text is the reason why nothing was written
+        "cloud": lambda path: write_ply(path, cloud().points_m, cloud().colors),
+        "pcd": lambda path: write_pcd(path, cloud().points_m, cloud().colors),
+        "octomap": lambda path: _write_octomap(path, source.occupancy),
+        "grid": lambda _: write_grid(folder, source.grid()),
+        "drive": lambda _: write_grid(folder, source.drive().navigation_grid(), "drive"),
+        "surfels": lambda path: _write_surfels(path, surfels()),
+        "poisson": lambda path: _write_mesh(path, *poisson_mesh(surfels(), config.poisson_depth)),
+    }
+    written: dict[str, Path] = {}
+    notes: dict[str, str] = {}
+    for product in dict.fromkeys(config.products):
+        if step is not None:
+            step(product)
+        path = folder / FILES[product]
+        reason = writers[product](path) if product in writers else _write_mesh(path, *mesh())
+        if isinstance(reason, str):
+            notes[product] = reason
+        else:
+            written[product] = path
+            if path.suffix == ".pgm":
+                written[f"{product}_yaml"] = path.with_suffix(".yaml")
+    return written, notes
+
+
+def _write_octomap(path: Path, occupancy: OccupancyMap) -> None:
+    with replacing(path) as file:
+        file.write(encode_bt(occupancy.max_likelihood_octree()))
+
+
+def _write_surfels(path: Path, surfels: Surfels) -> str | None:
+    """Write surfels as a PLY; return the reason if there are none."""
+    if len(surfels) == 0:
+        return "no surface was seen with dense depth by enough keyframes"
+    normals = dict(zip(("nx", "ny", "nz"), surfels.normals.T, strict=True))
+    extra = {**normals, "radius": surfels.radius_m, "confidence": surfels.confidence}
+    write_ply(path, surfels.points_m, surfels.colors, extra=extra)
+    return None
+
+
+def _write_mesh(path: Path, mesh: Mesh | None, reason: str) -> str | None:
+    """Write a mesh in the format that the name asks for; return the reason if there is none."""
+    if mesh is None:
+        return reason
+    match path.suffix:
+        case ".glb":
+            write_glb(path, mesh)
+        case ".obj":
+            write_obj(path, mesh)
+        case _:
+            write_ply(path, mesh.points_m, mesh.colors, mesh.triangles)
+    return None
