@@ -443,10 +443,10 @@ class MapConfig:
     enabled: bool = True
     resolution_m: float = 0.05  # octree voxel and grid cell; fine enough for table edges, 8 ms per keyframe
     insertion: Literal["discretised", "full"] = "discretised"  # one ray per end voxel; full: one per pixel, 10x dearer
-    hit_probability: float = 0.7  # OctoMap's sensor model, so that our maps are its maps
-    miss_probability: float = 0.4
-    clamp_min_probability: float = 0.1192  # OctoMap's clamping: a voxel changes its mind after a few contrary scans
-    clamp_max_probability: float = 0.971
+    hit_probability: float = 0.7  # OctoMap's
+    miss_probability: float = 0.32  # OctoMap's 0.4 is for 10 scans a second; of keyframes, at 2 Hz and more, with the
+    clamp_max_probability: float = 0.9  # clamping here, three clear a voxel: a person who left is gone within 1 s
+    clamp_min_probability: float = 0.1192  # OctoMap's: what was free for long is occupied after three scans
     min_range_m: float = 0.3  # nearer, structured-light depth and stereo matching are not valid
     max_range_m: float = 4.0  # depth noise grows with the square; farther points only clear the way to here
     pixel_step: int = 2  # keep every n-th row and column of a depth image; at 4 m still 3 pixels per voxel
