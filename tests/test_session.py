@@ -248,7 +248,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
     database = sqlite3.connect(tmp_path / "session.db")
     database.execute("PRAGMA user_version=1")
     database.close()
-    with pytest.raises(DataError, match="format 1, this vislam reads 3; run the recording again"):
+    with pytest.raises(DataError, match="format 1, this vislam reads 4; run the recording again"):
         Session(tmp_path / "session.db")
 
 

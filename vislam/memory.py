@@ -14,6 +14,7 @@ from vislam.messages import (
     GraphUpdate,
     Keyframe,
     KeyframePacket,
+    Localisation,
     LoopCandidate,
     LoopDecision,
     LoopEdge,
@@ -256,6 +257,8 @@ class FrameEntry:
     inliers: int = 0
     vo_keyframe_id: int = -1  # what the motion was measured against
     reason: str = ""
+    localisation: Localisation = Localisation.TRACKING
+    piece: int = 0  # of the trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

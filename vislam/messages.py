@@ -31,6 +31,14 @@ class Tracking(StrEnum):
     LOST = "lost"
 
 
+class Localisation(StrEnum):
+    """Whether the place in the map is known."""
+
+    TRACKING = "tracking"
+    LOST = "lost"  # vision is lost, or what it follows is a piece that is not joined with the map
+    RELOCALISED = "relocalised"  # just now the piece was joined
+
+
 class LoopDecision(StrEnum):
     """What became of a loop candidate."""
 

@@ -22,7 +22,7 @@ from vislam.loop.table import LoopRow, caption
 from vislam.loop_gallery import LoopGallery
 from vislam.mapping.map_pictures import write_pictures
 from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
-from vislam.messages import Frame, ImuSample, LoopDecision, MagSample, Tracking
+from vislam.messages import Frame, ImuSample, Localisation, LoopDecision, MagSample, Tracking
 from vislam.recording import Recording
 from vislam.runfolder import MapChoice, RunLog, storage, write_json, write_setup
 from vislam.session import Session, SessionWriter, has_begun, recall
@@ -211,6 +211,10 @@ class Run:
         if step.front.T_odom_body is not None:
             self.viewer.log_pose("ekf", frame.t_ns, step.front.T_odom_body)
         self.viewer.log_scalars(frame.t_ns, _plotted(step))
+        if step.localisation is Localisation.RELOCALISED:
+            self.viewer.log_note(
+                frame.t_ns, f"relocalised: piece {step.piece} of the trajectory is joined with the map"
+            )
         if track.vo.tracking != Tracking.OK:
             self.viewer.log_note(frame.t_ns, f"{track.vo.tracking}: {track.reason}")
         for keyframe in step.keyframes:
@@ -290,7 +294,7 @@ class Run:
         duration_s = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
         part = stamps[self._first_frame :]
         part_s = float(part[-1] - part[0]) * 1e-9 if len(part) else 0.0
-        counters: dict[str, Any] = {**front.all_counters}
+        counters: dict[str, Any] = {**front.all_counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             rooms = {"loop": back.loops, "map": back.mapper}
             counters |= {name: dict(room.counters) for name, room in rooms.items() if room is not None}

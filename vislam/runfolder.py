@@ -40,7 +40,7 @@ _RUN_FILES = (
     "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml", "map/drive.yaml",
     "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
-_TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
+_TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "piece", "reason")
 
 
 def prepare(out: Path, overwrite: bool) -> None:
@@ -273,7 +273,7 @@ class RunLog:
         front, vo = step.front, step.front.track.vo
         entry = FrameEntry(
             front.frame.t_ns, front.keyframe_id, front.T_keyframe_body, front.T_odom_body, step.T_map_body,
-            vo.tracking, vo.inliers, vo.keyframe_id, front.track.reason,
+            vo.tracking, vo.inliers, vo.keyframe_id, front.track.reason, step.localisation, step.piece,
         )  # fmt: skip
         self._frames.append(entry)
         if front.state is not None and front.track.keyframe is not None:
@@ -385,7 +385,10 @@ class RunLog:
 
     def write_tables(self, out: Path, loops: list[LoopRow]) -> dict[str, int]:
         """Write the tables of tracking and loops; return how many candidates were accepted, parked and rejected."""
-        tracking = [(f.t_ns, str(f.tracking), f.inliers, f.vo_keyframe_id, f.reason) for f in self._frames]
+        tracking = [
+            (f.t_ns, str(f.tracking), f.inliers, f.vo_keyframe_id, str(f.localisation), f.piece, f.reason)
+            for f in self._frames
+        ]
         write_text(out / "tracking.csv", csv_text(_TRACKING_HEADER, tracking))
         write_text(out / "retrieved.csv", retrieved_text(self._retrieved))
         write_text(out / "loops.csv", loops_text(loops))

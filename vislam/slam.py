@@ -29,11 +29,14 @@ from vislam.messages import (
     Frame,
     GraphUpdate,
     ImuSample,
+    Localisation,
     LoopCandidate,
     LoopEdge,
     MagSample,
     NavState,
+    Pieces,
     RetrievedKeyframe,
+    Tracking,
 )
 from vislam.odometry_keyframe import OdometryKeyframe
 
@@ -59,6 +62,8 @@ class Step:
 
     front: FrontStep
     T_map_body: Array | None  # None: no pose yet
+    localisation: Localisation
+    piece: int  # of the trajectory, from 0
     keyframes: list[KeyframeStep]
 
 
@@ -183,6 +188,8 @@ class Slam:
         self.back: Back | None = None  # begins with the first keyframe, when gravity is known
         self._make_back = partial(Back, config, rig)
         self._frames: deque[Frame] = deque()
+        self._pieces = Pieces()
+        self.counters = {"frames_lost": 0, "relocalised": 0}
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
         self._begins_recording = False  # in a map, with the next keyframe
 
@@ -195,7 +202,9 @@ class Slam:
         self.front.resume(memory.front)
         self.back = self._make_back(self.front.noise, self.clock, memory.first_state, memory.T_start)
         self._seen_again = memory.front.keyframe_id
-        return self.back.restore(memory)
+        update = self.back.restore(memory)
+        self._pieces = update.pieces
+        return update
 
     def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
         """Begin in the map of earlier runs, before the first value; return its poses.
@@ -206,7 +215,9 @@ class Slam:
         self.front.begin_in_map(memory.front.keyframe_id + 1, memory.front.news.next_track_id)
         self.back = self._make_back(self.front.noise, self.clock, memory.first_state, memory.T_start)
         self._begins_recording = True
-        return self.back.restore(memory)
+        update = self.back.restore(memory)
+        self._pieces = update.pieces.begun(memory.front.keyframe_id + 1)
+        return update
 
     def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
         """Take one measurement; return a step for every frame that could be processed with it.
@@ -253,6 +264,21 @@ class Slam:
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)
         keyframes = self._add(front.keyframes)
-        if self.back is None or front.T_odom_body is None:
-            return Step(front, None, keyframes)
-        return Step(front, self.back.T_map_odom @ front.T_odom_body, keyframes)
+        T_map_body = None
+        if self.back is not None and front.T_odom_body is not None:
+            T_map_body = self.back.T_map_odom @ front.T_odom_body
+        localisation = self._localisation(front.track.vo.tracking, keyframes)
+        return Step(front, T_map_body, localisation, len(self._pieces.groups) - 1, keyframes)
+
+    def _localisation(self, tracking: Tracking, keyframes: list[KeyframeStep]) -> Localisation:
+        """Return whether the place in the map is known after a frame."""
+        was_joined = self._pieces.groups[-1] == 0
+        if keyframes:
+            self._pieces = keyframes[-1].update.pieces
+        is_joined = self._pieces.groups[-1] == 0
+        if is_joined and not was_joined:
+            self.counters["relocalised"] += 1
+            return Localisation.RELOCALISED
+        is_lost = tracking is Tracking.LOST or not is_joined
+        self.counters["frames_lost"] += is_lost
+        return Localisation.LOST if is_lost else Localisation.TRACKING

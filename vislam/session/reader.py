@@ -20,6 +20,7 @@ from vislam.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, Tie
 from vislam.messages import (
     Array,
     KeyframePacket,
+    Localisation,
     LoopCandidate,
     LoopDecision,
     LoopEdge,
@@ -193,7 +194,19 @@ class Session:
 
         with readable(self.path):
             return [
-                FrameEntry(row[0], row[1], pose(row[2]), pose(row[3]), pose(row[4]), Tracking(row[5]), *row[6:9])
+                FrameEntry(
+                    row[0],
+                    row[1],
+                    pose(row[2]),
+                    pose(row[3]),
+                    pose(row[4]),
+                    Tracking(row[5]),
+                    row[6],
+                    row[7],
+                    row[8],
+                    Localisation(row[9]),
+                    row[10],
+                )
                 for row in self._db.execute("SELECT * FROM frames ORDER BY t_ns")
             ]
 

@@ -16,7 +16,7 @@ from vislam.memory import EdgeRecord, TiltRecord, WindowRecord
 from vislam.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": tells our files from other SQLite files
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -63,7 +63,8 @@ CREATE TABLE retrieved (
 );
 CREATE TABLE frames (
     t_ns INTEGER PRIMARY KEY, keyframe_id INTEGER NOT NULL, T_keyframe_body BLOB, T_odom_body BLOB, T_map_body BLOB,
-    tracking TEXT NOT NULL, inliers INTEGER NOT NULL, vo_keyframe_id INTEGER NOT NULL, reason TEXT NOT NULL
+    tracking TEXT NOT NULL, inliers INTEGER NOT NULL, vo_keyframe_id INTEGER NOT NULL, reason TEXT NOT NULL,
+    localisation TEXT NOT NULL, piece INTEGER NOT NULL
 );
 CREATE TABLE scans (
     id INTEGER PRIMARY KEY, t_ns INTEGER NOT NULL, depth_png BLOB NOT NULL, points BLOB NOT NULL, colors BLOB NOT NULL

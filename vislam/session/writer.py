@@ -292,4 +292,5 @@ def _candidate_row(c: LoopCandidate) -> tuple[Any, ...]:
 
 def _frame_row(f: FrameEntry) -> tuple[Any, ...]:
     poses = (maybe_bytes(T, "<f8") for T in (f.T_keyframe_body, f.T_odom_body, f.T_map_body))
-    return (f.t_ns, f.keyframe_id, *poses, str(f.tracking), int(f.inliers), f.vo_keyframe_id, f.reason)
+    seen = str(f.tracking), int(f.inliers), f.vo_keyframe_id, f.reason
+    return (f.t_ns, f.keyframe_id, *poses, *seen, str(f.localisation), f.piece)
