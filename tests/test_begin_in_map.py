@@ -91,6 +91,7 @@ def test_maps_are_chained_and_a_run_in_one_is_resumed(yesterday, tmp_path, capsy
     chained = run(YESTERDAY.replace("camera_hz=10", "camera_hz=9"), tomorrow, MapChoice(today, False))
     assert chained["map"]["keyframes"] == len(poses_of(today))
     assert chained["map"]["found_t_s"] < 6.0
+    assert run_verb(["eval", str(today), "--loops"]) == 0
 
 
 @pytest.mark.parametrize(

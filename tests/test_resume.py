@@ -291,3 +291,14 @@ def test_a_folder_that_cannot_be_written_is_a_storage_error(copied, capsys):
     finally:
         copied.chmod(0o700)
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_settings_that_came_with_a_newer_version_do_not_stop_a_run_from_being_resumed(copied):
+    with sqlite3.connect(copied / "session.db") as database:
+        config = json.loads(database.execute("SELECT value FROM info WHERE key = 'config'").fetchone()[0])
+        del config["loop"]["min_inliers"]
+        database.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(config),))
+    config = json.loads((copied / "config.json").read_text())
+    del config["loop"]["min_inliers"]
+    (copied / "config.json").write_text(json.dumps(config))
+    assert run_verb(["run", "--resume", str(copied)]) == 0

@@ -125,7 +125,8 @@ def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> Tru
     session = Session(session_path)
     try:
         rig = rig_from(session.info()["rig"])
-        stored = list(session.keyframes())
+        first_id = session.first_id  # the truth of older recordings, in whose map a run begins, is not at hand
+        stored = [keyframe for keyframe in session.keyframes() if keyframe.id >= first_id]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{session_path} is damaged ({error}); run the recording again") from error
     finally:

@@ -85,14 +85,14 @@ class Run:
             raise UsageError(
                 f"the run in {self.out} came to its end; there is nothing to resume (`vislam report` writes its report)"
             )
-        if info.get("config") != json.loads(json.dumps(asdict(self.config))):
+        if not _still(info.get("config") or {}, json.loads(json.dumps(asdict(self.config)))):
             raise UsageError(f"{self.out / 'config.json'} was changed since the run began; start a new run")
         memory = recall(stored)
         if memory is None:
             return False
         update = self.slam.resume(memory)
         self.base = info.get("map")
-        self.log.restore(stored, memory, 0 if self.base is None else int(self.base["keyframes"]))
+        self.log.restore(stored, memory)
         self.gallery.skip(self.log.candidates)
         front = memory.front
         self._first_frame, self._from = len(self.log), front
@@ -460,6 +460,13 @@ def execute(
             f"{stored.path} brings no clouds, or of another shape (--map.*): the map holds new ones only"
         )
     return run.execute(progress)
+
+
+def _still(began: Any, now: Any) -> bool:
+    """Return whether settings are what they were; those that a newer version has besides are at their defaults."""
+    if isinstance(began, dict) and isinstance(now, dict):
+        return all(name in now and _still(value, now[name]) for name, value in began.items())
+    return bool(began == now)
 
 
 def _map_of(stored: Session, recording: Recording, config: Config, noise: ImuNoise | None) -> SlamMemory:

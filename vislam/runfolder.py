@@ -246,9 +246,9 @@ class RunLog:
         """How many keyframes reached the back end."""
         return len(self._keyframe_t_ns)
 
-    def restore(self, session: Session, memory: SlamMemory, first_id: int = 0) -> None:
-        """Take over what a run remembered up to its last keyframe; those before `first_id` are a map's."""
-        self._first_id = first_id
+    def restore(self, session: Session, memory: SlamMemory) -> None:
+        """Take over what a run remembered up to its last keyframe; those of a map in which it began are not its own."""
+        self._first_id = session.first_id
         self._frames = session.frames()
         self._ekf_states = session.states("filter")
         for packet in memory.graph.packets[self._first_id :]:

@@ -108,6 +108,13 @@ class Session:
             rows = self._db.execute("SELECT key, value FROM info").fetchall()
             return {key: json.loads(value) for key, value in rows}
 
+    @property
+    def first_id(self) -> int:
+        """The first keyframe of the run's own recording; those before are of the map in which it began."""
+        base = self.info().get("map")
+        with readable(self.path):
+            return 0 if base is None else int(base["keyframes"])
+
     def newest(self) -> dict[str, Any]:
         """Return the small facts of the last commit; empty before the first."""
         with readable(self.path):
