@@ -1,7 +1,7 @@
 """The occupancy map against OctoMap C++: the same points, all four configurations, CPU time, memory and files.
 
     .venv/bin/python benchmarks/octomap.py
-    .venv/bin/python benchmarks/octomap.py --source tum:PATH --frames 40 --repeats 3
+    .venv/bin/python benchmarks/octomap.py --source tum:PATH --frames 30 --every 15
 
 The peer is built from Debian's liboctomap-dev (`apt-get install liboctomap-dev g++`): one thread, -O3. A scan is all
 valid pixels of a depth image, placed by the true poses. In each repeat the two run one after the other, so that both
@@ -185,9 +185,9 @@ def main() -> None:
     """Read the arguments and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["compare"], nargs="?", default="compare")
-    parser.add_argument("--source", default="sim:handheld-room", help="a recording with depth and truth")
+    parser.add_argument("--source", default="sim:handheld-room,camera_hz=1", help="a recording with depth and truth")
     parser.add_argument("--frames", type=int, default=30)
-    parser.add_argument("--every", type=int, default=15, help="frames between those that are taken")
+    parser.add_argument("--every", type=int, default=1, help="frames between those that are taken")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", type=Path, help="write the numbers here too")
     args = parser.parse_args()
