@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 from pathlib import Path
@@ -81,6 +82,9 @@ def svg(figure: Figure, name: str) -> str:
     text = re.sub(
         r'\bid="(figure|axes|patch|line2d|text|matplotlib|xtick|ytick|legend|\w*Collection)_[\w.]*"', "", text
     )
+    # matplotlib names clips after numbers that the layout's solver leaves different in their last bits
+    for clip, shape in re.findall(r'<clipPath id="(\w+)">(.*?)</clipPath>', text, flags=re.DOTALL):
+        text = text.replace(clip, f"p{hashlib.sha256(shape.encode()).hexdigest()[:10]}")
     for code, css in _VARIABLES.items():
         text = text.replace(code, css)
     return text.replace("'DejaVu Sans'", "var(--font)")
