@@ -437,6 +437,38 @@ MapProduct = Literal["cloud", "pcd", "octomap", "grid", "drive", "mesh", "glb", 
 
 
 @dataclass(frozen=True, slots=True)
+class MonoDepthConfig:
+    """Dense depth from one camera: a filter per pixel of a keyframe, fed by the frames that follow it."""
+
+    enabled: bool = False  # where the front end has one camera
+    scale: float = 0.5  # of the images; the time goes with its square
+    measure: Literal["sad", "ssd", "ncc", "zsad", "zssd", "zncc"] = "zncc"  # those with z do not mind exposure
+    fusion: Literal["gaussian", "beta"] = "beta"  # gaussian: the slambook's; beta knows a share of false matches
+    step_px: float = 0.7  # along the epipolar line; patches of 7 px change little over that
+    reach_px: float = 100.0  # searched to both sides of where a pixel is expected; bounds its time
+    search_sigmas: float = 3.0  # of inverse depth, to both sides
+    least_score: float | None = None  # of a match; None: the measure's own, see mapping/monodepth/matching.py
+    uniqueness: float = 0.8  # most that the best match's cost may be of the next one's; 1 asks for nothing
+    sigma_px: float = 1.0  # of a match along the epipolar line
+    min_gradient: float = 2.0  # grey levels per px, rms over the patch along the epipolar line; noise gives less
+    max_sigma_ratio: float = 4.0  # of a measurement over what is known; beyond, it is not worth a search
+    converged: float = 0.01  # sigma of inverse depth over its mean: 2 cm at 2 m
+    min_matches: int = 3
+    max_misses: int = 6  # more than matches by so many: hidden, moving or too alike, and not searched any more
+    min_good: float = 0.6  # share of good measurements (REMODE); half of it, and the pixel has failed
+    min_depth_m: float = 0.3  # nearer, frames share too little
+    max_depth_m: float = 20.0
+    derotate_deg: float = 1.5  # patches that are turned by more match worse than ones interpolated twice
+    handover_sigma: float = 0.05  # of inverse depth that the next keyframe takes over; it measures anew
+    smoothing: int = 10  # steps of smoothing inside surfaces; 0: none
+    frames_per_keyframe: int = 6  # used between two keyframes, the newer one included; bounds the time
+    keyframes: int = 3  # later ones that feed a keyframe before the next is begun; more parallax, fewer depth images
+    min_overlap: float = 0.5  # of the image that later ones must still see; less, and the next is begun at once
+    max_range_m: float = 8.0  # farther points only clear the way
+    threads: int = 2  # the result does not depend on it
+
+
+@dataclass(frozen=True, slots=True)
 class MapConfig:
     """Clouds, the occupancy octree, the navigation grid and the mesh."""
 
@@ -478,6 +510,7 @@ class MapConfig:
     poisson_depth: int = 9  # levels of Poisson's octree: cells of 2 cm in a room of 10 m
     # what is written into map/; mesh, glb, obj and poisson need Open3D and take seconds, surfels too
     products: tuple[MapProduct, ...] = ("cloud", "octomap", "grid", "drive")
+    mono_depth: MonoDepthConfig = field(default_factory=MonoDepthConfig)
 
 
 @dataclass(frozen=True, slots=True)

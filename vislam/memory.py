@@ -275,7 +275,7 @@ class KeyframeEntry:
     shifts: Mapping[int, tuple[float, float]] = field(
         default_factory=dict
     )  # edge: rms and largest of what moved with it
-    scan: PackedScan | None = None
+    scans: dict[int, PackedScan] = field(default_factory=dict)  # its own, or one that came late, by keyframe
     words: WordsMemory | None = None  # None: as before
     tags: tuple[TagSighting, ...] = ()
     start: StartFacts | None = None  # goes with the first keyframe

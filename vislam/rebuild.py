@@ -25,6 +25,7 @@ from vislam.memory import PackedScan
 from vislam.messages import Array, Frame, GraphUpdate, Keyframe
 from vislam.runfolder import read_setup, write_json
 from vislam.session import Session
+from vislam.slam import sees_mono
 from vislam.sources import open_source
 from vislam.trajectory import read_trajectory
 
@@ -57,8 +58,11 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         ran = from_data(info["config"], str(session.path))
         rig = rig_from(info["rig"])
         placed = _poses(session, run, poses)
-        mapper = Mapper(config, rig)
-        from_session = ran.map.enabled and _same_extraction(ran.map, config, rig)
+        # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
+        one_camera = ran.map.mono_depth.enabled and sees_mono(ran, rig)
+        config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
+        mapper = Mapper(config, rig, one_camera)
+        from_session = ran.map.enabled and (one_camera or _same_extraction(ran.map, config, rig))
         total = len(placed) + len(config.products)
         tell = _teller(progress, total)
         if from_session:

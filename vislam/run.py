@@ -194,7 +194,7 @@ class Run:
             packet, front = step.odometry.packet, self.slam.front
             entry = KeyframeEntry(
                 packet, step.odometry.T_odom_body, step.update, step.news, step.edges, step.candidates, step.retrieved,
-                self.log.shifts(step.update.accepted_loop_ids), step.scan, step.words, step.tags, front.start,
+                self.log.shifts(step.update.accepted_loop_ids), step.scans, step.words, step.tags, front.start,
                 front.news, self.log.filter_state(packet.keyframe.id),
             )  # fmt: skip
             self.session.add(entry)
@@ -296,7 +296,7 @@ class Run:
         part_s = float(part[-1] - part[0]) * 1e-9 if len(part) else 0.0
         counters: dict[str, Any] = {**front.all_counters, "localisation": dict(self.slam.counters)}
         if back is not None:
-            rooms = {"loop": back.loops, "map": back.mapper}
+            rooms = {"loop": back.loops, "map": back.mapper, "mono depth": back.depth}
             counters |= {name: dict(room.counters) for name, room in rooms.items() if room is not None}
         found = front.initialisation
         if self.noise is not None:

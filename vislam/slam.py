@@ -23,6 +23,7 @@ from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
 from vislam.loop.injection import FalseLoops, as_candidate
 from vislam.mapping.mapper import Mapper
+from vislam.mapping.monodepth import MonoDepth, SeenFrame
 from vislam.memory import GraphNews, PackedScan, SlamMemory, TagSighting, WordsMemory
 from vislam.messages import (
     Array,
@@ -40,6 +41,8 @@ from vislam.messages import (
 )
 from vislam.odometry_keyframe import OdometryKeyframe
 
+_MAX_SEEN = 120  # frames kept between two keyframes: 2 s at 60 Hz, 40 MB
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeStep:
@@ -51,7 +54,7 @@ class KeyframeStep:
     candidates: list[LoopCandidate]
     retrieved: list[RetrievedKeyframe]
     news: GraphNews  # what the graph has to remember
-    scan: PackedScan | None  # what the map keeps of it
+    scans: dict[int, PackedScan]  # what came into the map with it: its own scan, or depth that came late
     words: WordsMemory | None  # the vocabulary, when it is new
     tags: tuple[TagSighting, ...]  # that it saw
 
@@ -96,10 +99,12 @@ class Back:
         self.graph = PoseGraph(config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, window)
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
-        self.mapper = Mapper(config.map, rig) if config.map.enabled else None
         self._false = None
         if config.loop.inject_share > 0.0:
             self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
+        one_camera = config.map.mono_depth.enabled and sees_mono(config, rig)
+        self.mapper = Mapper(config.map, rig, one_camera) if config.map.enabled else None
+        self.depth = MonoDepth(config.map.mono_depth, rig) if one_camera and config.map.enabled else None
         self.clock = clock
         self.T_map_odom = np.eye(4)
         self._trainings = 0
@@ -128,8 +133,8 @@ class Back:
         self.graph.begin_recording(state, T_odom_body)
         self.T_map_odom = np.eye(4)
 
-    def add(self, odometry: OdometryKeyframe) -> KeyframeStep:
-        """Take one keyframe in: find its loops, optimise, follow with the map."""
+    def add(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> KeyframeStep:
+        """Take one keyframe and the frames before it in: find its loops, optimise, follow with the map."""
         keyframe = odometry.packet.keyframe
         edges: list[LoopEdge] = []
         candidates: list[LoopCandidate] = []
@@ -147,10 +152,10 @@ class Back:
         if self.mapper is not None and not self._held:
             with self.clock.measure("map"):
                 self.mapper.add(keyframe, self.T_map_odom @ odometry.T_odom_body)
-        scan = None if self.mapper is None else self.mapper.packed(keyframe.id)
+        scans = self._scans(keyframe.id, self._late_depth(odometry, seen))
         retrieved, tags = ([], ()) if self.loops is None else (self.loops.retrieved, self.loops.tags(keyframe.id))
         news, words = self.graph.take_news(), self._new_words()
-        return KeyframeStep(odometry, update, edges, candidates, retrieved, news, scan, words, tags)
+        return KeyframeStep(odometry, update, edges, candidates, retrieved, news, scans, words, tags)
 
     def finish(self) -> GraphUpdate:
         """Optimise to convergence and bring the map to the final poses."""
@@ -161,6 +166,25 @@ class Back:
             with self.clock.measure("map finish"):
                 self.mapper.finish()
         return update
+
+    def _late_depth(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> int | None:
+        """Let depth from one camera follow, and the map take what is done; return the keyframe that it belongs to."""
+        if self.depth is None or self.mapper is None or self._held:
+            return None
+        with self.clock.measure("depth"):
+            late = self.depth.add(odometry, self.T_map_odom @ odometry.T_odom_body, seen)
+        if late is None:
+            return None
+        with self.clock.measure("map"):
+            self.mapper.add_depth(late)
+        return late.keyframe_id
+
+    def _scans(self, *keyframe_ids: int | None) -> dict[int, PackedScan]:
+        """Return what the map keeps of those keyframes that have a scan."""
+        if self.mapper is None:
+            return {}
+        packed = {i: self.mapper.packed(i) for i in keyframe_ids if i is not None}
+        return {i: scan for i, scan in packed.items() if scan is not None}
 
     def _new_words(self) -> WordsMemory | None:
         """Return the vocabulary if it was trained since the last call."""
@@ -176,6 +200,8 @@ class Back:
         if self.mapper is not None:
             with self.clock.measure("map move"):
                 self.mapper.move(update)
+        if self.depth is not None:
+            self.depth.move(update.ids, update.T_map_body)
 
 
 class Slam:
@@ -190,6 +216,7 @@ class Slam:
         self._frames: deque[Frame] = deque()
         self._pieces = Pieces()
         self.counters = {"frames_lost": 0, "relocalised": 0}
+        self._seen: deque[SeenFrame] = deque(maxlen=_MAX_SEEN)  # since the newest keyframe
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
         self._begins_recording = False  # in a map, with the next keyframe
 
@@ -257,13 +284,17 @@ class Slam:
         if self._begins_recording:
             self.back.begin_recording(self.front.first_state, odometry.T_odom_body)
             self._begins_recording = False
-        step = self.back.add(odometry)
+        seen = list(self._seen)
+        self._seen.clear()
+        step = self.back.add(odometry, seen)
         self.front.feed_back(step.update)
         return step
 
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)
         keyframes = self._add(front.keyframes)
+        if self.back is not None and self.back.depth is not None and front.track.keyframe is None:
+            self._remember(front)
         T_map_body = None
         if self.back is not None and front.T_odom_body is not None:
             T_map_body = self.back.T_map_odom @ front.T_odom_body
@@ -282,3 +313,15 @@ class Slam:
         is_lost = tracking is Tracking.LOST or not is_joined
         self.counters["frames_lost"] += is_lost
         return Localisation.LOST if is_lost else Localisation.TRACKING
+
+    def _remember(self, front: FrontStep) -> None:
+        """Keep a frame for depth from one camera, if odometry knows where it was taken."""
+        frame, T = front.frame, front.T_keyframe_body
+        if T is not None and front.track.vo.tracking is not Tracking.LOST and frame.images:
+            self._seen.append(SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T))
+
+
+def sees_mono(config: Config, rig: Rig) -> bool:
+    """Return whether the front end has one camera and no depth."""
+    mode = config.frontend.mode
+    return mode == "mono" or (mode == "auto" and not rig.is_stereo and not rig.has_depth)

@@ -6,14 +6,14 @@ and put anywhere later.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.camera import Rig, StereoRectification
-from vislam.config import MapConfig
+from vislam.camera import Camera, Rig, StereoRectification
+from vislam.config import MapConfig, MonoDepthConfig
 from vislam.errors import DataError
 
 Array = NDArray[np.float64]
@@ -68,6 +68,19 @@ def stereo_view(rectification: StereoRectification, rig: Rig, config: MapConfig)
     max_range_m = min(reach_m, config.stereo_max_range_m)
     rays = _turned(_pinhole_rays(rectification.K, (width, height)), T, (height, width))
     return DepthView(rays, T, rectification.K, None, _unit_m(max_range_m), max_range_m)
+
+
+def mono_camera(rig: Rig, config: MonoDepthConfig) -> Camera:
+    """Return the camera without distortion whose images monocular depth is made of: cam0's at `config.scale`."""
+    return replace(rig.cameras[0].scaled(config.scale), distortion="none", coefficients=(), skew_px=0.0)
+
+
+def mono_view(rig: Rig, config: MonoDepthConfig) -> DepthView:
+    """Return the rays of `mono_camera`."""
+    camera = mono_camera(rig, config)
+    T = np.array(rig.T_body_cams[0], dtype=np.float64)
+    rays = _turned(_pinhole_rays(camera.K, (camera.width, camera.height)), T, (camera.height, camera.width))
+    return DepthView(rays, T, camera.K, None, _unit_m(config.max_range_m), config.max_range_m)
 
 
 def _pinhole_rays(K: Array, size: tuple[int, int]) -> Array:

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import MapConfig
-from vislam.mapping.depth import DepthView, filter_depth, rgbd_view
+from vislam.errors import DataError
+from vislam.mapping.depth import DepthView, filter_depth, mono_view, rgbd_view
 from vislam.mapping.stereo import DenseStereo
 from vislam.mapping.store import Scan
-from vislam.messages import Keyframe
+from vislam.messages import ImageF32, Keyframe
 
 ImageU8 = NDArray[np.uint8]
 
@@ -19,11 +20,15 @@ ImageU8 = NDArray[np.uint8]
 class ScanExtractor:
     """Makes scans of keyframes, the richest that each offers; what it could not use is counted."""
 
-    def __init__(self, config: MapConfig, rig: Rig) -> None:
+    def __init__(self, config: MapConfig, rig: Rig, one_camera: bool = False) -> None:
+        """Prepare for a rig; with `one_camera`, depth comes late, from `late`, and no other depth is used."""
         self._config = config
         self._cameras = rig.cameras
-        self._stereo = DenseStereo(rig, config) if rig.is_stereo and not rig.has_depth else None
-        self.view: DepthView = self._stereo.view if self._stereo else rgbd_view(rig, config)
+        self._one_camera = one_camera
+        stereo = rig.is_stereo and not rig.has_depth and not one_camera
+        self._stereo = DenseStereo(rig, config) if stereo else None
+        one_camera_view = mono_view(rig, config.mono_depth) if one_camera else rgbd_view(rig, config)
+        self.view: DepthView = self._stereo.view if self._stereo else one_camera_view
         self.counters = {"keyframes_dense": 0, "keyframes_sparse": 0, "keyframes_without_depth": 0}
 
     def extract(self, keyframe: Keyframe) -> Scan | None:
@@ -38,6 +43,17 @@ class ScanExtractor:
             self.counters["keyframes_dense" if scan.depth is not None else "keyframes_sparse"] += 1
         return scan
 
+    def late(self, depth_m: ImageF32, image: ImageU8) -> Scan:
+        """Return the scan of depth [h, w] that was made of several images, and of a grey or BGR image of that size.
+
+        Raises DataError when they do not have the size of the view.
+        """
+        if image.shape[:2] != depth_m.shape:
+            raise DataError(f"image is {image.shape[:2]} but its depth {depth_m.shape}; they must be alike")
+        scan = Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(image))
+        self.counters["keyframes_dense"] += 1
+        return scan
+
     def _dense(self, keyframe: Keyframe) -> Scan | None:
         frame = keyframe.frame
         if self._stereo is not None:
@@ -47,7 +63,7 @@ class ScanExtractor:
                 camera.check_image(picture)
             depth_m, grey = self._stereo.match(frame.images[0], frame.images[1])
             return Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(grey))
-        if frame.depth_m is None:
+        if frame.depth_m is None or self._one_camera:
             return None
         image = frame.images[0] if frame.color is None else frame.color
         self._cameras[0].check_image(image)

@@ -18,6 +18,7 @@ from vislam.mapping.drive import DriveGrid, DriveMap
 from vislam.mapping.extract import ScanExtractor
 from vislam.mapping.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh import Mesh, fuse_mesh
+from vislam.mapping.monodepth import LateDepth
 from vislam.mapping.occupancy import Occupancy, OccupancyMap
 from vislam.mapping.products import write_products
 from vislam.mapping.store import KeyframeStore, Scan
@@ -33,10 +34,13 @@ _RIGID_TOLERANCE = 1e-4
 class Mapper:
     """Keeps every keyframe's geometry in its own frame, and the maps made of it at the poses the graph gives."""
 
-    def __init__(self, config: MapConfig, rig: Rig) -> None:
-        """Raises DataError when the settings or the rig cannot make a map."""
+    def __init__(self, config: MapConfig, rig: Rig, one_camera: bool = False) -> None:
+        """Prepare for a rig; with `one_camera` only cam0 counts, and depth comes by `add_depth`.
+
+        Raises DataError when the settings or the rig cannot make a map.
+        """
         self._config = config
-        self._extractor = ScanExtractor(config, rig)
+        self._extractor = ScanExtractor(config, rig, one_camera)
         self._store = KeyframeStore()
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
         self._drive = DriveMap(config)
@@ -65,6 +69,18 @@ class Mapper:
             return
         self._store.add(keyframe.id, keyframe.t_ns, scan)
         self._occupancy.add(keyframe.id, scan, T)
+
+    def add_depth(self, late: LateDepth) -> None:
+        """Integrate depth that became known after its keyframe.
+
+        Raises DataError on a pose that is not rigid, a keyframe that has depth already, or depth of another size than
+        the mapper's rays.
+        """
+        T = np.array(late.T_map_body, dtype=np.float64)
+        _check_rigid(T[None], np.array([late.keyframe_id]))
+        scan = self._extractor.late(late.depth_m, late.image)
+        self._store.add(late.keyframe_id, late.t_ns, scan)
+        self._occupancy.add(late.keyframe_id, scan, T)
 
     def packed(self, keyframe_id: int) -> PackedScan | None:
         """Return what is kept of a keyframe's geometry, None if there was none."""

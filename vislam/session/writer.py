@@ -169,9 +169,8 @@ class SessionWriter:
             self._insert("packets", [packet_row(packet, update.newest)])
             if entry.filter_state is not None:
                 self._put_states("filter", [(keyframe.id, entry.filter_state)])
-            if entry.scan is not None:
-                scan = entry.scan
-                self._insert("scans", [(keyframe.id, scan.t_ns, scan.depth_png, scan.points, scan.colors)])
+            scans = entry.scans.items()
+            self._insert("scans", [(i, scan.t_ns, scan.depth_png, scan.points, scan.colors) for i, scan in scans])
             if entry.words is not None:
                 words = entry.words
                 self._replace("vocabulary", [(1, words.data, words.trained_at, words.trainings)])
