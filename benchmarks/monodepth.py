@@ -144,7 +144,9 @@ def compare_with_sensor(source: str, run: Path, config: MonoDepthConfig) -> None
             depths[stored.id] = value.depth_m
         image_only = replace(packet.keyframe, frame=Frame(t_ns, value.index, value.images[:1]))
         start = time.process_time()
-        late = stage.add(OdometryKeyframe(replace(packet, keyframe=image_only), stored.T_odom_body), stored.T_map_body, seen)
+        late = stage.add(
+            OdometryKeyframe(replace(packet, keyframe=image_only), stored.T_odom_body), stored.T_map_body, seen
+        )
         cpu_ms.append(1e3 * (time.process_time() - start))
         seen = []
         if late is not None and late.keyframe_id in depths:
