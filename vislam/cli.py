@@ -66,7 +66,7 @@ class _Verb:
 
 def _help() -> str:
     lines = ["usage: vislam VERB ...", "", "SLAM from a camera and a cheap IMU.", ""]
-    lines += [f"  {name:<10}{verb.summary}" for name, verb in _VERBS.items()]
+    lines += [f"  {name:<12}{verb.summary}" for name, verb in _VERBS.items()]
     lines += ["", "examples:"] + [f"  {verb.example}" for verb in _VERBS.values()]
     lines += [
         "",
@@ -509,6 +509,26 @@ def _rebuild(options: MapOptions) -> int:
     return 0
 
 
+def _vocabulary(arguments: list[str]) -> int:
+    from vislam.loop.orbslam import read_orbslam
+    from vislam.options import VocabularyOptions
+    from vislam.train_vocabulary import train_vocabulary
+
+    options = _parse(VocabularyOptions, arguments, "vocabulary")
+    if (options.from_orbslam is None) != bool(options.sources):
+        raise UsageError("give either SOURCE... to train on, or --from-orbslam FILE to convert")
+    if options.from_orbslam is not None:
+        vocabulary, origin = read_orbslam(options.from_orbslam), str(options.from_orbslam)
+    else:
+        left_out = ("sources", "out", "from_orbslam")
+        choices = {name: value for name, value in asdict(options).items() if name not in left_out}
+        vocabulary, images, unreadable = train_vocabulary(options.sources, **choices)
+        origin = f"{images} images" + (f" ({unreadable} could not be read)" if unreadable else "")
+    vocabulary.save(options.out)
+    print(f"{vocabulary.word_count} words from {origin}; next: vislam run ... --loop.vocabulary {options.out}")
+    return 0
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -534,5 +554,10 @@ _VERBS = {
         "vislam map runs/desk --resolution-m 0.02 --products cloud octomap mesh",
     ),
     "loops": _Verb(_loops, "list the loop edges of a run, or undo some", "vislam loops runs/desk --undo 7"),
+    "vocabulary": _Verb(
+        _vocabulary,
+        "train the words of loop closing on images, or convert ORB-SLAM's",
+        "vislam vocabulary images/ tum:PATH --out words.npz",
+    ),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

@@ -414,10 +414,16 @@ class LoopConfig:
     island_gap: int = 3  # ids in one island differ by at most this
     appearance_skip_keyframes: int = 20  # the newest ones always look most alike
     appearance_skip_s: float = 5.0  # and so do those of the last seconds
-    first_training: int = 10  # keyframes; before, none is old enough to be a candidate by appearance anyway
-    training_descriptors: int = 200_000  # at most: bounds a training to about half a second
+    vocabulary: str | None = None  # file of `vislam vocabulary`; None: the one that comes along, then the run's own
+    train: Literal["auto", "always", "never"] = "auto"  # on the run's own keyframes; auto: unless a file is given
+    first_training: int = 20  # keyframes; trained on fewer, words find less than those that come along
+    training_growth: float = 1.25  # keyframes, until trained again: words find less what they were not trained on
+    min_training_lag: int = 2  # keyframes that come during a training, at least ...
+    training_lag_share: float = 0.05  # ... and of those it is trained on; so long it takes at 10 keyframes a second
+    catch_up_keyframes: int = 8  # of those, so many are indexed with each new one once it is done: 0.4 ms each
+    training_descriptors: int = 500_000  # at most: bounds a training, in the background, to 2 s
     vocabulary_branching: int = 10  # children of a node
-    vocabulary_depth: int = 5  # levels; one less while there are few descriptors
+    vocabulary_depth: int = 6  # levels at most; as many as leave each word five descriptors
     inject_share: float = 0.0  # for experiments: share of false loops, made up, among those that the graph is offered
     inject_group: int = 1  # how many of them agree among themselves, as from an object that is there twice
 

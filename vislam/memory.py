@@ -147,11 +147,11 @@ class GraphMemory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WordsMemory:
-    """A vocabulary as bytes, and where its training stands."""
+    """The vocabulary in use as bytes, and where training stands."""
 
     data: bytes
-    trained_at: int  # keyframes that there were
-    trainings: int
+    trained_at: int  # keyframes that there were when the latest training began, whether it is in use yet or not
+    trainings: int  # begun so far
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -196,6 +196,30 @@ class LoopsOptions:
 
 
 @dataclass(frozen=True)
+class VocabularyOptions:
+    """Options of `vislam vocabulary`."""
+
+    out: Path
+    """File to write, for --loop.vocabulary"""
+    sources: Positional[tuple[str, ...]] = ()
+    """Folders of PNG or JPEG images, and recordings as for `run`"""
+    from_orbslam: Path | None = None
+    """Convert this text vocabulary of ORB-SLAM instead of training one"""
+    every: int = 1
+    """Use every n-th image"""
+    features: int = 1000
+    """ORB descriptors per image"""
+    branching: int = 10
+    """Children of a node"""
+    depth: int | None = None
+    """Levels; None: as many as leave each word some descriptors"""
+    max_descriptors: int = 1_000_000
+    """That the tree grows on, taken evenly"""
+    seed: int = 0
+    """Same seed, same bytes"""
+
+
+@dataclass(frozen=True)
 class ReportOptions:
     """Options of `vislam report`."""
 

@@ -107,7 +107,7 @@ class Back:
         self.depth = MonoDepth(config.map.mono_depth, rig) if one_camera and config.map.enabled else None
         self.clock = clock
         self.T_map_odom = np.eye(4)
-        self._trainings = 0
+        self._words_revision = 0
         self._held = 0  # keyframes of a map that is not to change
 
     def restore(self, memory: SlamMemory) -> GraphUpdate:
@@ -118,7 +118,7 @@ class Back:
         update = self.graph.restore(graph)
         if self.loops is not None:
             self.loops.restore(memory.places)
-            self._trainings = self.loops.trainings
+            self._words_revision = self.loops.words_revision
         if self.mapper is not None:
             ids = [packet.keyframe.id for packet in graph.packets]
             self.mapper.restore(memory.scans, dict(zip(ids, graph.T_map_body, strict=True)))
@@ -159,6 +159,8 @@ class Back:
 
     def finish(self) -> GraphUpdate:
         """Optimise to convergence and bring the map to the final poses."""
+        if self.loops is not None:
+            self.loops.close()
         with self.clock.measure("graph finish"):
             update = self.graph.finish()
         self._follow(update)
@@ -187,10 +189,10 @@ class Back:
         return {i: scan for i, scan in packed.items() if scan is not None}
 
     def _new_words(self) -> WordsMemory | None:
-        """Return the vocabulary if it was trained since the last call."""
-        if self.loops is None or self.loops.trainings == self._trainings:
+        """Return the vocabulary if it is new since the last call."""
+        if self.loops is None or self.loops.words_revision == self._words_revision:
             return None
-        self._trainings = self.loops.trainings
+        self._words_revision = self.loops.words_revision
         return self.loops.words()
 
     def _follow(self, update: GraphUpdate) -> None:

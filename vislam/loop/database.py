@@ -1,12 +1,19 @@
 """Finding keyframes that look alike: a vocabulary trained on the run's own keyframes, over an inverted index.
 
-There is no vocabulary file. The first training comes after a few keyframes, before any of them is old enough to be a
-candidate, and the tree is grown again each time their number has doubled: always on what this run has seen, which
-retrieves better than a generic tree of 700,000 words. Training is part of `add`, so that a replay gives the same
-words.
+A small vocabulary that was trained on simulated images serves the first keyframes, or one that the user names. The
+run's own words find more as long as they know most of its keyframes (docs/loops.md), so they are trained again and
+again, in a thread whose compiled parts run beside the rest. What a training was started with and when it is taken over
+are counted in keyframes, so a replay gives the same bytes however long a training took.
 """
 
 from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from threading import Event
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,68 +21,166 @@ from numpy.typing import NDArray
 from vislam.config import LoopConfig
 from vislam.loop.index import InvertedIndex
 from vislam.loop.view import View
-from vislam.loop.vocabulary import Vocabulary, train
+from vislam.loop.vocabulary import Vocabulary, depth_for, train
 from vislam.memory import WordsMemory
 
-_DEEP_FROM = 60_000  # descriptors; fewer do not fill a fifth level
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Words:
+    """A vocabulary and the index of the keyframes under it."""
+
+    vocabulary: Vocabulary
+    index: InvertedIndex
+    data: bytes  # of the vocabulary, for a session: compressing a large one takes long, so it is part of a training
+
+    def add(self, view: View) -> None:
+        self.index.add(view.id, self.vocabulary.transform(view.descriptors))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Training:
+    """A training under way, and at how many keyframes it is taken over."""
+
+    words: Future[_Words | None]
+    due: int
+
+
+def seed_vocabulary() -> Vocabulary:
+    """Return the vocabulary that comes with vislam: small, trained on images of the simulator."""
+    file = resources.files("vislam.loop") / "seed_vocabulary.npz"
+    return Vocabulary.from_bytes(file.read_bytes(), file.name)
 
 
 class PlaceDatabase:
-    """Owns the vocabulary and the inverted index of a run."""
+    """Owns the vocabulary and the inverted index of a run; `close` it, so that no training outlives it."""
 
     def __init__(self, config: LoopConfig, seed: int) -> None:
+        """Start with the configured vocabulary or the seed; raises DataError when the file cannot be used."""
         self._config = config
         self._seed = seed
         self._views: list[View] = []
+        first = Vocabulary.load(Path(config.vocabulary)) if config.vocabulary else seed_vocabulary()
+        self._words = _Words(first, InvertedIndex(first.idf), first.to_bytes())
+        self._trains = config.train == "always" or (config.train == "auto" and config.vocabulary is None)
         self._train_at = config.first_training
-        self._index: InvertedIndex | None = None
-        self.vocabulary: Vocabulary | None = None
+        self._training: _Training | None = None
+        self._next: _Words | None = None  # trained, but some keyframes that came meanwhile are not in its index yet
+        self._closed = Event()
+        self._trained_at = 0
         self.trainings = 0
+        self.revision = 0  # grows when what `words` returns is new
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """The vocabulary in use."""
+        return self._words.vocabulary
 
     def query(self, view: View, k: int, excluded: NDArray[np.int64]) -> tuple[list[int], list[float]]:
         """Return ids and scores 0..1 of the at most k keyframes that look most like a view, best first."""
-        if self.vocabulary is None or self._index is None or len(view.descriptors) == 0:
-            return [], []
-        ids, scores = self._index.query(self.vocabulary.transform(view.descriptors), k, excluded)
+        bag = self._words.vocabulary.transform(view.descriptors)
+        ids, scores = self._words.index.query(bag, k, excluded)
         return ids.tolist(), scores.tolist()
 
+    def add(self, view: View) -> None:
+        """Add a view (ids ascend), start a training when it is time, and take one over when it is due.
+
+        An error of a training is raised here, when it is due.
+        """
+        self._views.append(view)
+        self._words.add(view)
+        self._take_over()
+        self._catch_up()
+        idle = self._training is None and self._next is None
+        if idle and self._trains and len(self._views) >= self._train_at:
+            self._begin(len(self._views))
+
+    def close(self) -> None:
+        """Stop a training that is under way and wait for its thread; raises what it raised."""
+        self._closed.set()
+        if self._training is not None:
+            training, self._training = self._training, None
+            training.words.result()
+
     def words(self) -> WordsMemory | None:
-        """Return the vocabulary as `restore` takes it; None before the first training."""
-        if self.vocabulary is None:
+        """Return what `restore` takes; None before the first training."""
+        if self.trainings == 0:
             return None
-        return WordsMemory(self.vocabulary.to_bytes(), self._train_at // 2, self.trainings)
+        return WordsMemory(self._words.data, self._trained_at, self.trainings)
 
     def restore(self, views: list[View], words: WordsMemory | None) -> None:
-        """Take over the views of an earlier run and the vocabulary it had; raises DataError when that is damaged."""
+        """Take over the views of an earlier run and where its words stood; raises DataError when they are damaged.
+
+        A training that was under way begins again, and is taken over when it would have been.
+        """
         self._views = list(views)
         if words is not None:
-            self.vocabulary = Vocabulary.from_bytes(words.data, "of the session")
-            self._train_at, self.trainings = 2 * words.trained_at, words.trainings
-            self._rebuild()
-
-    def add(self, view: View) -> None:
-        """Add a view (ids ascend) and train again when it is time."""
-        self._views.append(view)
-        if len(self._views) >= self._train_at and any(len(old.descriptors) for old in self._views):
-            self._train()
-            self._train_at = 2 * len(self._views)
-        elif self.vocabulary is not None and self._index is not None:
-            self._index.add(view.id, self.vocabulary.transform(view.descriptors))
-
-    def _train(self) -> None:
-        config = self._config
-        images = [view.descriptors for view in self._views]
-        used = min(sum(len(image) for image in images), config.training_descriptors)
-        depth = config.vocabulary_depth if used >= _DEEP_FROM else max(1, config.vocabulary_depth - 1)
-        self.vocabulary = train(
-            images, config.vocabulary_branching, depth, self._seed + self.trainings, config.training_descriptors
-        )
-        self._rebuild()
-        self.trainings += 1
-
-    def _rebuild(self) -> None:
-        """Index all views anew."""
-        assert self.vocabulary is not None
-        self._index = InvertedIndex(self.vocabulary.idf)
+            vocabulary = Vocabulary.from_bytes(words.data, "of the session")
+            self._words = _Words(vocabulary, InvertedIndex(vocabulary.idf), words.data)
         for view in self._views:
-            self._index.add(view.id, self.vocabulary.transform(view.descriptors))
+            self._words.add(view)
+        if words is None:
+            return
+        self._trained_at, self.trainings = words.trained_at, words.trainings
+        self._train_at = self._following(words.trained_at)
+        due, step = words.trained_at + self._lag(words.trained_at), 1 + self._config.catch_up_keyframes
+        behind = len(views) - words.trained_at - step * max(0, len(views) - due + 1)
+        if not self._trains or behind <= 0:
+            return
+        self.trainings -= 1
+        self._begin(words.trained_at)
+        if len(views) >= due:
+            self._take_over()
+            if self._next is not None:
+                for view in self._views[words.trained_at : len(views) - behind]:
+                    self._next.add(view)
+
+    def _following(self, count: int) -> int:
+        """Return at how many keyframes the training after one at `count` begins."""
+        return max(count + 1, int(self._config.training_growth * count))
+
+    def _lag(self, count: int) -> int:
+        return max(self._config.min_training_lag, int(self._config.training_lag_share * count))
+
+    def _begin(self, count: int) -> None:
+        """Begin to train on the first `count` views."""
+        views = tuple(self._views[:count])
+        if not any(len(view.descriptors) for view in views):
+            return
+        # a pool for one job: its thread ends with it
+        pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="vislam-words")
+        job = partial(_train, self._config, self._seed + self.trainings, views, self._closed)
+        self._training = _Training(pool.submit(job), count + self._lag(count))
+        pool.shutdown(wait=False)
+        self._trained_at, self._train_at = count, self._following(count)
+        self.trainings += 1
+        self.revision += 1
+
+    def _take_over(self) -> None:
+        if self._training is not None and len(self._views) >= self._training.due:
+            training, self._training = self._training, None
+            self._next = training.words.result()
+
+    def _catch_up(self) -> None:
+        """Index some keyframes that the training did not see yet; with the last one its words come into use."""
+        if self._next is None:
+            return
+        done = len(self._next.index)
+        for view in self._views[done : done + 1 + self._config.catch_up_keyframes]:
+            self._next.add(view)
+        if len(self._next.index) == len(self._views):
+            self._words, self._next = self._next, None
+            self.revision += 1
+
+
+def _train(config: LoopConfig, seed: int, views: tuple[View, ...], closed: Event) -> _Words | None:
+    """Train on views and index them; None when closed meanwhile."""
+    images = [view.descriptors for view in views]
+    branching = config.vocabulary_branching
+    depth = depth_for(sum(len(image) for image in images), branching, config.vocabulary_depth)
+    vocabulary = train(images, branching, depth, seed, config.training_descriptors)
+    words = _Words(vocabulary, InvertedIndex(vocabulary.idf), vocabulary.to_bytes())
+    for view in views:
+        if closed.is_set():
+            return None
+        words.add(view)
+    return words

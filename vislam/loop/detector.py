@@ -71,14 +71,14 @@ class LoopDetector:
         self.counters = {"verified": 0, "accepted": 0, "parked": 0, "rejected": 0, "promoted": 0}
 
     @property
-    def vocabulary(self) -> Vocabulary | None:
-        """The vocabulary in use; None before the first training."""
+    def vocabulary(self) -> Vocabulary:
+        """The vocabulary in use."""
         return self._database.vocabulary
 
     @property
-    def trainings(self) -> int:
-        """How often the vocabulary was trained: when this grows, `words` is new."""
-        return self._database.trainings
+    def words_revision(self) -> int:
+        """Grows when what `words` returns is new."""
+        return self._database.revision
 
     def words(self) -> WordsMemory | None:
         """Return the vocabulary as `restore` takes it; None before the first training."""
@@ -137,6 +137,10 @@ class LoopDetector:
         self._forget(view.id)
         return edges, records
 
+    def close(self) -> None:
+        """End what runs in the background; raises what failed there."""
+        self._database.close()
+
     def move(self, update: GraphUpdate) -> None:
         """Follow the keyframes that the graph moved, and the pieces that it joined."""
         self._poses.move(update)
@@ -169,9 +173,6 @@ class LoopDetector:
             recent.append(old.id)
         is_lost = self._pieces.group(view.id) != 0
         wanted = config.max_verifications if is_lost else config.max_appearance
-        if self._database.vocabulary is None and is_lost:  # the first keyframes of all: try the newest
-            others = [k for k in reversed(self._views) if not self._pieces.are_joined(k, view.id)]
-            return [Candidate(k, "appearance", 0.0) for k in others[:wanted]]
         ids, scores = self._database.query(view, config.retrieved, np.array(recent, dtype=np.int64))
         chosen = self._appearance.select(ids, scores)
         self.retrieved = [

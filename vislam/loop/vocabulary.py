@@ -1,8 +1,7 @@
 """The vocabulary: which of some thousand words a descriptor is, and how much each word tells about a place.
 
 tf-idf weights and the L1 score are those of DBoW2 (Galvez-Lopez and Tardos, "Bags of binary words for fast place
-recognition in image sequences", T-RO 2012). A vocabulary trained on the run's own keyframes beats a generic one of
-700,000 words, so none is shipped: see `database.py`.
+recognition in image sequences", T-RO 2012). Where vocabularies come from: `database.py`.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from vislam.loop.hamming import packed
 from vislam.loop.tree import MAX_CHILDREN, descend, grow, similarity, walk_table, weigh
 
 _FORMAT = 1
+_PER_WORD = 5  # descriptors
 _MAX_FILE_BYTES = 512 * 1024 * 1024  # ten million nodes; a file that claims more is damaged or hostile
 _DTYPES = {"format": "<i8", "nodes": "<u8", "first_child": "<i4", "child_count": "<i4", "idf": "<f8"}
 
@@ -130,6 +130,17 @@ class Vocabulary:
         except OSError as error:
             raise DataError(f"vocabulary {path} cannot be read: {error.strerror}; give one that exists") from error
         return Vocabulary.from_bytes(data, str(path))
+
+
+def depth_for(descriptors: int, branching: int, most: int) -> int:
+    """Return how many levels leave each word at least five of so many descriptors: 1 to `most`.
+
+    Words that are rarer know their training images by heart and nothing else (measured: docs/loops.md).
+    """
+    depth = 1
+    while depth < most and branching ** (depth + 1) * _PER_WORD <= descriptors:
+        depth += 1
+    return depth
 
 
 def train(

@@ -1,0 +1,74 @@
+"""A vocabulary from images, recordings or ORB-SLAM's text file: the library's side of `vislam vocabulary`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.camera import Camera
+from vislam.datasets.images import UnreadableImageError, probe, read_grey_or_color
+from vislam.errors import DataError, UsageError
+from vislam.features import describe
+from vislam.loop.vocabulary import Vocabulary, depth_for, train
+from vislam.messages import Frame, ImageU8
+from vislam.sources import open_source
+
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+_MAX_PIXELS = 100_000_000  # of an image; more is no camera's
+
+
+def train_vocabulary(
+    sources: tuple[str, ...],
+    *,
+    every: int = 1,
+    features: int = 1000,
+    branching: int = 10,
+    depth: int | None = None,
+    max_descriptors: int = 1_000_000,
+    seed: int = 0,
+) -> tuple[Vocabulary, int, int]:
+    """Train a vocabulary on every n-th image of folders of PNG or JPEG files, and of recordings as for `vislam run`.
+
+    Without `depth` the tree is as deep as leaves each word some descriptors. Returns the vocabulary, how many images it
+    comes from, and how many could not be read. Raises UsageError for numbers that make no sense, DataError when
+    there is nothing to train on.
+    """
+    if every < 1 or features < 1:
+        raise UsageError(f"--every {every} --features {features}: both must be at least 1")
+    images: list[NDArray[np.uint8]] = []
+    unreadable = 0
+    for source in sources:
+        for image in _images(source, every, seed):
+            if image is None:
+                unreadable += 1
+                continue
+            images.append(describe(image, features)[1])
+    total = sum(len(image) for image in images)
+    levels = depth_for(total, branching, 6) if depth is None else depth
+    return train(images, branching, levels, seed, max_descriptors), len(images), unreadable
+
+
+def _images(source: str, every: int, seed: int) -> Iterator[ImageU8 | None]:
+    """Yield every n-th grey image of a source; None where one cannot be read."""
+    folder = Path(source)
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+    for path in files[::every]:
+        yield _read(path)
+    if not files:
+        frames = (event for event in open_source(source, seed).events() if isinstance(event, Frame))
+        for number, frame in enumerate(frames):
+            if number % every == 0:
+                yield frame.images[0]
+
+
+def _read(path: Path) -> ImageU8 | None:
+    try:
+        width, height = probe(path)
+        if width * height > _MAX_PIXELS:
+            return None
+        return read_grey_or_color(path, Camera(width, height, 1.0, 1.0, 0.0, 0.0))[0]
+    except (UnreadableImageError, DataError):
+        return None
