@@ -121,15 +121,44 @@ class DriveMap:
     def __init__(self, config: MapConfig) -> None:
         self._config = config
         self._store = ColumnStore()
+        self._slopes = _Slopes()
 
     def update(self, occupancy: OccupancyMap) -> DriveGrid:
         """Return the grid of the map as it is now; only columns that changed since the last call are read again."""
         self._store.update(occupancy)
-        return drive_grid(self._store.columns(), occupancy.resolution_m, self._config)
+        return drive_grid(self._store.columns(), occupancy.resolution_m, self._config, self._slopes)
 
 
-def drive_grid(columns: Columns, resolution_m: float, config: MapConfig) -> DriveGrid:
-    """Return the drive grid of columns.
+class _Slopes:
+    """Slopes of ground that changes; planes are fitted again where the ground within their reach is other than before.
+
+    The result does not depend on what was before.
+    """
+
+    def __init__(self) -> None:
+        self._ground: _I16 = np.zeros((0, 0), np.int16)
+        self._slope: F32 = np.zeros((0, 0), np.float32)
+        self._of = (0, 0, 0, 0)  # corner, reach and step
+
+    def update(self, ground: _I16, corner: tuple[int, int], reach: int, step: int) -> F32:
+        """Return the tangents of the slopes [rows, columns], as `_fit_slopes` does."""
+        before = np.full(ground.shape, NEVER, np.int16)
+        slope = np.full(ground.shape, np.nan, np.float32)
+        rows, columns = self._ground.shape
+        x, y = self._of[0] - corner[0], self._of[1] - corner[1]  # of the old grid in the new one
+        covers = min(x, y) >= 0 and y + rows <= ground.shape[0] and x + columns <= ground.shape[1]
+        if covers and self._of[2:] == (reach, step):
+            before[y : y + rows, x : x + columns] = self._ground
+            slope[y : y + rows, x : x + columns] = self._slope
+        changed = (ground != before).astype(np.uint8)
+        near = cv2.dilate(changed, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        _fit_slopes(ground, reach, step, near, slope)
+        self._ground, self._slope, self._of = ground, slope, (*corner, reach, step)
+        return slope
+
+
+def drive_grid(columns: Columns, resolution_m: float, config: MapConfig, slopes: _Slopes | None = None) -> DriveGrid:
+    """Return the drive grid of columns; `slopes` of an earlier one save work and change nothing.
 
     Raises DataError when it would be larger than any map to drive by.
     """
@@ -146,7 +175,7 @@ def drive_grid(columns: Columns, resolution_m: float, config: MapConfig) -> Driv
     states = _classify(columns.runs, columns.counts, columns.lowest_free, ground, around, step, head)
     reach = max(1, round(0.5 * drive.slope_window_m / resolution_m))
     steepest = float(np.tan(np.deg2rad(drive.max_slope_deg)))
-    slope = _slopes(ground, reach, step)
+    slope = (_Slopes() if slopes is None else slopes).update(ground, columns.corner, reach, step)
     states[(states == Drive.FREE) & (slope > steepest)] = Drive.STEEP
     height_m = np.where(ground == NEVER, np.nan, (ground.astype(np.float64) + 1.0) * resolution_m)  # a voxel's top
     return DriveGrid(
@@ -263,17 +292,19 @@ def _classify(runs: _I16, counts: _I16, lowest_free: _I16, ground: _I16, around:
 
 
 @njit(cache=True, nogil=True)
-def _slopes(ground: _I16, reach: int, step: int) -> F32:
-    """Return the tangent of the slope of the plane that fits the ground around each cell best; NaN without ground.
+def _fit_slopes(ground: _I16, reach: int, step: int, wanted: NDArray[np.bool_], out: F32) -> None:
+    """Set the tangent of the slope of the plane that fits the ground around each wanted cell best; NaN without ground.
 
     Ground that can only be reached over a larger step, or around by leaving the window, belongs to another plane.
     """
     rows, columns = ground.shape
-    out = np.full((rows, columns), np.nan, np.float32)
     size = 2 * reach + 1
     seen, stack = np.zeros(size * size, np.int64), np.empty(size * size, np.int64)
     for cell in range(rows * columns):
         y, x = cell // columns, cell % columns
+        if not wanted[y, x]:
+            continue
+        out[y, x] = np.nan
         if ground[y, x] == NEVER:
             continue
         n = sx = sy = sz = sxx = sxy = syy = sxz = syz = 0.0
@@ -301,7 +332,6 @@ def _slopes(ground: _I16, reach: int, step: int) -> F32:
         determinant = a * c - b * b
         if n >= _MIN_PLANE_CELLS and determinant > 1e-6 * n * n:
             out[y, x] = np.hypot((c * p - b * q) / determinant, (a * q - b * p) / determinant)
-    return out
 
 
 def _distance(blocked: NDArray[np.bool_]) -> F32:
