@@ -13,6 +13,7 @@ from inertial_world import NS, T0_NS
 from msckf_world import Flight
 from scipy.stats import chi2
 
+from vislam.config import EkfConfig
 from vislam.messages import Array
 
 RUNS = int(os.environ.get("VISLAM_RUNS", "4"))
@@ -35,7 +36,7 @@ def spoilt(flight: Flight, seed: int, lose: float, outage: bool, swap: bool) -> 
 def normalised_errors(seed: int, delay_s: float, outage: bool) -> Array:
     """Return the NEES of one run at its end: of each part (3 degrees), of yaw (1) and of everything (15)."""
     flight = spoilt(Flight.make(seed, 12.0, tracks=80), seed, 0.05, outage, delay_s > 0.0)
-    ekf = flight.filter(tight_history_s=3.0)
+    ekf = flight.filter(tight_history_s=3.0, tight_point_inflation=EkfConfig().tight_point_inflation)
     error, state = next((e, s) for k, e, s in flight.fly(ekf, delay_s) if k == 2300)
     P = state.covariance
     parts = [error[i : i + 3] @ np.linalg.solve(P[i : i + 3, i : i + 3], error[i : i + 3]) for i in range(0, 15, 3)]
