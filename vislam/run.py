@@ -241,6 +241,7 @@ class Run:
         if self.slam.back is not None and self.slam.back.mapper is not None:
             with self.slam.clock.measure("map export"):
                 self.slam.back.mapper.export(self.out / "map")
+            self.warnings += [f"no {name}: {reason}" for name, reason in self.slam.back.mapper.notes.items()]
         self._show_result(final, truth)
         wall_s = time.perf_counter() - start  # everything but pictures and report
         if self.slam.back is not None and self.slam.back.mapper is not None:

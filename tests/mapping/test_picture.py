@@ -148,3 +148,12 @@ def test_empty_maps_and_broken_lines_still_give_a_picture():
     ):
         assert image.shape == (180, 320, 3)
         assert (image == 255).mean() > 0.5
+
+
+def test_points_that_are_no_places_are_left_out():
+    style = Style(size=SIZE, floor_grid=False)
+    bad = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e30, 0, 0], [0, -3e38, 0]], np.float32)
+    broken = joined(plate(0.0, RED), Cloud(bad, np.full((5, 3), 9, np.uint8)))
+    np.testing.assert_array_equal(render_cloud(broken, style=style), render_cloud(plate(0.0, RED), style=style))
+    only_bad = Cloud(bad, np.full((5, 3), 9, np.uint8))
+    assert render_cloud(only_bad, style=style).shape == (180, 320, 3)

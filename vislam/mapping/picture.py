@@ -28,6 +28,7 @@ _SUPERSAMPLING = 2
 _FIELD_OF_VIEW = np.deg2rad(38.0)
 _MARGIN = 0.05  # of the picture's size, left free on each side
 _NEAR_M = 0.02
+_FARTHEST_M = 1e6  # a point beyond is damage, and no picture could show it beside the others
 _LOOK_AHEAD_VOXELS = (3.0, 6.0)  # from a surface towards the eye: past its own voxels, also at a grazing angle
 _HIDDEN_ALPHA = 0.3  # of a line behind a surface
 _EDL_STRENGTH = 60.0
@@ -125,6 +126,7 @@ def render_cloud(
     """
     style = style or Style()
     R_up = level_rotation(np.array(style.up, dtype=np.float64))
+    cloud = cloud.select(np.all(np.abs(cloud.points_m) < _FARTHEST_M, axis=1))  # NaN is not
     points, lines = cloud.points_m @ R_up.T, _turned(lines, R_up)
     below = points[:, 2] <= _ceiling_m(style, lines, points)
     points, colors = points[below], cloud.colors[below].astype(np.float32)
