@@ -47,7 +47,7 @@ from vislam.sources import open_source  # noqa: E402
 
 WIDTH = 640
 K = camera(WIDTH).K
-OURS = replace(MonoDepthConfig(), fusion="gaussian", threads=1)
+OURS = replace(MonoDepthConfig(), fusion="gaussian", converged=0.01, threads=1)
 PLAIN = replace(
     OURS, uniqueness=1.0, min_gradient=0.0, max_sigma_ratio=np.inf, max_misses=255, min_matches=0, derotate_deg=180.0
 )  # what the peer does too
