@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vislam.config import DriveConfig, MapConfig
+from vislam.errors import DataError
 from vislam.mapping.drive import Drive, DriveMap
 from vislam.mapping.occupancy import OccupancyMap
 
@@ -232,3 +233,11 @@ def test_the_floor_is_told_or_found_and_an_empty_map_is_unknown():
     told = DriveMap(replace(CONFIG, grid_floor_m=0.0)).update(occupancy)
     assert (at(told)(range(20), range(12, 20)) == Drive.FREE).all()
     assert (at(told)(range(20), range(12)) == Drive.OBSTACLE).all()
+
+
+def test_a_map_that_is_too_wide_for_a_grid_is_an_error_before_memory_is_taken():
+    occupancy = Yard(4, 4).occupancy()
+    far = np.array([[3000.0, -3000.0, 0.0]])
+    occupancy.insert(far, far[0] + [0.0, 0.0, 1.0])
+    with pytest.raises(DataError, match="coarser"):
+        DriveMap(CONFIG).update(occupancy)

@@ -12,6 +12,7 @@ from needs import missing
 from vislam.errors import DataError
 from vislam.mapping import _open3d
 from vislam.mapping._open3d import load_open3d
+from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.mesh import Mesh
 from vislam.mapping.mesh_files import write_glb, write_obj
@@ -218,3 +219,13 @@ def test_an_empty_map_says_what_it_cannot_give(tmp_path):
     mapper = Mapper(replace(CONFIG, products=("surfels", "mesh", "poisson", "drive", "pcd")), RIG)
     assert set(mapper.export(tmp_path)) == {"drive", "drive_yaml", "pcd"}
     assert set(mapper.notes) == {"surfels", "mesh", "poisson"}
+
+
+def test_one_stray_keyframe_far_away_costs_the_grids_and_nothing_else(tmp_path):
+    mapper = room(("drive", "cloud", "octomap"))
+    far = pose(0)
+    far[:3, 3] += [1500.0, -1500.0, 0.0]
+    mapper.add(keyframe(8), far)
+    assert set(mapper.export(tmp_path)) == {"cloud", "octomap"}
+    assert "coarser" in mapper.notes["drive"]
+    assert [path.name for path in write_pictures(mapper, tmp_path, np.zeros((0, 3)), True)] != []

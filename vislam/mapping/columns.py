@@ -13,12 +13,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vislam.errors import DataError
 from vislam.mapping.blocks import KEY_ORIGIN
 from vislam.mapping.occupancy import OccupancyMap
 
 MAX_RUNS = 6  # floor, seat, table, shelf, lamp, ceiling; what is higher is taken for one with the highest
 NEVER = np.int16(32767)  # the lowest free voxel of a column without any
 _EDGE = 8  # columns along a block
+_MAX_COLUMNS = 1 << 25  # 290 x 290 m at 5 cm; 900 MB
 _XY_BITS = 26  # of a block's key: its place in the plane
 _WORDS = 16  # a layer of 64 voxels is a word: eight of occupied ones, eight of free ones
 
@@ -76,13 +78,22 @@ class ColumnStore:
         return len(dirty)
 
     def columns(self) -> Columns:
-        """Return the columns as arrays over the map's bounding box; a single empty one for an empty map."""
+        """Return the columns as arrays over the map's bounding box; a single empty one for an empty map.
+
+        Raises DataError when the box is larger than any map to drive by.
+        """
         x, y = self._tiles & 0x1FFF, self._tiles >> 13
         if len(self._tiles) == 0:
             nothing = np.zeros((1, 1, MAX_RUNS, 2), np.int16)
             return Columns(nothing, np.zeros((1, 1), np.int16), np.full((1, 1), NEVER, np.int16), (0, 0))
         low_x, low_y = int(x.min()), int(y.min())
-        table = np.full((int(y.max()) - low_y + 1, int(x.max()) - low_x + 1), len(self._tiles), np.int64)
+        shape = (int(y.max()) - low_y + 1, int(x.max()) - low_x + 1)
+        if shape[0] * shape[1] * _EDGE**2 > _MAX_COLUMNS:
+            raise DataError(
+                f"the map spans {shape[1] * _EDGE} x {shape[0] * _EDGE} columns of voxels; at most {_MAX_COLUMNS} "
+                "in all make a grid: use a coarser map.resolution_m or a shorter map.max_range_m"
+            )
+        table = np.full(shape, len(self._tiles), np.int64)
         table[y - low_y, x - low_x] = np.arange(len(self._tiles))
         return Columns(
             _spread(self._runs, table, 0),

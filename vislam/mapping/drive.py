@@ -17,7 +17,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from vislam.config import MapConfig
-from vislam.errors import DataError
 from vislam.mapping.columns import NEVER, Columns, ColumnStore
 from vislam.mapping.grid import Grid
 from vislam.mapping.occupancy import OccupancyMap
@@ -27,7 +26,6 @@ F32 = NDArray[np.float32]
 _I16 = NDArray[np.int16]
 _I8 = NDArray[np.int8]
 
-_MAX_CELLS = 1 << 26
 _LARGE_SHARE = 0.5  # of the largest level of surfaces: from there on one may be the floor
 _MIN_PLANE_CELLS = 6
 _FARTHEST_CELLS = 500  # clearance is not asked beyond
@@ -124,7 +122,10 @@ class DriveMap:
         self._slopes = _Slopes()
 
     def update(self, occupancy: OccupancyMap) -> DriveGrid:
-        """Return the grid of the map as it is now; only columns that changed since the last call are read again."""
+        """Return the grid of the map as it is now; only columns that changed since the last call are read again.
+
+        Raises DataError when the map's extent is larger than any to drive by.
+        """
         self._store.update(occupancy)
         return drive_grid(self._store.columns(), occupancy.resolution_m, self._config, self._slopes)
 
@@ -158,13 +159,7 @@ class _Slopes:
 
 
 def drive_grid(columns: Columns, resolution_m: float, config: MapConfig, slopes: _Slopes | None = None) -> DriveGrid:
-    """Return the drive grid of columns; `slopes` of an earlier one save work and change nothing.
-
-    Raises DataError when it would be larger than any map to drive by.
-    """
-    rows, width = columns.counts.shape
-    if rows * width > _MAX_CELLS:
-        raise DataError(f"a grid of {width}x{rows} cells of {resolution_m} m is too large; use a coarser resolution")
+    """Return the drive grid of columns; `slopes` of an earlier one save work and change nothing."""
     drive = config.drive
     step = max(1, int(np.floor(drive.max_step_m / resolution_m + _TOLERANCE)))
     head = max(1, int(np.ceil(config.grid_high_m / resolution_m - _TOLERANCE)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.errors import DataError
 from vislam.mapping.cloud import Cloud
 from vislam.mapping.drive import Drive
 from vislam.mapping.files import replacing
@@ -34,9 +36,10 @@ def write_pictures(source: MapSource, folder: Path, path_m: NDArray[np.float64],
             pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path, octree=octree)
     if len(octree.occupied_voxels()):
         pictures["picture_octree.png"] = render_octree(octree, path)
-    drive = source.drive()
-    if is_level and (drive.states == Drive.FREE).any():
-        pictures["picture_where_to_drive.png"] = render_drive(drive, path)
+    with suppress(DataError):  # too large a map for a grid: that is said where the grid is written
+        drive = source.drive()
+        if is_level and (drive.states == Drive.FREE).any():
+            pictures["picture_where_to_drive.png"] = render_drive(drive, path)
     for name, image in pictures.items():
         with replacing(folder / name) as file:
             file.write(cv2.imencode(".png", image[..., ::-1])[1].tobytes())

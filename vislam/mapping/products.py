@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from vislam.config import MapConfig
-from vislam.errors import StorageError
+from vislam.errors import DataError, StorageError
 from vislam.mapping.cloud import Cloud
 from vislam.mapping.drive import DriveGrid
 from vislam.mapping.files import replacing
@@ -77,7 +77,10 @@ def write_products(
         if step is not None:
             step(product)
         path = folder / FILES[product]
-        reason = writers[product](path) if product in writers else _write_mesh(path, *mesh())
+        try:
+            reason = writers[product](path) if product in writers else _write_mesh(path, *mesh())
+        except DataError as error:  # too large for a grid, say; the other products are none the worse
+            reason = str(error)
         if isinstance(reason, str):
             notes[product] = reason
         else:
