@@ -38,12 +38,12 @@ def pose(step):
 
 def columns(path, entity):
     """All rows logged at an entity: {column: list of values} in the order of logging."""
+    batches = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
     rows = {}
-    for chunk in RrdReader(path).stream():
-        if chunk.entity_path == entity:
-            batch = chunk.to_record_batch()
-            for name in batch.schema.names:
-                rows.setdefault(name, []).extend(batch.column(name).to_pylist())
+    # chunks with other columns may be written in any order; row ids ascend with time
+    for batch in sorted(batches, key=lambda batch: batch.column("rerun.controls.RowId")[0].as_py()):
+        for name in batch.schema.names:
+            rows.setdefault(name, []).extend(batch.column(name).to_pylist())
     return rows
 
 
