@@ -201,7 +201,7 @@ class Three:
     def truth(self):
         return None
 
-    def events(self):
+    def events(self, from_ns=None):
         for i in range(4):
             if i:
                 yield Frame(i * 100 - 50, i - 1, ())

@@ -88,14 +88,13 @@ def test_frames_that_disagree_through_odometry_wait(laps: tuple[LandmarkWorld, l
     assert [c for c in found[1][1] if "disagree" in c.reason]
 
 
-def test_a_loss_right_at_the_start_needs_no_vocabulary(
+def test_a_loss_right_at_the_start_needs_no_words_of_the_run(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
     world, poses, keyframes = laps
     detector = LoopDetector(CONFIG, world.rig, 0)
     for k in range(4):
         detector.detect(keyframes[k], poses[k])
-    assert detector.vocabulary is None
     again = [replace(keyframes[k], id=k + 3) for k in (1, 2)]
     found = go_on(detector, again, [AWAY @ poses[k] for k in (1, 2)])
     assert {edge.to_id for edge in found[1][0]} == {4, 5}
