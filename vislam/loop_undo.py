@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.config import Config, from_data
+from vislam.config import Config
 from vislam.errors import DataError, UsageError, VislamError
 from vislam.factor_log import rig_from
 from vislam.graph import PoseGraph
@@ -64,7 +64,7 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
     """
     session = Session(_session(run))
     try:
-        info, memory = session.info(), recall(session)
+        info, config, memory = session.info(), session.config(), recall(session)
         if memory is None:
             raise DataError(f"{run} has no keyframe with gravity yet; there is nothing to optimise")
         if (info.get("map") or {}).get("localize_only"):
@@ -75,7 +75,7 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
         log.restore(session, memory)
     finally:
         session.close()
-    redone = _optimise(_config(run, info), info, memory)
+    redone = _optimise(config, info, memory)
     asked = {*undo, *redo}
     states = {state.id: state for state in redone.news.loops}
     states |= {loop.state.id: loop.state for loop in changed if loop.state.id in asked and loop.state.id not in states}
@@ -131,13 +131,6 @@ def _put(state: LoopState, place: LoopPlace) -> LoopState:
     decision = LoopDecision.REJECTED if undone else LoopDecision.ACCEPTED
     reason = f"{state.reason}; {'undone' if undone else 'brought back'} by the user"
     return replace(state, decision=decision, reason=reason, place=place, tie=None)
-
-
-def _config(run: Path, info: dict[str, Any]) -> Config:
-    try:
-        return from_data(info["config"], source=str(run / "session.db"))
-    except (KeyError, TypeError, UsageError) as error:
-        raise DataError(f"{error}; the settings stored with the run are of another version, run it again") from error
 
 
 def _optimise(config: Config, info: dict[str, Any], memory: SlamMemory) -> _Redone:

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from vislam.camera import Rig
-from vislam.config import Config, MapConfig, from_data
+from vislam.config import Config, MapConfig
 from vislam.errors import DataError, UsageError
 from vislam.factor_log import rig_from
+from vislam.frontend import mode_for
 from vislam.mapping.extract import ScanExtractor
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
@@ -25,7 +26,6 @@ from vislam.memory import PackedScan
 from vislam.messages import Array, Frame, GraphUpdate, Keyframe
 from vislam.runfolder import read_setup, write_json
 from vislam.session import Session
-from vislam.slam import sees_mono
 from vislam.sources import open_source
 from vislam.trajectory import read_trajectory
 
@@ -41,7 +41,7 @@ def map_settings(run: Path) -> Config:
     """Return the settings of a run; raises DataError when its session cannot be read."""
     session = Session(run / "session.db")
     try:
-        return from_data(session.info()["config"], str(session.path))
+        return session.config()
     finally:
         session.close()
 
@@ -55,11 +55,11 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     session = Session(run / "session.db")
     try:
         info = session.info()
-        ran = from_data(info["config"], str(session.path))
+        ran = session.config()
         rig = rig_from(info["rig"])
         placed = _poses(session, run, poses)
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
-        one_camera = ran.map.mono_depth.enabled and sees_mono(ran, rig)
+        one_camera = ran.map.mono_depth.enabled and mode_for(ran.frontend, rig) == "mono"
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
         mapper = Mapper(config, rig, one_camera)
         from_session = ran.map.enabled and (one_camera or _same_extraction(ran.map, config, rig))

@@ -18,6 +18,7 @@ from vislam.clock import StageClock
 from vislam.config import Config
 from vislam.errors import UsageError
 from vislam.front import Front, FrontStep
+from vislam.frontend import mode_for
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
@@ -102,7 +103,7 @@ class Back:
         self._false = None
         if config.loop.inject_share > 0.0:
             self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
-        one_camera = config.map.mono_depth.enabled and sees_mono(config, rig)
+        one_camera = config.map.mono_depth.enabled and mode_for(config.frontend, rig) == "mono"
         self.mapper = Mapper(config.map, rig, one_camera) if config.map.enabled else None
         self.depth = MonoDepth(config.map.mono_depth, rig) if one_camera and config.map.enabled else None
         self.clock = clock
@@ -321,9 +322,3 @@ class Slam:
         frame, T = front.frame, front.T_keyframe_body
         if T is not None and front.track.vo.tracking is not Tracking.LOST and frame.images:
             self._seen.append(SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T))
-
-
-def sees_mono(config: Config, rig: Rig) -> bool:
-    """Return whether the front end has one camera and no depth."""
-    mode = config.frontend.mode
-    return mode == "mono" or (mode == "auto" and not rig.is_stereo and not rig.has_depth)

@@ -13,7 +13,7 @@ from vislam.frontend.result import FrontEnd, TrackResult
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
 
-__all__ = ["FrontEnd", "TrackResult", "make_frontend"]
+__all__ = ["FrontEnd", "TrackResult", "make_frontend", "mode_for"]
 
 
 def _rgbd(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
@@ -35,12 +35,13 @@ FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {
 }
 
 
-def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
-    """Return the front end that the configuration asks for; `auto` takes the richest that the rig allows.
+def mode_for(config: FrontEndConfig, rig: Rig) -> str:
+    """Return the name of the front end that a configuration means; `auto` takes the richest that the rig allows."""
+    if config.mode != "auto":
+        return config.mode
+    return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else "mono"
 
-    Raises UsageError when the rig lacks what the mode needs.
-    """
-    mode = config.mode
-    if mode == "auto":
-        mode = "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else "mono"
-    return FRONT_ENDS[mode](config, rig, seed)
+
+def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
+    """Return the front end of `mode_for`; raises UsageError when the rig lacks what the mode needs."""
+    return FRONT_ENDS[mode_for(config, rig)](config, rig, seed)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vislam.errors import DataError
 from vislam.mapping.files import replacing
-from vislam.mapping.ply import chunks
+from vislam.mapping.ply import chunks, read_rows
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
@@ -48,20 +48,10 @@ def read_pcd(path: Path) -> tuple[Points, Colors]:
     Raises DataError when it is something else or cut short; what a header promises is checked against the file's size
     before memory is taken.
     """
-    try:
-        with path.open("rb") as file:
-            count, point = _read_header(file, path)
-            available = path.stat().st_size - file.tell()
-            if count * point.itemsize > available:
-                raise DataError(
-                    f"{path} is cut: it promises {count} points of {point.itemsize} bytes, {available} bytes follow"
-                )
-            rows = np.fromfile(file, point, count)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    rows = read_rows(path, _read_header)
     points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float32)
-    if "rgb" not in (point.names or ()) or point["rgb"].itemsize != 4:
-        return points, np.full((count, 3), 128, np.uint8)
+    if "rgb" not in (rows.dtype.names or ()) or rows.dtype["rgb"].itemsize != 4:
+        return points, np.full((len(rows), 3), 128, np.uint8)
     packed = np.ascontiguousarray(rows["rgb"]).view("<u4")
     return points, np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], axis=1).astype(np.uint8)
 

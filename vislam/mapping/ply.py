@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -75,21 +75,29 @@ def read_ply(path: Path) -> tuple[Points, Colors]:
     Raises DataError when it is something else or cut short; what a header promises is checked against the file's size
     before memory is taken.
     """
+    rows = read_rows(path, _read_header)
+    points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float32)
+    if not {"red", "green", "blue"} <= set(rows.dtype.names or ()):
+        return points, np.full((len(rows), 3), 128, np.uint8)
+    return points, np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
+
+
+def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.dtype[np.void]]]) -> NDArray[np.void]:
+    """Return the points [N] of a file, whose header says how many there are and what each holds.
+
+    Raises DataError when the file cannot be read or is cut short, before memory is taken.
+    """
     try:
         with path.open("rb") as file:
-            count, vertex = _read_header(file, path)
+            count, point = read_header(file, path)
             available = path.stat().st_size - file.tell()
-            if count * vertex.itemsize > available:
+            if count * point.itemsize > available:
                 raise DataError(
-                    f"{path} is cut: it promises {count} points of {vertex.itemsize} bytes, {available} bytes follow"
+                    f"{path} is cut: it promises {count} points of {point.itemsize} bytes, {available} bytes follow"
                 )
-            rows = np.fromfile(file, vertex, count)
+            return np.fromfile(file, point, count)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float32)
-    if not {"red", "green", "blue"} <= set(vertex.names or ()):
-        return points, np.full((count, 3), 128, np.uint8)
-    return points, np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:

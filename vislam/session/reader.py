@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.errors import DataError
+from vislam.config import Config, from_data
+from vislam.errors import DataError, UsageError
 from vislam.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
 from vislam.frames import LoggedFrames
 from vislam.imu import ImuNoise
@@ -107,6 +108,15 @@ class Session:
         with readable(self.path):
             rows = self._db.execute("SELECT key, value FROM info").fetchall()
             return {key: json.loads(value) for key, value in rows}
+
+    def config(self) -> Config:
+        """Return the settings of the run; raises DataError when they are damaged, or of another version."""
+        try:
+            return from_data(self.info()["config"], source=str(self.path))
+        except (KeyError, TypeError, AttributeError, UsageError) as error:
+            raise DataError(
+                f"{error}; the settings stored with the run are of another version, run it again"
+            ) from error
 
     @property
     def first_id(self) -> int:

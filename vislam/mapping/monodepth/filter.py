@@ -71,11 +71,6 @@ class DepthFilter:
         return np.asarray(self.belief.state == CONVERGED)
 
     @property
-    def searching(self) -> int:
-        """How many pixels still cost time."""
-        return int(np.count_nonzero(self.belief.state == SEARCHED))
-
-    @property
     def typical_rho(self) -> float:
         """Median inverse depth in 1/m of the pixels that are searched or known."""
         live = (self.belief.state == SEARCHED) | (self.belief.state == CONVERGED)
