@@ -1,0 +1,28 @@
+"""The health word: what the controller must know before it trusts a pose, as bits that travel in every datagram."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+
+class Health(IntFlag):
+    """32 bits. The low half says how the estimate is, the high half what ails the sensors; 0 is not yet started."""
+
+    LEVELLED = 1 << 0  # gravity is known
+    VISION_OK = 1 << 1  # vision corrects the filter
+    DEAD_RECKONING = 1 << 2  # no vision: inertial data, wheels' constraint and rest alone
+    INVALID = 1 << 3  # position sigma is beyond the stated limit: do not steer by it
+    AT_REST = 1 << 4
+    MAG_OK = 1 << 5
+    GATE_REJECT = 1 << 6  # vision contradicts the filter now
+    IMU_MISSING = 1 << 16  # no sample within the time that the source allows
+    IMU_GAP = 1 << 17  # samples were lost since the last word
+    ACCEL_SATURATED = 1 << 18
+    GYRO_SATURATED = 1 << 19
+    ACCEL_FAULT = 1 << 20  # chip missing, stuck or failed its self-test
+    GYRO_FAULT = 1 << 21
+    MAG_FAULT = 1 << 22
+    BUS_FAULT = 1 << 23  # NACK, stuck bus, frames that fail their check
+    TEMPERATURE_DRIFT = 1 << 24  # too far from where the biases were calibrated
+    CLOCK_STEP = 1 << 25  # device time and host time parted and were joined again
+    CAMERA_MISSING = 1 << 26
