@@ -1,0 +1,85 @@
+"""PoseGraphProblem: poses to estimate and relative measurements between them, as pose-graph files hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from vislam.batch.graph_kernels import chi2_2d, chi2_3d
+from vislam.errors import DataError
+from vislam.messages import Array
+
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseGraphProblem:
+    """A pose graph in the plane (d = 2, tangents of k = 3) or in space (d = 3, k = 6): measurements and a start.
+
+    Tangents and information matrices are ordered rotation, then translation (2D: angle, x, y), on the body side.
+    The error of an edge from i to j with measurement Z is r = Log(Z^-1 @ T_world_i^-1 @ T_world_j), the logarithm of
+    SE(2) or SE(3). The cost is chi2 = sum of r^T @ information @ r, without a prior and without a factor 1/2: twice the
+    error that gtsam 4.3 gives for the same file. Every array is C-contiguous.
+    """
+
+    dimension: int  # 2 or 3
+    ids: Ids  # [N] ascending, as the file names the poses; never negative
+    poses: Array  # [N, d + 1, d + 1] T_world_pose to start from; all NaN where there is none
+    fixed: NDArray[np.bool_]  # [N] poses that keep their value
+    edges: Ids  # [E, 2] indices (not ids) of the poses from and to
+    measurements: Array  # [E, d + 1, d + 1] T_from_to
+    information: Array  # [E, k, k] symmetric, positive semidefinite
+    passed_lines: tuple[str, ...] = ()  # of landmarks and parameters: kept, never optimised
+    notes: tuple[str, ...] = field(default=())  # what a reader found odd and how it went about it
+
+    def __post_init__(self) -> None:
+        d, n, m = self.dimension, len(self.ids), len(self.edges)
+        k = 3 * (d - 1)
+        shapes = {"poses": (n, d + 1, d + 1), "fixed": (n,), "edges": (m, 2)}
+        shapes |= {"measurements": (m, d + 1, d + 1), "information": (m, k, k)}
+        wrong = {name: getattr(self, name).shape for name in shapes if getattr(self, name).shape != shapes[name]}
+        if d not in (2, 3) or wrong:
+            raise DataError(f"a pose graph of dimension {d}, {n} poses and {m} edges cannot have the shapes {wrong}")
+        if n and (self.ids[0] < 0 or np.any(np.diff(self.ids) <= 0)):
+            raise DataError("the ids of a pose graph must ascend, without repetition, from 0 at least")
+        if m and (self.edges.min() < 0 or self.edges.max() >= n or np.any(self.edges[:, 0] == self.edges[:, 1])):
+            raise DataError(f"an edge must join two different poses of the {n} that there are")
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """Which poses [N] have an initial value."""
+        return ~np.isnan(self.poses[:, 0, 0])
+
+    @property
+    def tangent(self) -> int:
+        """Dimension of a pose's tangent: 3 in the plane, 6 in space."""
+        return 3 * (self.dimension - 1)
+
+    def chi2(self, poses: Array, weights: Array | None = None) -> float:
+        """Return the cost (see the class) of poses [N, d + 1, d + 1]; `weights` [E] multiply the edges' terms."""
+        return float(np.dot(self.edge_chi2(poses), np.ones(len(self.edges)) if weights is None else weights))
+
+    def edge_chi2(self, poses: Array) -> Array:
+        """Return the terms [E] that sum up to the cost."""
+        out = np.empty(len(self.edges))
+        kernel = chi2_2d if self.dimension == 2 else chi2_3d
+        kernel(self.edges, np.ascontiguousarray(poses, dtype=np.float64), self.measurements, self.information, out)
+        return out
+
+    def components(self) -> Ids:
+        """Return for each pose [N] the number of the connected part that it is in, counted in the order of the ids."""
+        n, m = len(self.ids), len(self.edges)
+        joined = coo_array((np.ones(m, dtype=np.int8), (self.edges[:, 0], self.edges[:, 1])), shape=(n, n))
+        _, labels = connected_components(joined, directed=False)
+        _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+        rank = np.empty(len(first), dtype=np.int64)
+        rank[np.argsort(first)] = np.arange(len(first))
+        return rank[inverse]
+
+    def with_poses(self, poses: Array) -> PoseGraphProblem:
+        """Return the problem with other poses to start from."""
+        return replace(self, poses=np.ascontiguousarray(poses, dtype=np.float64))
