@@ -1,0 +1,259 @@
+"""What a controller reads: the struct, its C header, shared memory, datagrams, prediction."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+import uuid
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vislam.errors import DataError, UsageError
+from vislam.geometry import se3_exp, so3_exp, so3_log, transform
+from vislam.hw.health import Health
+from vislam.live.published_pose import HEADER, LAYOUT, SIZE, PublishedPose, of_base, pack, unpack
+from vislam.live.publisher import PoseListener, PosePublisher, PoseReader
+from vislam.live.slot import SlotReader, SlotWriter
+from vislam.messages import NavState
+
+
+def random_pose(seed: int = 3, **changes: object) -> PublishedPose:
+    rng = np.random.default_rng(seed)
+
+    def covariance(n: int) -> np.ndarray:
+        A = rng.normal(size=(n, n)) * 0.01
+        return A @ A.T
+
+    twist = np.zeros((6, 6))
+    twist[:3, :3], twist[3:, 3:] = covariance(3), np.diag(rng.uniform(1e-6, 1e-4, 3))
+    values = {
+        "t_ns": 10**12 + 5, "published_ns": 10**12 + 1005, "sequence": 7, "health": Health.LEVELLED | Health.VISION_OK,
+        "T_odom_base": se3_exp(rng.normal(size=6)), "velocity_m_s": rng.normal(size=3),
+        "rate_rad_s": rng.normal(size=3),
+        "pose_covariance": covariance(6), "twist_covariance": twist, "T_map_odom": se3_exp(rng.normal(size=6)),
+        "map_revision": 12, "reset_counter": 2, "vision_age_s": 0.125,
+    }  # fmt: skip
+    return PublishedPose(**(values | changes))  # type: ignore[arg-type]
+
+
+def test_pack_and_unpack_are_inverse() -> None:
+    pose = random_pose()
+    again = unpack(pack(pose))
+    assert len(pack(pose)) == SIZE == LAYOUT.itemsize
+    for name in ("t_ns", "published_ns", "sequence", "health", "map_revision", "reset_counter", "vision_age_s"):
+        assert getattr(again, name) == getattr(pose, name), name
+    np.testing.assert_array_equal(again.T_odom_base[:3, 3], pose.T_odom_base[:3, 3])  # double: odom may be far
+    for name in ("T_odom_base", "T_map_odom", "velocity_m_s", "rate_rad_s", "pose_covariance", "twist_covariance"):
+        np.testing.assert_allclose(getattr(again, name), getattr(pose, name), rtol=1e-6, atol=3e-7, err_msg=name)
+    assert unpack(pack(random_pose(vision_age_s=float("inf")))).vision_age_s == float("inf")
+
+
+@given(st.integers(0, SIZE - 1), st.integers(1, 255))
+def test_a_changed_byte_is_never_taken_for_a_pose(place: int, change: int) -> None:
+    data = bytearray(pack(random_pose()))
+    data[place] ^= change
+    with pytest.raises(DataError):
+        unpack(bytes(data))
+
+
+@given(st.binary(max_size=2 * SIZE))
+def test_garbage_is_refused(data: bytes) -> None:
+    with pytest.raises(DataError):
+        unpack(data)
+
+
+_PROGRAM = r"""
+#include <stdio.h>
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <unistd.h>
+#include "vislam_pose.h"
+_Static_assert(sizeof(vislam_pose) == 256, "size");
+#define FIELD(name) printf("%zu ", offsetof(vislam_pose, name));
+int main(int count, char **path) {
+    FIELDS
+    printf("\n");
+    int file = open(path[1], O_RDONLY);
+    const vislam_pose_slot *slot = mmap(NULL, sizeof *slot, PROT_READ, MAP_SHARED, file, 0);
+    vislam_pose pose;
+    if (!vislam_pose_read(slot, &pose)) return 2;
+    printf("%u %.17g %.9g %u %lld\n", pose.sequence, pose.position_m[1], pose.pose_covariance[20], pose.health,
+           (long long)pose.stamp_sample_ns);
+    return 0;
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+def test_the_c_header_reads_what_is_published(tmp_path: Path) -> None:
+    name, pose = f"vislam-test-{uuid.uuid4().hex}", random_pose()
+    fields = " ".join(f"FIELD({field})" for field in LAYOUT.names or ())
+    (tmp_path / "read.c").write_text(_PROGRAM.replace("FIELDS", fields))
+    program = tmp_path / "read"
+    command = ["cc", "-std=c11", "-Wall", "-Werror", "-I", str(HEADER.parent), "-o", str(program)]
+    subprocess.run([*command, str(tmp_path / "read.c")], check=True)
+    publisher = PosePublisher(name, ())
+    try:
+        publisher.publish(pose)
+        done = subprocess.run([str(program), f"/dev/shm/{name}"], check=True, capture_output=True, text=True)
+    finally:
+        publisher.close()
+    offsets, values = done.stdout.splitlines()
+    assert [int(word) for word in offsets.split()] == [LAYOUT.fields[field][1] for field in LAYOUT.names]
+    sequence, y, last, health, stamp = values.split()
+    assert (int(sequence), int(health), int(stamp)) == (pose.sequence, int(pose.health), pose.t_ns)
+    assert float(y) == pose.T_odom_base[1, 3]
+    assert float(last) == pytest.approx(pose.pose_covariance[5, 5], rel=1e-6)
+
+
+def test_the_header_knows_every_health_bit() -> None:
+    text = HEADER.read_text()
+    for bit in Health:
+        assert f"VISLAM_{bit.name} = 1u << {bit.value.bit_length() - 1}" in text
+
+
+def test_publishing_in_shared_memory_and_by_datagram(tmp_path: Path) -> None:
+    name = f"vislam-test-{uuid.uuid4().hex}"
+    listener = PoseListener(f"unix:{tmp_path / 'pose.sock'}")
+    publisher = PosePublisher(name, (f"unix:{tmp_path / 'pose.sock'}", "udp:127.0.0.1:9"))
+    reader = PoseReader(name)
+    try:
+        assert reader.latest() is None
+        for sequence in (1, 2):
+            publisher.publish(random_pose(sequence=sequence))
+        latest, first, second = reader.latest(), listener.next(1.0), listener.next(1.0)
+        assert latest is not None and first is not None and second is not None
+        assert (latest.sequence, first.sequence, second.sequence) == (2, 1, 2)
+        assert listener.next(0.0) is None
+        for _ in range(2000):  # nobody takes them: the publisher must not wait
+            publisher.publish(random_pose())
+        assert publisher.counters["datagrams_refused"] > 0
+    finally:
+        publisher.close()
+        publisher.close()
+        listener.close()
+        reader.close()
+    assert not Path(f"/dev/shm/{name}").exists()
+    with pytest.raises(DataError, match="is `vislam live` running"):
+        PoseReader(name)
+
+
+def test_nothing_goes_beyond_this_machine_unasked() -> None:
+    for address in ("udp:192.0.2.1:5000", "udp:0.0.0.0:5000"):
+        with pytest.raises(UsageError, match="allow-remote"):
+            PosePublisher("vislam-test", (address,))
+    for address in ("tcp:127.0.0.1:1", "udp:127.0.0.1", "udp::", "udp:127.0.0.1:99999"):
+        with pytest.raises(UsageError, match="no place"):
+            PosePublisher("vislam-test", (address,))
+
+
+def _write_for_ever(name: str, ready: object, stop: object) -> None:
+    slot, k = SlotWriter(name, 4096), 0
+    while not stop.is_set():  # type: ignore[attr-defined]
+        k += 1
+        slot.write(bytes([k % 256]) * 4096)
+        time.sleep(2e-5)
+        if k == 1:
+            ready.set()  # type: ignore[attr-defined]
+    slot.close()
+
+
+def test_a_reader_never_sees_half_of_two_values() -> None:
+    context, name = get_context("spawn"), f"vislam-test-{uuid.uuid4().hex}"
+    ready, stop = context.Event(), context.Event()
+    writer = context.Process(target=_write_for_ever, args=(name, ready, stop))
+    writer.start()
+    try:
+        assert ready.wait(60.0)
+        slot, last, seen = SlotReader(name), 0, 0
+        for _ in range(200_000):
+            read = slot.read()
+            if read is None:  # the writer was in the way every time
+                continue
+            sequence, value = read
+            assert value == bytes([sequence % 256]) * 4096
+            assert sequence >= last
+            seen, last = seen + (sequence > last), sequence
+            if seen == 200:
+                break
+        assert seen > 10
+    finally:
+        stop.set()
+        writer.join(10.0)
+    assert not Path(f"/dev/shm/{name}").exists()
+
+
+def test_a_new_writer_takes_over_what_a_killed_one_left() -> None:
+    name = f"vislam-test-{uuid.uuid4().hex}"
+    old = SlotWriter(name, 8)
+    new = SlotWriter(name, 8)
+    new.write(b"new")
+    old.close()  # is no longer the owner
+    assert SlotReader(name).read() == (1, b"new")
+    new.close()
+    assert not Path(f"/dev/shm/{name}").exists()
+
+
+def test_prediction_goes_along_the_arc_and_its_covariance_covers_what_may_happen() -> None:
+    """Monte Carlo: true twist drawn from the covariance, constant acceleration from its sigma."""
+    rng = np.random.default_rng(11)
+    pose = random_pose(
+        T_odom_base=transform(so3_exp(np.array([0.1, -0.2, 1.0])), np.array([3.0, 4.0, 0.2])),
+        velocity_m_s=np.array([1.0, 0.05, 0.0]), rate_rad_s=np.array([0.0, 0.05, 0.8]),
+    )  # fmt: skip
+    dt = 0.2
+    predicted = pose.predict(pose.t_ns + round(dt * 1e9), 0.5, 0.5)
+    errors = []
+    R0, p0 = pose.T_odom_base[:3, :3], pose.T_odom_base[:3, 3]
+    for _ in range(400):
+        start = rng.multivariate_normal(np.zeros(6), pose.pose_covariance)
+        twist = rng.multivariate_normal(np.concatenate([pose.velocity_m_s, pose.rate_rad_s]), pose.twist_covariance)
+        accel = rng.normal(size=6) * 0.5
+        R, p, steps = so3_exp(start[3:]) @ R0, p0 + start[:3], 40
+        for k in range(steps):
+            now = twist + accel * (k + 0.5) * dt / steps
+            p = p + R @ so3_exp(now[3:] * 0.5 * dt / steps) @ now[:3] * dt / steps
+            R = R @ so3_exp(now[3:] * dt / steps)
+        e = np.concatenate([p - predicted.T_odom_base[:3, 3], so3_log(R @ predicted.T_odom_base[:3, :3].T)])
+        errors.append(e @ np.linalg.solve(predicted.pose_covariance, e))
+    assert 5.2 < np.mean(errors) < 6.8  # 6 degrees of freedom, 400 runs: sigma of the mean is 0.17
+    with pytest.raises(DataError, match="predicted forward only"):
+        pose.predict(pose.t_ns - 1)
+
+
+def test_the_base_and_its_covariance_follow_from_the_state() -> None:
+    """Against numerical differentiation of the same quantities."""
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(15, 15))
+    covariance = A @ A.T * 1e-6
+    gyro, offset = np.array([0.1, -0.2, 0.7]), np.array([-0.3, 0.05, -0.2])
+    state = NavState(
+        5, se3_exp(rng.normal(size=6)), rng.normal(size=3), rng.normal(size=3) * 0.01, np.zeros(3), covariance
+    )
+
+    def observed(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        T = transform(state.T_world_body[:3, :3] @ so3_exp(d[:3]), state.T_world_body[:3, 3] + d[3:6])
+        moved = NavState(
+            5, T, state.velocity_world_m_s + d[6:9], state.gyro_bias_rad_s + d[9:12], np.zeros(3), covariance
+        )
+        T_base, speed, rate, _, _ = of_base(moved, gyro, 0.0, offset)
+        return T_base, np.concatenate([speed, rate])
+
+    T0, twist0 = observed(np.zeros(15))
+    J, K, step = np.zeros((6, 15)), np.zeros((6, 15)), 1e-6
+    for i in range(15):
+        T, twist = observed(step * np.eye(15)[i])
+        J[:3, i] = (T[:3, 3] - T0[:3, 3]) / step
+        J[3:, i] = so3_log(T[:3, :3] @ T0[:3, :3].T) / step
+        K[:, i] = (twist - twist0) / step
+    _, _, _, pose_covariance, twist_covariance = of_base(state, gyro, 0.0, offset)
+    np.testing.assert_allclose(pose_covariance, J @ covariance @ J.T, rtol=1e-4, atol=1e-11)
+    full = K @ covariance @ K.T
+    np.testing.assert_allclose(twist_covariance[:3, :3], full[:3, :3], rtol=1e-4, atol=1e-11)
+    np.testing.assert_allclose(twist_covariance[3:, 3:], full[3:, 3:], rtol=1e-4, atol=1e-11)

@@ -1,0 +1,94 @@
+/* The pose that `vislam live` publishes: in shared memory (/dev/shm/NAME), and as one datagram per inertial sample.
+ *
+ * Little-endian, 256 bytes, no padding; docs/cart.md explains the fields. Check magic, version, size and crc32, then
+ * the health word: a controller must not steer by a pose with VISLAM_INVALID or VISLAM_IMU_MISSING set.
+ */
+#ifndef VISLAM_POSE_H
+#define VISLAM_POSE_H
+
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#define VISLAM_POSE_MAGIC 0x4F505356u /* "VSPO" */
+#define VISLAM_POSE_VERSION 1
+#define VISLAM_NO_VISION_MS 0xFFFFu
+
+enum vislam_health {
+    VISLAM_LEVELLED = 1u << 0,          /* gravity is known */
+    VISLAM_VISION_OK = 1u << 1,         /* vision corrects the filter */
+    VISLAM_DEAD_RECKONING = 1u << 2,    /* no vision */
+    VISLAM_INVALID = 1u << 3,           /* do not steer by it */
+    VISLAM_AT_REST = 1u << 4,
+    VISLAM_MAG_OK = 1u << 5,
+    VISLAM_GATE_REJECT = 1u << 6,       /* vision contradicts the filter now */
+    VISLAM_IMU_MISSING = 1u << 16,
+    VISLAM_IMU_GAP = 1u << 17,
+    VISLAM_ACCEL_SATURATED = 1u << 18,
+    VISLAM_GYRO_SATURATED = 1u << 19,
+    VISLAM_ACCEL_FAULT = 1u << 20,
+    VISLAM_GYRO_FAULT = 1u << 21,
+    VISLAM_MAG_FAULT = 1u << 22,
+    VISLAM_BUS_FAULT = 1u << 23,
+    VISLAM_TEMPERATURE_DRIFT = 1u << 24,
+    VISLAM_CLOCK_STEP = 1u << 25,
+    VISLAM_CAMERA_MISSING = 1u << 26
+};
+
+typedef struct vislam_pose {
+    uint32_t magic;
+    uint16_t version;
+    uint16_t size;                      /* 256 */
+    uint32_t sequence;                  /* one more with each */
+    uint32_t health;                    /* enum vislam_health */
+    int64_t stamp_sample_ns;            /* CLOCK_MONOTONIC of the inertial sample */
+    int64_t stamp_publish_ns;           /* CLOCK_MONOTONIC */
+    double position_m[3];               /* base in odom */
+    float orientation_xyzw[4];          /* base to odom */
+    float velocity_m_s[3];              /* of the base, in its own axes */
+    float rate_rad_s[3];                /* in axes of the base */
+    float pose_covariance[21];          /* upper triangle by rows: x, y, z, rotation about X, Y, Z of odom */
+    float velocity_covariance[6];       /* upper triangle by rows, axes of the base */
+    float rate_variance[3];             /* axes of the base */
+    float map_odom_position_m[3];       /* odom in map; jumps when a loop closes */
+    float map_odom_orientation_xyzw[4]; /* odom to map */
+    uint32_t map_revision;              /* 0: map and odom coincide */
+    uint16_t reset_counter;
+    uint16_t vision_age_ms;             /* VISLAM_NO_VISION_MS: never, or longer ago */
+    uint32_t crc32;                     /* of the 252 bytes before; polynomial 0xEDB88320, as in zlib */
+} vislam_pose;
+
+typedef struct vislam_pose_slot {       /* what is mapped from shared memory */
+    uint64_t sequence;                  /* written last */
+    uint32_t length;
+    uint32_t crc32;                     /* of the pose's 256 bytes */
+    vislam_pose pose;
+    uint64_t sequence_first;            /* written first */
+} vislam_pose_slot;
+
+static inline uint32_t vislam_crc32(const void *data, size_t length) {
+    const uint8_t *bytes = (const uint8_t *)data;
+    uint32_t crc = 0xFFFFFFFFu;
+    for (size_t i = 0; i < length; ++i) {
+        crc ^= bytes[i];
+        for (int bit = 0; bit < 8; ++bit) crc = (crc >> 1) ^ (0xEDB88320u & (0u - (crc & 1u)));
+    }
+    return ~crc;
+}
+
+/* Whether 256 bytes, from a datagram or a slot, are a sound pose. */
+static inline int vislam_pose_is_sound(const vislam_pose *pose) {
+    return pose->magic == VISLAM_POSE_MAGIC && pose->version == VISLAM_POSE_VERSION &&
+           pose->size == sizeof(vislam_pose) && vislam_crc32(pose, offsetof(vislam_pose, crc32)) == pose->crc32;
+}
+
+/* Copy the newest pose out of shared memory; 0 when there is none yet, or the writer was in between (try again). */
+static inline int vislam_pose_read(const volatile vislam_pose_slot *slot, vislam_pose *out) {
+    uint64_t sequence = slot->sequence;
+    __sync_synchronize();
+    memcpy(out, (const void *)&slot->pose, sizeof *out);
+    __sync_synchronize();
+    return sequence != 0 && slot->sequence_first == sequence && vislam_pose_is_sound(out);
+}
+
+#endif
