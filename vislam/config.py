@@ -534,6 +534,32 @@ class ViewConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class BridgeClockConfig:
+    """The line that turns the serial bridge's clock into the host's."""
+
+    window_s: float = 20.0  # of arrivals that the line is laid under; 0.1 ms of jitter then costs 5 ppm of rate
+    bin_s: float = 0.1  # the least delayed arrival of each counts; the line is laid anew so often
+    settle_s: float = 0.5  # no sample is passed before the rate has been seen for so long
+    max_drift: float = 0.025  # of the rate; a ceramic resonator, as on an Arduino Nano, is off by up to 0.5 %
+    step_s: float = 0.1  # before its time by so much is no jitter: the device restarted or the host slept
+    late_s: float = 2.0  # everything late by step_s for so long: the device's clock lost time
+    max_slew: float = 0.05  # share of an interval by which a better line may stretch it: 5 ms are caught up in 0.1 s
+
+
+@dataclass(frozen=True, slots=True)
+class SerialConfig:
+    """The serial bridge: a microcontroller that reads the inertial chips, docs/cart.md."""
+
+    baud: int = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
+    delay_s: float | None = None  # from reading the chips to the last byte; None: of the wire, and 0.5 ms of the chips
+    missing_s: float = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
+    start_s: float = 4.0  # an Uno's boot loader runs 2 s after the port is opened; silent for longer, it is opened anew
+    reopen_s: float = 0.5  # between attempts to open a port that is not there
+    stuck_s: float = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
+    clock: BridgeClockConfig = field(default_factory=BridgeClockConfig)
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole configuration of a run."""
 
