@@ -80,6 +80,13 @@ class PoseGraphProblem:
         rank[np.argsort(first)] = np.arange(len(first))
         return rank[inverse]
 
+    def anchors(self) -> Ids:
+        """Return the poses (indices) that hold the graph: the fixed ones, and the first of each part that has none."""
+        labels = self.components()
+        held = np.unique(labels[self.fixed])
+        first = np.unique(labels, return_index=True)[1]
+        return np.sort(np.concatenate([np.flatnonzero(self.fixed), np.delete(first, held)]))
+
     def with_poses(self, poses: Array) -> PoseGraphProblem:
         """Return the problem with other poses to start from."""
         return replace(self, poses=np.ascontiguousarray(poses, dtype=np.float64))
