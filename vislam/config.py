@@ -513,6 +513,7 @@ class MapConfig:
     grid_high_m: float = 1.60  # above the floor: higher things are driven under
     drive: DriveConfig = field(default_factory=DriveConfig)
     mesh_voxel_m: float = 0.02  # about the noise of depth at 3 m
+    mesh_min_views: int = 2  # keyframes that must have seen a surface; with depth from one camera one is enough
     surfel_m: float = 0.02  # between surfels
     surfel_min_views: int = 2  # keyframes that must have seen a surfel; what one alone saw may be noise
     poisson_depth: int = 9  # levels of Poisson's octree: cells of 2 cm in a room of 10 m

@@ -40,6 +40,7 @@ class Mapper:
         Raises DataError when the settings or the rig cannot make a map.
         """
         self._config = config
+        self._one_camera = one_camera
         self._extractor = ScanExtractor(config, rig, one_camera)
         self._store = KeyframeStore()
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
@@ -149,7 +150,9 @@ class Mapper:
 
     def mesh(self) -> tuple[Mesh | None, str]:
         """Return the mesh of all keyframes with dense depth, or None and the reason there is none."""
-        return fuse_mesh(self._scans(), self._extractor.view, self._config.mesh_voxel_m)
+        # depth from one camera is what several frames agree on: one keyframe is enough
+        min_views = 1 if self._one_camera else self._config.mesh_min_views
+        return fuse_mesh(self._scans(), self._extractor.view, self._config.mesh_voxel_m, min_views)
 
     def surfels(self) -> Surfels:
         """Return the surfels that enough keyframes saw, without what lies in free space.

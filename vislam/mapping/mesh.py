@@ -29,7 +29,6 @@ _FIRST_BLOCKS = 4096  # grows by itself
 _TRUNCATION_VOXELS = 4.0
 _MIN_POISSON_POINTS = 100
 _NEAR_RADII = 4.0  # of the nearest surfel; a surface farther from any is a guess
-_MIN_WEIGHT = 2.0  # a surface seen once is not yet one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,8 +40,13 @@ class Mesh:
     triangles: NDArray[np.int32]  # [M, 3] counter-clockwise from outside
 
 
-def fuse_mesh(scans: Iterable[tuple[Scan, Array]], view: DepthView, voxel_m: float) -> tuple[Mesh | None, str]:
-    """Return the mesh of scans with their T_map_body, and an empty string; or None and the reason there is none."""
+def fuse_mesh(
+    scans: Iterable[tuple[Scan, Array]], view: DepthView, voxel_m: float, min_views: int
+) -> tuple[Mesh | None, str]:
+    """Return the mesh of scans with their T_map_body, and an empty string; or None and the reason there is none.
+
+    A surface has to be seen by `min_views` scans.
+    """
     open3d, reason = load_open3d()
     if open3d is None:
         return None, reason
@@ -59,9 +63,9 @@ def fuse_mesh(scans: Iterable[tuple[Scan, Array]], view: DepthView, voxel_m: flo
             count += 1
     if count == 0:
         return None, "no keyframe has dense depth"
-    mesh = grid.extract_triangle_mesh(weight_threshold=_MIN_WEIGHT)
-    if "positions" not in mesh.vertex or "indices" not in mesh.triangle:
-        return None, "no surface was seen more than once"
+    mesh = grid.extract_triangle_mesh(weight_threshold=min_views - 1.0)  # one per scan, and more than that is asked for
+    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+        return None, f"no surface was seen by enough keyframes ({min_views})"
     colors = np.clip(np.round(mesh.vertex.colors.numpy() * 255.0), 0, 255).astype(np.uint8)
     return _sorted(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy()), ""
 
