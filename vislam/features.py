@@ -36,7 +36,9 @@ class FlowSettings:
     max_back_px: float = 0.7  # largest distance between a corner and where the way back ends
     min_eigenvalue: float = 1e-4  # of the normalised gradient matrix; windows below are flat
     iterations: int = 30
-    epsilon_px: float = 0.01
+    epsilon_px: float = 0.02
+    back_iterations: int = 10
+    back_epsilon_px: float = 0.1  # the way back only has to tell right from wrong
 
 
 def detect_corners(
@@ -135,8 +137,10 @@ def follow(
     if len(tried) == 0:
         return found, difference
     start = pixels[tried].astype(np.float32)
-    there, seen, error = _flow(source, target, start, guess[tried].astype(np.float32), settings.levels, settings)
-    back, seen_back, _ = _flow(target, source, there, start, settings.back_levels, settings)
+    forth = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, settings.iterations, settings.epsilon_px)
+    returns = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, settings.back_iterations, settings.back_epsilon_px)
+    there, seen, error = _flow(source, target, start, guess[tried].astype(np.float32), settings.levels, forth, settings)
+    back, seen_back, _ = _flow(target, source, there, start, settings.back_levels, returns, settings)
     good = seen & seen_back & (np.linalg.norm(back - start, axis=1) <= settings.max_back_px)
     height, width = target.shape
     good &= (there[:, 0] >= 0.0) & (there[:, 0] <= width - 1) & (there[:, 1] >= 0.0) & (there[:, 1] <= height - 1)
@@ -159,9 +163,9 @@ def _flow(
     pixels: NDArray[np.float32],
     guess: NDArray[np.float32],
     levels: int,
+    criteria: tuple[int, int, float],
     s: FlowSettings,
 ) -> tuple[NDArray[np.float32], Bools, NDArray[np.float32]]:
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, s.iterations, s.epsilon_px)
     there, status, error = cv2.calcOpticalFlowPyrLK(
         source, target, pixels[:, None], guess[:, None].copy(), winSize=(s.window_px, s.window_px), maxLevel=levels,
         criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=s.min_eigenvalue,
@@ -212,14 +216,17 @@ def match(
     return np.asarray(_match(words_a, words_b, ratio, max_distance), dtype=np.int64)
 
 
-def find_tags(image: ImageU8, family: str) -> tuple[Indices, Array]:
+def find_tags(image: ImageU8, family: str, min_side_px: float) -> tuple[Indices, Array]:
     """Find AprilTags (Olson 2011) of a family, as "36h11", in a grey image [H, W].
+
+    Tags with sides well below `min_side_px` are not looked for, which saves most of the time.
 
     Returns:
         Ids [T], ascending, and corners [T, 4, 2] in pixels: top left of the tag first, then clockwise as printed.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.minMarkerPerimeterRate = 0.8 * 4.0 * min_side_px / max(image.shape)  # outlines come out a little short
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_APRILTAG_{family}"))
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     if ids is None:

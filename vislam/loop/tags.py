@@ -28,7 +28,7 @@ def sight_tags(frame: Frame, camera: Camera, config: LoopConfig) -> tuple[TagSig
     """Return the tags that cam0 of a frame sees; one that is seen twice in an image tells nothing and is left out."""
     if config.tags == "off" or not frame.images:
         return ()
-    ids, corners_px = find_tags(frame.images[0], config.tags)
+    ids, corners_px = find_tags(frame.images[0], config.tags, _MIN_SIDE_PX)
     sightings = []
     for tag_id, corners in zip(ids.tolist(), corners_px, strict=True):
         side_px = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
