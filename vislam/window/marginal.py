@@ -56,9 +56,7 @@ def marginalise(
         X, X_first, held, leaving.points, calibration, leaving.views, camera, poses_at, A, g, A_points, g_points, cross
     )
     schur.eliminate(np.empty((L, 3, 3)), A_points, g_points, cross, 0.0, poses_at, A, g)
-    diagonal = np.diag(A).copy()
-    A = A + A.T  # only the upper triangle was filled
-    np.fill_diagonal(A, diagonal)
+    A = np.triu(A) + np.triu(A, 1).T  # only the upper triangle counts
     gone = where[0]
     kept = np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
     gain = A[np.ix_(kept, gone)] @ _inverse(A[np.ix_(gone, gone)])

@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from vislam.messages import Array
-from vislam.window.layout import CALIBRATION
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -26,40 +25,33 @@ def invert(H: Array, damping: float, inverse: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def eliminate(
     points_at: Array, A_points: Array, g_points: Array, cross: Array, damping: float, poses_at: int, A: Array, g: Array
 ) -> bool:
     """Take the landmarks out of the normal equations A, g (Schur complement); False if one is indefinite.
 
-    `points_at` [L, 3, 3] gets the inverses of the landmarks' own blocks, for `follow`.
+    `points_at` [L, 3, 3] gets the inverses of the landmarks' own blocks, for `follow`. The upper triangle of A is what
+    counts; the lower one is filled with what the product leaves there.
     """
-    width = cross.shape[2]
-    y = np.empty((3, width))
+    carried = np.empty_like(cross)
+    if not _carry(points_at, A_points, cross, damping, carried):
+        return False
+    rows = carried.reshape(-1, cross.shape[2])
+    A[poses_at:, poses_at:] -= rows.T @ cross.reshape(rows.shape)
+    g[poses_at:] -= rows.T @ g_points.ravel()
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _carry(points_at: Array, A_points: Array, cross: Array, damping: float, carried: Array) -> bool:
+    """Multiply the landmarks' inverses [L, 3, 3] with their cross terms [L, 3, D]; False if one is indefinite."""
     for p in range(len(A_points)):
-        inverse, W = points_at[p], cross[p]
+        inverse, W, y = points_at[p], cross[p], carried[p]
         if not invert(A_points[p], damping, inverse):
             return False
-        q = g_points[p]
-        for j in range(width):
-            w0, w1, w2 = W[0, j], W[1, j], W[2, j]
-            y[0, j] = inverse[0, 0] * w0 + inverse[0, 1] * w1 + inverse[0, 2] * w2
-            y[1, j] = inverse[1, 0] * w0 + inverse[1, 1] * w1 + inverse[1, 2] * w2
-            y[2, j] = inverse[2, 0] * w0 + inverse[2, 1] * w1 + inverse[2, 2] * w2
-            g[poses_at + j] -= y[0, j] * q[0] + y[1, j] * q[1] + y[2, j] * q[2]
-        # only the columns of keyframes that see it; they lie together, and calibration lies at the end
-        end = width - CALIBRATION
-        while end > 0 and W[0, end - 1] == 0.0 and W[1, end - 1] == 0.0 and W[2, end - 1] == 0.0:
-            end -= 1
-        for i in range(width):
-            y0, y1, y2 = y[0, i], y[1, i], y[2, i]
-            if y0 == 0.0 and y1 == 0.0 and y2 == 0.0:
-                continue
-            out = A[poses_at + i, poses_at:]
-            for j in range(i, end):
-                out[j] -= y0 * W[0, j] + y1 * W[1, j] + y2 * W[2, j]
-            for j in range(max(i, width - CALIBRATION), width):
-                out[j] -= y0 * W[0, j] + y1 * W[1, j] + y2 * W[2, j]
+        for i in range(3):
+            for j in range(cross.shape[2]):
+                y[i, j] = inverse[i, 0] * W[0, j] + inverse[i, 1] * W[1, j] + inverse[i, 2] * W[2, j]
     return True
 
 
