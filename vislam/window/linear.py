@@ -1,7 +1,7 @@
 """Linear algebra of the window over LAPACK: a Cholesky factor in place, and what is solved with it.
 
-Matrices are upper triangles in rows: `A = U.T @ U`. Their transposes are lower triangles in columns, LAPACK's own order,
-so nothing is copied.
+Matrices are upper triangles in rows: `A = U.T @ U`. Their transposes are lower triangles in columns, which is LAPACK's
+own order, so nothing is copied.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _PIVOTS = (1e-12, 1e30)  # outside, information is rounding or nonsense
 
 
 def factorise(A: Array) -> bool:
-    """Replace the upper triangle of A [D, D], contiguous, by its Cholesky factor; False if A is not positive definite."""
+    """Replace the upper triangle of A [D, D], contiguous, by its Cholesky factor; False where it has none."""
     _, info = dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
     pivots = np.diag(A) ** 2
     return info == 0 and bool(((pivots > _PIVOTS[0]) & (pivots < _PIVOTS[1])).all())  # NaN is in no range
