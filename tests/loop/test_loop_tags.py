@@ -83,7 +83,7 @@ def test_what_says_nothing_is_left_out():
     assert far == ()
     image = render(np.eye(4), {3: hung(1.5, 0.0, 0.0)}, rng)
     twice = np.hstack([image[:, 160:480], image[:, 160:480]])
-    assert len(find_tags(twice, "36h11")[0]) == 2
+    assert len(find_tags(twice, "36h11", 30.0)[0]) == 2
     assert sight_tags(Frame(0, 0, (twice,)), CAMERA, config) == ()
     (frontal,) = sight_tags(Frame(0, 0, (image,)), CAMERA, load(None, {}).loop)
     assert frontal.T_cam_tag is None  # no size, no pose
