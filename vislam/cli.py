@@ -242,7 +242,22 @@ def _demo(arguments: list[str]) -> int:
     return 0
 
 
+def _simulate_graph(arguments: list[str]) -> int:
+    from vislam.batch.graph_worlds import simulate_graph, write_simulated
+    from vislam.options import SimulateGraphOptions
+
+    options = _parse(SimulateGraphOptions, arguments, "simulate")
+    graph = simulate_graph(options.graph, options.settings)
+    write_simulated(graph, options.out, options.truth, options.outliers)
+    edges, false = len(graph.problem.edges), int(graph.outlier.sum())
+    print(f"{len(graph.truth)} poses and {edges} edges ({false} false loops) in {options.out}")
+    print(f"next: vislam optimize {options.out}")
+    return 0
+
+
 def _simulate(arguments: list[str]) -> int:
+    if any(argument.partition("=")[0] == "--graph" for argument in arguments):
+        return _simulate_graph(arguments)
     from vislam.datasets.recorder import record
     from vislam.options import SimulateOptions
     from vislam.sim import open_world
@@ -543,7 +558,11 @@ _VERBS = {
     "run": _Verb(
         _run, "run the pipeline on a recording; --resume RUN goes on with one", "vislam run tum:PATH --out runs/desk"
     ),
-    "simulate": _Verb(_simulate, "record a simulated world", "vislam simulate corridor-loop --out recordings/corridor"),
+    "simulate": _Verb(
+        _simulate,
+        "record a simulated world, or with --graph make a pose graph",
+        "vislam simulate corridor-loop --out recordings/corridor",
+    ),
     "eval": _Verb(_eval, "compare a trajectory with the truth", "vislam eval runs/desk"),
     "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
     "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),

@@ -367,6 +367,20 @@ class BatchConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GraphWorldConfig:
+    """A made pose graph, as `vislam simulate --graph` writes it. Noise is white, of odometry and loops alike."""
+
+    poses: int = 1000
+    loops_per_pose: float = 1.0  # true ones; only between poses that are at most 5 m apart
+    rotation_sigma_deg: float = 1.0  # per axis; the drift of a thousand steps then needs its loops
+    translation_sigma_m: float = 0.05  # per axis; 5 % of a step, poor odometry
+    anisotropy: float = 1.0  # forward, and about z, the sigmas are this many times as large
+    outlier_fraction: float = 0.0  # of all loops
+    alias_group: int = 1  # so many false loops in a row agree, as a corridor that looks like another one gives them
+    seed: int = 0  # same seed, same graph
+
+
+@dataclass(frozen=True, slots=True)
 class LoopConfig:
     """Loop detection and verification."""
 

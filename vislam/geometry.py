@@ -166,11 +166,12 @@ def transform_points(T: Array, points: Array) -> Array:
 
 
 def invert_many(T: Array) -> Array:
-    """Return the inverses of rigid transforms [N, 4, 4]."""
+    """Return the inverses of rigid transforms [N, d + 1, d + 1], in space (d = 3) or in the plane (d = 2)."""
+    d = T.shape[1] - 1
     out = np.zeros_like(T)
-    out[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
-    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], T[:, :3, 3])
-    out[:, 3, 3] = 1.0
+    out[:, :d, :d] = T[:, :d, :d].transpose(0, 2, 1)
+    out[:, :d, d] = -np.einsum("nij,nj->ni", out[:, :d, :d], T[:, :d, d])
+    out[:, d, d] = 1.0
     return out
 
 

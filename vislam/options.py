@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from vislam.config import BatchConfig, Config, LoopTruthConfig, MapConfig
+from vislam.config import BatchConfig, Config, GraphWorldConfig, LoopTruthConfig, MapConfig
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,21 @@ class SimulateOptions:
     """Of motion and sensors; same seed, same bytes"""
     world_seed: int = 0
     """Of the place: its textures, and where things stand"""
+
+
+@dataclass(frozen=True)
+class SimulateGraphOptions:
+    """Options of `vislam simulate --graph SHAPE`: a pose graph with known truth, for `vislam optimize`."""
+
+    graph: Literal["grid3d", "torus", "sphere", "manhattan"]
+    """Shape of the path: in space, manhattan in the plane; steps of 1 m"""
+    out: Path
+    """g2o file to write; it starts from odometry"""
+    settings: Annotated[GraphWorldConfig, tyro.conf.arg(name="")] = field(default_factory=GraphWorldConfig)
+    truth: Path | None = None
+    """Write the true poses here (TUM; the id as seconds)"""
+    outliers: Path | None = None
+    """Write which loops are false here (CSV: from_id, to_id)"""
 
 
 @dataclass(frozen=True)
