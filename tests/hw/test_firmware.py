@@ -1,0 +1,115 @@
+"""The sketch for the microcontroller, compiled for this machine on a small imitation of Arduino's core."""
+
+import shutil
+import subprocess
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from needs import missing
+
+from vislam.hw.bridge_protocol import SAMPLE_WIRE_BYTES, Chips, FrameDecoder, Hello, RawSample, Status, encode
+
+SKETCH = Path(str(files("vislam.hw"))) / "firmware" / "vislam_bridge"
+FAKE = Path(__file__).parent / "fake_arduino"
+NOBODY = ("0", "0", "0")
+GYRO, MAG = str(0x68), str(0x1E)
+
+
+@pytest.fixture(scope="module")
+def bridge(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        missing("no C++ compiler for the sketch")
+    program = tmp_path_factory.mktemp("sketch") / "bridge"
+    sources = ["-I", FAKE, "-I", SKETCH, FAKE / "main.cpp", "-o", program]
+    strict = ["-std=c++11", "-Wall", "-Wextra", "-Wconversion", "-Wno-psabi", "-Werror=return-type", "-O1"]
+    result = subprocess.run([compiler, *strict, *sources], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "vislam_bridge.ino" not in result.stderr, result.stderr  # no warnings
+    return program
+
+
+def run(
+    bridge: Path, seconds: float, begin_us: int = 0, silent: tuple = NOBODY, blocked: tuple = ("0", "0")
+) -> tuple[list, bytes, str]:
+    """Return messages, the bytes they came in, and the registers that the sketch set."""
+    command = [str(bridge), str(seconds), str(begin_us), *silent, *blocked]
+    done = subprocess.run(command, capture_output=True, check=True, timeout=60)
+    decoder = FrameDecoder()
+    messages = decoder.feed(done.stdout)
+    assert decoder.bad == 0
+    return messages, done.stdout, done.stderr.decode()
+
+
+def parts(messages: list) -> tuple[list[RawSample], list[Hello]]:
+    return [m for m in messages if isinstance(m, RawSample)], [m for m in messages if isinstance(m, Hello)]
+
+
+def test_its_frames_are_ours_byte_for_byte(bridge: Path) -> None:
+    messages, wire, registers = run(bridge, 3.0)
+    assert b"".join(encode(message) for message in messages) == wire
+    samples, hellos = parts(messages)
+    assert len(samples) == pytest.approx(2.88 * 400, abs=3)  # the chips take 0.12 s to start
+    assert registers == "0b 1a 20"  # full resolution and 16 g; 2000 deg/s and 98 Hz; 1.3 gauss
+    assert [m.sequence for m in messages] == list(range(len(messages)))
+    for n, sample in enumerate(samples):
+        assert sample.accel == (n % 500, -(n % 500), 256)
+        assert sample.gyro == (-(n % 700), 0, n % 700)
+        assert sample.temperature == -13200
+        reading = n // 8  # the magnetometer is read in every eighth
+        assert sample.mag == (200 + reading % 9, reading % 9, -400)  # x, y, z from the chip's x, z, y
+        new = n % 8 == 0 and reading >= 2
+        assert sample.status == (Status.MAG_NEW if new else 0)
+    intervals = [b.t_us - a.t_us for a, b in pairwise(samples)]
+    assert min(intervals) > 2400
+    assert max(intervals) < 2600
+    assert [h.chips for h in hellos] == [Chips(0x87), Chips(7), Chips(7)]
+    hello = hellos[0]
+    assert (hello.accel_id, hello.gyro_id, hello.mag_id, hello.rate_hz) == (0xE5, 0x69, b"H43", 400)
+
+
+def test_the_scales_are_those_of_the_data_sheets(bridge: Path) -> None:
+    hello = parts(run(bridge, 0.3)[0])[1][0]
+    assert hello.accel_nm_s2 * 1e-9 * 256 == pytest.approx(9.80665, rel=1e-7)
+    assert hello.gyro_nrad_s * 1e-9 * 14.375 == pytest.approx(0.017453293, rel=1e-6)
+    assert hello.mag_pt * 1e-6 * 1090 == pytest.approx(100.0, rel=1e-5)
+    assert hello.temperature_mc * 1e-3 - 13200 * hello.temperature_nk * 1e-9 == pytest.approx(35.0, abs=1e-3)
+
+
+def test_its_clock_wraps_without_a_hole(bridge: Path) -> None:
+    samples, _ = parts(run(bridge, 2.0, begin_us=2**32 - 1_000_000)[0])
+    assert samples[0].t_us > samples[-1].t_us
+    assert all(2400 < (b.t_us - a.t_us) % 2**32 < 2600 for a, b in pairwise(samples))
+
+
+def test_a_chip_that_goes_away_is_told_and_set_up_again(bridge: Path) -> None:
+    messages = run(bridge, 3.0, silent=(GYRO, "100", "120"))[0]
+    samples, _ = parts(messages)
+    failed = [i for i, s in enumerate(samples) if Status.GYRO_ERROR in s.status]
+    assert failed[-1] - failed[0] + 1 == len(failed)
+    assert 40 < len(failed) < 1200
+    assert all(Status.ACCEL_ERROR not in s.status for s in samples)
+    assert samples[-1].gyro != samples[failed[0]].gyro
+    assert max((b.t_us - a.t_us) for a, b in pairwise(samples)) < 10_000  # the others are read on time
+
+
+def test_without_a_magnetometer_the_rest_goes_on(bridge: Path) -> None:
+    samples, hellos = parts(run(bridge, 2.0, silent=(MAG, "0", "1000000"))[0])
+    assert hellos[0].chips == Chips.ACCEL | Chips.GYRO | Chips.STARTED
+    assert all(sample.status in (Status.MAG_ERROR, Status.MAG_ERROR | Status.MISSED) for sample in samples)
+    assert samples[-1].gyro[2] == (len(samples) - 1) % 700
+
+
+def test_a_line_that_takes_nothing_leaves_holes_and_stops_nothing(bridge: Path) -> None:
+    messages = run(bridge, 2.0, blocked=("1000", "1100"))[0]
+    gaps = [(b.sequence - a.sequence) % 2**16 for a, b in pairwise(messages)]
+    assert max(gaps) == pytest.approx(41, abs=2)
+    assert sorted(gaps)[-2] == 1
+    samples, _ = parts(messages)
+    assert samples[-1].t_us - samples[-2].t_us < 2600
+
+
+def test_a_sample_fits_the_smallest_buffer() -> None:
+    assert SAMPLE_WIRE_BYTES < 64  # SERIAL_TX_BUFFER_SIZE of an AVR
