@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.config import BridgeClockConfig
-from vislam.hw.bridge_clock import HostClock
+from vislam.hw.bridge_clock import DeviceClock
 
 PERIOD_NS = 2_500_000
 HOST_BEGIN_NS = 5_000_000_000_000
 
 
 def feed(
-    clock: HostClock, true_ns: np.ndarray, device_us: np.ndarray, delay_ns: np.ndarray
+    clock: DeviceClock, true_ns: np.ndarray, device_us: np.ndarray, delay_ns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps and true times of what was passed."""
     pairs = []
@@ -45,7 +45,7 @@ def run(count: int, drift: float, device_begin_us: int = 0) -> tuple[np.ndarray,
 @settings(max_examples=6)
 @given(st.floats(-0.02, 0.02), st.integers(0, 2**32 - 1), st.integers(0, 1000))
 def test_drift_jitter_stalls_and_wraps_move_no_stamp(drift: float, device_begin_us: int, seed: int) -> None:
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(12_000, drift, device_begin_us)
     stamps, truth = feed(clock, true_ns, device_us, delays(len(true_ns), seed))
     error_ns = stamps - truth - 1_000_000  # the constant part of the delay is nobody's to know
@@ -59,7 +59,7 @@ def test_drift_jitter_stalls_and_wraps_move_no_stamp(drift: float, device_begin_
 
 
 def test_a_wrap_after_71_minutes_is_no_step() -> None:
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(8000, 0.01, 2**32 - 10_000_000)
     assert device_us[0] < 2**32 < device_us[-1]
     stamps, truth = feed(clock, true_ns, device_us, delays(8000, 1))
@@ -69,7 +69,7 @@ def test_a_wrap_after_71_minutes_is_no_step() -> None:
 
 @pytest.mark.parametrize("ran_s", [0.6, 30.0, 3000.0])
 def test_a_restarted_device_gets_a_new_line_without_loss_of_rate(ran_s: float) -> None:
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(4000, 0.02, int(ran_s * 1e6))
     feed(clock, true_ns, device_us, delays(4000, 2))
     after_ns = true_ns + 4000 * PERIOD_NS + 2_000_000_000  # boots for 2 s
@@ -82,7 +82,7 @@ def test_a_restarted_device_gets_a_new_line_without_loss_of_rate(ran_s: float) -
 
 def test_a_host_that_slept_is_one_step() -> None:
     """CLOCK_MONOTONIC stands still in sleep while the device runs on."""
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(8000, -0.01)
     device_us[4000:] += 30_000_000
     stamps, truth = feed(clock, true_ns, device_us, delays(8000, 4))
@@ -93,7 +93,7 @@ def test_a_host_that_slept_is_one_step() -> None:
 
 
 def test_a_device_clock_that_lost_time_is_one_step() -> None:
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(8000, 0.0)
     device_us[4000:] -= 400_000  # interrupts were off for 0.4 s
     keep = np.r_[0:4000, 4160:8000]
@@ -105,7 +105,7 @@ def test_a_device_clock_that_lost_time_is_one_step() -> None:
 
 def test_a_burst_after_a_long_stall_of_the_host_is_no_step() -> None:
     """What waited 5 s in the kernel comes at once."""
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(8000, 0.015)
     delay = delays(8000, 6)
     delay[3000:5000] += (true_ns[5000] - true_ns[3000:5000]).astype(np.int64)
@@ -117,7 +117,7 @@ def test_a_burst_after_a_long_stall_of_the_host_is_no_step() -> None:
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1000, 1900))
 def test_one_absurd_stamp_is_left_out(wrong_us: int, at: int) -> None:
-    clock = HostClock(BridgeClockConfig())
+    clock = DeviceClock(BridgeClockConfig())
     true_ns, device_us = run(2000, 0.01, 1_000_000)
     if abs(wrong_us - int(device_us[at])) < 200_000:
         return

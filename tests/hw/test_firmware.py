@@ -32,10 +32,15 @@ def bridge(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(
-    bridge: Path, seconds: float, begin_us: int = 0, silent: tuple = NOBODY, blocked: tuple = ("0", "0")
+    bridge: Path,
+    seconds: float,
+    begin_us: int = 0,
+    silent: tuple = NOBODY,
+    blocked: tuple = ("0", "0"),
+    forgets_at: int = -1,
 ) -> tuple[list, bytes, str]:
     """Return messages, the bytes they came in, and the registers that the sketch set."""
-    command = [str(bridge), str(seconds), str(begin_us), *silent, *blocked]
+    command = [str(bridge), str(seconds), str(begin_us), *silent, *blocked, str(forgets_at)]
     done = subprocess.run(command, capture_output=True, check=True, timeout=60)
     decoder = FrameDecoder()
     messages = decoder.feed(done.stdout)
@@ -93,6 +98,16 @@ def test_a_chip_that_goes_away_is_told_and_set_up_again(bridge: Path) -> None:
     assert all(Status.ACCEL_ERROR not in s.status for s in samples)
     assert samples[-1].gyro != samples[failed[0]].gyro
     assert max((b.t_us - a.t_us) for a, b in pairwise(samples)) < 10_000  # the others are read on time
+
+
+@pytest.mark.parametrize(("address", "error"), [(0x53, Status.ACCEL_ERROR), (0x68, Status.GYRO_ERROR)])
+def test_a_chip_that_lost_its_settings_is_not_believed(bridge: Path, address: int, error: Status) -> None:
+    messages, _, registers = run(bridge, 2.0, silent=(str(address), "0", "0"), forgets_at=400)
+    samples, _ = parts(messages)
+    failed = [i for i, s in enumerate(samples) if error in s.status]
+    assert 1 <= len(failed) <= 60
+    assert failed[-1] - failed[0] + 1 == len(failed)
+    assert registers == "0b 1a 20"
 
 
 def test_without_a_magnetometer_the_rest_goes_on(bridge: Path) -> None:

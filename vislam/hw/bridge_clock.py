@@ -22,7 +22,7 @@ class _Point:
     host_ns: int  # of arrival
 
 
-class HostClock:
+class DeviceClock:
     """Turns device stamps [us, 32 bits] into host time [ns], rising strictly.
 
     Device time that runs off its line (the device restarted, or the host slept while it ran on) begins a new line:

@@ -11,6 +11,7 @@ struct FakeWire {
   int reads[128] = {};          // of the data registers
   uint8_t registers[128][128];  // what was written
   int silent_address = -1, silent_from = 0, silent_until = 0;  // does not answer between these transfers to it
+  int forgets_at = -1;  // loses its registers then, as when its power fails for a moment
   int transfers[128] = {};
 
   void begin() {}
@@ -20,6 +21,7 @@ struct FakeWire {
   bool present() {
     fake_us += 100;
     int n = transfers[address]++;
+    if (n == forgets_at && address == silent_address) memset(registers[address], 0, 128);
     bool there = address == 0x53 || address == 0x68 || address == 0x1E;
     return there && !(address == silent_address && n >= silent_from && n < silent_until);
   }
@@ -43,9 +45,12 @@ struct FakeWire {
     if (from == 0x68 && reg == 0x00) answer[answers++] = 0x69;
     if (from == 0x1E && reg == 0x0A) memcpy(answer, "H43", answers = 3);
     int n = reads[from];
-    if (from == 0x53 && reg == 0x32) put(false, n % 500), put(false, -n % 500), put(false, 256), reads[from]++;
-    if (from == 0x68 && reg == 0x1B)
+    if (from == 0x53 && reg == 0x31)
+      answer[answers++] = registers[from][reg], put(false, n % 500), put(false, -n % 500), put(false, 256), reads[from]++;
+    if (from == 0x68 && reg == 0x15) {
+      for (int i = 0; i < 6; i++) answer[answers++] = registers[from][0x15 + i];
       put(true, -13200), put(true, -n % 700), put(true, 0), put(true, n % 700), reads[from]++;
+    }
     if (from == 0x1E && reg == 0x03) put(true, 200 + n % 9), put(true, -400), put(true, n % 9), reads[from]++;
     return answers == count ? count : 0;
   }

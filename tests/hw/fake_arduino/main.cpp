@@ -1,4 +1,4 @@
-// Runs the sketch: `bridge SECONDS BEGIN_US SILENT_ADDRESS FROM UNTIL BLOCKED_FROM_MS BLOCKED_UNTIL_MS`.
+// Runs the sketch: `bridge SECONDS BEGIN_US SILENT_ADDRESS FROM UNTIL BLOCKED_FROM_MS BLOCKED_UNTIL_MS FORGETS_AT`.
 #include "Arduino.h"
 #include "Wire.h"
 
@@ -15,6 +15,7 @@ int main(int, char **arguments) {
   Wire.silent_from = atoi(arguments[4]);
   Wire.silent_until = atoi(arguments[5]);
   const uint32_t blocked_from = (uint32_t)atoi(arguments[6]) * 1000, blocked_until = (uint32_t)atoi(arguments[7]) * 1000;
+  Wire.forgets_at = atoi(arguments[8]);
   setup();
   while (fake_us - begin_us < length_us) {
     const uint32_t passed = fake_us - begin_us;

@@ -33,6 +33,8 @@ static const uint16_t MAG_LIMIT = 2048;          // 12 bits; -4096 says overflow
 static const uint32_t PERIOD_US = 1000000UL / RATE_HZ;
 static const uint32_t HELLO_EVERY_US = 1000000UL;
 static const uint8_t MAG_EVERY = RATE_HZ / MAG_RATE_HZ;
+static const uint8_t ACCEL_FORMAT = 0x0B;          // full resolution, 16 g
+static const uint8_t GYRO_FILTER = (3 << 3) | 2;   // 2000 degrees per second, filter at 98 Hz
 static const uint8_t MAG_SETTLING = 2;  // its first readings still have the gain before
 static const uint8_t MAX_BODY = 48;     // the hello is 42 bytes
 
@@ -109,16 +111,17 @@ static bool beginAccel() {
     return writeRegister(addresses[i], 0x2D, 0x00)     // standby
            && writeRegister(addresses[i], 0x38, 0x00)  // no FIFO: the newest sample is read
            && writeRegister(addresses[i], 0x2C, rate)  // its filter is at half the rate
-           && writeRegister(addresses[i], 0x31, 0x0B)  // full resolution, 16 g
+           && writeRegister(addresses[i], 0x31, ACCEL_FORMAT)
            && writeRegister(addresses[i], 0x2D, 0x08);  // measure
   }
   return false;
 }
 
+// Settings are read with the data: a chip that lost its power for a moment would go on with other ones.
 static bool readAccel() {
-  uint8_t data[6];
-  if (!readRegisters(accelChip.address, 0x32, data, 6)) return false;
-  for (uint8_t i = 0; i < 3; i++) accel[i] = littleEndian(data + 2 * i);
+  uint8_t data[7];
+  if (!readRegisters(accelChip.address, 0x31, data, 7) || data[0] != ACCEL_FORMAT) return false;
+  for (uint8_t i = 0; i < 3; i++) accel[i] = littleEndian(data + 1 + 2 * i);
   return true;
 }
 
@@ -129,17 +132,17 @@ static bool beginGyro() {
     if (!readRegisters(addresses[i], 0x00, gyroChip.id, 1) || (gyroChip.id[0] & 0x7E) != 0x68) continue;
     return writeRegister(addresses[i], 0x3E, 0x01)     // clock from the X gyro's PLL
            && writeRegister(addresses[i], 0x15, 0x00)  // 1 kHz: the newest sample is at most 1 ms old
-           && writeRegister(addresses[i], 0x16, (3 << 3) | 2)  // 2000 deg/s, filter at 98 Hz
+           && writeRegister(addresses[i], 0x16, GYRO_FILTER)
            && writeRegister(addresses[i], 0x17, 0x00);
   }
   return false;
 }
 
 static bool readGyro() {
-  uint8_t data[8];
-  if (!readRegisters(gyroChip.address, 0x1B, data, 8)) return false;
-  temperature = bigEndian(data);
-  for (uint8_t i = 0; i < 3; i++) gyro[i] = bigEndian(data + 2 + 2 * i);
+  uint8_t data[14];
+  if (!readRegisters(gyroChip.address, 0x15, data, 14) || data[1] != GYRO_FILTER) return false;
+  temperature = bigEndian(data + 6);
+  for (uint8_t i = 0; i < 3; i++) gyro[i] = bigEndian(data + 8 + 2 * i);
   return true;
 }
 
