@@ -134,7 +134,7 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
 
     options = _parse(ResumeOptions, arguments, "run")
     source, config, base = read_setup(out)
-    recording = open_source(source, config.seed)
+    recording = open_source(source, config.seed, config.calibration)
     with _written_up(out), _progress(recording.name) as progress:
         metrics = resume(recording, config, out, source, command, progress, base)
     _show(metrics, out, options.json)
@@ -154,11 +154,13 @@ def _run_source(
     source: str, settings: Config, out: Path, overwrite: bool, command: list[str], base: MapChoice | None = None
 ) -> dict[str, Any]:
     """Run a source into a folder and write its report, whatever happened on the way."""
+    from vislam.datasets.calibrated import with_clock
     from vislam.run import execute
     from vislam.runfolder import prepare
     from vislam.sources import open_source
 
-    recording = open_source(source, settings.seed)
+    settings = with_clock(settings)
+    recording = open_source(source, settings.seed, settings.calibration)
     prepare(out, overwrite)
     with _written_up(out), _progress(recording.name) as progress:
         return execute(recording, settings, out, source=source, command=command, progress=progress, base=base)
@@ -544,6 +546,27 @@ def _vocabulary(arguments: list[str]) -> int:
     return 0
 
 
+def _calibrate(arguments: list[str]) -> int:
+    import tyro
+
+    from vislam.calibration.kinds import KINDS
+    from vislam.runfolder import plain
+
+    if not arguments or arguments[0] in ("-h", "--help"):
+        lines = [f"  {name:<12}{kind.summary}" for name, kind in KINDS.items()]
+        usage = "usage: vislam calibrate WHAT ...; vislam calibrate WHAT --help tells more"
+        print("\n".join([usage, "", *lines]))
+        return 0 if arguments else UsageError.exit_code
+    kind = KINDS.get(arguments[0])
+    if kind is None:
+        raise UsageError(f"nothing called '{arguments[0]}' to calibrate; there are: {', '.join(KINDS)}")
+    prog = f"vislam calibrate {arguments[0]}"
+    options = tyro.cli(kind.options, prog=prog, description=kind.summary, args=arguments[1:])
+    outcome = kind.calibrate(options)
+    print(json.dumps(plain(outcome.report)) if options.json else "\n".join([*outcome.lines, *map(str, outcome.files)]))
+    return 0
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -577,6 +600,11 @@ _VERBS = {
         _vocabulary,
         "train the words of loop closing on images, or convert ORB-SLAM's",
         "vislam vocabulary images/ tum:PATH --out words.npz",
+    ),
+    "calibrate": _Verb(
+        _calibrate,
+        "find what camera, IMU, magnetometer and floor are like; each WHAT has its --help",
+        "vislam calibrate noise recordings/still --out calibration",
     ),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

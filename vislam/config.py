@@ -37,6 +37,16 @@ class ImuConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class CalibrationConfig:
+    """Files that `vislam calibrate` writes; None keeps what the recording's own sensor files say."""
+
+    camera: str | None = None  # Kalibr's camchain.yaml, an ASL sensor.yaml or ROS's camera_info
+    imu: str | None = None  # scale, axes and bias, applied to samples that must be raw
+    imu_noise: str | None = None  # Kalibr's imu.yaml or an ASL sensor.yaml; single numbers in `imu` go before it
+    mag: str | None = None  # hard and soft iron, applied to a field that must be raw
+
+
+@dataclass(frozen=True, slots=True)
 class FrontEndConfig:
     """Feature tracking and visual odometry."""
 
@@ -579,6 +589,7 @@ class Config:
     """The whole configuration of a run."""
 
     seed: int = 0  # of every random choice in the pipeline
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
     frontend: FrontEndConfig = field(default_factory=FrontEndConfig)
     init: InitConfig = field(default_factory=InitConfig)

@@ -68,7 +68,7 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         if from_session:
             _from_session(session, mapper, placed, config.rebuild_keyframes_per_call, tell)
         else:
-            _from_recording(session, mapper, placed, read_setup(run)[0], ran.seed, tell)
+            _from_recording(session, mapper, placed, read_setup(run)[0], ran, tell)
     finally:
         session.close()
     mapper.finish()
@@ -135,9 +135,14 @@ def _from_session(
 
 
 def _from_recording(
-    session: Session, mapper: Mapper, placed: dict[int, Array], source: str, seed: int, tell: Callable[[int, str], None]
+    session: Session,
+    mapper: Mapper,
+    placed: dict[int, Array],
+    source: str,
+    ran: Config,
+    tell: Callable[[int, str], None],
 ) -> None:
-    recording = open_source(source, seed)
+    recording = open_source(source, ran.seed, ran.calibration)
     offsets_ns = [round(packet.time_offset_s * 1e9) for packet in session.packets(light=True)]
     stored = {k.t_ns - offsets_ns[k.id]: k for k in session.keyframes() if k.id in placed}  # by the camera's clock
     count = 0

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vislam.config import CalibrationConfig
 from vislam.errors import DataError, UsageError
 from vislam.recording import Recording
 
@@ -13,16 +14,20 @@ if TYPE_CHECKING:
     from vislam.sim import MeasuredInertial
 
 
-def open_source(uri: str, seed: int = 0) -> Recording:
+def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None = None) -> Recording:
     """Open a recording on disk or a simulated one.
 
     On disk: `euroc:PATH`, `tum:PATH`, `kitti:PATH`, `video:PATH`, or a bare path. Rendered: `sim:WORLD`. Vision
     simulated as points, on a world's motion or on the real IMU of a recording with truth: `points:WORLD` or
-    `points:PATH`. To the simulated ones options are appended as `,option=value`.
+    `points:PATH`. To the simulated ones options are appended as `,option=value`. Calibration files that are named take
+    the place of what a recording on disk says itself.
 
-    Raises UsageError for an unknown format, world or option, DataError when the recording cannot be used.
+    Raises UsageError for an unknown format, world or option, or for calibration files of a simulated source; DataError
+    when the recording cannot be used.
     """
     scheme, _, rest = uri.partition(":")
+    if scheme in ("sim", "points") and calibration is not None and calibration != CalibrationConfig():
+        raise UsageError(f"{uri} knows its sensors exactly; leave the calibration files away")
     if scheme == "sim":
         from vislam.sim import open_world
 
@@ -35,7 +40,7 @@ def open_source(uri: str, seed: int = 0) -> Recording:
         return open_points(name if name in POINT_WORLD_NAMES else measured_inertial(name), seed=seed, **options)
     from vislam.datasets import open_dataset
 
-    return open_dataset(uri)
+    return open_dataset(uri, calibration)
 
 
 def measured_inertial(uri: str) -> MeasuredInertial:
@@ -60,6 +65,8 @@ def measured_inertial(uri: str) -> MeasuredInertial:
         raise DataError(f"{uri} lacks {lacks}; simulated vision on a real IMU needs inertial data and true poses")
     rows = list(in_time_order(read_numbers(found.imu_file, 6, problems), problems, "imu"))
     values = np.array([row[1] for row in rows]).reshape(-1, 6)
+    if found.imu_calibration is not None:
+        values = found.imu_calibration.apply_to(values)
     t_ns = np.array([row[0] for row in rows], dtype=np.int64)
     name = found.root.resolve().name
     return MeasuredInertial(name, t_ns, values[:, :3], values[:, 3:], found.imu_noise, truth, found.rig)

@@ -8,7 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+from vislam.config import CalibrationConfig
 from vislam.datasets import asl, kitti, tum, video
+from vislam.datasets.calibrated import calibrated
 from vislam.datasets.stream import FileRecording, Survey
 from vislam.errors import DataError, UsageError
 from vislam.recording import Recording
@@ -33,14 +35,15 @@ class Reader(Protocol):
 READERS: dict[str, Reader] = {"euroc": asl, "tum": tum, "kitti": kitti, "video": video}
 
 
-def open_dataset(uri: str) -> Recording:
-    """Open `FORMAT:PATH` or a bare path as a recording.
+def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Recording:
+    """Open `FORMAT:PATH` or a bare path as a recording, with the calibration files that are named instead of its own.
 
     Raises:
         UsageError: there is no such format.
         DataError: the path holds no recording of the format, or one that cannot be replayed.
     """
-    return FileRecording(survey(uri))
+    found = survey(uri)
+    return FileRecording(found if calibration is None else calibrated(found, calibration))
 
 
 def survey(uri: str) -> Survey:

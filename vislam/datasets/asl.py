@@ -15,12 +15,13 @@ from vislam.camera import Rig
 from vislam.datasets import calibration as files
 from vislam.datasets.calibration import CAMERA_EXAMPLE, DEPTH_UNITS_PER_M, CameraFile
 from vislam.datasets.images import ImageList
+from vislam.datasets.imu_files import imu_calibration, mag_calibration
 from vislam.datasets.stream import Survey, image_list
 from vislam.datasets.tables import Problems, read_names
 from vislam.datasets.truth import Truth, asl_truth
 from vislam.errors import DataError
 from vislam.geometry import invert
-from vislam.imu import ImuNoise
+from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 Array = NDArray[np.float64]
 
@@ -42,12 +43,12 @@ def survey(path: Path) -> Survey:
         return Survey("euroc", path, errors=(DataError(f"{path} is no ASL folder: no {LOOKS_FOR} in it"),))
     problems = Problems()
     errors: list[DataError] = []
-    imu_file, imu_noise, T_body_imu = _imu(root, errors)
+    imu_file, imu_noise, T_body_imu, imu_calibration = _imu(root, errors)
     cameras, rig = _cameras(root, T_body_imu, problems, errors)
     depth, units = _depth(root, rig, problems, errors)
     if rig is not None and depth is not None:
         rig = Rig(rig.cameras, rig.T_body_cams, has_depth=True)
-    mag_file, R_imu_mag = _mag(root, T_body_imu, errors)
+    mag_file, R_imu_mag, mag_calibration = _mag(root, T_body_imu, errors)
     return Survey(
         format="euroc",
         root=path,
@@ -57,7 +58,9 @@ def survey(path: Path) -> Survey:
         rig=rig,
         imu_file=imu_file,
         imu_noise=imu_noise,
+        imu_calibration=imu_calibration,
         mag_file=mag_file,
+        mag_calibration=mag_calibration,
         R_body_mag=R_imu_mag,
         truth=_truth(root, T_body_imu, errors),
         problems=problems,
@@ -72,22 +75,22 @@ def _root(path: Path) -> Path | None:
     return None
 
 
-def _imu(root: Path, errors: list[DataError]) -> tuple[Path | None, ImuNoise | None, Array]:
-    """Return the IMU's file, its noise, and its pose in the file's body frame."""
+def _imu(root: Path, errors: list[DataError]) -> tuple[Path | None, ImuNoise | None, Array, ImuCalibration | None]:
+    """Return the IMU's file, its noise, its pose in the file's body frame, and its calibration if samples are raw."""
     data, sensor = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
     if not data.is_file():
-        return None, None, np.eye(4)
+        return None, None, np.eye(4), None
     try:
         if sensor.is_file():
             noise, T_body_imu = files.read_imu(sensor)
-            return data, noise, T_body_imu
+            return data, noise, T_body_imu, imu_calibration(files.load_yaml(sensor), sensor)
         kalibr = _kalibr(root, "imu_config.yaml")
         if kalibr is None:
             raise DataError(f"{sensor} is missing; write the IMU's noise into it, see docs/formats.md")
-        return data, files.read_imu_config(kalibr), np.eye(4)
+        return data, files.read_imu_config(kalibr), np.eye(4), None
     except DataError as error:
         errors.append(error)
-        return data, None, np.eye(4)
+        return data, None, np.eye(4), None
 
 
 def _cameras(
@@ -145,17 +148,20 @@ def _depth(root: Path, rig: Rig | None, problems: Problems, errors: list[DataErr
         return None, DEPTH_UNITS_PER_M
 
 
-def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path | None, Array]:
-    """Return the magnetometer's file and its rotation to the IMU."""
+def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path | None, Array, MagCalibration | None]:
+    """Return the magnetometer's file, its rotation to the IMU, and its calibration if samples are raw."""
     data, sensor = root / "mag0" / "data.csv", root / "mag0" / "sensor.yaml"
     if not data.is_file():
-        return None, np.eye(3)
+        return None, np.eye(3), None
+    T_body_mag, calibration = T_body_imu, None
     try:
-        T_body_mag = files.read_pose(files.load_yaml(sensor), sensor) if sensor.is_file() else T_body_imu
+        if sensor.is_file():
+            keys = files.load_yaml(sensor)
+            T_body_mag, calibration = files.read_pose(keys, sensor), mag_calibration(keys, sensor)
     except DataError as error:
         errors.append(error)
-        return None, np.eye(3)
-    return data, (invert(T_body_imu) @ T_body_mag)[:3, :3]
+        return None, np.eye(3), None
+    return data, (invert(T_body_imu) @ T_body_mag)[:3, :3], calibration
 
 
 def _truth(root: Path, T_body_imu: Array, errors: list[DataError]) -> Truth | None:

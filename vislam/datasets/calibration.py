@@ -6,7 +6,7 @@ docs/formats.md lists every key. Poses are `T_BS`: the sensor's pose in the body
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,12 @@ Array = NDArray[np.float64]
 
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
 _MAX_YAML_BYTES = 2**18
-_MODELS: dict[str, Distortion] = {
+MODELS: dict[str, Distortion] = {
     "radial-tangential": "radtan", "radtan": "radtan", "plumb_bob": "radtan",
     "equidistant": "equidistant", "fisheye": "equidistant", "none": "none",
 }  # fmt: skip
-_MODEL_NAMES: dict[Distortion, str] = {"radtan": "radial-tangential", "equidistant": "equidistant", "none": "none"}
-_NOISE_KEYS = {
+MODEL_NAMES: dict[Distortion, str] = {"radtan": "radial-tangential", "equidistant": "equidistant", "none": "none"}
+NOISE_KEYS = {
     "gyro_noise_density": "gyroscope_noise_density",
     "accel_noise_density": "accelerometer_noise_density",
     "gyro_bias_walk": "gyroscope_random_walk",
@@ -75,10 +75,10 @@ def read_camera(path: Path) -> CameraFile:
     data = load_yaml(path)
     try:
         return CameraFile(
-            camera=_camera(data, path, "distortion_coefficients"),
+            camera=parse_camera(data, path, "distortion_coefficients"),
             T_body_cam=read_pose(data, path),
-            rate_hz=_optional_positive(data, "rate_hz", path),
-            depth_units_per_m=_optional_positive(data, "depth_units_per_m", path),
+            rate_hz=optional_positive(data, "rate_hz", path),
+            depth_units_per_m=optional_positive(data, "depth_units_per_m", path),
         )
     except DataError as error:
         raise DataError(f"{error}; a camera's file holds: {CAMERA_EXAMPLE}") from error
@@ -87,7 +87,7 @@ def read_camera(path: Path) -> CameraFile:
 def read_imu(path: Path) -> tuple[ImuNoise, Array]:
     """Return noise and pose `T_BS` [4, 4] of an ASL IMU file; raises DataError naming the key."""
     data = load_yaml(path)
-    return _noise(data, "rate_hz", path), read_pose(data, path)
+    return parse_noise(data, "rate_hz", path), read_pose(data, path)
 
 
 def read_camchain(path: Path, index: int) -> CameraFile:
@@ -95,13 +95,13 @@ def read_camchain(path: Path, index: int) -> CameraFile:
     data = load_yaml(path).get(f"cam{index}")
     if not isinstance(data, dict):
         raise DataError(f"{path} has no cam{index}")
-    T_cam_imu = np.array(_numbers(data, "T_cam_imu", path, 16)).reshape(4, 4)
-    return CameraFile(_camera(data, path, "distortion_coeffs"), invert(T_cam_imu))
+    T_cam_imu = np.array(numbers_in(data, "T_cam_imu", path, 16)).reshape(4, 4)
+    return CameraFile(parse_camera(data, path, "distortion_coeffs"), invert(T_cam_imu))
 
 
 def read_imu_config(path: Path) -> ImuNoise:
     """Return the noise in a Kalibr IMU file; raises DataError naming the key."""
-    return _noise(load_yaml(path), "update_rate", path)
+    return parse_noise(load_yaml(path), "update_rate", path)
 
 
 def read_pose(data: Mapping[str, Any], path: Path) -> Array:
@@ -110,7 +110,7 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
         return np.eye(4)
     matrix = data["T_BS"]
     holder = matrix if isinstance(matrix, dict) else {"data": matrix}
-    T = np.array(_numbers(holder, "data", path, 16)).reshape(4, 4)
+    T = np.array(numbers_in(holder, "data", path, 16)).reshape(4, 4)
     R = T[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
         raise DataError(f"{path}: T_BS is not a rigid transform: {T.tolist()}")
@@ -120,52 +120,55 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
 def depth_units(path: Path, camera: Camera) -> float:
     """Return raw units per metre of a depth folder's sensor file; raises DataError unless it is registered to cam0."""
     data = load_yaml(path)
-    resolution = [int(x) for x in _numbers(data, "resolution", path, 2)] if "resolution" in data else None
+    resolution = [int(x) for x in numbers_in(data, "resolution", path, 2)] if "resolution" in data else None
     if resolution is not None and resolution != [camera.width, camera.height]:
         raise DataError(
             f"{path}: depth of {resolution} does not match cam0's {camera.width}x{camera.height}; "
             "depth must be registered to cam0, pixel by pixel"
         )
-    return _optional_positive(data, "depth_units_per_m", path) or DEPTH_UNITS_PER_M
+    return optional_positive(data, "depth_units_per_m", path) or DEPTH_UNITS_PER_M
 
 
-def _camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:
-    width, height = _numbers(data, "resolution", path, 2)
-    fx, fy, cx, cy = _numbers(data, "intrinsics", path, 4)
+def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:
+    """Return the camera in the keys that ASL and Kalibr share; raises DataError naming the key."""
+    width, height = numbers_in(data, "resolution", path, 2)
+    fx, fy, cx, cy = numbers_in(data, "intrinsics", path, 4)
     name = str(data.get("distortion_model", "none")).lower()
-    model = _MODELS.get(name)
+    model = MODELS.get(name)
     if str(data.get("camera_model", "pinhole")).lower() != "pinhole" or model is None:
         raise DataError(
-            f"{path}: '{data.get('camera_model')}', '{name}' is not supported; use pinhole with {[*_MODELS]}"
+            f"{path}: '{data.get('camera_model')}', '{name}' is not supported; use pinhole with {[*MODELS]}"
         )
-    coefficients = _numbers(data, coefficients_key, path) if model != "none" else []
-    skew = _numbers({"skew_px": [data.get("skew_px", 0.0)]}, "skew_px", path, 1)[0]
+    coefficients = numbers_in(data, coefficients_key, path) if model != "none" else []
+    skew = numbers_in({"skew_px": [data.get("skew_px", 0.0)]}, "skew_px", path, 1)[0]
     try:
         return Camera(int(width), int(height), fx, fy, cx, cy, skew, model, tuple(coefficients))
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 
 
-def _noise(data: Mapping[str, Any], rate_key: str, path: Path) -> ImuNoise:
+def parse_noise(data: Mapping[str, Any], rate_key: str, path: Path) -> ImuNoise:
+    """Return the noise model in the keys that ASL and Kalibr share; raises DataError naming the key."""
     values = {}
-    for name, key in _NOISE_KEYS.items():
-        value = _optional_positive(data, key, path, allow_zero=name.endswith("walk"))
+    for name, key in NOISE_KEYS.items():
+        value = optional_positive(data, key, path, allow_zero=name.endswith("walk"))
         if value is None:
-            raise DataError(f"{path}: no '{key}'; an IMU's file holds {', '.join(_NOISE_KEYS.values())} and {rate_key}")
+            raise DataError(f"{path}: no '{key}'; an IMU's file holds {', '.join(NOISE_KEYS.values())} and {rate_key}")
         values[name] = value
-    return ImuNoise(**values, rate_hz=_optional_positive(data, rate_key, path) or 0.0)
+    return ImuNoise(**values, rate_hz=optional_positive(data, rate_key, path) or 0.0)
 
 
-def _optional_positive(data: Mapping[str, Any], key: str, path: Path, allow_zero: bool = False) -> float | None:
+def optional_positive(data: Mapping[str, Any], key: str, path: Path, allow_zero: bool = False) -> float | None:
+    """Return a number, None where the key is absent; raises DataError unless it is positive."""
     if data.get(key) is None:
         return None
-    value = _numbers({key: [data[key]]}, key, path, 1)[0]
+    value = numbers_in({key: [data[key]]}, key, path, 1)[0]
     if value < 0.0 or (value == 0.0 and not allow_zero):
         raise DataError(f"{path}: {key} must be positive, got {value}")
     return value
 
 
-def _numbers(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
+def numbers_in(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
     """Return a list (nested lists are joined) of finite numbers; YAML reads 5e-6 as text, so text is converted."""
     value = data.get(key)
     rows = value if isinstance(value, list) else [value]
@@ -185,21 +188,22 @@ def pose_text(T: Array) -> str:
     return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
 
 
-def camera_text(camera: Camera, T_body_cam: Array, comment: str) -> str:
-    """Return the sensor file of a camera."""
+def camera_text(camera: Camera, T_body_cam: Array | None, comment: str) -> str:
+    """Return the sensor file of a camera; without a pose it says none."""
+    pose = "" if T_body_cam is None else pose_text(T_body_cam)
     return (
-        f"sensor_type: camera\ncomment: {json.dumps(comment)}\n{pose_text(T_body_cam)}"
+        f"sensor_type: camera\ncomment: {json.dumps(comment)}\n{pose}"
         f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
-        f"intrinsics: {_list([camera.fx, camera.fy, camera.cx, camera.cy])}  # fu, fv, cu, cv in pixels\n"
+        f"intrinsics: {list_text([camera.fx, camera.fy, camera.cx, camera.cy])}  # fu, fv, cu, cv in pixels\n"
         f"skew_px: {float(camera.skew_px)!r}\n"
-        f"distortion_model: {_MODEL_NAMES[camera.distortion]}\n"
-        f"distortion_coefficients: {_list(camera.coefficients)}\n"
+        f"distortion_model: {MODEL_NAMES[camera.distortion]}\n"
+        f"distortion_coefficients: {list_text(camera.coefficients)}\n"
     )
 
 
 def imu_text(noise: ImuNoise, comment: str) -> str:
     """Return the sensor file of an IMU that is the body frame."""
-    lines = [f"{key}: {float(getattr(noise, name))!r}\n" for name, key in _NOISE_KEYS.items()]
+    lines = [f"{key}: {float(getattr(noise, name))!r}\n" for name, key in NOISE_KEYS.items()]
     rate = f"rate_hz: {float(noise.rate_hz)!r}\n" if noise.rate_hz > 0.0 else ""
     return f"sensor_type: imu\ncomment: {json.dumps(comment)}\n{pose_text(np.eye(4))}{rate}{''.join(lines)}"
 
@@ -212,5 +216,6 @@ def depth_text(camera: Camera, units_per_m: float) -> str:
     )
 
 
-def _list(values: Sequence[float]) -> str:
+def list_text(values: Iterable[float]) -> str:
+    """Return numbers as a YAML list that reads back to the same bits."""
     return "[" + ", ".join(repr(float(value)) for value in values) + "]"

@@ -210,7 +210,9 @@ class _Inspector:
 
     def _rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         assert self._found.imu_file is not None
-        return in_time_order(read_numbers(self._found.imu_file, 6, problems), problems, "imu")
+        calibration = self._found.imu_calibration
+        for t_ns, values in in_time_order(read_numbers(self._found.imu_file, 6, problems), problems, "imu"):
+            yield t_ns, values if calibration is None else calibration.apply_to(np.array([values]))[0].tolist()
 
     def _check_imu(self) -> ImuFacts | None:
         if self._found.imu_file is None:

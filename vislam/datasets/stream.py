@@ -18,7 +18,7 @@ from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoade
 from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
 from vislam.datasets.truth import Truth
 from vislam.errors import DataError
-from vislam.imu import ImuNoise
+from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.messages import Frame, ImuSample, MagSample
 from vislam.trajectory import Trajectory
 
@@ -44,7 +44,9 @@ class Survey:
     rig: Rig | None = None
     imu_file: Path | None = None
     imu_noise: ImuNoise | None = None
+    imu_calibration: ImuCalibration | None = None  # of raw samples; None: they are calibrated
     mag_file: Path | None = None
+    mag_calibration: MagCalibration | None = None  # as for the IMU, in the magnetometer's own axes
     R_body_mag: Array = field(default_factory=lambda: np.eye(3))
     truth: Truth | None = None
     problems: Problems = field(default_factory=Problems)  # met while listing
@@ -169,18 +171,23 @@ class FileRecording:
             return
         rate_hz = self.imu_noise.rate_hz if self.imu_noise is not None else 0.0
         gaps = _GapWatch("imu", imu_gap_limit_s(rate_hz), self._counter)
+        calibration = self._survey.imu_calibration
         rows = read_numbers(self._survey.imu_file, 6, self._counter)
         for t_ns, values in in_time_order(rows, self._counter, "imu"):
             gaps.see(t_ns)
             both = np.array(values)
-            yield ImuSample(t_ns, both[:3], both[3:])
+            sample = ImuSample(t_ns, both[:3], both[3:])
+            yield sample if calibration is None else calibration.apply(sample)
 
     def _read_mag(self) -> Generator[MagSample, None, None]:
         if self._survey.mag_file is None:
             return
+        calibration = self._survey.mag_calibration
         rows = read_numbers(self._survey.mag_file, 3, self._counter)
         for t_ns, values in in_time_order(rows, self._counter, "mag"):
-            yield MagSample(t_ns, self._survey.R_body_mag @ np.array(values))
+            raw = MagSample(t_ns, np.array(values))
+            field_ut = raw.field_ut if calibration is None else calibration.apply(raw).field_ut
+            yield MagSample(t_ns, self._survey.R_body_mag @ field_ut)
 
     def _place(self, path: Path) -> str:
         return str(path.relative_to(self._survey.root)) if path.is_relative_to(self._survey.root) else path.name

@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vislam.config import dump, from_data
 from vislam.experiment.identity import environment, sha256_of, source_identity
 from vislam.experiment.plan import Plan, Scalar, Sequence, nested
+from vislam.runfolder import fingerprint
 
 JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
 
@@ -65,9 +67,10 @@ def expand(plan: Plan) -> list[Job]:
                 config = dump(resolved) | {"seed": seed}
                 config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
                 batch = "batch" in estimator.outputs
+                files = [fingerprint(Path(name)) for name in config["calibration"].values() if name is not None]
                 jobs.append(
                     Job(
-                        sha256_of([identities[source], config, batch, environment()]),
+                        sha256_of([identities[source], files, config, batch, environment()]),
                         sequence.name, variant, estimator.name, index, seed, member,
                         source, config, batch, plan.timeout_s,
                     )

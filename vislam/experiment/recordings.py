@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from vislam.config import CalibrationConfig
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.errors import StorageError
@@ -21,14 +22,14 @@ from vislam.trajectory import Trajectory
 _SIMULATOR = Path(__file__).resolve().parent.parent / "sim"
 
 
-def open_cached(source: str, seed: int, cache: Path) -> Recording:
+def open_cached(source: str, seed: int, cache: Path, calibration: CalibrationConfig | None = None) -> Recording:
     """Open a source; a simulated world is rendered into `cache` first, unless it is there.
 
     Jobs that want the same world at the same time wait for the one that renders it. A recording appears whole or not
     at all. Raises as `open_source` and `record` do.
     """
     if not source.startswith("sim:"):
-        return open_source(source, seed)
+        return open_source(source, seed, calibration)
     key = sha256_of([source, seed, code_sha256(_SIMULATOR)])[:24]
     folder = cache / key
     try:

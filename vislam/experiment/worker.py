@@ -49,7 +49,7 @@ def run_job(spec: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
 
 def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -> None:
     config: Config = from_data(spec["config"], "job")
-    recording = TimedRecording(open_cached(spec["source"], config.seed, cache))
+    recording = TimedRecording(open_cached(spec["source"], config.seed, cache, config.calibration))
     prepare(out, overwrite=False)
     cpu_s = time.process_time()
     try:

@@ -2,7 +2,7 @@
 
 from vislam.imu.buffer import ImuBuffer
 from vislam.imu.envelope import NoiseEnvelope, NoiseRatios
-from vislam.imu.noise import ImuCalibration, ImuNoise
+from vislam.imu.noise import ImuCalibration, ImuNoise, MagCalibration
 from vislam.imu.preintegration import Preintegrated, preintegrate
 from vislam.imu.rest import RestDetector
 from vislam.imu.series import ImuSeries, join, subtract_bias
@@ -12,6 +12,7 @@ __all__ = [
     "ImuCalibration",
     "ImuNoise",
     "ImuSeries",
+    "MagCalibration",
     "NoiseEnvelope",
     "NoiseRatios",
     "Preintegrated",

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vislam.errors import DataError
-from vislam.messages import Array, ImuSample
+from vislam.messages import Array, ImuSample, MagSample
+
+_SINGULAR = 1e-6  # determinant
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,26 @@ def _identity() -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MagCalibration:
+    """Hard and soft iron of a magnetometer: `calibrated = matrix @ (raw - bias)`, in the sensor's own axes.
+
+    Raises:
+        DataError: an entry is not finite, or the matrix cannot be inverted.
+    """
+
+    bias_ut: Array = field(default_factory=_zero)  # [3]
+    matrix: Array = field(default_factory=_identity)  # [3, 3]
+
+    def __post_init__(self) -> None:
+        """Refuse a calibration that would turn every sample into nonsense."""
+        _check_affine("magnetometer", self.bias_ut, self.matrix)
+
+    def apply(self, sample: MagSample) -> MagSample:
+        """Return the calibrated sample."""
+        return MagSample(sample.t_ns, self.matrix @ (sample.field_ut - self.bias_ut))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ImuCalibration:
     """Affine calibration from raw sensor axes to the body frame: `calibrated = matrix @ (raw - bias)`.
 
@@ -47,13 +69,13 @@ class ImuCalibration:
 
     def __post_init__(self) -> None:
         """Refuse a calibration that would turn every sample into nonsense."""
-        for name in ("gyro_bias_rad_s", "accel_bias_m_s2", "gyro_matrix", "accel_matrix"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            expected = (3, 3) if name.endswith("matrix") else (3,)
-            if value.shape != expected or not np.isfinite(value).all():
-                raise DataError(f"IMU calibration: {name} must be {expected} finite numbers, got {value.tolist()}")
-            if name.endswith("matrix") and abs(np.linalg.det(value)) < 1e-6:
-                raise DataError(f"IMU calibration: {name} is singular, got {value.tolist()}; calibrate again")
+        _check_affine("gyroscope", self.gyro_bias_rad_s, self.gyro_matrix)
+        _check_affine("accelerometer", self.accel_bias_m_s2, self.accel_matrix)
+
+    def apply_to(self, raw: Array) -> Array:
+        """Return samples [N, 6], rates then forces, in calibrated body axes."""
+        gyro = (raw[:, :3] - self.gyro_bias_rad_s) @ self.gyro_matrix.T
+        return np.hstack([gyro, (raw[:, 3:] - self.accel_bias_m_s2) @ self.accel_matrix.T])
 
     def apply(self, sample: ImuSample) -> ImuSample:
         """Return the sample in calibrated body axes."""
@@ -62,3 +84,12 @@ class ImuCalibration:
             gyro_rad_s=self.gyro_matrix @ (sample.gyro_rad_s - self.gyro_bias_rad_s),
             accel_m_s2=self.accel_matrix @ (sample.accel_m_s2 - self.accel_bias_m_s2),
         )
+
+
+def _check_affine(sensor: str, bias: Array, matrix: Array) -> None:
+    for name, value, shape in (("bias", bias, (3,)), ("matrix", matrix, (3, 3))):
+        if np.shape(value) != shape or not np.isfinite(value).all():
+            got = np.asarray(value).tolist()
+            raise DataError(f"{sensor} calibration: the {name} must be {shape} finite numbers, got {got}")
+    if abs(np.linalg.det(matrix)) < _SINGULAR:
+        raise DataError(f"{sensor} calibration: the matrix is singular, {np.asarray(matrix).tolist()}; calibrate again")

@@ -1,0 +1,246 @@
+"""Files of cameras, IMUs and magnetometers: what is written reads back, and a recording takes them."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from calibration_worlds import T0_NS, write_table
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vislam.camera import Camera, Rig
+from vislam.cli import run_verb
+from vislam.config import CalibrationConfig, Config, load
+from vislam.datasets import open_dataset
+from vislam.datasets.calibrated import with_clock
+from vislam.datasets.calibration import camera_text, imu_text
+from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text, read_cameras
+from vislam.datasets.imu_files import (
+    imu_calibration_text,
+    imu_noise_text,
+    mag_calibration_text,
+    read_imu_calibration,
+    read_mag_calibration,
+    read_noise,
+)
+from vislam.errors import DataError, UsageError
+from vislam.geometry import se3_exp
+from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
+from vislam.messages import ImuSample, MagSample
+from vislam.sources import open_source
+
+NOISE = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 50.0)
+CAMERA = Camera(64, 48, 50.0, 51.0, 31.5, 23.5, 0.0, "radtan", (-0.1, 0.01, 1e-4, 2e-4))
+
+numbers = st.floats(-0.5, 0.5)
+lenses = st.one_of(
+    st.just(("none", ())),
+    st.tuples(st.just("radtan"), st.tuples(*[numbers] * 4)),
+    st.tuples(st.just("radtan"), st.tuples(*[numbers] * 5)),
+    st.tuples(st.just("equidistant"), st.tuples(*[numbers] * 4)),
+)
+cameras = st.builds(
+    lambda size, f, c, skew, lens: Camera(*size, *f, *c, skew, *lens),
+    st.tuples(st.integers(1, 8000), st.integers(1, 8000)),
+    st.tuples(st.floats(1e-2, 1e5), st.floats(1e-2, 1e5)),
+    st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
+    st.sampled_from([0.0, 0.25, -3e-5]),
+    lenses,
+)
+poses = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(lambda xi: se3_exp(np.array(xi)))
+matrices = st.lists(st.floats(-0.2, 0.2), min_size=9, max_size=9).map(lambda x: np.eye(3) + np.reshape(x, (3, 3)))
+vectors = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3).map(np.array)
+
+
+def written(text: str) -> Path:
+    path = Path(tempfile.mkdtemp()) / "file.yaml"
+    path.write_text(text)
+    return path
+
+
+def same_camera(a: Camera, b: Camera) -> bool:
+    """Equal but for coefficients that are zero anyway."""
+
+    def key(camera: Camera) -> tuple[object, ...]:
+        k = [*camera.coefficients, *[0.0] * (5 - len(camera.coefficients))]
+        return replace(camera, distortion="none", coefficients=()), camera.distortion if any(k) else "none", k
+
+    return key(a) == key(b)
+
+
+@given(cameras, poses, st.none() | st.floats(-0.1, 0.1))
+def test_kalibr_chains_read_back(camera: Camera, T: np.ndarray, offset_s: float | None) -> None:
+    second = CameraCalibration(CAMERA, T @ T)
+    text = camchain_text([CameraCalibration(camera, T, offset_s, 1e-3), second], "two\nlines")
+    first, other = read_cameras(written(text))
+    assert first.camera == camera
+    assert first.time_offset_s == offset_s and first.time_offset_sigma_s == 1e-3
+    assert first.T_body_cam == pytest.approx(T, abs=1e-9) and other.T_body_cam == pytest.approx(T @ T, abs=1e-9)
+    alone = read_cameras(written(camchain_text([CameraCalibration(camera)], "")))[0]
+    assert alone.camera == camera and alone.T_body_cam is None and alone.time_offset_s is None
+
+
+@given(cameras, st.none() | poses)
+def test_asl_sensor_files_read_back(camera: Camera, T: np.ndarray | None) -> None:
+    (found,) = read_cameras(written(camera_text(camera, T, "c")))
+    assert found.camera == camera
+    assert found.T_body_cam is None if T is None else np.array_equal(found.T_body_cam, T)
+
+
+@given(cameras)
+def test_ros_files_read_back(camera: Camera) -> None:
+    (found,) = read_cameras(written(camera_info_text(camera, "webcam")))
+    assert same_camera(found.camera, camera)
+
+
+def test_kalibrs_relative_poses_are_followed() -> None:
+    T_body_cam0, T_cam1_cam0 = (
+        se3_exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])),
+        se3_exp(np.array([0.0] * 3 + [-0.1, 0, 0])),
+    )
+    text = camchain_text([CameraCalibration(CAMERA, T_body_cam0), CameraCalibration(CAMERA)], "")
+    rows = "".join(f"  - {row}\n" for row in T_cam1_cam0.tolist())
+    found = read_cameras(written(text.replace("cam1:\n", "cam1:\n  T_cn_cnm1:\n" + rows)))
+    assert found[1].T_body_cam == pytest.approx(T_body_cam0 @ np.linalg.inv(T_cam1_cam0))
+
+
+RATIONAL = camera_info_text(replace(CAMERA, coefficients=(-0.1, 0.01, 1e-4, 2e-4, 0.5)), "c")
+RATIONAL = RATIONAL.replace("plumb_bob", "rational_polynomial").replace("0.5]", "0.5, 0.1, 0.1, 0.1]")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("camera_matrix: {rows: 3, cols: 3, data: [1, 2]}\nimage_width: 4\nimage_height: 4\n", "must be 9"),
+        (RATIONAL, "not supp"),
+        (camchain_text([CameraCalibration(CAMERA, np.eye(4))], "").replace("1.0, 0.0]", "2.0, 0.0]"), "not a rigid"),
+        (camera_info_text(CAMERA, "c").replace("image_width: 64", "image_width: wide"), "image_width"),
+        ("- 1\n", "key: value"),
+    ],
+)  # fmt: skip
+def test_wrong_camera_files_are_named(text: str, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        read_cameras(written(text))
+
+
+@given(vectors, matrices, vectors, matrices)
+def test_imu_and_mag_files_read_back(b: np.ndarray, A: np.ndarray, c: np.ndarray, B: np.ndarray) -> None:
+    if min(abs(np.linalg.det(A)), abs(np.linalg.det(B))) < 1e-3:
+        return
+    given_imu = ImuCalibration(b, c, A, B)
+    found = read_imu_calibration(written(imu_calibration_text(given_imu, "x")))
+    for name in ("gyro_bias_rad_s", "accel_bias_m_s2", "gyro_matrix", "accel_matrix"):
+        assert np.array_equal(getattr(found, name), getattr(given_imu, name))
+    mag = read_mag_calibration(written(mag_calibration_text(MagCalibration(b, A), "x")))
+    assert np.array_equal(mag.bias_ut, b) and np.array_equal(mag.matrix, A)
+    sample = ImuSample(0, b, c)
+    both = given_imu.apply_to(np.concatenate([b, c])[None])[0]
+    applied = given_imu.apply(sample)
+    assert both == pytest.approx(np.concatenate([applied.gyro_rad_s, applied.accel_m_s2]))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["gyro_bias_rad_s: [0, 0, 0]\n", "a: 1\n", imu_calibration_text(ImuCalibration(), "").replace("1.0", "0.0")],
+)
+def test_partial_or_singular_imu_files_are_refused(text: str) -> None:
+    with pytest.raises(DataError, match="calibrat"):
+        read_imu_calibration(written(text))
+
+
+def test_noise_reads_back() -> None:
+    assert read_noise(written(imu_noise_text(NOISE, "x"))) == NOISE
+    assert read_noise(written(imu_text(NOISE, "x"))) == NOISE
+
+
+def raw_recording(folder: Path, sensor_extra: str = "") -> Path:
+    """Three frames, and an IMU and a magnetometer at rest whose samples are raw."""
+    t_s = np.arange(11) * 0.02
+    write_table(folder, "imu0", t_s, np.tile([0.1, 0.2, 0.3, 1.0, 2.0, 5.0], (11, 1)))
+    write_table(folder, "mag0", t_s, np.tile([10.0, 20.0, 30.0], (11, 1)))
+    (folder / "mav0/imu0/sensor.yaml").write_text(imu_text(NOISE, "raw") + sensor_extra)
+    data = folder / "mav0/cam0/data"
+    data.mkdir(parents=True)
+    image = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+    names = [f"{T0_NS + k * 100_000_000}" for k in range(3)]
+    for name in names:
+        cv2.imwrite(str(data / f"{name}.png"), image)
+    (data.parent / "data.csv").write_text("".join(f"{name},{name}.png\n" for name in names))
+    (data.parent / "sensor.yaml").write_text(camera_text(CAMERA, np.eye(4), "test"))
+    return folder
+
+
+CALIBRATION = ImuCalibration(np.array([0.1, 0.2, 0.3]), np.array([0.0, 0.0, 1.0]), 2.0 * np.eye(3), 2.0 * np.eye(3))
+
+
+def calibration_files(folder: Path) -> CalibrationConfig:
+    folder.mkdir()
+    T = se3_exp(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
+    new = replace(CAMERA, fx=77.0)
+    texts = {
+        "camera": camchain_text([CameraCalibration(new, T, 0.012, 0.0005)], ""),
+        "imu": imu_calibration_text(CALIBRATION, ""),
+        "imu_noise": imu_noise_text(replace(NOISE, accel_noise_density=0.5), ""),
+        "mag": mag_calibration_text(MagCalibration(np.array([10.0, 20.0, 20.0]), 3.0 * np.eye(3)), ""),
+    }
+    for name, text in texts.items():
+        (folder / f"{name}.yaml").write_text(text)
+    return CalibrationConfig(**{name: str(folder / f"{name}.yaml") for name in texts})
+
+
+def test_a_recording_is_seen_with_the_files_that_are_named(tmp_path: Path) -> None:
+    recording = open_dataset(str(raw_recording(tmp_path / "r")), calibration_files(tmp_path / "c"))
+    assert recording.rig.cameras[0].fx == 77.0
+    assert recording.rig.T_body_cams[0] == pytest.approx(se3_exp(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])))
+    assert recording.imu_noise == replace(NOISE, accel_noise_density=0.5)
+    events = list(recording.events())
+    imu = next(value for value in events if isinstance(value, ImuSample))
+    mag = next(value for value in events if isinstance(value, MagSample))
+    assert imu.gyro_rad_s == pytest.approx(np.zeros(3)) and imu.accel_m_s2 == pytest.approx([2.0, 4.0, 8.0])
+    assert mag.field_ut == pytest.approx([0.0, 0.0, 30.0])
+
+
+def test_a_recordings_own_sensor_file_may_say_that_samples_are_raw(tmp_path: Path) -> None:
+    text = "\n".join(imu_calibration_text(CALIBRATION, "").splitlines()[2:]) + "\n"
+    recording = open_dataset(str(raw_recording(tmp_path / "r", text)))
+    imu = next(value for value in recording.events() if isinstance(value, ImuSample))
+    assert imu.accel_m_s2 == pytest.approx([2.0, 4.0, 8.0])
+
+
+def test_the_clock_of_a_calibrated_camera_reaches_the_settings(tmp_path: Path) -> None:
+    config = Config(calibration=calibration_files(tmp_path / "c"))
+    assert with_clock(config).init.time_offset_s == 0.012
+    assert with_clock(config).init.time_offset_sigma_s == pytest.approx(0.0015)
+    own = load(overrides={"init.time_offset_s": 0.5, "calibration.camera": config.calibration.camera})
+    assert with_clock(own).init.time_offset_s == 0.5
+    assert with_clock(Config()) == Config()
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    files = calibration_files(tmp_path / "c")
+    recording = raw_recording(tmp_path / "r")
+    (tmp_path / "wide.yaml").write_text(camera_info_text(replace(CAMERA, width=128), "w"))
+    with pytest.raises(DataError, match="128x48"):
+        open_dataset(str(recording), CalibrationConfig(camera=str(tmp_path / "wide.yaml")))
+    with pytest.raises(DataError, match=r"none\.yaml"):
+        open_dataset(str(recording), CalibrationConfig(imu=str(tmp_path / "none.yaml")))
+    with pytest.raises(UsageError, match="exactly"):
+        open_source("points:laps", calibration=files)
+    assert isinstance(open_source("points:still", calibration=CalibrationConfig()).rig, Rig)
+
+
+def test_a_run_takes_the_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = calibration_files(tmp_path / "c")
+    command = ["run", str(raw_recording(tmp_path / "r")), "--out", str(tmp_path / "run")]
+    command += ["--calibration.camera", str(files.camera), "--calibration.imu", str(files.imu), "--view.no-enabled"]
+    assert run_verb(command) == 4, "three equal images are no trajectory, but the run begins"
+    config = load(overrides={})
+    text = (tmp_path / "run/config.json").read_text()
+    assert "0.012" in text and str(files.imu) in text and config.init.time_offset_s == 0.0
+    assert run_verb([*command, "--overwrite", "--calibration.imu", str(tmp_path / "none.yaml")]) == 3
+    assert "none.yaml" in capsys.readouterr().err

@@ -1,0 +1,25 @@
+"""The kinds of calibration that `vislam calibrate` knows: one row each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from vislam.calibration import options as o
+from vislam.calibration.noise import calibrate_noise
+from vislam.calibration.outcome import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of calibration."""
+
+    options: type[Any]
+    calibrate: Callable[[Any], Outcome]
+    summary: str
+
+
+KINDS = {
+    "noise": Kind(o.NoiseOptions, calibrate_noise, "white noise and bias walk of an IMU that stands still"),
+}

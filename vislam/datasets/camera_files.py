@@ -1,0 +1,147 @@
+"""Camera calibrations in the files of others: Kalibr's camchain.yaml, ROS's camera_info, ASL's sensor.yaml.
+
+A Kalibr chain of cameras alone has no `T_cam_imu`; ROS files have no pose at all. What a file does not say is None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.camera import Camera, Distortion
+from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_camera, read_pose
+from vislam.errors import DataError
+from vislam.geometry import invert
+from vislam.messages import Array
+
+_MAX_CAMERAS = 2
+_KALIBR_MODELS: dict[Distortion, str] = {"radtan": "radtan", "equidistant": "equidistant", "none": "none"}
+_ROS_MODELS: dict[Distortion, str] = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
+_RIGID = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """What a file says of one camera."""
+
+    camera: Camera
+    T_body_cam: Array | None = None  # [4, 4], body is the IMU
+    time_offset_s: float | None = None  # to be added to the camera's stamps to get the IMU's time
+    time_offset_sigma_s: float | None = None
+
+
+def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
+    """Return the calibration of one camera, or of the first two of a Kalibr chain; raises DataError naming the key."""
+    data = load_yaml(path)
+    if "camera_matrix" in data:
+        return (CameraCalibration(_ros_camera(data, path)),)
+    if not isinstance(data.get("cam0"), dict):
+        pose = read_pose(data, path) if data.get("T_BS") is not None else None
+        return (CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose),)
+    chain = [data[name] for k in range(_MAX_CAMERAS) if isinstance(data.get(name := f"cam{k}"), dict)]
+    found: list[CameraCalibration] = []
+    for entry in chain:
+        camera = parse_camera(entry, path, "distortion_coeffs")
+        T_body_cam = _optional_pose(entry, "T_cam_imu", path)
+        T_cam_before = _optional_pose(entry, "T_cn_cnm1", path)
+        if T_body_cam is None and found and T_cam_before is not None:
+            before = found[-1].T_body_cam
+            T_body_cam = None if before is None else before @ T_cam_before
+        found.append(CameraCalibration(camera, T_body_cam, *_offset(entry, path)))
+    return tuple(found)
+
+
+def camchain_text(cameras: Sequence[CameraCalibration], comment: str) -> str:
+    """Return Kalibr's camchain.yaml; our keys `skew_px` and `timeshift_cam_imu_sigma` stand in it only where needed."""
+    return f"# {' '.join(comment.split())}\n" + "".join(_chain_entry(k, found) for k, found in enumerate(cameras))
+
+
+def camera_info_text(camera: Camera, name: str) -> str:
+    """Return ROS's camera calibration file; the lens has no rectification, the projection matrix is K."""
+    coefficients = list(camera.coefficients)
+    if camera.distortion != "equidistant":
+        coefficients += [0.0] * (5 - len(coefficients))
+    projection = np.column_stack([camera.K, np.zeros(3)])
+    return (
+        f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: {name}\n"
+        + _ros_matrix("camera_matrix", camera.K)
+        + f"distortion_model: {_ROS_MODELS[camera.distortion]}\n"
+        + _ros_matrix("distortion_coefficients", np.array([coefficients]))
+        + _ros_matrix("rectification_matrix", np.eye(3))
+        + _ros_matrix("projection_matrix", projection)
+    )
+
+
+def _chain_entry(index: int, found: CameraCalibration) -> str:
+    camera = found.camera
+    lines = [f"cam{index}:"]
+    if found.T_body_cam is not None:
+        lines += ["  T_cam_imu:", *(f"  - {list_text(row)}" for row in invert(found.T_body_cam))]
+    lines += [
+        "  camera_model: pinhole",
+        f"  intrinsics: {list_text([camera.fx, camera.fy, camera.cx, camera.cy])}",
+        f"  distortion_model: {_KALIBR_MODELS[camera.distortion]}",
+        f"  distortion_coeffs: {list_text(camera.coefficients)}",
+        f"  resolution: [{camera.width}, {camera.height}]",
+        f"  rostopic: /cam{index}/image_raw",
+    ]
+    if camera.skew_px != 0.0:
+        lines.append(f"  skew_px: {float(camera.skew_px)!r}")
+    if found.time_offset_s is not None:
+        lines.append(f"  timeshift_cam_imu: {float(found.time_offset_s)!r}  # s, t_imu = t_cam + shift")
+    if found.time_offset_sigma_s is not None:
+        lines.append(f"  timeshift_cam_imu_sigma: {float(found.time_offset_sigma_s)!r}")
+    return "\n".join(lines) + "\n"
+
+
+def _offset(entry: Mapping[str, Any], path: Path) -> tuple[float | None, float | None]:
+    keys = ("timeshift_cam_imu", "timeshift_cam_imu_sigma")
+    values = [None if entry.get(key) is None else numbers_in({key: [entry[key]]}, key, path, 1)[0] for key in keys]
+    return values[0], values[1]
+
+
+def _optional_pose(entry: Mapping[str, Any], key: str, path: Path) -> Array | None:
+    """Return the inverse of a transform [4, 4] in a chain, None where there is none."""
+    if entry.get(key) is None:
+        return None
+    T = np.array(numbers_in(entry, key, path, 16)).reshape(4, 4)
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=_RIGID) or np.linalg.det(R) < 0.0:
+        raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
+    return invert(T)
+
+
+def _ros_camera(data: Mapping[str, Any], path: Path) -> Camera:
+    K = np.array(_ros_numbers(data, "camera_matrix", path, 9)).reshape(3, 3)
+    sizes = {key: [data.get(key)] for key in ("image_width", "image_height")}
+    width, height = (int(numbers_in(sizes, key, path, 1)[0]) for key in sizes)
+    name = str(data.get("distortion_model", "plumb_bob"))
+    coefficients = _ros_numbers(data, "distortion_coefficients", path)
+    if name == "equidistant":
+        model: Distortion = "equidistant"
+    elif name in ("plumb_bob", "rational_polynomial") and not any(coefficients[5:]):
+        model = "radtan" if any(coefficients) else "none"
+        coefficients = coefficients[: 5 if len(coefficients) > 4 and coefficients[4] != 0.0 else 4]
+    else:
+        raise DataError(f"{path}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob")
+    try:
+        return Camera(
+            width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model,
+            () if model == "none" else tuple(coefficients),
+        )  # fmt: skip
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _ros_numbers(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
+    holder = data.get(key)
+    return numbers_in(holder if isinstance(holder, dict) else {"data": holder}, "data", path, count)
+
+
+def _ros_matrix(name: str, matrix: Array) -> str:
+    rows, columns = matrix.shape
+    return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: {list_text(matrix.ravel())}\n"

@@ -1,0 +1,107 @@
+"""Calibrations of inertial and magnetic sensors in YAML: Kalibr's imu.yaml, and our keys for scale, axes and bias.
+
+Our keys may stand in a file of their own (as `vislam calibrate imu` writes it) or in a recording's `sensor.yaml`, which
+says that its samples are raw; docs/formats.md lists them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_noise
+from vislam.errors import DataError
+from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
+from vislam.messages import Array
+
+Calibration = TypeVar("Calibration", ImuCalibration, MagCalibration)
+
+_IMU_KEYS = {"gyro_bias_rad_s": 3, "accel_bias_m_s2": 3, "gyro_matrix": 9, "accel_matrix": 9}
+_MAG_KEYS = {"mag_bias_ut": 3, "mag_matrix": 9}
+
+
+def imu_noise_text(noise: ImuNoise, comment: str) -> str:
+    """Return Kalibr's imu.yaml for a noise model; `comment` becomes its first line."""
+    return (
+        f"# {' '.join(comment.split())}\n"
+        f"rostopic: /imu0\n"
+        f"update_rate: {float(noise.rate_hz)!r}  # Hz\n"
+        f"gyroscope_noise_density: {float(noise.gyro_noise_density)!r}  # rad/s/sqrt(Hz)\n"
+        f"gyroscope_random_walk: {float(noise.gyro_bias_walk)!r}  # rad/s^2/sqrt(Hz)\n"
+        f"accelerometer_noise_density: {float(noise.accel_noise_density)!r}  # m/s^2/sqrt(Hz)\n"
+        f"accelerometer_random_walk: {float(noise.accel_bias_walk)!r}  # m/s^3/sqrt(Hz)\n"
+    )
+
+
+def read_noise(path: Path) -> ImuNoise:
+    """Return the noise model of Kalibr's imu.yaml or of an ASL sensor.yaml; raises DataError naming the key."""
+    data = load_yaml(path)
+    return parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
+
+
+def imu_calibration_text(calibration: ImuCalibration, comment: str) -> str:
+    """Return the file of an IMU's calibration."""
+    return (
+        f"sensor_type: imu\ncomment: {json.dumps(comment)}\n"
+        "# calibrated = matrix @ (raw - bias); matrices by row\n"
+        f"gyro_bias_rad_s: {list_text(calibration.gyro_bias_rad_s)}\n"
+        f"gyro_matrix: {_rows(calibration.gyro_matrix)}\n"
+        f"accel_bias_m_s2: {list_text(calibration.accel_bias_m_s2)}\n"
+        f"accel_matrix: {_rows(calibration.accel_matrix)}\n"
+    )
+
+
+def mag_calibration_text(calibration: MagCalibration, comment: str) -> str:
+    """Return the file of a magnetometer's calibration."""
+    return (
+        f"sensor_type: magnetometer\ncomment: {json.dumps(comment)}\n"
+        "# calibrated = matrix @ (raw - bias); matrix by row\n"
+        f"mag_bias_ut: {list_text(calibration.bias_ut)}\n"
+        f"mag_matrix: {_rows(calibration.matrix)}\n"
+    )
+
+
+def read_imu_calibration(path: Path) -> ImuCalibration:
+    """Return the calibration of an IMU in a file; raises DataError when it holds none."""
+    return _wanted(imu_calibration(load_yaml(path), path), path, _IMU_KEYS, "imu")
+
+
+def read_mag_calibration(path: Path) -> MagCalibration:
+    """Return the calibration of a magnetometer in a file; raises DataError when it holds none."""
+    return _wanted(mag_calibration(load_yaml(path), path), path, _MAG_KEYS, "mag")
+
+
+def imu_calibration(data: Mapping[str, Any], path: Path) -> ImuCalibration | None:
+    """Return the calibration in the keys of a sensor file, None without any; raises DataError when some are missing."""
+    values = _values(data, path, _IMU_KEYS)
+    return None if values is None else ImuCalibration(**values)
+
+
+def mag_calibration(data: Mapping[str, Any], path: Path) -> MagCalibration | None:
+    """Return the calibration in the keys of a sensor file, None without any; raises DataError when some are missing."""
+    values = _values(data, path, _MAG_KEYS)
+    return None if values is None else MagCalibration(values["mag_bias_ut"], values["mag_matrix"])
+
+
+def _values(data: Mapping[str, Any], path: Path, keys: Mapping[str, int]) -> dict[str, Array] | None:
+    there = [key for key in keys if data.get(key) is not None]
+    if not there:
+        return None
+    if missing := [key for key in keys if key not in there]:
+        raise DataError(f"{path} holds {', '.join(there)} but not {', '.join(missing)}; calibrate again")
+    arrays = {key: np.array(numbers_in(data, key, path, count)) for key, count in keys.items()}
+    return {key: value.reshape(3, 3) if len(value) == 9 else value for key, value in arrays.items()}
+
+
+def _wanted(found: Calibration | None, path: Path, keys: Mapping[str, int], kind: str) -> Calibration:
+    if found is None:
+        raise DataError(f"{path} holds none of {', '.join(keys)}; `vislam calibrate {kind}` writes such a file")
+    return found
+
+
+def _rows(matrix: Array) -> str:
+    return "[" + ",\n  ".join(list_text(row)[1:-1] for row in matrix) + "]"
