@@ -465,7 +465,7 @@ class DriveConfig:
     slope_window_m: float = 0.40  # slope is that of a plane through the ground within it: a voxel's step is no slope
 
 
-MapProduct = Literal["cloud", "pcd", "octomap", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
+MapProduct = Literal["cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
 
 
 @dataclass(frozen=True, slots=True)

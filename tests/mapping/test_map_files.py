@@ -2,6 +2,7 @@ import json
 import struct
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from box_world import CONFIG, RIG, keyframe, pose
@@ -16,8 +17,9 @@ from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.mesh import Mesh
 from vislam.mapping.mesh_files import write_glb, write_obj
+from vislam.mapping.octomap_io import read_octree
 from vislam.mapping.pcd import read_pcd, write_pcd
-from vislam.mapping.ply import read_ply, write_ply
+from vislam.mapping.ply import read_ply, read_ply_mesh, write_ply
 
 
 def some_points(count, seed=0):
@@ -135,6 +137,61 @@ def square():
     return Mesh(points, colors, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
 
 
+def write_mesh(path):
+    mesh = square()
+    write_ply(path, mesh.points_m, mesh.colors, mesh.triangles)
+    return mesh
+
+
+def test_a_mesh_is_read_back(tmp_path):
+    mesh = write_mesh(tmp_path / "a.ply")
+    for got, wrote in zip(read_ply_mesh(tmp_path / "a.ply"), (mesh.points_m, mesh.colors, mesh.triangles), strict=True):
+        np.testing.assert_array_equal(got, wrote)
+        assert got.dtype == wrote.dtype
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (b"element face 2", b"element face 3", "is cut"),
+        (b"element face 2", b"element face " + b"9" * 12, "is cut"),
+        (b"element face 2", b"element face " + b"9" * 50, "element face COUNT"),
+        (b"element face 2", b"element face -2", "element face COUNT"),
+        (b"element face 2\nproperty list uchar int vertex_indices\n", b"", "element face COUNT"),
+        (b"list uchar int", b"list uchar uint", "element face COUNT"),
+        (struct.pack("<B3i", 3, 0, 2, 3), struct.pack("<B3i", 3, 0, 2, 4), "not a triangle"),
+        (struct.pack("<B3i", 3, 0, 2, 3), struct.pack("<B3i", 3, 0, -1, 3), "not a triangle"),
+        (struct.pack("<B3i", 3, 0, 2, 3), struct.pack("<B3i", 4, 0, 2, 3), "not a triangle"),
+    ],
+)
+def test_damaged_and_hostile_meshes_are_errors(tmp_path, old, new, words):
+    path = tmp_path / "a.ply"
+    write_mesh(path)
+    whole = path.read_bytes()
+    assert whole.count(old) == 1
+    path.write_bytes(whole.replace(old, new))
+    with pytest.raises(DataError, match=words):
+        read_ply_mesh(path)
+
+
+def test_any_damage_to_a_mesh_is_an_error_or_another_mesh(tmp_path):
+    path = tmp_path / "a.ply"
+    write_mesh(path)
+    whole = path.read_bytes()
+
+    @settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @given(st.integers(0, len(whole) - 1), st.binary(max_size=6), st.integers(0, len(whole)))
+    def damage(place, put, length):
+        path.write_bytes((whole[:place] + put + whole[place + len(put) :])[:length])
+        try:
+            points, _, triangles = read_ply_mesh(path)
+        except DataError:
+            return
+        assert triangles.size == 0 or triangles.max() < len(points)
+
+    damage()
+
+
 def test_glb_holds_the_mesh_with_its_colours(tmp_path):
     mesh = square()
     write_glb(tmp_path / "a.glb", mesh)
@@ -185,7 +242,7 @@ def room(products):
 def test_every_product_is_a_file(tmp_path):
     if load_open3d()[0] is None:
         missing("open3d")
-    products = ("cloud", "pcd", "octomap", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels")
+    products = ("cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels")
     mapper, told = room(products), []
     written = mapper.export(tmp_path, told.append)
     assert tuple(told) == products
@@ -193,6 +250,11 @@ def test_every_product_is_a_file(tmp_path):
     assert mapper.notes == {}
     assert all(path.is_file() for path in written.values())
     np.testing.assert_array_equal(read_pcd(written["pcd"])[0], read_ply(written["cloud"])[0])
+    plain, coloured = read_octree(written["octomap"]), read_octree(written["ot"])
+    np.testing.assert_array_equal(coloured.occupied_voxels(), plain.occupied_voxels())
+    shown = coloured.colors[(coloured.colors != 255).any(axis=1)]
+    assert len(shown) > 0.5 * (coloured.log_odds >= 0.0).sum()
+    assert np.abs(np.median(shown, axis=0) - [200, 0, 0]).max() <= 4
     surfels, _ = read_ply(written["surfels"])
     poisson, _ = read_ply(written["poisson"])
     for points in (surfels, poisson):
@@ -202,6 +264,21 @@ def test_every_product_is_a_file(tmp_path):
     assert {name: path.read_bytes() for name, path in again.items()} == {
         name: path.read_bytes() for name, path in written.items()
     }
+
+
+def test_cloud_mesh_and_octree_are_drawn(tmp_path):
+    if load_open3d()[0] is None:
+        missing("open3d")
+    mapper = room(("cloud", "mesh"))
+    mapper.export(tmp_path)
+    path_m = np.array([pose(k)[:3, 3] for k in range(8)])
+    pictures = {
+        path.stem: cv2.imread(str(path)).astype(int) for path in write_pictures(mapper, tmp_path, path_m, False)
+    }
+    assert set(pictures) == {"picture_cloud", "picture_mesh", "picture_octree"}
+    for name in ("picture_cloud", "picture_mesh"):  # the room's red
+        blue, green, red = pictures[name].transpose(2, 0, 1)
+        assert ((red > 100) & (green < 60) & (blue < 60)).mean() > 0.05
 
 
 def test_without_open3d_only_meshes_are_missing_and_said(tmp_path, monkeypatch):

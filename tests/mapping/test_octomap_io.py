@@ -163,6 +163,32 @@ def test_octomap_reads_our_colours(tmp_path):
     assert (tmp_path / "b.ot").read_bytes() == encode_ot(coloured)
 
 
+@pytest.mark.parametrize("insertion", ["discretised", "full"])
+def test_a_coloured_map_is_that_of_octomap_byte_for_byte(tmp_path, insertion):
+    """Each occupied leaf of OctoMap's own tree of the same points gets the mean colour of the points in it."""
+    rng = np.random.default_rng(9)
+    ours, theirs = OccupancyMap(0.1), pyoctomap.ColorOcTree(0.1)
+    points = np.round(rng.uniform(-0.45, 0.45, (4000, 3)), 2).astype(np.float32) + np.float32(0.004)
+    colors = rng.integers(0, 256, points.shape).astype(np.uint8)
+    for scan in [points[:300], *[points] * 6]:  # often enough for most to be clamped, and pruned
+        ours.insert(scan, np.zeros(3), 2.0, insertion)
+        theirs.insertPointCloud(
+            scan.astype(np.float64), np.zeros(3), max_range=2.0, discretize=insertion == "discretised"
+        )
+    coloured = ours.octree()
+    assert ((coloured.log_odds >= 0.0) & (coloured.levels > 0)).any()
+    is_occupied = coloured.log_odds_at(points) >= 0.0
+    coloured = coloured.with_colors(points[is_occupied], colors[is_occupied])
+    for centre, edge in zip(*coloured.centres_m(), strict=True):
+        inside = is_occupied & (np.abs(points - centre) < 0.5 * edge).all(axis=1)
+        if inside.any():
+            mean = colors[inside].astype(int).sum(axis=0) // inside.sum()
+            theirs.setNodeColor(theirs.coordToKey(centre), *mean.tolist())
+    theirs.updateInnerOccupancy()
+    theirs.write(str(tmp_path / "theirs.ot"))
+    assert encode_ot(coloured) == (tmp_path / "theirs.ot").read_bytes()
+
+
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.booleans())
 def test_any_octree_survives_writing_and_reading(seed, count, is_coloured):

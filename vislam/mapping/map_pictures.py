@@ -13,9 +13,10 @@ from vislam.errors import DataError
 from vislam.mapping.cloud import Cloud
 from vislam.mapping.drive import Drive
 from vislam.mapping.files import replacing
-from vislam.mapping.picture import Line, render_cloud, render_octree
+from vislam.mapping.mesh import Mesh
+from vislam.mapping.picture import Line, render_cloud, render_mesh, render_octree
 from vislam.mapping.plan_picture import render_drive
-from vislam.mapping.ply import read_ply
+from vislam.mapping.ply import read_ply, read_ply_mesh
 from vislam.mapping.products import FILES, MapSource
 
 _PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
@@ -24,8 +25,8 @@ _PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph
 def write_pictures(source: MapSource, folder: Path, path_m: NDArray[np.float64], is_level: bool) -> list[Path]:
     """Write pictures of the map, with the path [N, 3] drawn in; an empty map has none, return what was written.
 
-    The cloud is that of the folder, if it is there. Where to drive is only shown of a map that is level, with z up.
-    Raises StorageError when one cannot be written.
+    Cloud and mesh are those of the folder, if they are there. Where to drive is only shown of a map that is level,
+    with z up. Raises StorageError when one cannot be written.
     """
     path = [Line(path_m, _PATH_COLOR)]
     octree = source.occupancy.max_likelihood_octree()
@@ -34,6 +35,9 @@ def write_pictures(source: MapSource, folder: Path, path_m: NDArray[np.float64],
         points, colors = read_ply(folder / FILES["cloud"])
         if len(points):
             pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path, octree=octree)
+    if (folder / FILES["mesh"]).is_file():
+        mesh = Mesh(*read_ply_mesh(folder / FILES["mesh"]))
+        pictures["picture_mesh.png"] = render_mesh(mesh, path, octree=octree)
     if len(octree.occupied_voxels()):
         pictures["picture_octree.png"] = render_octree(octree, path)
     with suppress(DataError):  # too large a map for a grid: that is said where the grid is written

@@ -20,6 +20,7 @@ from vislam.mapping.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh import Mesh, fuse_mesh
 from vislam.mapping.monodepth import LateDepth
 from vislam.mapping.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree import Octree
 from vislam.mapping.products import write_products
 from vislam.mapping.store import KeyframeStore, Scan
 from vislam.mapping.surfels import SurfelMap, Surfels
@@ -29,6 +30,7 @@ from vislam.messages import GraphUpdate, Keyframe
 Array = NDArray[np.float64]
 
 _RIGID_TOLERANCE = 1e-4
+_MAX_COLOURED_VOXELS = 1 << 22  # of the octree; more, and neighbours share a colour
 
 
 class Mapper:
@@ -123,19 +125,19 @@ class Mapper:
     def cloud(self) -> Cloud:
         """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
         config = self._config
-        average = VoxelAverage(config.cloud_voxel_m, config.cloud_max_points)
-        sparse_only = True
-        for scan, T in self._scans():
-            sparse_only = sparse_only and scan.depth is None
-            points = self._points(scan, T)
-            seen_from = (T @ self._extractor.view.T_body_view)[:3, 3].astype(np.float32)
-            squared_m2 = np.maximum(np.sum((points.points_m - seen_from) ** 2, axis=1), config.min_range_m**2)
-            # depth from disparity, structured light included, errs with the square of range: weight 1 / sigma^2
-            average.add(points, (1.0 / squared_m2**2).astype(np.float32))
+        average, sparse_only = self._averaged(config.cloud_voxel_m, config.cloud_max_points)
         fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
         return without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
+
+    def coloured_octree(self) -> Octree:
+        """Return the octree of log-odds; occupied leaves have the mean colour of what keyframes saw in them."""
+        octree = self.occupancy.octree()
+        average, _ = self._averaged(self._config.resolution_m, _MAX_COLOURED_VOXELS)
+        points = average.cloud()
+        points = points.select(octree.log_odds_at(points.points_m) >= 0.0)
+        return octree.with_colors(points.points_m, points.colors)
 
     def grid(self) -> Grid:
         """Return the navigation grid of the occupancy map."""
@@ -178,6 +180,19 @@ class Mapper:
     def _scans(self) -> Iterator[tuple[Scan, Array]]:
         for keyframe_id in self._store.ids:
             yield self._store.scan(keyframe_id), self._occupancy.poses[keyframe_id]
+
+    def _averaged(self, voxel_m: float, max_points: int) -> tuple[VoxelAverage, bool]:
+        """Return the average of all keyframes' points in each voxel, and whether none of them has dense depth."""
+        average = VoxelAverage(voxel_m, max_points)
+        sparse_only = True
+        for scan, T in self._scans():
+            sparse_only = sparse_only and scan.depth is None
+            points = self._points(scan, T)
+            seen_from = (T @ self._extractor.view.T_body_view)[:3, 3].astype(np.float32)
+            squared_m2 = np.maximum(np.sum((points.points_m - seen_from) ** 2, axis=1), self._config.min_range_m**2)
+            # depth from disparity, structured light included, errs with the square of range: weight 1 / sigma^2
+            average.add(points, (1.0 / squared_m2**2).astype(np.float32))
+        return average, sparse_only
 
     def _points(self, scan: Scan, T_frame_body: Array) -> Cloud:
         if scan.depth is not None:

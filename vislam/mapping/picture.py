@@ -144,16 +144,18 @@ def render_cloud(
     return _finish(canvas, scene)
 
 
-def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
-    """Return the picture [H, W, 3] RGB of a coloured mesh, seen from above at an angle."""
+def render_mesh(
+    mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = None, octree: Octree | None = None
+) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of a coloured mesh, seen from above at an angle; the octree as for a cloud."""
     style = style or Style()
     R_up = level_rotation(np.array(style.up, dtype=np.float64))
     points, lines = mesh.points_m @ R_up.T, _turned(lines, R_up)
     below = points[:, 2] <= _ceiling_m(style, lines, points)
     triangles = mesh.triangles[below[mesh.triangles].all(axis=1)]
-    used = points[np.unique(triangles)]
-    scene = _Scene(used, lines, style, R_up, None)
+    scene = _Scene(points[np.unique(triangles)], lines, style, R_up, octree)
     canvas = _canvas(scene)
+    triangles = triangles[scene.seen_from(canvas.eye, points)[triangles].all(axis=1)]
     _draw_triangles(canvas, points, mesh.colors.astype(np.float32), triangles)
     return _finish(canvas, scene)
 

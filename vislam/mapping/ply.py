@@ -1,4 +1,4 @@
-"""Binary little-endian PLY: clouds and meshes written in pieces, clouds read with memory bounded by the file's size."""
+"""Binary little-endian PLY: clouds and meshes written in pieces, read with memory bounded by the file's size."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ _MAX_HEADER_LINES = 100
 _MAX_LINE_BYTES = 1024
 _VERTEX: list[Any] = [("xyz", "<f4", 3), ("rgb", "u1", 3)]
 _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
+_FACE_PROPERTY = "property list uchar int vertex_indices"
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -42,7 +43,7 @@ def write_ply(
     extra = {} if extra is None else extra
     vertex = np.dtype([*_VERTEX, *((name, "<f4") for name in extra)])
     floats = "".join(f"property float {name}\n" for name in extra)
-    faces = "" if triangles is None else f"element face {len(triangles)}\nproperty list uchar int vertex_indices\n"
+    faces = "" if triangles is None else f"element face {len(triangles)}\n{_FACE_PROPERTY}\n"
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment vislam, metres in the map frame\n"
         f"element vertex {len(points_m)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -82,10 +83,24 @@ def read_ply(path: Path) -> tuple[Points, Colors]:
     return points, np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
 
 
-def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.dtype[np.void]]]) -> NDArray[np.void]:
-    """Return the points [N] of a file, whose header says how many there are and what each holds.
+def read_ply_mesh(path: Path) -> tuple[Points, Colors, NDArray[np.int32]]:
+    """Return vertices [N, 3], RGB colours [N, 3] and triangles [M, 3] of a mesh that `write_ply` wrote.
 
-    Raises DataError when the file cannot be read or is cut short, before memory is taken.
+    Raises DataError as `read_ply`, and when its faces are not triangles of its vertices.
+    """
+    points, colors = read_ply(path)
+    faces = read_rows(path, _read_face_header)
+    triangles = faces["vertices"]
+    if (faces["corners"] != 3).any() or (triangles < 0).any() or (triangles >= len(points)).any():
+        raise DataError(f"{path} is damaged: a face is not a triangle of its {len(points)} vertices")
+    return points, colors, np.ascontiguousarray(triangles)
+
+
+def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.dtype[np.void]]]) -> NDArray[np.void]:
+    """Return the rows [N] of a file, whose header says how many there are and what each holds.
+
+    The header's reader leaves the file where the rows begin. Raises DataError when the file cannot be read or is cut
+    short, before memory is taken.
     """
     try:
         with path.open("rb") as file:
@@ -100,8 +115,22 @@ def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
-    """Return the number of vertices and their layout; the vertices must come first."""
+def _read_face_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
+    """Return the number of faces and their layout, and leave the file where they begin, after the vertices."""
+    count, vertex = _read_header(file, path)
+    vertices_at = file.tell()
+    file.seek(0)
+    lines = _header_lines(file, path)
+    start = next((i for i, line in enumerate(lines) if line.startswith("element face ")), -1)
+    number = lines[start].removeprefix("element face ")
+    if start < 0 or lines[start + 1 :] != [_FACE_PROPERTY, "end_header"] or not number.isdecimal() or len(number) > 12:
+        raise DataError(f"{path}: after the vertices must come 'element face COUNT' and '{_FACE_PROPERTY}' alone")
+    file.seek(vertices_at + count * vertex.itemsize)
+    return int(number), _FACE
+
+
+def _header_lines(file: BinaryIO, path: Path) -> list[str]:
+    """Return the lines of a binary PLY's header, from "ply" to "end_header"."""
     lines = []
     for _ in range(_MAX_HEADER_LINES):
         line = file.readline(_MAX_LINE_BYTES).decode("ascii", errors="replace").strip()
@@ -112,6 +141,12 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
         raise DataError(f"{path} has no PLY header that ends within {_MAX_HEADER_LINES} lines")
     if "format binary_little_endian 1.0" not in lines:
         raise DataError(f"{path} is not a binary little-endian PLY; convert it first")
+    return lines
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
+    """Return the number of vertices and their layout; the vertices must come first."""
+    lines = _header_lines(file, path)
     start = next((i for i, line in enumerate(lines) if line.startswith("element")), len(lines) - 1)
     words = lines[start].split()
     if words[:2] != ["element", "vertex"] or len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 12:

@@ -16,13 +16,15 @@ from vislam.mapping.grid import Grid, write_grid
 from vislam.mapping.mesh import Mesh, poisson_mesh
 from vislam.mapping.mesh_files import write_glb, write_obj
 from vislam.mapping.occupancy import OccupancyMap
-from vislam.mapping.octomap_io import encode_bt
+from vislam.mapping.octomap_io import encode_bt, encode_ot
+from vislam.mapping.octree import Octree
 from vislam.mapping.pcd import write_pcd
 from vislam.mapping.ply import write_ply
 from vislam.mapping.surfels import Surfels
 
 FILES = {
-    "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "grid": "grid.pgm", "drive": "drive.pgm",
+    "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",
+    "grid": "grid.pgm", "drive": "drive.pgm",
     "mesh": "mesh.ply", "glb": "mesh.glb", "obj": "mesh.obj", "poisson": "poisson.ply", "surfels": "surfels.ply",
 }  # fmt: skip
 
@@ -33,6 +35,9 @@ class MapSource(Protocol):
     @property
     def occupancy(self) -> OccupancyMap:
         """The occupancy map."""
+
+    def coloured_octree(self) -> Octree:
+        """Return the octree with colours."""
 
     def cloud(self) -> Cloud:
         """Return the cloud."""
@@ -65,7 +70,8 @@ def write_products(
     writers: dict[str, Callable[[Path], object]] = {  # a text is the reason why nothing was written
         "cloud": lambda path: write_ply(path, cloud().points_m, cloud().colors),
         "pcd": lambda path: write_pcd(path, cloud().points_m, cloud().colors),
-        "octomap": lambda path: _write_octomap(path, source.occupancy),
+        "octomap": lambda path: _write_octree(path, encode_bt(source.occupancy.max_likelihood_octree())),
+        "ot": lambda path: _write_octree(path, encode_ot(source.coloured_octree())),
         "grid": lambda _: write_grid(folder, source.grid()),
         "drive": lambda _: write_grid(folder, source.drive().navigation_grid(), "drive"),
         "surfels": lambda path: _write_surfels(path, surfels()),
@@ -90,9 +96,9 @@ def write_products(
     return written, notes
 
 
-def _write_octomap(path: Path, occupancy: OccupancyMap) -> None:
+def _write_octree(path: Path, content: bytes) -> None:
     with replacing(path) as file:
-        file.write(encode_bt(occupancy.max_likelihood_octree()))
+        file.write(content)
 
 
 def _write_surfels(path: Path, surfels: Surfels) -> str | None:
