@@ -558,6 +558,82 @@ class ViewConfig:
     max_range_m: float = 8.0  # farther depth is noise that hides the scene
 
 
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+Axes = tuple[Axis, Axis, Axis]
+Vector3 = tuple[float, float, float]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+
+_IDENTITY: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorCalibration:
+    """From the axes of chips to the calibrated body frame (x forward, y left, z up): axes first, then the rest.
+
+    `calibrated = matrix @ (turned - bias)`, where `turned` is in body axes; zero and identity are an ideal chip.
+    """
+
+    gyro_axes: Axes = ("x", "y", "z")  # axes of the chip that point along x, y, z of the body
+    accel_axes: Axes = ("x", "y", "z")  # the three chips of a GY-85 are placed alike; check yours: docs/cart.md
+    mag_axes: Axes = ("x", "y", "z")  # clones are placed otherwise
+    gyro_bias_rad_s: Vector3 = (0.0, 0.0, 0.0)
+    gyro_matrix: Matrix3 = _IDENTITY
+    accel_bias_m_s2: Vector3 = (0.0, 0.0, 0.0)
+    accel_matrix: Matrix3 = _IDENTITY
+    mag_bias_ut: Vector3 = (0.0, 0.0, 0.0)
+    mag_matrix: Matrix3 = _IDENTITY
+
+
+@dataclass(frozen=True, slots=True)
+class Gy85Config:
+    """The GY-85 board (ADXL345, ITG3205, HMC5883L or a clone of it) on an I2C bus."""
+
+    bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
+    bus_timeout_s: float = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
+    rate_hz: float = 400.0  # of samples; 28 % of a 400 kHz bus. On a 100 kHz bus ask for 100
+    gyro_bandwidth_hz: Literal[256, 188, 98, 42, 20, 10, 5] = 98  # below half the rate: the chip cannot be aliased
+    gyro_delay_s: float | None = None  # of that filter, taken off the stamps; None: what its makers state
+    accel_rate_hz: Literal[100, 200, 400, 800] = 400  # 1600 and more lose the last bit, less than 100 no self-test
+    accel_range_g: Literal[2, 4, 8, 16] = 16  # full resolution has 3.9 mg in every range, so the widest costs nothing
+    mag: bool = True  # look for a magnetometer
+    mag_rate_hz: float = 50.0  # how often it is asked; it measures at 75 (clones: 100)
+    mag_range_ga: float = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
+    self_test: bool = True  # at the start, 1 s, standing still; docs/cart.md says what is tested
+    supply_v: float = 3.3  # of the accelerometer: its self-test limits grow with it
+    reopen_s: float = 0.5  # between attempts to reach a chip or bus that went away; one costs up to 0.1 s
+    nacks_to_reopen: int = 5  # in a row until a chip counts as gone: single ones are noise on the wire
+    silent_s: float = 0.1  # without a sample, a chip is set up again, and the source says that it is missing
+    stuck_samples: int = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
+    max_temperature_change_c: float = 10.0  # since the biases were taken; an ITG3205 then drifts by up to 1 deg/s
+    calibration: SensorCalibration = field(default_factory=SensorCalibration)
+
+
+@dataclass(frozen=True, slots=True)
+class PowerUpConfig:
+    """Taking the current attitude as horizontal and the current rate as zero, when the power comes on."""
+
+    window_s: float = 2.0  # of standing still; a gyro of 0.03 deg/s/sqrt(Hz) gives its bias to 0.02 deg/s
+    max_gyro_std_rad_s: float = 0.02  # per axis; an ITG3205 at 98 Hz has 0.0065, a hand on the cart gives 0.03
+    max_accel_std_m_s2: float = 0.25  # per axis; an ADXL345 at 400 Hz has 0.08
+    max_rate_rad_s: float = 0.7  # mean; the ITG3205 may start with 40 deg/s, more is motion
+    max_turn_rad_s: float = 0.02  # of the mean between the halves of the window: a bias does not change within it
+    max_bias_change_rad_s: float = 0.05  # from what was remembered for this temperature: an even turn looks like a bias
+    gravity_tolerance_m_s2: float = 0.5  # of the measured norm: an accelerometer after calibration
+    max_tilt_deg: float = 20.0  # of the body to gravity; more is a wrong axis, or no cart that stands on a floor
+    remembered: int = 64  # biases kept, one per degree of temperature
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeConfig:
+    """Complementary filter: attitude from gyro and accelerometer alone, the baseline without vision."""
+
+    proportional_gain: float = 0.05  # 1/s: leans on the accelerometer over 20 s, which outlasts a cart's accelerations
+    integral_gain: float = 0.0005  # 1/s^2: learns what bias is left after power-up within minutes
+    gate_m_s2: float = 0.15  # |force| further from gravity is motion, not tilt
+    mag_gain: float = 0.05  # 1/s, of the yaw by the magnetometer
+    mag_gate: float = 0.1  # relative, of the norm of the field from that at the start: iron or a motor is near
+
+
 @dataclass(frozen=True, slots=True)
 class BridgeClockConfig:
     """The line that turns the serial bridge's clock into the host's."""

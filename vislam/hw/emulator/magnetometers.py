@@ -1,0 +1,148 @@
+"""Virtual HMC5883L (or DA5883), QMC5883L and QMC5883P."""
+
+from __future__ import annotations
+
+import struct
+
+from vislam.hw.emulator.chips import Chip, NowNs
+from vislam.hw.emulator.sensing import IDEAL, Sensing, SensorError, Triple, Truth, quantised
+
+_UT_PER_GA = 100.0
+
+
+class VirtualHmc5883l(Chip):
+    """Order X, Z, Y; the gain lags one measurement; -4096 beyond the range; a part of the data read locks the rest."""
+
+    _LSB_PER_GA = (1370, 1090, 820, 660, 440, 390, 330, 230)
+    _RATES_HZ = (0.75, 1.5, 3.0, 7.5, 15.0, 30.0, 75.0, 75.0)
+
+    def __init__(
+        self,
+        truth: Truth,
+        now_ns: NowNs,
+        error: SensorError = IDEAL,
+        seed: int = 0,
+        status_works: bool = True,
+        coil_ga: Triple = (1.16, 1.16, 1.08),
+    ) -> None:
+        """Take the motion, the host's clock and the errors; without a working status it is a DA5883."""
+        self._truth, self._now_ns, self._status_works, self._coil_ga = truth, now_ns, status_works, coil_ga
+        self._sense = Sensing(error, seed)
+        self._rate = 1.0 + error.rate_error
+        super().__init__()
+
+    def power_cycle(self) -> None:
+        """Come up in single-measurement mode with gain 1."""
+        super().power_cycle()
+        self.registers[0x00], self.registers[0x01], self.registers[0x02] = 0x10, 0x20, 0x01
+        self.registers[0x0A:0x0D] = b"H43"
+        self._start_ns = self._now_ns()
+        self._sample = 0
+        self._gain = 1
+        self._locked = False
+
+    def lock(self) -> None:
+        """Lock the data, as a read that broke off in the middle of them does; a write of the mode frees them too."""
+        self._locked = True
+
+    def _write_register(self, register: int, value: int) -> None:
+        if register > 0x02:
+            return
+        self._run()
+        self.registers[register] = value
+        if register == 0x02:
+            self._start_ns, self._sample, self._locked = self._now_ns(), 0, False
+
+    def _period_ns(self) -> float:
+        return 1e9 / (self._RATES_HZ[self.registers[0x00] >> 2 & 7] * self._rate)
+
+    def _run(self) -> None:
+        mode = self.registers[0x02] & 3
+        sample = int((self._now_ns() - self._start_ns) / self._period_ns())
+        if mode > 1 or sample == self._sample or self._locked or self.is_frozen:
+            return
+        steps, self._sample = sample - self._sample, sample
+        t_ns = self._start_ns + int(sample * self._period_ns())
+        if steps > 1:
+            self._gain = self.registers[0x01] >> 5
+        _, _, field, temperature_c = self._truth(t_ns)
+        coil = self.registers[0x00] & 3
+        x, y, z = self._sense(field, t_ns, temperature_c, 0.5e9 / self._period_ns())
+        gauss = (x / _UT_PER_GA, y / _UT_PER_GA, z / _UT_PER_GA)
+        if coil in (1, 2):  # the chip takes the outer field out by itself
+            sign = 1.0 if coil == 1 else -1.0
+            gauss = (sign * self._coil_ga[0], sign * self._coil_ga[1], sign * self._coil_ga[2])
+        counts = quantised(gauss, self._LSB_PER_GA[self._gain], -32768, 32767)
+        x_, y_, z_ = (-4096 if abs(value) > 2047 else value for value in counts)
+        struct.pack_into(">3h", self.registers, 0x03, x_, z_, y_)
+        self._gain = self.registers[0x01] >> 5
+        if mode == 1:
+            self.registers[0x02] = 0x03
+
+    def _begin_read(self, first: int, count: int) -> None:
+        self._run()
+        into_ns = (self._now_ns() - self._start_ns) % self._period_ns()
+        ready = self._sample > 0 and into_ns >= 250_000
+        self.registers[0x09] = (0x01 if ready else 0) | (0x02 if self._locked else 0) if self._status_works else 0
+
+    def _end_read(self, first: int, count: int) -> None:
+        if first <= 0x08 and first + count > 0x03:
+            self._locked = first > 0x03 or first + count < 0x09
+
+    def _next(self, pointer: int) -> int:
+        return {0x08: 0x03, 0x0C: 0x00}.get(pointer, (pointer + 1) & 0xFF)
+
+
+class VirtualQmc5883(Chip):
+    """QMC5883L ("L") or QMC5883P ("P"): little-endian X, Y, Z, ready and overflow bits that reading the data clears."""
+
+    def __init__(
+        self,
+        truth: Truth,
+        now_ns: NowNs,
+        error: SensorError = IDEAL,
+        seed: int = 0,
+        variant: str = "L",
+    ) -> None:
+        """Take the motion, the host's clock and the errors."""
+        self._truth, self._now_ns, self._is_p = truth, now_ns, variant == "P"
+        self._sense = Sensing(error, seed)
+        self._rate = 1.0 + error.rate_error
+        self._data, self._status, self._control = (0x01, 0x09, 0x0A) if self._is_p else (0x00, 0x06, 0x09)
+        super().__init__()
+
+    def power_cycle(self) -> None:
+        """Come up suspended."""
+        super().power_cycle()
+        self.registers[0x00 if self._is_p else 0x0D] = 0x80 if self._is_p else 0xFF
+        self._start_ns = self._now_ns()
+        self._sample = 0
+
+    def _write_register(self, register: int, value: int) -> None:
+        if register in (0x09, 0x0A, 0x0B, 0x29) and register != self._status:
+            self.registers[register] = value
+        if register == self._control:
+            self._start_ns, self._sample = self._now_ns(), 0
+
+    def _begin_read(self, first: int, count: int) -> None:
+        control = self.registers[self._control]
+        rate_hz = (10.0, 50.0, 100.0, 200.0)[control >> 2 & 3] * self._rate
+        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
+        if not control & 3 or sample == self._sample or self.is_frozen:
+            return
+        self._sample = sample
+        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
+        _, _, field, temperature_c = self._truth(t_ns)
+        x, y, z = self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
+        if self._is_p:
+            lsb = (1000.0, 2500.0, 3750.0, 15000.0)[self.registers[0x0B] >> 2 & 3]
+        else:
+            lsb = 3000.0 if control >> 4 & 1 else 12000.0
+        exact = quantised((x, y, z), lsb / _UT_PER_GA, -(1 << 20), 1 << 20)
+        counts = [min(max(value, -32768), 32767) for value in exact]
+        struct.pack_into("<3h", self.registers, self._data, *counts)
+        self.registers[self._status] = 0x01 | (0x02 if tuple(counts) != exact else 0)
+
+    def _end_read(self, first: int, count: int) -> None:
+        if first <= self._data + 5 and first + count > self._data:
+            self.registers[self._status] = 0

@@ -1,0 +1,458 @@
+"""The GY-85 board: three chips on one bus, merged into calibrated body-frame samples stamped at capture."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vislam.config import Axes, Gy85Config, Matrix3, Vector3
+from vislam.errors import HardwareError
+from vislam.hw import adxl345, itg3205
+from vislam.hw.adxl345 import Adxl345
+from vislam.hw.bus import BusError, I2cBus, SettingsLostError, kernel_driver
+from vislam.hw.field import Magnetometer
+from vislam.hw.health import Health
+from vislam.hw.hmc5883l import Hmc5883l
+from vislam.hw.itg3205 import Itg3205
+from vislam.hw.magnetometer import find_magnetometer
+from vislam.hw.self_test import SelfTest
+from vislam.hw.timing import Clock, HostClock
+from vislam.hw.track import SampleTrack
+from vislam.messages import Array, ImuSample, MagSample
+
+_NS = 1_000_000_000
+_G_M_S2 = 9.80665
+_TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
+_SILENT_MAG_READS = 20  # in a row without anything new, of a chip that measures faster than it is asked
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Affine:
+    """From counts or chip units to calibrated body axes: `matrix @ value + offset`."""
+
+    matrix: Array  # [3, 3]
+    offset: Array  # [3]
+
+    @staticmethod
+    def of(axes: Axes, matrix: Matrix3, bias: Vector3, unit: float) -> Affine:
+        """Return the map from a chip's values of `unit` each; see `config.SensorCalibration`.
+
+        Raises HardwareError if the axes name one axis of the chip twice.
+        """
+        turned = np.zeros((3, 3))
+        for row, axis in enumerate(axes):
+            turned[row, "xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+        if abs(np.linalg.det(turned)) < 0.5:
+            raise HardwareError(f"axes {axes} name an axis of the chip twice; each of x, y, z is needed once")
+        left = np.array(matrix)
+        return Affine(left @ turned * unit, -left @ np.array(bias))
+
+
+@dataclass(slots=True)
+class _Link:
+    """How it stands with one chip."""
+
+    retry_ns: int = 0
+    good_from_ns: int = 0
+    newest_ns: int = 0  # when it last gave something new
+    nacks: int = 0
+    repeats: int = 0  # equal samples in a row
+    silent: int = 0  # reads in a row that found nothing new
+    is_up: bool = False
+    self_test: SelfTest | None = None
+
+
+@dataclass(slots=True)
+class _Zero:
+    """What is known of the biases at a temperature."""
+
+    temperature_c: float | None = None
+    gyro_per_c: Array = field(default_factory=lambda: np.zeros(3))
+
+
+class Gy85:
+    """Satisfies `InertialSource`. The gyro is the master of time; accelerometer samples are interpolated to its stamps.
+
+    Stamps are those of the middle of what the gyro's filter lets through, some milliseconds before the transfer, by
+    when newer accelerometer samples are there: a sample is given out in the call that captured it. A magnetometer
+    sample may be stamped up to 15 ms before inertial ones that were given out earlier.
+
+    One thread only. Transfers are bounded by `config.bus_timeout_s`, which is what a call may take longer than asked.
+    """
+
+    def __init__(self, config: Gy85Config, clock: Clock | None = None, must_be_there: bool = True) -> None:
+        """Open the bus, set the chips up, test them (`config.self_test`: about 2 s, standing still).
+
+        With `must_be_there` False a missing board is not an error: it is looked for as after unplugging.
+
+        Raises:
+            HardwareError: bus, gyro or accelerometer is missing or is another chip; smbus2 is not installed.
+        """
+        self._config = config
+        self._clock: Clock = HostClock() if clock is None else clock
+        self.rate_hz = config.rate_hz
+        self.self_tests: tuple[SelfTest, ...] = ()
+        self._period_ns = round(_NS / config.rate_hz)
+        c = config.calibration
+        gyro_unit = np.deg2rad(1.0 / itg3205.LSB_PER_DEG_S)
+        self._gyro_map = Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, gyro_unit)
+        self._accel_map = Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, _G_M_S2 / adxl345.LSB_PER_G)
+        self._mag_map = Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0)
+        self._counts: Counter[str] = Counter()
+        self._bus: I2cBus | None = None
+        self._gyro: Itg3205 | None = None
+        self._accel: Adxl345 | None = None
+        self._mag: Magnetometer | None = None
+        self._gyro_link, self._accel_link, self._mag_link = _Link(), _Link(), _Link()
+        self._events = Health(0)
+        self._zero = _Zero()
+        self._temperature_c: float | None = None
+        self._track = SampleTrack(config.accel_rate_hz)
+        self._last_accel: Array = np.full(3, np.nan)
+        self._last_field_ut: Array = np.full(3, np.nan)
+        self._pending: deque[tuple[int, Array]] = deque()  # gyro samples that wait for the accelerometer
+        self._last_counts: tuple[int, int, int] | None = None
+        self._last_gyro_ns = 0
+        self._is_flowing = False
+        self._last_out_ns = self._clock.now_ns()
+        self._next_ns = self._clock.now_ns()
+        self._next_mag_ns = 0
+        self._retry_bus_ns = 0
+        problem = self._connect(self._clock.now_ns())
+        if must_be_there and problem is not None:
+            self.close()
+            raise problem
+        if config.self_test and self._gyro_link.is_up and self._accel_link.is_up:
+            self.run_self_tests()
+        self._next_ns = self._clock.now_ns()
+
+    @property
+    def temperature_c(self) -> float | None:
+        """Temperature of the gyro, smoothed over a second; None before the first sample."""
+        return self._temperature_c
+
+    @property
+    def magnetometer_name(self) -> str | None:
+        """Which of the chips that are sold as HMC5883L it is; None if there is none."""
+        return None if self._mag is None else self._mag.name
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array | None = None) -> None:
+        """Tell at which temperature the biases were taken, and by how much [3] the gyro's changes per deg C (rad/s).
+
+        From then on that drift is taken off, and TEMPERATURE_DRIFT tells when the temperature is too far from it.
+        """
+        self._zero = _Zero(temperature_c, np.zeros(3) if gyro_per_c is None else np.asarray(gyro_per_c))
+
+    def run_self_tests(self) -> tuple[SelfTest, ...]:
+        """Test accelerometer and magnetometer by their own means; about 2 s, standing still, no samples meanwhile."""
+        found = []
+        for chip, link in ((self._accel, self._accel_link), (self._mag, self._mag_link)):
+            if chip is None or not link.is_up:
+                continue
+            try:
+                if isinstance(chip, Adxl345):
+                    link.self_test = chip.self_test(self._clock, self._config.supply_v)
+                else:
+                    link.self_test = chip.self_test(self._clock)
+                found.append(link.self_test)
+            except BusError as error:
+                self._failed(link, error)
+        with suppress(BusError):
+            if self._accel is not None and self._accel_link.is_up:
+                self._accel.read_fifo()  # what came in meanwhile
+        self._track.restart()
+        self._is_flowing = False
+        now = self._clock.now_ns()
+        self._next_ns = now
+        for link in (self._accel_link, self._mag_link):
+            link.newest_ns = now
+        self.self_tests = tuple(found)
+        return self.self_tests
+
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
+        deadline = self._clock.now_ns() + round(timeout_s * _NS)
+        while True:
+            if self._next_ns > deadline:
+                self._clock.sleep_until(deadline)
+                return []
+            self._clock.sleep_until(self._next_ns)
+            samples = self._poll()
+            if samples:
+                return samples
+
+    def health(self) -> Health:
+        """Return the sensor bits that hold now and the events since the last call."""
+        word, self._events = self._events, Health(0)
+        now = self._clock.now_ns()
+        if now - self._last_out_ns > self._config.silent_s * _NS:
+            word |= Health.IMU_MISSING
+        for link, bit in ((self._gyro_link, Health.GYRO_FAULT), (self._accel_link, Health.ACCEL_FAULT)):
+            if not link.is_up or (link.self_test is not None and link.self_test.passed is False):
+                word |= bit
+        if self._config.mag:
+            link = self._mag_link
+            is_bad = not link.is_up or (link.self_test is not None and link.self_test.passed is False)
+            word |= Health.MAG_FAULT if is_bad else Health(0)
+        if self._bus is None:
+            word |= Health.BUS_FAULT
+        zero_c, now_c = self._zero.temperature_c, self._temperature_c
+        if zero_c is not None and now_c is not None and abs(now_c - zero_c) > self._config.max_temperature_change_c:
+            word |= Health.TEMPERATURE_DRIFT
+        return word
+
+    def counters(self) -> dict[str, int]:
+        """Return how often each fault occurred since the start."""
+        return dict(self._counts)
+
+    def close(self) -> None:
+        """Close the bus; may be called twice."""
+        if self._bus is not None:
+            self._bus.close()
+        self._bus = None
+        for link in (self._gyro_link, self._accel_link, self._mag_link):
+            link.is_up = False
+
+    # ---- one round --------------------------------------------------------------------------------------------
+
+    def _poll(self) -> list[ImuSample | MagSample]:
+        now = self._clock.now_ns()
+        late = (now - self._next_ns) // self._period_ns
+        self._next_ns += (late + 1) * self._period_ns
+        if late > 0 and self._gyro_link.is_up:
+            self._counts["rounds_missed"] += late
+            self._events |= Health.IMU_GAP
+        if not (self._gyro_link.is_up and self._accel_link.is_up and (self._mag_link.is_up or not self._config.mag)):
+            self._connect(now)
+        self._read_gyro()
+        self._read_accel()
+        samples: list[ImuSample | MagSample] = [*self._merge()]
+        mag = self._read_mag(now) if self._config.mag and now >= self._next_mag_ns else None
+        if mag is not None:
+            samples.append(mag)
+            samples.sort(key=lambda sample: sample.t_ns)
+        return samples
+
+    def _read_gyro(self) -> None:
+        if self._gyro is None or not self._gyro_link.is_up:
+            return
+        asked = self._clock.now_ns()
+        try:
+            temperature, *counts = self._gyro.read()
+        except (BusError, SettingsLostError) as error:
+            self._failed(self._gyro_link, error)
+            return
+        answered = self._clock.now_ns()
+        link = self._gyro_link
+        link.nacks = 0
+        if asked < link.good_from_ns:
+            return
+        is_repeated = tuple(counts) == self._last_counts
+        link.repeats = link.repeats + 1 if is_repeated else 0
+        self._last_counts = (counts[0], counts[1], counts[2])
+        if link.repeats >= self._config.stuck_samples:
+            self._counts["gyro_stuck"] += 1
+            self._drop(link, asked)
+            return
+        self._take_temperature(temperature)
+        if max(map(abs, counts)) >= itg3205.LIMIT_LSB:
+            self._counts["gyro_saturated"] += 1
+            self._events |= Health.GYRO_SATURATED
+        rate = self._gyro_map.matrix @ np.array(counts, dtype=np.float64) + self._gyro_map.offset
+        if self._zero.temperature_c is not None and self._temperature_c is not None:
+            rate -= self._zero.gyro_per_c * (self._temperature_c - self._zero.temperature_c)
+        # a process that was put aside within the call must not move the stamp by more than the call usually takes
+        delay_s = self._gyro.delay_s if self._config.gyro_delay_s is None else self._config.gyro_delay_s
+        t_ns = asked + min(answered - asked, self._period_ns) // 2 - round(delay_s * _NS)
+        if t_ns <= self._last_gyro_ns:
+            return
+        self._last_gyro_ns = link.newest_ns = t_ns
+        self._pending.append((t_ns, rate))
+
+    def _read_accel(self) -> None:
+        if self._accel is None or not self._accel_link.is_up:
+            return
+        link = self._accel_link
+        asked = self._clock.now_ns()
+        try:
+            counts, was_full = self._accel.read_fifo()
+        except BusError as error:
+            self._failed(link, error)
+            return
+        link.nacks = 0
+        if was_full:
+            self._counts["accel_overrun"] += 1
+            self._events |= Health.IMU_GAP
+            self._track.restart()
+        if len(counts) == 0:
+            if asked - link.newest_ns > self._config.silent_s * _NS:
+                self._counts["accel_silent"] += 1
+                self._drop(link, asked)
+            return
+        if (abs(counts) >= self._accel.limit_lsb).any():
+            self._counts["accel_saturated"] += int((abs(counts) >= self._accel.limit_lsb).any(axis=1).sum())
+            self._events |= Health.ACCEL_SATURATED
+        link.newest_ns = asked
+        values = counts @ self._accel_map.matrix.T + self._accel_map.offset
+        self._track.add(values, asked, self._clock.now_ns())
+        for row in counts:
+            link.repeats = link.repeats + 1 if (row == self._last_accel).all() else 0
+            self._last_accel = row
+        if link.repeats >= self._config.stuck_samples:
+            self._counts["accel_stuck"] += 1
+            self._drop(link, asked)
+
+    def _read_mag(self, now: int) -> MagSample | None:
+        if self._mag is None or not self._mag_link.is_up:
+            return None
+        link = self._mag_link
+        rate_hz = min(self._config.mag_rate_hz, self._mag.rate_hz)
+        self._next_mag_ns = max(self._next_mag_ns + round(_NS / rate_hz), now)
+        try:
+            reading = self._mag.read()
+        except (BusError, SettingsLostError) as error:
+            self._failed(link, error)
+            return None
+        link.nacks = 0
+        if reading is None:
+            link.silent += 1
+            if link.silent >= _SILENT_MAG_READS:
+                self._counts["mag_silent"] += 1
+                self._drop(link, now)
+            return None
+        link.newest_ns, link.silent = now, 0
+        link.repeats = link.repeats + 1 if (reading.field_ut == self._last_field_ut).all() else 0
+        self._last_field_ut = reading.field_ut
+        if link.repeats >= self._config.stuck_samples:
+            self._counts["mag_stuck"] += 1
+            self._drop(link, now)
+            return None
+        if reading.overflow:
+            self._counts["mag_overflow"] += 1
+            self._events |= Health.MAG_FAULT
+            return None
+        # the measurement ended up to a period ago, and took most of one
+        t_ns = now - round(0.5 * _NS / self._mag.rate_hz)
+        return MagSample(t_ns, self._mag_map.matrix @ reading.field_ut + self._mag_map.offset)
+
+    def _merge(self) -> list[ImuSample]:
+        """Return the gyro samples for which accelerometer samples lie on both sides, with those interpolated."""
+        merged = []
+        newest_ns = self._track.newest_ns
+        while self._pending and newest_ns is not None and self._pending[0][0] <= newest_ns:
+            t_ns, rate = self._pending.popleft()
+            force = self._track.at(t_ns)
+            if force is None:
+                self._unpaired()
+            else:
+                merged.append(ImuSample(t_ns, rate, force))
+                self._is_flowing = True
+        while self._pending and self._last_gyro_ns - self._pending[0][0] > self._config.silent_s * _NS:
+            self._pending.popleft()
+            self._unpaired()
+        if merged:
+            self._last_out_ns = self._clock.now_ns()
+        return merged
+
+    def _unpaired(self) -> None:
+        if self._is_flowing:  # the first ones after a start come before the accelerometer's
+            self._counts["gyro_unpaired"] += 1
+            self._events |= Health.IMU_GAP
+
+    def _take_temperature(self, temperature_c: float) -> None:
+        if self._temperature_c is None:
+            self._temperature_c = temperature_c
+        gain = min(1.0 / (_TEMPERATURE_TAU_S * self.rate_hz), 1.0)
+        self._temperature_c += gain * (temperature_c - self._temperature_c)
+
+    # ---- coming and going -------------------------------------------------------------------------------------
+
+    def _failed(self, link: _Link, error: BusError | SettingsLostError) -> None:
+        """Take note of a failed read; the chip is given up after several, or at once if the wire is dead."""
+        if link is self._gyro_link:
+            self._events |= Health.IMU_GAP
+        now = self._clock.now_ns()
+        if isinstance(error, SettingsLostError):
+            self._counts["settings_lost"] += 1
+            self._drop(link, now)
+            return
+        self._events |= Health.BUS_FAULT
+        link.nacks += 1
+        if error.kind != "nack" or link.nacks >= self._config.nacks_to_reopen:
+            self._drop(link, now)
+        if error.kind == "gone":
+            for other in (self._gyro_link, self._accel_link, self._mag_link):
+                self._drop(other, now)
+
+    def _drop(self, link: _Link, now: int) -> None:
+        """Take a chip for lost; it is looked for in the next round, then every `config.reopen_s`."""
+        link.is_up = False
+        link.retry_ns = max(link.retry_ns, now)
+
+    def _connect(self, now: int) -> HardwareError | None:
+        """Set up what is down and due; return what keeps gyro or accelerometer from coming up."""
+        reopen_ns = round(self._config.reopen_s * _NS)
+        if self._bus is None:
+            if now < self._retry_bus_ns:
+                return None
+            self._retry_bus_ns = now + reopen_ns
+            try:
+                self._bus = I2cBus(self._config.bus, self._config.bus_timeout_s, self._counts)
+            except BusError as error:
+                return error
+        problem: HardwareError | None = None
+        starts = [(self._gyro_link, self._start_gyro), (self._accel_link, self._start_accel)]
+        if self._config.mag:
+            starts.append((self._mag_link, self._start_mag))
+        for link, start in starts:
+            if link.is_up or now < link.retry_ns:
+                continue
+            link.retry_ns = now + reopen_ns
+            try:
+                start(self._bus)
+            except HardwareError as error:
+                problem = problem if problem is not None or link is self._mag_link else error
+                self._events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
+                continue
+            if link.newest_ns:
+                self._counts["reopened"] += 1
+            link.is_up, link.newest_ns = True, now
+            link.nacks = link.repeats = link.silent = 0
+        if not any(link.is_up for link, _ in starts):
+            self.close()  # an adapter that comes back has a new device file
+        return problem
+
+    def _start_gyro(self, bus: I2cBus) -> None:
+        _refuse_shared(bus, itg3205.ADDRESS)
+        self._gyro = Itg3205(bus, self._config.gyro_bandwidth_hz)
+        self._gyro.configure(self._clock)
+        self._gyro_link.good_from_ns = self._clock.now_ns() + round(itg3205.START_UP_S * _NS)
+
+    def _start_accel(self, bus: I2cBus) -> None:
+        _refuse_shared(bus, adxl345.ADDRESS)
+        self._accel = Adxl345(bus, self._config.accel_rate_hz, self._config.accel_range_g)
+        self._accel.configure()
+        self._track.restart()
+        self._is_flowing = False
+
+    def _start_mag(self, bus: I2cBus) -> None:
+        found = find_magnetometer(bus, self._config.mag_range_ga)
+        if found is None:
+            raise HardwareError(f"{bus.path}: no magnetometer answers at 0x1e, 0x0d or 0x2c")
+        if isinstance(found, Hmc5883l) and isinstance(self._mag, Hmc5883l):
+            found.scale = self._mag.scale
+        self._mag = found
+        found.configure()
+
+
+def _refuse_shared(bus: I2cBus, address: int) -> None:
+    driver = kernel_driver(bus.path, address)
+    if driver is not None:
+        device = f"{bus.path.rpartition('-')[2]}-{address:04x}"
+        raise HardwareError(
+            f"{bus.path}: the kernel's driver {driver} owns the chip at 0x{address:02x}; release it: "
+            f"echo {device} | sudo tee /sys/bus/i2c/drivers/{driver}/unbind"
+        )
