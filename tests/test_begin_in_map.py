@@ -37,12 +37,16 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def poses_of(path: Path) -> np.ndarray:
+def keyframes_of(path: Path) -> list:
     session = Session(path / "session.db")
     stored = list(session.keyframes())
     session.close()
     assert [keyframe.id for keyframe in stored] == list(range(len(stored)))
-    return np.array([keyframe.T_map_body for keyframe in stored])
+    return stored
+
+
+def poses_of(path: Path) -> np.ndarray:
+    return np.array([keyframe.T_map_body for keyframe in keyframes_of(path)])
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +74,12 @@ def test_a_run_is_found_in_the_map_of_another_which_is_not_written(localize_only
     assert digest(yesterday / "session.db") == before
     assert metrics["map"]["found_t_s"] < 6.0
     assert metrics["map"]["keyframes"] == len(old)
-    new = poses_of(tmp_path / "today")
+    stored = keyframes_of(tmp_path / "today")
+    new = np.array([keyframe.T_map_body for keyframe in stored])
     assert len(new) == len(old) + metrics["keyframes"]
+    first_s = np.diff([keyframe.t_ns for keyframe in stored[len(old) : len(old) + 6]]) * 1e-9
+    print(f"seconds between the first keyframes, which are to be recognised: {first_s}")
+    assert first_s.max() < 0.3  # as after a loss; later ones are up to two seconds apart
     moved_m = np.linalg.norm(new[: len(old), :3, 3] - old[:, :3, 3], axis=1).max()
     error_m = error_in_map_m(yesterday, tmp_path / "today")
     print(f"old keyframes moved {moved_m:.2e} m, rms error in their map {error_m:.3f} m")

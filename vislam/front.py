@@ -152,7 +152,7 @@ class Front:
     def begin_in_map(self, keyframe_id: int, next_track_id: int) -> None:
         """Number keyframes and tracks on from those of a map, before the first frame; the first begins a new piece."""
         self._first_id = keyframe_id
-        self.frontend.begin_at(keyframe_id, FrontNews(next_track_id))
+        self.frontend.begin_at(keyframe_id, FrontNews(next_track_id), seeks_place=True)
 
     @property
     def start(self) -> StartFacts | None:

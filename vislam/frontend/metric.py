@@ -113,9 +113,11 @@ class MetricFrontEnd:
         self._learn_shutter(attempt)
         return self._report(frame, self._keyframe, attempt)
 
-    def begin_at(self, keyframe_id: int, news: FrontNews) -> None:
+    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._first_id, self._tracker.next_id = keyframe_id, news.next_track_id
+        if seeks_place:
+            self._since_restart = 0
         if news.readout_s is not None:
             self._shutter.start_at(news.readout_s)
 

@@ -122,9 +122,11 @@ class MonoFrontEnd:
         self._t_placed_ns = frame.t_ns
         return self._report(frame, self._keyframe, motion)
 
-    def begin_at(self, keyframe_id: int, news: FrontNews) -> None:
+    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._first_id, self._tracker.next_id = keyframe_id, news.next_track_id
+        if seeks_place:
+            self._since_restart = 0
 
     @property
     def news(self) -> FrontNews:

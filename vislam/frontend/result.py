@@ -46,8 +46,11 @@ class FrontEnd(Protocol):
         """
         ...
 
-    def begin_at(self, keyframe_id: int, news: FrontNews) -> None:
-        """Number the first keyframe and new tracks as given, and know what is known; before the first frame."""
+    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
+        """Number the first keyframe and new tracks as given, and know what is known; before the first frame.
+
+        With `seeks_place` the first keyframes come quickly, as after a loss: chances to recognise the place.
+        """
         ...
 
     @property
