@@ -651,13 +651,40 @@ class BridgeClockConfig:
 class SerialConfig:
     """The serial bridge: a microcontroller that reads the inertial chips, docs/cart.md."""
 
+    port: str = "/dev/ttyUSB0"  # the path in /dev/serial/by-id stays the same when other devices come and go
     baud: int = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
-    delay_s: float | None = None  # from reading the chips to the last byte; None: of the wire, and 0.5 ms of the chips
+    chips_s: float = 0.0005  # from a sample's time to its first byte: reading two chips at 400 kHz
+    filter_s: float = 0.0033  # delay of the gyro's 98 Hz filter, and half a millisecond of its sampling
+    mag_delay_s: float = 0.0067  # half a period of 75 Hz
     missing_s: float = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
-    start_s: float = 4.0  # an Uno's boot loader runs 2 s after the port is opened; silent for longer, it is opened anew
+    start_s: float = 4.0  # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it anew
     reopen_s: float = 0.5  # between attempts to open a port that is not there
     stuck_s: float = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
+    calibrated_at_c: float | None = None  # temperature of the gyro when its biases were taken
+    max_temperature_change_c: float = 10.0  # from it; an ITG3205 then drifts by up to 1 deg/s
     clock: BridgeClockConfig = field(default_factory=BridgeClockConfig)
+    calibration: SensorCalibration = field(default_factory=SensorCalibration)
+
+
+@dataclass(frozen=True, slots=True)
+class WebcamConfig:
+    """A webcam on V4L2; docs/cart.md. What a camera does not do as asked is reported, not hidden."""
+
+    device: str = "0"  # index, or a path below /dev/v4l/by-id, which stays the same when other cameras come and go
+    width_px: int = 640  # enough for 400 tracks; 1280 costs four times the work of the front end
+    height_px: int = 480
+    rate_hz: float = 30.0
+    fourcc: str = "MJPG"  # uncompressed video of more than 640x480 at 30 Hz does not fit through USB 2
+    exposure_s: float | None = 0.01  # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera, and lights flicker then
+    gain: float | None = None  # in units of the camera; None leaves it as it is
+    focus: float | None = 0.0  # in units of the camera, 0 is infinity; None leaves autofocus on, which moves the centre
+    white_balance_k: float | None = None  # None leaves it to the camera: tracking uses grey images
+    buffers: int = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
+    delay_s: float = 0.05  # from capture to arrival, where the driver's stamps cannot be used: exposure, readout, USB
+    max_age_s: float = 1.0  # of a stamp at arrival; older, it is from another clock
+    missing_s: float = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
+    start_s: float = 5.0  # until the first image; some cameras take 2 s
+    reopen_s: float = 1.0  # between attempts to open a camera that is not there
 
 
 @dataclass(frozen=True, slots=True)

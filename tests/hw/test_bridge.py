@@ -1,0 +1,289 @@
+"""The bridge's driver over a real pseudo-terminal and the real pyserial, with every fault of boards and cables."""
+
+import errno
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vislam.config import BridgeClockConfig, SensorCalibration, SerialConfig
+from vislam.errors import HardwareError
+from vislam.hw import bridge_protocol as protocol
+from vislam.hw.bridge import SerialBridge, _why_not_open
+from vislam.hw.emulator import SensorError
+from vislam.hw.emulator import bridge as emulator
+from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults, at_rest
+from vislam.hw.health import Health
+from vislam.messages import ImuSample, MagSample
+
+EXACT = (SensorError(), SensorError(), SensorError())
+PERIOD_NS = 2_500_000
+LONG_S = 30.0  # how long a test waits for what must come; never how long it takes
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> SerialConfig:
+    """Patience of tests; a gap of a second is no fault of the bridge on a busy machine."""
+    clock = BridgeClockConfig(settle_s=0.2, bin_s=0.05)
+    return SerialConfig(port=str(tmp_path / "tty"), start_s=1.0, reopen_s=0.05, missing_s=1.0, clock=clock)
+
+
+@pytest.fixture
+def board(config: SerialConfig) -> Iterator[BridgeEmulator]:
+    with BridgeEmulator(Path(config.port), at_rest, drift=0.01) as running:
+        yield running
+
+
+def collect(bridge: SerialBridge, enough: Callable[[list], bool]) -> list[ImuSample | MagSample]:
+    """Read until there is enough, for a time that only a broken driver needs."""
+    found: list[ImuSample | MagSample] = []
+    end = time.monotonic() + LONG_S
+    while not enough(found):
+        assert time.monotonic() < end, f"{bridge.problem} {bridge.counters()}"
+        found += bridge.read(0.05)
+    return found
+
+
+def imu(samples: list) -> list[ImuSample]:
+    return [sample for sample in samples if isinstance(sample, ImuSample)]
+
+
+def swinging(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
+    """A motion that tells its time: 1 ms too late is 12 mrad/s off at most."""
+    phase = 2.0 * math.pi * 2.0 * (t_ns % 500_000_000) * 1e-9
+    return (math.sin(phase), math.cos(phase), 0.5), (1.0, -2.0, 9.8), (20.0, -10.0, -43.0), 31.0
+
+
+def test_samples_are_calibrated_and_stamped_at_capture(config: SerialConfig) -> None:
+    calibration = SensorCalibration(
+        gyro_axes=("-y", "x", "z"), mag_axes=("y", "-x", "z"), gyro_bias_rad_s=(0.0, 0.0, 0.1),
+        accel_matrix=((1.1, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    )  # fmt: skip
+    with BridgeEmulator(Path(config.port), swinging, drift=-0.02, errors=EXACT):
+        bridge = SerialBridge(replace(config, calibration=calibration))
+        assert bridge.rate_hz == 400.0
+        samples = collect(bridge, lambda found: len(found) > 900)
+        assert bridge.temperature_c == pytest.approx(31.0, abs=0.1)
+        bridge.close()
+    late_rad_s = []
+    for sample in imu(samples)[300:]:
+        (x, y, z), _, _, _ = swinging(sample.t_ns)
+        late_rad_s.append(max(abs(sample.gyro_rad_s - [-y, x, z - 0.1])))
+        assert sample.accel_m_s2 == pytest.approx([1.1, -2.0, 9.8], abs=0.03)
+    assert np.median(late_rad_s) < 0.02
+    fields = [sample for sample in samples if isinstance(sample, MagSample)]
+    assert len(fields) == pytest.approx(900 / 9, abs=30)
+    assert fields[-1].field_ut == pytest.approx([-10.0, -20.0, -43.0], abs=0.06)
+
+
+def test_no_wrong_sample_passes_a_bad_cable(config: SerialConfig) -> None:
+    with BridgeEmulator(Path(config.port), at_rest, seed=1, errors=EXACT) as board:
+        bridge = SerialBridge(config)
+        right = imu(collect(bridge, lambda found: len(imu(found)) > 0))[0]
+        board.faults = LineFaults(dropped=0.002, flipped=0.002)
+        samples = imu(collect(bridge, lambda found: len(found) > 800))
+        word, counts = bridge.health(), bridge.counters()
+        bridge.close()
+    assert counts["bad_frames"] > 20
+    assert counts["frames_lost"] > 20
+    assert Health.BUS_FAULT | Health.IMU_GAP in word
+    for sample in samples:
+        assert (sample.gyro_rad_s == right.gyro_rad_s).all()
+        assert (sample.accel_m_s2 == right.accel_m_s2).all()
+    assert (np.diff([sample.t_ns for sample in samples]) > 0).all()
+
+
+def test_an_unplugged_board_is_missed_and_taken_back(config: SerialConfig, board: BridgeEmulator) -> None:
+    bridge = SerialBridge(replace(config, missing_s=0.05))
+    before = imu(collect(bridge, lambda found: len(found) > 100))
+    board.unplug()
+    end = time.monotonic() + LONG_S
+    while bridge.counters().get("port_lost", 0) == 0:
+        assert time.monotonic() < end
+        bridge.read(0.05)
+    assert bridge.read(0.2) == []
+    assert Health.IMU_MISSING in bridge.health()
+    assert "no port" in bridge.problem
+    bridge.close()  # a caller may close what is gone
+    board.plug()
+    after = imu(collect(bridge, lambda found: len(found) > 100))
+    assert after[0].t_ns > before[-1].t_ns
+    assert bridge.problem == ""
+    assert bridge.counters()["opened"] == 2
+    assert Health.CLOCK_STEP in bridge.health()
+    bridge.close()
+    bridge.close()
+
+
+def test_a_restarted_board_gets_a_new_clock_at_once(config: SerialConfig, board: BridgeEmulator) -> None:
+    bridge = SerialBridge(config)
+    samples = collect(bridge, lambda found: len(found) > 300)
+    board.restart()
+    samples += collect(bridge, lambda found: len(found) > 300)
+    counts, word = bridge.counters(), bridge.health()
+    bridge.close()
+    assert counts["device_restarts"] == 1
+    assert counts["clock_steps"] == 1
+    assert counts.get("frames_lost", 0) == 0
+    assert Health.CLOCK_STEP in word
+    assert (np.diff([sample.t_ns for sample in imu(samples)]) > 0).all()
+
+
+def test_a_host_that_was_busy_stamps_as_if_it_had_not_been(config: SerialConfig, board: BridgeEmulator) -> None:
+    bridge = SerialBridge(config)
+    samples = collect(bridge, lambda found: len(found) > 300)
+    time.sleep(0.2)
+    samples += collect(bridge, lambda found: len(found) > 300)
+    lost = bridge.counters().get("frames_lost", 0)
+    bridge.close()
+    intervals = np.diff([sample.t_ns for sample in imu(samples)[200:]])
+    if not lost:  # the kernel keeps a third of a second
+        assert intervals.max() < 1.1 * PERIOD_NS
+    assert np.median(intervals) == pytest.approx(PERIOD_NS, rel=0.02)
+
+
+def test_a_port_that_is_not_there_is_named_at_once(config: SerialConfig) -> None:
+    with pytest.raises(HardwareError, match=r"there is no port .*tty; there are: "):
+        SerialBridge(config)
+
+
+def test_a_board_may_come_later(config: SerialConfig) -> None:
+    bridge = SerialBridge(config, must_be_there=False)
+    assert bridge.read(0.12) == []
+    assert bridge.counters()["open_failures"] >= 2
+    assert Health.IMU_MISSING in bridge.health()
+    with BridgeEmulator(Path(config.port), at_rest):
+        collect(bridge, lambda found: len(imu(found)) > 10)
+    bridge.close()
+
+
+@pytest.mark.parametrize(
+    ("faults", "problem", "counter"),
+    [
+        (LineFaults(silent=True), "is silent", "silent"),
+        (LineFaults(garbage=True), "another rate than 500000 baud", "no_valid_frame"),
+        (LineFaults(no_gyro=True), "no answer from the gyro", "gyro_errors"),
+        (LineFaults(no_gyro=True, no_accel=True), "no answer from the accelerometer and the gyro", "accel_errors"),
+    ],
+)
+def test_what_keeps_samples_from_coming_is_said(
+    config: SerialConfig, board: BridgeEmulator, faults: LineFaults, problem: str, counter: str
+) -> None:
+    board.faults = faults
+    with pytest.raises(HardwareError, match=problem):
+        SerialBridge(config)
+    patient = SerialBridge(config, must_be_there=False)
+    collect(patient, lambda _: patient.counters().get(counter, 0) > 0)
+    assert Health.IMU_MISSING in patient.health()
+    board.faults = LineFaults()
+    collect(patient, lambda found: len(imu(found)) > 10)
+    patient.close()
+
+
+def test_a_sketch_of_another_version_is_refused(
+    config: SerialConfig, board: BridgeEmulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def encode_as_2(message: protocol.RawSample | protocol.Hello) -> bytes:
+        body = bytearray(protocol.unstuff(protocol.encode(message)[:-1]) or b"")
+        if isinstance(message, protocol.Hello):
+            body[7] = 2
+        body[-2:] = protocol.binascii.crc_hqx(bytes(body[:-2]), 0xFFFF).to_bytes(2, "little")
+        return protocol.stuff(bytes(body)) + b"\0"
+
+    monkeypatch.setattr(emulator, "encode", encode_as_2)
+    board.restart()
+    with pytest.raises(HardwareError, match="version 2 of the protocol, this vislam speaks 1"):
+        SerialBridge(config)
+
+
+def test_a_chip_that_goes_away_and_comes_back(config: SerialConfig, board: BridgeEmulator) -> None:
+    bridge = SerialBridge(config)
+    board.faults = LineFaults(no_accel=True)
+    collect(bridge, lambda _: bridge.counters().get("accel_errors", 0) > 10)
+    assert Health.ACCEL_FAULT | Health.IMU_GAP | Health.BUS_FAULT in bridge.health()
+    board.faults = LineFaults()
+    collect(bridge, lambda found: len(imu(found)) > 10)
+    assert Health.ACCEL_FAULT not in bridge.health()
+    bridge.close()
+
+
+def test_a_chip_that_hangs_is_a_fault(config: SerialConfig, board: BridgeEmulator) -> None:
+    bridge = SerialBridge(config)
+    collect(bridge, lambda found: len(imu(found)) > 200)
+    assert bridge.health() & ~Health.IMU_GAP == 0
+    board.faults = LineFaults(frozen=True)
+    collect(bridge, lambda _: bridge.counters().get("gyro_stuck", 0) > 0)
+    assert Health.GYRO_FAULT in bridge.health()
+    bridge.close()
+
+
+def test_saturation_and_temperature_are_told(config: SerialConfig) -> None:
+    def wild(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
+        return (0.0, 40.0, 0.0), (0.0, 0.0, -200.0), (200.0, 0.0, 0.0), 50.0
+
+    with BridgeEmulator(Path(config.port), wild):
+        bridge = SerialBridge(replace(config, calibrated_at_c=25.0))
+        samples = collect(bridge, lambda found: len(found) > 100)
+        word, counts = bridge.health(), bridge.counters()
+        bridge.close()
+    assert Health.ACCEL_SATURATED | Health.GYRO_SATURATED | Health.MAG_FAULT | Health.TEMPERATURE_DRIFT in word
+    assert counts["gyro_saturated"] > 0 < counts["accel_saturated"]
+    assert counts["mag_overflow"] > 0
+    assert not any(isinstance(sample, MagSample) for sample in samples)
+
+
+def test_one_port_has_one_reader(config: SerialConfig, board: BridgeEmulator) -> None:
+    bridge = SerialBridge(config)
+    with pytest.raises(HardwareError, match="another program"):
+        SerialBridge(config)
+    bridge.close()
+
+
+def test_a_file_is_no_port(config: SerialConfig) -> None:
+    Path(config.port).write_text("no port")
+    with pytest.raises(HardwareError, match="cannot be opened as a serial port"):
+        SerialBridge(config)
+
+
+def test_a_port_without_permission_says_which_group(config: SerialConfig) -> None:
+    assert "dialout" in _why_not_open(config, OSError(errno.EACCES, "Permission denied"))
+
+
+def test_without_pyserial_it_says_what_to_install(config: SerialConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(HardwareError, match=r"vislam\[hw\]"):
+        SerialBridge(config)
+
+
+def test_endless_noise_neither_hangs_nor_fills_memory(config: SerialConfig) -> None:
+    master, slave = os.openpty()
+    os.set_blocking(master, False)
+    Path(config.port).symlink_to(os.ttyname(slave))
+    stop = threading.Event()
+
+    def babble() -> None:
+        while not stop.is_set():
+            try:
+                os.write(master, b"\xa5\x5a\x01" * 300)
+            except BlockingIOError:
+                time.sleep(0.001)
+
+    writer = threading.Thread(target=babble)
+    writer.start()
+    bridge = SerialBridge(config, must_be_there=False)
+    for _ in range(5):
+        assert bridge.read(0.1) == []
+    assert len(bridge._decoder._rest) <= protocol.MAX_STUFFED_BYTES + 1
+    collect(bridge, lambda _: bridge.counters().get("no_valid_frame", 0) > 0)
+    bridge.close()
+    stop.set()
+    writer.join()
+    os.close(slave)
+    os.close(master)

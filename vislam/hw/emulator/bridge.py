@@ -1,0 +1,234 @@
+"""A serial bridge without hardware: a thread that writes its frames to a pseudo-terminal, with the faults of a cable.
+
+What it sends is what the sketch sends, byte for byte (a test compiles the sketch), so that the real pyserial and the
+real driver can be proven on it.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import random
+import threading
+import time
+import tty
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from vislam.hw.bridge_protocol import SAMPLE_WIRE_BYTES, Chips, Hello, RawSample, Status, encode
+from vislam.hw.emulator.sensing import Sensing, SensorError, Truth, quantised
+
+_NS = 1_000_000_000
+_PERIOD_NS = 2_500_000
+_MAG_EVERY = 8
+_HELLO_EVERY_NS = _NS
+_READ_NS = 500_000  # from a sample's time to its first byte
+_FILTER_NS = 3_300_000  # what the gyro shows is so old
+_BOOT_NS = 120_000_000
+_SEQUENCES, _WRAP_US = 2**16, 2**32
+_ACCEL_M_S2, _GYRO_RAD_S, _MAG_UT = 38_307_227e-9, 1_214_142e-9, 91_743e-6
+_HELLO = Hello(
+    0, 0, Chips(7), 0xE5, 0x68, b"H43", 400, 38_307_227, 1_214_142, 91_743, 3_571_429, 82_143, 4095, 28_750, 2048
+)
+NOISE = (  # per sqrt(Hz), of gyro, accelerometer and magnetometer
+    SensorError(density=(5.2e-4, 5.2e-4, 5.2e-4)),
+    SensorError(density=(4.1e-3, 4.1e-3, 6.0e-3)),
+    SensorError(density=(0.033, 0.033, 0.033)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LineFaults:
+    """What goes wrong between device and host; shares of bytes."""
+
+    dropped: float = 0.0
+    flipped: float = 0.0
+    silent: bool = False  # the device sends nothing
+    garbage: bool = False  # as at another baud rate: every byte is another one
+    no_accel: bool = False  # the chip does not answer
+    no_gyro: bool = False
+    frozen: bool = False  # the gyro gives the same counts for ever
+
+
+class BridgeEmulator:
+    """A board on a port of its own; `path` is what a driver opens. Use it as a context manager.
+
+    The path is a link that comes and goes with `plug` and `unplug`, as below /dev/serial/by-id.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        truth: Truth,
+        seed: int = 0,
+        drift: float = 0.0,
+        errors: tuple[SensorError, SensorError, SensorError] = NOISE,
+        baud: int = 500_000,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Start the board and plug it in.
+
+        Args:
+            path: link to make.
+            truth: the motion, see `sensing.Truth`.
+            seed: of noise and faults.
+            drift: of the device's clock, relative; 0.02 runs fast.
+            errors: of gyro, accelerometer and magnetometer; the noise of the data sheets unless told otherwise.
+            baud: sets how long a frame is on its way; the terminal itself has no rate.
+            now_ns: the clock that truth and bytes follow.
+        """
+        self.path = path
+        self.faults = LineFaults()
+        self._truth = truth
+        self._drift = drift
+        self._wire_ns = SAMPLE_WIRE_BYTES * 10 * _NS // baud
+        self._now_ns = now_ns
+        self._rng = random.Random(seed)
+        self._sensing = [Sensing(error, seed + i) for i, error in enumerate(errors)]
+        self._lock = threading.Lock()
+        self._master: int | None = None
+        self._is_stopping = threading.Event()
+        self._restart_asked = threading.Event()
+        self.plug()
+        self._thread = threading.Thread(target=self._run, name="bridge-emulator", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def plug(self) -> None:
+        """Plug the cable in; the board starts, as one that is powered by USB."""
+        with self._lock:
+            if self._master is not None:
+                return
+            self._master, slave = pty.openpty()
+            tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            self.path.unlink(missing_ok=True)
+            self.path.symlink_to(os.ttyname(slave))
+            os.close(slave)
+        self._restart_asked.set()
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        with self._lock:
+            master, self._master = self._master, None
+            if master is not None:
+                self.path.unlink(missing_ok=True)
+                os.close(master)
+
+    def restart(self) -> None:
+        """Press the board's reset button."""
+        self._restart_asked.set()
+
+    def close(self) -> None:
+        """Stop the board; may be called twice."""
+        self._is_stopping.set()
+        self._thread.join(timeout=5.0)
+        self.unplug()
+
+    def _run(self) -> None:
+        while not self._is_stopping.is_set():
+            self._restart_asked.clear()
+            if self._waited_until(self._now_ns() + _BOOT_NS):
+                self._run_from(self._now_ns())
+
+    def _run_from(self, begin_ns: int) -> None:
+        """Sample and send as the sketch does, until the board is to start anew."""
+        sequence = ticks = 0
+        hello_ns, chips = begin_ns, Chips(7) | Chips.STARTED
+        due_ns = begin_ns
+        while True:
+            frames = b""
+            if due_ns >= hello_ns:
+                hello_ns += _HELLO_EVERY_NS
+                hello = self._hello(sequence, self._device_us(due_ns - begin_ns), chips)
+                frames, sequence, chips = encode(hello), (sequence + 1) % _SEQUENCES, Chips(7)
+            sample = self._sample(sequence, self._device_us(due_ns - begin_ns), due_ns, ticks)
+            sequence, ticks = (sequence + 1) % _SEQUENCES, ticks + 1
+            if not self._waited_until(due_ns + _READ_NS + self._wire_ns):
+                return
+            self._send(frames + encode(sample))
+            due_ns += _PERIOD_NS
+            if self._now_ns() - due_ns > _NS:  # this thread was put aside: the board would have gone on sampling
+                due_ns = self._now_ns()
+
+    def _device_us(self, elapsed_ns: int) -> int:
+        return round(elapsed_ns * (1.0 + self._drift)) // 1000 % _WRAP_US
+
+    def _hello(self, sequence: int, t_us: int, chips: Chips) -> Hello:
+        if self.faults.no_accel:
+            chips &= ~Chips.ACCEL
+        if self.faults.no_gyro:
+            chips &= ~Chips.GYRO
+        h = _HELLO
+        return Hello(
+            sequence, t_us, chips, h.accel_id, h.gyro_id, h.mag_id, h.rate_hz, h.accel_nm_s2, h.gyro_nrad_s, h.mag_pt,
+            h.temperature_nk, h.temperature_mc, h.accel_limit, h.gyro_limit, h.mag_limit,
+        )  # fmt: skip
+
+    def _sample(self, sequence: int, t_us: int, t_ns: int, tick: int) -> RawSample:
+        """Return what the chips show at a time of the host's clock."""
+        rate, force, field_ut, temperature_c = self._truth(t_ns - _FILTER_NS)
+        gyro, accel, mag = self._sensing
+        status = Status(0)
+        if tick % _MAG_EVERY == 0 and tick >= 2 * _MAG_EVERY:
+            status |= Status.MAG_NEW
+        if self.faults.no_accel:
+            status |= Status.ACCEL_ERROR
+        if self.faults.no_gyro:
+            status |= Status.GYRO_ERROR
+        counts = quantised(gyro(rate, t_ns, temperature_c, 98.0), 1.0 / _GYRO_RAD_S, -32768, 32767)
+        field = quantised(mag(field_ut, t_ns, temperature_c, 37.5), 1.0 / _MAG_UT, -32768, 32767)
+        field = field if max(map(abs, field)) < _HELLO.mag_limit else (-4096, -4096, -4096)
+        temperature = round((temperature_c - 82.143) * 280.0)
+        if self.faults.frozen:
+            counts, temperature = (1, 2, 3), 0
+        return RawSample(
+            sequence, t_us, status,
+            quantised(accel(force, t_ns, temperature_c, 200.0), 1.0 / _ACCEL_M_S2, -4096, 4095), counts,
+            field, temperature,
+        )  # fmt: skip
+
+    def _waited_until(self, t_ns: int) -> bool:
+        """Return at a time, or earlier with False when the board is to stop or to start anew."""
+        left_s = (t_ns - self._now_ns()) / _NS
+        while left_s > 0.0 and not self._interrupted():
+            time.sleep(min(left_s, 0.05))
+            left_s = (t_ns - self._now_ns()) / _NS
+        return not self._interrupted()
+
+    def _interrupted(self) -> bool:
+        return self._is_stopping.is_set() or self._restart_asked.is_set()
+
+    def _send(self, frames: bytes) -> None:
+        """Put bytes on the wire; what a full line does not take is lost, as in the sketch."""
+        faults = self.faults
+        if faults.silent:
+            return
+        if faults.dropped or faults.flipped or faults.garbage:
+            frames = self._spoiled(frames, faults)
+        with self._lock:
+            if self._master is not None:
+                with suppress(OSError):  # nobody listens, or the line is full
+                    os.write(self._master, frames)
+
+    def _spoiled(self, frames: bytes, faults: LineFaults) -> bytes:
+        if faults.garbage:
+            return bytes(byte * 7 + 3 & 0xFF for byte in frames)
+        kept = [byte for byte in frames if self._rng.random() >= faults.dropped]
+        return bytes(
+            byte ^ 1 << self._rng.randrange(8) if self._rng.random() < faults.flipped else byte for byte in kept
+        )
+
+
+def at_rest(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:
+    """Return the truth of a board that stands level at 25 deg C, for `BridgeEmulator`."""
+    return (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665), (20.0, 0.0, -43.0), 25.0
