@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vislam.cli import run_verb
 from vislam.messages import Array
@@ -49,3 +51,53 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: Any, code: int = 3) 
     out, err = capsys.readouterr()
     assert out == ""
     return err
+
+
+ACCEL_MATRIX = np.array([[1.05, 0.004, -0.006], [0.0, 0.96, 0.01], [0.0, 0.0, 1.08]])  # calibrated = M (raw - b)
+ACCEL_BIAS = np.array([0.9, -1.2, 2.0])
+GYRO_MATRIX = np.array([[1.02, 0.01, -0.008], [-0.006, 0.97, 0.012], [0.009, -0.011, 1.01]])
+GYRO_BIAS = np.array([0.2, -0.35, 0.5])  # rad/s: the ITG3205's data sheet allows 40 deg/s
+GYRO_DENSITY, ACCEL_DENSITY = 5.2e-4, 4.2e-3  # those of a GY-85 at 100 Hz
+RATE_HZ = 100.0
+
+
+def hand_held(
+    seed: int, ups: Array, rest_s: float = 3.0, move_s: float = 1.5, noise: float = 1.0
+) -> tuple[Array, Array]:
+    """Return times and raw samples [N, 6] of a sensor that is held with each of `ups` [M, 3] up, turned in between.
+
+    Turns are at a smooth rate about one axis each, with a twist about the vertical, so that all axes are turned about.
+    """
+    rng = np.random.default_rng(seed)
+    R_world_body = Rotation.align_vectors([[0.0, 0.0, 1.0]], [ups[0]])[0]
+    steps = round(move_s * RATE_HZ)
+    shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(steps) + 0.5) / steps)  # its mean is one
+    rates, attitudes = [np.zeros((round(rest_s * RATE_HZ), 3))], [np.tile(R_world_body.as_matrix(), (300, 1, 1))]
+    attitudes[0] = np.tile(R_world_body.as_matrix(), (len(rates[0]), 1, 1))
+    for up in ups[1:]:
+        target = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
+        target = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-2.0, 2.0)]) * target
+        turn = (R_world_body.inv() * target).as_rotvec()
+        angle = np.cumsum(shape) / steps
+        rates.append(np.outer(shape / move_s, turn))
+        attitudes.append((R_world_body * Rotation.from_rotvec(np.outer(angle, turn))).as_matrix())
+        R_world_body = target
+        rates.append(np.zeros((round(rest_s * RATE_HZ), 3)))
+        attitudes.append(np.tile(R_world_body.as_matrix(), (len(rates[-1]), 1, 1)))
+    rate, R = np.vstack(rates), np.vstack(attitudes)
+    force = 9.81 * R[:, 2] + 0.5 * np.gradient(rate, axis=0) * RATE_HZ * 0.1  # the arm of the hand
+    rate_samples = np.vstack([0.5 * (rate[1:] + rate[:-1]), rate[-1:]])
+    gyro = rate_samples @ np.linalg.inv(GYRO_MATRIX).T + GYRO_BIAS
+    accel = force @ np.linalg.inv(ACCEL_MATRIX).T + ACCEL_BIAS
+    gyro += noise * rng.normal(0.0, GYRO_DENSITY * np.sqrt(RATE_HZ), gyro.shape)
+    accel += noise * rng.normal(0.0, ACCEL_DENSITY * np.sqrt(RATE_HZ), accel.shape)
+    return np.arange(len(gyro)) / RATE_HZ, np.hstack([gyro, accel])
+
+
+def ups(seed: int, count: int = 12) -> Array:
+    """Return directions all over the sphere [M, 3]: six sides, then corners, all a little off."""
+    rng = np.random.default_rng(seed)
+    sides = np.vstack([np.eye(3), -np.eye(3)])[rng.permutation(6)]
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))[rng.permutation(8)] / np.sqrt(3.0)
+    chosen = np.vstack([sides, corners])[:count] + rng.normal(0.0, 0.06, (count, 3))
+    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -18,6 +19,26 @@ class NoiseOptions:
     """Folder for noise.yaml, noise.png and noise.json"""
     driving: Path | None = None
     """Recording of a usual drive: white noise is raised to what its quietest half second shows"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class ImuOptions:
+    """Options of `vislam calibrate imu`."""
+
+    source: Positional[Path]
+    """Raw recording (folder, or csv like imu0/data.csv) in which the sensor is held still in twelve poses or more"""
+    out: Path = Path("calibration")
+    """Folder for imu.yaml, imu.png and imu.json"""
+    model: Literal["full", "scale"] = "full"
+    """full: scale, axes, bias; scale: axes as they are, for which seven poses do"""
+    rest_s: float = 2.0
+    """A pose counts when it was held so long"""
+    gravity_m_s2: float = 9.81
+    """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as imu.gravity_m_s2 of the config"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
     json: bool = False
