@@ -523,10 +523,7 @@ class MapConfig:
     stereo_max_sigma_m: float = 0.25  # farther stereo points, with a larger error of depth, only clear the way
     move_voxels: float = 1.0  # a keyframe corrected by more than this many voxels is integrated again
     move_deg: float = 1.0  # or turned by more than this: 7 cm at 4 m
-    rebuild_keyframes_per_call: int = 8  # bounded work per call while a correction is followed; 2 ms each
-    checkpoint_keyframes: int = 16  # the map is copied every so many keyframes; a correction begins at a copy
-    checkpoints: int = 6  # copies kept, the newest: a correction of the last 80 keyframes needs no whole rebuild
-    checkpoint_max_mb: float = 32.0  # a larger map is not copied: at 5 cm that is 1000 m^3 of seen space
+    rebuild_keyframes_per_call: int = 8  # that cast rays again in one call while a correction is followed; 3 ms each
     cloud_voxel_m: float = 0.015  # one averaged point per voxel in cloud.ply
     cloud_max_points: int = 1_500_000  # a larger cloud gets larger voxels: 22 MB
     cloud_min_points: int = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud

@@ -48,6 +48,14 @@ def _rehash(table: NDArray[np.int64], rows: NDArray[np.int32], keys: NDArray[np.
         rows[slot] = row
 
 
+@njit(cache=True, nogil=True)
+def _holds_any(table: NDArray[np.int64], keys: NDArray[np.int64]) -> bool:
+    found = False
+    for key in keys:
+        found |= table[find_slot(table, key)] == key
+    return found
+
+
 class BlockPool:
     """Growing storage of voxel blocks; `keys[:count]` and `values[:count]` are in order of first use."""
 
@@ -87,6 +95,32 @@ class BlockPool:
             self.table = np.full(size, _EMPTY, np.int64)
             self.rows = np.zeros(size, np.int32)
             _rehash(self.table, self.rows, self.keys, self.count)
+
+    def holds_any(self, keys: NDArray[np.int64]) -> bool:
+        """Return whether one of the blocks with these keys is here."""
+        return bool(_holds_any(self.table, keys))
+
+    @classmethod
+    def of(cls, keys: NDArray[np.int64], values: NDArray[np.float32]) -> BlockPool:
+        """Return a pool of blocks with different keys [N] and their values [N, 512], which it takes over."""
+        out = cls(0)
+        out.keys, out.values, out.count = keys, values, len(keys)
+        size = 4
+        while size < 4 * len(keys):
+            size *= 2
+        out.table, out.rows = np.full(size, _EMPTY, np.int64), np.zeros(size, np.int32)
+        _rehash(out.table, out.rows, out.keys, out.count)
+        return out
+
+    def replaced(self, patch: BlockPool) -> BlockPool:
+        """Return a pool of these blocks, where `patch` has none, and of those of `patch` that hold anything."""
+        keys, values = patch.keys[: patch.count], patch.values[: patch.count]
+        kept = ~np.isin(self.keys[: self.count], keys)
+        known = ~np.isnan(values).all(axis=1)
+        return BlockPool.of(
+            np.concatenate([self.keys[: self.count][kept], keys[known]]),
+            np.concatenate([self.values[: self.count][kept], values[known]]),
+        )
 
     def copy(self) -> BlockPool:
         """Return a pool of the same blocks, without spare room."""

@@ -57,8 +57,18 @@ class Mapper:
 
     @property
     def occupancy(self) -> OccupancyMap:
-        """The occupancy map as it is now."""
+        """The occupancy map as it is now, for the thread that feeds the mapper.
+
+        A new keyframe goes into it; a correction leaves it alone, and puts another in its place when complete.
+        """
         return self._occupancy.occupancy
+
+    def snapshot(self) -> OccupancyMap:
+        """Return a copy of the occupancy map for other threads, which nothing changes and for which nobody waits.
+
+        The thread that feeds the mapper calls this and hands the copy on.
+        """
+        return self._occupancy.occupancy.copy()
 
     def add(self, keyframe: Keyframe, T_map_body: Array) -> None:
         """Integrate a keyframe at its pose [4, 4].

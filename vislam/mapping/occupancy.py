@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
 
@@ -14,7 +15,7 @@ from vislam.errors import DataError
 from vislam.mapping.blocks import KEY_ORIGIN, BlockPool
 from vislam.mapping.levels import fill_from_octree, largest_log_odds
 from vislam.mapping.octree import TREE_LEVELS, Octree, log_odds, octree_from_blocks
-from vislam.mapping.scan import cast_rays, end_voxels, finite_points, marked_blocks, merge_blocks
+from vislam.mapping.scan import apply_marks, cast_rays, end_voxels, finite_points, marked_blocks, pack_marks
 
 Array = NDArray[np.float64]
 Insertion = Literal["discretised", "full"]
@@ -29,6 +30,18 @@ class Occupancy(IntEnum):
     UNKNOWN = -1
     FREE = 0
     OCCUPIED = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanMarks:
+    """What one scan says of voxels, wherever the map stands: which are free and which are hit."""
+
+    points: int  # that were used
+    blocks: NDArray[np.int64]  # [B] keys of blocks
+    bits: NDArray[np.uint8]  # [B, 2, 64] see `pack_marks`
+
+
+NO_MARKS = ScanMarks(0, np.zeros(0, np.int64), np.zeros((0, 2, 64), np.uint8))
 
 
 class OccupancyMap:
@@ -68,7 +81,19 @@ class OccupancyMap:
         max_range_m: float = -1.0,
         insertion: Insertion = "discretised",
     ) -> int:
-        """Integrate one scan of points [N, 3] seen from `origin_map_m` [3]; return how many points were used.
+        """Integrate one scan, as `trace` and `apply` do; return how many points were used."""
+        marks = self.trace(points_map_m, origin_map_m, max_range_m, insertion)
+        self.apply(marks)
+        return marks.points
+
+    def trace(
+        self,
+        points_map_m: NDArray[np.floating],
+        origin_map_m: Array,
+        max_range_m: float = -1.0,
+        insertion: Insertion = "discretised",
+    ) -> ScanMarks:
+        """Return what one scan of points [N, 3] seen from `origin_map_m` [3] says of voxels; the map stays as it is.
 
         Points beyond `max_range_m` (negative: no limit) only clear the way up to it; points that are not finite are
         left out. "discretised" casts one ray per end voxel, "full" one per point. Raises DataError when a point lies
@@ -79,7 +104,7 @@ class OccupancyMap:
         if not np.isfinite(origin).all():
             raise DataError(f"a scan's origin must be finite, got {origin.tolist()}")
         if len(points) == 0:
-            return 0
+            return NO_MARKS
         # discretised insertion looks at the end voxels of all points, however far, before it shortens the rays
         reach_m = max_range_m if insertion == "full" and max_range_m >= 0.0 else np.inf
         low, high = np.maximum(low, origin - reach_m), np.minimum(high, origin + reach_m)
@@ -94,14 +119,31 @@ class OccupancyMap:
         if insertion == "discretised":
             ends = end_voxels(points, self.resolution_m, base, nx, nxy, grid)
         cast_rays(ends, origin, max_range_m, self.resolution_m, base, nx, nxy, grid)
-        marked = marked_blocks(words, blocks)
+        keys, bits = pack_marks(marked_blocks(words, blocks), words, blocks, base)
+        return ScanMarks(len(points), keys, bits)
+
+    def apply(self, marks: ScanMarks) -> None:
+        """Update every voxel that a scan says anything of; raises DataError when the map would outgrow any machine."""
+        self.pool.reserve(len(marks.blocks))
+        self._apply(marks, False)
+
+    def apply_to_known_blocks(self, marks: ScanMarks) -> None:
+        """Update the voxels that a scan says anything of in the blocks that the map has."""
+        self._apply(marks, True)
+
+    def _apply(self, marks: ScanMarks, only_known: bool) -> None:
         pool = self.pool
-        pool.reserve(len(marked))
-        pool.count = merge_blocks(
-            marked, grid, words, blocks, base, pool.table, pool.rows, pool.keys, pool.values, pool.count,
+        pool.count = apply_marks(
+            marks.blocks, marks.bits, only_known, pool.table, pool.rows, pool.keys, pool.values, pool.count,
             self._hit, self._miss, self._low, self._high,
         )  # fmt: skip
-        return len(points)
+
+    def with_pool(self, pool: BlockPool) -> OccupancyMap:
+        """Return a map of the same sensor model with other voxels."""
+        out = copy.copy(self)
+        out.pool = pool
+        out._words = np.zeros(1 << 12, np.uint64)
+        return out
 
     def _scan_box(self, low: Array, high: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the lowest voxel key [3], a multiple of 8, and the size in blocks [3] of the box around a scan."""
@@ -135,10 +177,7 @@ class OccupancyMap:
 
     def copy(self) -> OccupancyMap:
         """Return a map of the same voxels that goes its own way from here on."""
-        out = copy.copy(self)
-        out.pool = self.pool.copy()
-        out._words = np.zeros(1 << 12, np.uint64)
-        return out
+        return self.with_pool(self.pool.copy())
 
     def log_odds_at(self, points_map_m: NDArray[np.floating], level: int = 0) -> NDArray[np.float32]:
         """Return the log-odds [N] at points [N, 3]; NaN where unknown, outside the key range or not finite.

@@ -3,8 +3,8 @@
 OctoMap 1.9 (Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on octrees", Autonomous
 Robots 2013) walks each ray with the 3D-DDA of Amanatides and Woo, in float32 directions and float64 crossing
 distances. The same arithmetic in the same order gives the same cells. All cells of a scan are marked in a grid that
-covers its bounding box first, so that each voxel gets one update per scan and end points win over rays, and then merged
-into the blocks of the map.
+covers its bounding box first, so that each voxel gets one update per scan and end points win over rays, then packed
+into a bit per voxel, and then applied to the blocks of the map: at once, or again when the map is corrected.
 """
 
 from __future__ import annotations
@@ -161,31 +161,48 @@ def marked_blocks(words: NDArray[np.uint64], blocks: _I64) -> _I64:
 
 
 @njit(cache=True, nogil=True)
-def merge_blocks(marked: _I64, grid: _Bytes, words: NDArray[np.uint64], blocks: _I64, base: _I64, table: _I64,
-                 rows: NDArray[np.int32], keys: _I64, values: _F32, count: int, hit: Any, miss: Any, low: Any,
-                 high: Any) -> int:  # fmt: skip
-    """Update the map's blocks by a scan's marks, clear the marks, and return the new number of blocks."""
+def pack_marks(marked: _I64, words: NDArray[np.uint64], blocks: _I64, base: _I64) -> tuple[_I64, _Bytes]:
+    """Return keys [B] and bits [B, 2, 64] of a scan's blocks, and clear its grid.
+
+    A byte is a row of 8 voxels along x, rows in order of y, then z; first those that rays passed, then those hit.
+    """
     nbx, nby = blocks[0], blocks[1]
+    keys, bits = np.empty(len(marked), np.int64), np.empty((len(marked), 2, 64), np.uint8)
+    lowest, gather, top = np.uint64(0x0101010101010101), np.uint64(0x0102040810204080), np.uint64(56)
     for i in range(len(marked)):
         bx, by, bz = marked[i] % nbx, (marked[i] // nbx) % nby, marked[i] // (nbx * nby)
-        key = pack_block(base[0] // 8 + bx, base[1] // 8 + by, base[2] // 8 + bz)
-        slot = find_slot(table, key)
+        keys[i] = pack_block(base[0] // 8 + bx, base[1] // 8 + by, base[2] // 8 + bz)
+        for z in range(8):
+            for y in range(8):
+                place = (((bz * 8 + z) * nby + by) * 8 + y) * nbx + bx
+                word = words[place]
+                # the lowest bit of each byte, side by side in the highest byte
+                bits[i, 0, z * 8 + y] = ((word & lowest) * gather) >> top
+                bits[i, 1, z * 8 + y] = (((word >> np.uint64(1)) & lowest) * gather) >> top
+                words[place] = 0
+    return keys, bits
+
+
+@njit(cache=True, nogil=True)
+def apply_marks(block_keys: _I64, bits: _Bytes, only_known: bool, table: _I64, rows: NDArray[np.int32], keys: _I64,
+                values: _F32, count: int, hit: Any, miss: Any, low: Any, high: Any) -> int:  # fmt: skip
+    """Update the map's blocks by a scan's marks, and return the new number of blocks; `only_known` adds none."""
+    for i in range(len(block_keys)):
+        slot = find_slot(table, block_keys[i])
         if table[slot] < 0:
-            table[slot], rows[slot], keys[count] = key, count, key
+            if only_known:
+                continue
+            table[slot], rows[slot], keys[count] = block_keys[i], count, block_keys[i]
             values[count, :] = np.float32(np.nan)
             count += 1
         voxels = values[rows[slot]]
-        for z in range(8):
-            for y in range(8):
-                word = (((bz * 8 + z) * nby + by) * 8 + y) * nbx + bx
-                if words[word] == 0:
-                    continue
-                for x in range(8):
-                    mark = grid[word * 8 + x]
-                    if mark == 0:
-                        continue
-                    old = voxels[z * 64 + y * 8 + x]
-                    new = (np.float32(0.0) if np.isnan(old) else old) + (hit if mark == END_MARK else miss)
-                    voxels[z * 64 + y * 8 + x] = min(max(new, low), high)
-                words[word] = 0
+        for row in range(64):
+            ends = bits[i, 1, row]
+            seen = bits[i, 0, row] | ends
+            if seen == 0:
+                continue
+            for x in range(8):
+                old = voxels[row * 8 + x]
+                new = (np.float32(0.0) if np.isnan(old) else old) + (hit if (ends >> x) & 1 else miss)
+                voxels[row * 8 + x] = min(max(new, low), high) if (seen >> x) & 1 else old
     return count
