@@ -613,7 +613,7 @@ class PowerUpConfig:
     max_gyro_std_rad_s: float = 0.02  # per axis; an ITG3205 at 98 Hz has 0.0065, a hand on the cart gives 0.03
     max_accel_std_m_s2: float = 0.25  # per axis; an ADXL345 at 400 Hz has 0.08
     max_rate_rad_s: float = 0.7  # mean; the ITG3205 may start with 40 deg/s, more is motion
-    max_turn_rad_s: float = 0.02  # of the mean between the halves of the window: a bias does not change within it
+    max_turn_rad_s: float = 0.005  # between the means of the window's halves: a bias stays, white noise leaves 0.0003
     max_bias_change_rad_s: float = 0.05  # from what was remembered for this temperature: an even turn looks like a bias
     gravity_tolerance_m_s2: float = 0.5  # of the measured norm: an accelerometer after calibration
     max_tilt_deg: float = 20.0  # of the body to gravity; more is a wrong axis, or no cart that stands on a floor
@@ -624,11 +624,12 @@ class PowerUpConfig:
 class AttitudeConfig:
     """Complementary filter: attitude from gyro and accelerometer alone, the baseline without vision."""
 
-    proportional_gain: float = 0.05  # 1/s: leans on the accelerometer over 20 s, which outlasts a cart's accelerations
-    integral_gain: float = 0.0005  # 1/s^2: learns what bias is left after power-up within minutes
+    proportional_gain: float = 0.1  # 1/s: leans on the accelerometer over 10 s; half of it and ten times it are worse
+    integral_gain: float = 0.001  # 1/s^2: learns what bias is left after power-up within minutes
     gate_m_s2: float = 0.15  # |force| further from gravity is motion, not tilt
+    level_cutoff_hz: float = 5.0  # low-pass on the force that levels, so that vibration does not close the gate
     mag_gain: float = 0.05  # 1/s, of the yaw by the magnetometer
-    mag_gate: float = 0.1  # relative, of the norm of the field from that at the start: iron or a motor is near
+    mag_gate: float = 0.1  # relative change of the field's norm, and of its vertical part: iron or a motor is near
 
 
 @dataclass(frozen=True, slots=True)

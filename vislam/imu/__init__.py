@@ -1,13 +1,18 @@
-"""Inertial data: noise model, calibration, the buffer that cuts spans, preintegration, rest detection."""
+"""Inertial data: noise model, calibration, spans, preintegration, rest detection, power-up, attitude without vision."""
 
+from vislam.imu.attitude import AttitudeFilter
+from vislam.imu.bias_memory import BiasMemory
 from vislam.imu.buffer import ImuBuffer
 from vislam.imu.envelope import NoiseEnvelope, NoiseRatios
 from vislam.imu.noise import ImuCalibration, ImuNoise, MagCalibration
+from vislam.imu.power_up import PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, preintegrate
 from vislam.imu.rest import RestDetector
 from vislam.imu.series import ImuSeries, join, subtract_bias
 
 __all__ = [
+    "AttitudeFilter",
+    "BiasMemory",
     "ImuBuffer",
     "ImuCalibration",
     "ImuNoise",
@@ -15,9 +20,12 @@ __all__ = [
     "MagCalibration",
     "NoiseEnvelope",
     "NoiseRatios",
+    "PowerUp",
     "Preintegrated",
+    "Refusal",
     "RestDetector",
     "join",
+    "power_up",
     "preintegrate",
     "subtract_bias",
 ]

@@ -1,0 +1,104 @@
+"""The self-calibration of the paper's cart at power-up: the current attitude is horizontal, the current rate is zero.
+
+Karpov 2026, section 2. It is refused while the cart moves, for a wrong zero would stay wrong for the whole drive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.config import PowerUpConfig
+from vislam.geometry import level_rotation
+from vislam.imu.bias_memory import BiasMemory
+from vislam.messages import Array, ImuSpan
+
+_NS = 1e-9
+_MAX_STEP_S = 0.1  # a hole in which the cart may have moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PowerUp:
+    """What standing still told."""
+
+    t_ns: int  # end of the window
+    gyro_bias_rad_s: Array  # [3]
+    gyro_bias_sigma_rad_s: Array  # [3] of white noise alone
+    up_body: Array  # [3] unit vector, the direction of the measured force
+    R_level_body: Array  # [3, 3] zero yaw; turns what the body measures into a frame whose z is that direction
+    tilt_deg: float  # of the body against it: mounting and floor together
+    force_m_s2: float  # norm; how far it is from gravity is what bias and scale of the accelerometer leave
+    temperature_c: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why there is no zero: what was asked for and what was measured."""
+
+    reason: str
+
+
+def power_up(
+    span: ImuSpan,
+    config: PowerUpConfig,
+    gravity_m_s2: float,
+    temperature_c: float | None = None,
+    memory: BiasMemory | None = None,
+) -> PowerUp | Refusal:
+    """Take the newest `config.window_s` of a span as rest, or say why they are not.
+
+    An even turn looks like a bias; it is told from one by what the gyro is remembered to have at this temperature.
+    What is horizontal here is what gravity says; vision needs the tilt against the floor, which on a slope is not it.
+    """
+    t_s = (span.t_ns - span.t_ns[-1]) * _NS
+    inside = t_s >= -config.window_s - 0.5 * _MAX_STEP_S
+    t_s, gyro, accel = t_s[inside], span.gyro_rad_s[inside], span.accel_m_s2[inside]
+    duration_s = float(-t_s[0])
+    if duration_s < config.window_s - _MAX_STEP_S or len(t_s) < 20:
+        return Refusal(f"{config.window_s:g} s of samples asked, got {duration_s:.2f} s with {len(t_s)}; wait")
+    if np.diff(t_s).max() > _MAX_STEP_S:
+        return Refusal(f"a hole of {np.diff(t_s).max():.2f} s in the samples, {_MAX_STEP_S:g} s allowed; check the IMU")
+    rate, force = gyro.mean(axis=0), accel.mean(axis=0)
+    half = len(t_s) // 2
+    norm = float(np.linalg.norm(force))
+    up = force / norm if norm > 0.0 else np.array([0.0, 0.0, 1.0])
+    tilt_deg = float(np.rad2deg(np.arccos(np.clip(up[2], -1.0, 1.0))))
+    checks = [
+        ("the rate varies by", gyro.std(axis=0).max(), config.max_gyro_std_rad_s, "rad/s", "stand still"),
+        ("the force varies by", accel.std(axis=0).max(), config.max_accel_std_m_s2, "m/s^2", "stand still"),
+        ("the mean rate is", float(np.linalg.norm(rate)), config.max_rate_rad_s, "rad/s", "stand still"),
+        (
+            "the mean rate changed within the window by",
+            abs(gyro[:half].mean(axis=0) - gyro[half:].mean(axis=0)).max(),
+            config.max_turn_rad_s,
+            "rad/s",
+            "stand still",
+        ),
+        (
+            "the measured force is off gravity by",
+            abs(norm - gravity_m_s2),
+            config.gravity_tolerance_m_s2,
+            "m/s^2",
+            "calibrate the accelerometer (vislam calibrate imu)",
+        ),
+        ("the body is tilted by", tilt_deg, config.max_tilt_deg, "deg", "check the axes of the IMU, or level the cart"),
+    ]
+    expected = None if memory is None or temperature_c is None else memory.at(temperature_c)
+    if expected is not None:
+        changed = float(np.linalg.norm(rate - expected))
+        what = f"at {temperature_c:.0f} deg C the bias differs from the remembered one by"
+        checks.append((what, changed, config.max_bias_change_rad_s, "rad/s", "stand still, or forget what is kept"))
+    for what, got, allowed, unit, next_step in checks:
+        if not got <= allowed:  # NaN is no rest either
+            return Refusal(f"{what} {got:.3g} {unit}, {allowed:g} allowed; {next_step}")
+    return PowerUp(
+        t_ns=int(span.t_ns[-1]),
+        gyro_bias_rad_s=rate,
+        gyro_bias_sigma_rad_s=gyro.std(axis=0) / np.sqrt(len(t_s)),
+        up_body=up,
+        R_level_body=level_rotation(up),
+        tilt_deg=tilt_deg,
+        force_m_s2=norm,
+        temperature_c=temperature_c,
+    )
