@@ -1,5 +1,6 @@
 """The complementary filter: attitude from the IMU alone on a cart that accelerates, turns, shakes and meets magnets."""
 
+import imufusion
 import numpy as np
 import pytest
 from carts import GRAVITY_M_S2, Cart
@@ -95,7 +96,6 @@ def test_it_remains_a_rotation_whatever_comes(start: list[float], sample: list[f
 
 
 def test_against_imufusion() -> None:
-    imufusion = pytest.importorskip("imufusion")
     cart = Cart.drive(0)
     ahrs = imufusion.Ahrs()
     ahrs.set_sample_period(1.0 / 200.0)
