@@ -47,10 +47,37 @@ class CalibrationConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PlanarConfig:
+    """Odometry of a cart by the floor that one camera sees (front end `planar`)."""
+
+    height_m: float | None = None  # of cam0 above the floor; known, it makes `auto` choose this front end
+    height_sigma_m: float = 0.002  # a tape, or a measured drive of 3 m: its share of H is an error of scale
+    tilt_deg: float | None = None  # of the optical axis below the horizon; None: body z is up, cam0 as the rig says
+    roll_deg: float = 0.0  # about the optical axis, clockwise in the image; counts with tilt_deg only
+    tilt_sigma_deg: float = 0.5  # of both, before the floor itself corrects them; 0.5 deg is 2.5 % of scale
+    method: Literal["joint", "split"] = "joint"  # split: Karpov 2026, rotation from above the horizon
+    vibration_deg: float = 0.2  # of a driving cart's tilt, where no gyro tells it
+    vibration_known_deg: float = 0.03  # what the gyro leaves of it
+    vibration_s: float = 3.0  # so long the gyro's word on tilt counts: springs bring a cart back, bias would not
+    tilt_walk_deg: float = 0.01  # per root of a second, of the mean tilt: load and tyres
+    heave_m: float = 0.002  # of the camera's height between two frames
+    sigma_px: float = 0.3  # of a corner of the floor followed from the keyframe; residuals raise it
+    max_distance_m: float = 5.0  # of floor points: their error grows with the square
+    correlation_m: float = 10.0  # way over which an error of height or tilt adds up: the size of a room
+    max_tracks: int = 260  # over the whole image; 60 on the floor are as good as 320
+    min_points: int = 20  # of the floor that agree on a motion; fewer: lost
+    min_cells: int = 4  # of 8 parts of the floor in which they lie
+    texture_ratio: float = 4.0  # of a corner's response to that of image noise alone; below, it is noise
+    yaw_gate_sigmas: float = 4.0  # between the yaw of floor and gyro; beyond, one of them is wrong
+    yaw_gate_deg: float = 0.3  # and by at least as much
+    history_frames: int = 8  # method split: a base frame is at most so old
+
+
+@dataclass(frozen=True, slots=True)
 class FrontEndConfig:
     """Feature tracking and visual odometry."""
 
-    mode: Literal["auto", "mono", "stereo", "rgbd"] = "auto"  # auto: the richest the recording offers
+    mode: Literal["auto", "mono", "stereo", "rgbd", "planar"] = "auto"  # auto: the richest the recording offers
 
     max_tracks: int = 400  # more add little accuracy once the image is covered, and cost time
     cell_px: int = 48  # side of the grid cells that share the tracks
@@ -94,6 +121,8 @@ class FrontEndConfig:
     keyframe_max_interval_s: float = 2.0  # a camera at rest still reports
     restart_keyframes: int = 8  # after a loss, so many come as soon as they may: chances to recognise the place
     described_features: int = 1000  # ORB keypoints per keyframe for loop closing
+
+    planar: PlanarConfig = field(default_factory=PlanarConfig)
 
 
 @dataclass(frozen=True, slots=True)

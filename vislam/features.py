@@ -75,6 +75,47 @@ def detect_corners(
     return candidates[order][chosen]
 
 
+def detect_harris(image: ImageU8, boxes: Array, count: int, min_distance_px: float, live: Array) -> Array:
+    """Find new Harris corners (Harris and Stephens, AVC 1988), box by box.
+
+    Args:
+        image: grey image [H, W].
+        boxes: left, top, right, bottom [B, 4] in pixels.
+        count: of corners in each box, those that are followed included.
+        min_distance_px: from every live corner and from each other.
+        live: pixels [M, 2] of corners that are already followed.
+
+    Returns:
+        Pixels [N, 2], box by box, strongest first.
+    """
+    found = []
+    for left, top, right, bottom in boxes.astype(np.int64).tolist():
+        inside = (live >= (left, top)).all(axis=1) & (live < (right, bottom)).all(axis=1)
+        wanted = count - int(np.count_nonzero(inside))
+        if wanted <= 0 or right - left < _BORDER_PX or bottom - top < _BORDER_PX:
+            continue
+        mask = np.full((bottom - top, right - left), 255, dtype=np.uint8)
+        for x, y in live[inside]:
+            cv2.circle(mask, (round(x) - left, round(y) - top), round(min_distance_px), 0, -1)
+        corners = cv2.goodFeaturesToTrack(
+            image[top:bottom, left:right], wanted, 0.02, min_distance_px, mask=mask, blockSize=3,
+            useHarrisDetector=True, k=0.04,
+        )  # fmt: skip
+        if corners is not None:
+            found.append(np.asarray(corners, dtype=np.float64).reshape(-1, 2) + np.array([left, top]))
+    return np.vstack(found) if found else np.empty((0, 2))
+
+
+def noise_grey(image: ImageU8) -> float:
+    """Return the standard deviation of an image's noise in grey levels (Immerkaer, CVIU 1996, with a median).
+
+    Texture as fine as a pixel counts as noise.
+    """
+    kernel = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32)
+    rough = cv2.filter2D(image, cv2.CV_32F, kernel)[1:-1:2, 1:-1:2]
+    return float(1.4826 * np.median(np.abs(rough)) / 6.0)
+
+
 def _rank_in_cells(points: Array, strengths: NDArray[np.float32], cell_px: int, width: int) -> Indices:
     """Return how many stronger points [N] share each point's cell, so that cells are served in turn."""
     columns = width // cell_px + 1

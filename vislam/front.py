@@ -71,12 +71,12 @@ class Front:
         if noise is None and self.frontend.mode == "mono":
             raise UsageError(
                 "one camera without an IMU cannot see scale; use --frontend.mode stereo or rgbd where the recording "
-                "allows it, or record an IMU"
+                "allows it, planar for a camera of known height above a floor, or record an IMU"
             )
         if config.ekf.vision == "accumulated" and self.frontend.mode == "mono":
             raise UsageError(
                 "--ekf.vision accumulated sums up motion in metres, which one camera does not see; use --frontend.mode "
-                "stereo or rgbd, or --ekf.vision relative"
+                "stereo, rgbd or planar, or --ekf.vision relative"
             )
         self.initialisation: Initialisation | None = None
         self._refused: Initialisation | None = None  # the newest answer without a state

@@ -70,8 +70,8 @@ class SimulateOptions:
     """Frames per second; None: what the world has"""
     image_width_px: int = 640
     """Width of the 4:3 images"""
-    exposure_s: float = 0.0
-    """Motion blur of this exposure"""
+    exposure_s: float | None = None
+    """Motion blur of this exposure; 0: none, None: what the world has"""
     readout_s: float = 0.0
     """Rolling shutter: time from the first to the last row"""
     workers: int = 2

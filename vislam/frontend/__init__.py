@@ -1,4 +1,4 @@
-"""Visual odometry: mono, stereo and RGB-D front ends behind one protocol."""
+"""Visual odometry: mono, stereo, RGB-D and planar front ends behind one protocol."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from vislam.config import FrontEndConfig
 from vislam.errors import UsageError
 from vislam.frontend.metric import MetricFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
+from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import FrontEnd, TrackResult
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
@@ -32,14 +33,19 @@ FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {
     "rgbd": _rgbd,
     "stereo": _stereo,
     "mono": MonoFrontEnd,
+    "planar": PlanarFrontEnd,
 }
 
 
 def mode_for(config: FrontEndConfig, rig: Rig) -> str:
-    """Return the name of the front end that a configuration means; `auto` takes the richest that the rig allows."""
+    """Return the name of the front end that a configuration means.
+
+    `auto` takes the richest that the rig allows; one camera whose height above a floor is known is `planar`.
+    """
     if config.mode != "auto":
         return config.mode
-    return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else "mono"
+    one_camera = "mono" if config.planar.height_m is None else "planar"
+    return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
 
 
 def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:

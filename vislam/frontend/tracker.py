@@ -9,6 +9,9 @@ Lucas-Kanade, and keep their ids; once such a track has been dropped it is not t
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,14 +20,17 @@ from vislam.features import FlowSettings, detect_corners, follow
 from vislam.messages import Array, Frame, ImageU8, Observations
 
 Bools = NDArray[np.bool_]
+FindCorners = Callable[[ImageU8, Array], Array]
+"""Finds new corners: grey image [H, W], pixels [M, 2] of those that are followed -> pixels [N, 2]."""
 
 
 class Tracker:
     """The corners of one keyframe image and how they fare in the frames after it."""
 
-    def __init__(self, config: FrontEndConfig) -> None:
-        """Start without tracks."""
+    def __init__(self, config: FrontEndConfig, find: FindCorners | None = None) -> None:
+        """Start without tracks; `find` looks for corners instead of a grid over the whole image."""
         self._config = config
+        self._find = find
         self._flow = FlowSettings(
             window_px=config.flow_window_px, levels=config.flow_levels, max_back_px=config.max_back_px
         )
@@ -51,6 +57,23 @@ class Tracker:
         if self._image is None:
             return np.full((len(self), 2), np.nan)
         return follow(self._image, frame.images[0], self.pixels, guess, self._flow)[0]
+
+    def follow_warped(self, frame: Frame, guess: Array, on_plane: Bools, H: Array) -> Array:
+        """Return the same where tracks `on_plane` [N] lie on a plane whose homography is about H [3, 3].
+
+        H takes pixels of the keyframe to those of the frame. Their patches are seen as it warps the keyframe: what is
+        left to find is then a shift, and a way over the plane does not pull the answer to one side.
+        """
+        found = self.follow(frame, np.where(on_plane[:, None], np.nan, guess))
+        if self._image is None or frame.tracks is not None or not on_plane.any():
+            return found
+        height, width = self._image.shape
+        flags = cv2.INTER_LINEAR
+        warped = np.asarray(cv2.warpPerspective(self._image, H, (width, height), flags=flags), dtype=np.uint8)
+        at = np.column_stack([self.pixels[on_plane], np.ones(int(on_plane.sum()))]) @ H.T
+        source = at[:, :2] / np.where(at[:, 2:] > 0.0, at[:, 2:], np.nan)
+        found[on_plane] = follow(warped, frame.images[0], source, guess[on_plane], self._flow)[0]
+        return found
 
     def judge(self, good: Bools) -> Bools:
         """Count misses of tracks that are not `good` [N] in this frame and drop those with too many.
@@ -82,10 +105,13 @@ class Tracker:
     def _detect(self, image: ImageU8) -> tuple[NDArray[np.int64], Array]:
         """Return ids [M] and pixels [M, 2] of new corners."""
         config = self._config
-        fresh = detect_corners(
-            image, config.max_tracks - len(self.ids), config.cell_px, config.min_distance_px, self.pixels,
-            config.min_corner_response,
-        )  # fmt: skip
+        if self._find is not None:
+            fresh = self._find(image, self.pixels)
+        else:
+            fresh = detect_corners(
+                image, config.max_tracks - len(self.ids), config.cell_px, config.min_distance_px, self.pixels,
+                config.min_corner_response,
+            )  # fmt: skip
         ids = np.arange(self.next_id, self.next_id + len(fresh), dtype=np.int64)
         self.next_id += len(fresh)
         return ids, fresh

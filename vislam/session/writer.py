@@ -266,8 +266,8 @@ def _start_data(start: StartFacts) -> dict[str, Any]:
 
 def _front_data(front: FrontNews | None) -> dict[str, Any]:
     front = front or FrontNews()
-    camera = front.filter_camera
-    return {**asdict(front), "filter_camera": None if camera is None else camera.tolist()}
+    arrays = {"filter_camera": front.filter_camera, "tilt": front.tilt}
+    return {**asdict(front), **{name: None if array is None else array.tolist() for name, array in arrays.items()}}
 
 
 def _state_row(state: LoopState) -> tuple[Any, ...]:

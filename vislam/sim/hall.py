@@ -16,6 +16,14 @@ _BODY_HEIGHT_M = 0.3
 _REST_S = 2.5
 _SPEED_M_S = 0.85
 _KNOTS_S = 0.15
+_CART_REST_S = 4.0  # before it drives: gravity and gyro bias are found
+_SQUAT_RAD_S2_M = 0.004  # pitch of a cart by its acceleration: stiff springs, 0.2 degrees at 0.85 m/s^2
+_LAPS: list[tuple[float, float]] = [
+    (4.55, -2.65), (4.6, 2.6), (-0.4, 2.75), (-4.6, 2.55), (-4.55, -2.6), (0.5, -2.75),
+    (4.4, -2.5), (4.45, 2.45), (0.4, 2.7), (-4.4, 2.7), (-4.65, -2.5), (0.6, -2.6),
+    (4.6, -2.75), (4.5, 2.7), (-0.2, 2.5), (-4.5, 2.6), (-4.5, -2.7), (0.4, -2.55),
+    (4.45, -2.6), (4.6, 2.5), (0.2, 2.75), (-4.65, 2.65), (-4.4, -2.6),
+]  # fmt: skip
 
 
 def motion(rng: np.random.Generator) -> BodySpline:
@@ -24,7 +32,7 @@ def motion(rng: np.random.Generator) -> BodySpline:
     second = [(4.4, -2.5), (4.45, 2.45), (1.2, 2.6), (0.1, 2.85), (-4.4, 2.7), (-4.65, -2.5)]
     path = rounded_path([(-1.2, -2.6), (2.5, -2.7), *first, (-0.5, -2.75), (1.5, -2.55), *second, (0.2, -2.65)], 1.05)
     lap_m = 0.5 * path.length_m
-    travel = Travel(path.length_m, _SPEED_M_S, 1.5, _REST_S, 1.5, stop_at_m=1.05 * lap_m, pause_s=1.5)
+    travel = Travel(path.length_m, _SPEED_M_S, 1.5, _REST_S, 1.5, stops_m=(1.05 * lap_m,), pause_s=1.5)
 
     def design(t_s: Array) -> tuple[Array, Array]:
         arc = travel.arc_m(t_s)
@@ -40,6 +48,28 @@ def motion(rng: np.random.Generator) -> BodySpline:
         return np.column_stack([xy, z]), np.column_stack([shaking[:, 0], shaking[:, 1], heading])
 
     shake_seed = int(rng.integers(0, 2**32))
+    return BodySpline.from_design(design, travel.duration_s, _KNOTS_S)
+
+
+def cart_drive(rng: np.random.Generator) -> BodySpline:
+    """Return four laps and a bit, 105 m with stops: what a transport cart does, its nose down when it brakes."""
+    path = rounded_path([(-1.2, -2.6), *_LAPS, (0.2, -2.65)], 0.9)
+    stops = tuple(np.cumsum(rng.uniform(7.0, 13.0, 10)).tolist())
+    travel = Travel(path.length_m, _SPEED_M_S, 1.5, _CART_REST_S, 2.0, tuple(s for s in stops if s < 98.0), 1.6)
+    shake_seed = int(rng.integers(0, 2**32))
+
+    def design(t_s: Array) -> tuple[Array, Array]:
+        arc = travel.arc_m(t_s)
+        xy, heading = path.at(arc)
+        shaking = wander(arc, np.random.default_rng(shake_seed), 1.0, (0.4, 2.5), 3)
+        rolling = smoothstep(arc, 0.05, 0.5) * smoothstep(path.length_m - arc, 0.05, 0.5)
+        shaking *= rolling[:, None] * np.array([0.003, 0.003, 0.0008])
+        step_s = 0.05
+        ahead, behind = travel.arc_m(t_s + step_s), travel.arc_m(t_s - step_s)
+        pitch = shaking[:, 1] - _SQUAT_RAD_S2_M * (ahead - 2.0 * arc + behind) / step_s**2
+        z = _BODY_HEIGHT_M + shaking[:, 2]
+        return np.column_stack([xy, z]), np.column_stack([shaking[:, 0], pitch, heading])
+
     return BodySpline.from_design(design, travel.duration_s, _KNOTS_S)
 
 

@@ -80,7 +80,7 @@ class Travel:
     ramp_s: float
     rest_s: float  # before the start
     end_rest_s: float
-    stop_at_m: float | None = None  # one pause on the way
+    stops_m: tuple[float, ...] = ()  # pauses on the way, ascending
     pause_s: float = 0.0
 
     @property
@@ -99,7 +99,7 @@ class Travel:
         return arc
 
     def _nodes(self) -> tuple[list[float], list[float]]:
-        stops = [self.length_m] if self.stop_at_m is None else [self.stop_at_m, self.length_m]
+        stops = [*self.stops_m, self.length_m]
         times, distances = [0.0, self.rest_s], [0.0, 0.0]
         for index, stop in enumerate(stops):
             times.append(times[-1] + (stop - distances[-1]) / self.speed_m_s + self.ramp_s)

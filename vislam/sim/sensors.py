@@ -21,8 +21,25 @@ CONSUMER_IMU = ImuNoise(
     accel_bias_walk=3.0e-4,
     rate_hz=200.0,
 )
-_GYRO_TURN_ON_RAD_S = 0.006
-_ACCEL_TURN_ON_M_S2 = 0.06
+GY85_IMU = ImuNoise(
+    gyro_noise_density=5.2e-4,  # ITG3205: 0.03 deg/s/sqrt(Hz)
+    accel_noise_density=6.0e-3,  # ADXL345: 1.1 LSB of 3.9 mg rms at 100 Hz
+    gyro_bias_walk=3.0e-5,
+    accel_bias_walk=4.0e-4,
+    rate_hz=200.0,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TurnOn:
+    """Standard deviations of the biases with which an IMU wakes up."""
+
+    gyro_rad_s: float = 0.006
+    accel_m_s2: float = 0.06
+
+
+CONSUMER_TURN_ON = TurnOn()
+GY85_TURN_ON = TurnOn(0.015, 0.1)  # after power-up calibration, a few degrees colder
 EARTH_FIELD_UT = np.array(
     [18.2, -10.5, -43.0]
 )  # central Europe: 21 µT to the north, here 30 degrees right of x; 64 deg dip
@@ -39,8 +56,9 @@ class ImuRecord:
 
 
 def sense_imu(
-    motion: Motion, noise: ImuNoise, gravity_m_s2: float, rng: np.random.Generator, disturbed: bool = True
-) -> ImuRecord:
+    motion: Motion, noise: ImuNoise, gravity_m_s2: float, rng: np.random.Generator, disturbed: bool = True,
+    turn_on: TurnOn = CONSUMER_TURN_ON,
+) -> ImuRecord:  # fmt: skip
     """Return what an IMU at the body measures at N times spaced `1 / noise.rate_hz`.
 
     Biases start at a random turn-on value and walk; white noise of density s has the deviation `s * sqrt(rate)` per
@@ -55,8 +73,8 @@ def sense_imu(
     step = 1.0 / np.sqrt(noise.rate_hz)
     gyro_walk = np.cumsum(rng.normal(0.0, noise.gyro_bias_walk * step, (count, 3)), axis=0)
     accel_walk = np.cumsum(rng.normal(0.0, noise.accel_bias_walk * step, (count, 3)), axis=0)
-    gyro_bias = rng.normal(0.0, _GYRO_TURN_ON_RAD_S, 3) + gyro_walk
-    accel_bias = rng.normal(0.0, _ACCEL_TURN_ON_M_S2, 3) + accel_walk
+    gyro_bias = rng.normal(0.0, turn_on.gyro_rad_s, 3) + gyro_walk
+    accel_bias = rng.normal(0.0, turn_on.accel_m_s2, 3) + accel_walk
     gyro = gyro + gyro_bias + rng.normal(0.0, noise.gyro_noise_density / step, (count, 3))
     accel = accel + accel_bias + rng.normal(0.0, noise.accel_noise_density / step, (count, 3))
     return ImuRecord(gyro, accel, gyro_bias, accel_bias)

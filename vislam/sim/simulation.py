@@ -23,9 +23,9 @@ from vislam.sim.bake import bake
 from vislam.sim.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.render import Renderer
 from vislam.sim.scene import Scene
-from vislam.sim.sensors import CONSUMER_IMU, DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
+from vislam.sim.sensors import DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
 from vislam.sim.spline import BodySpline
-from vislam.sim.worlds import WORLD_NAMES, WORLDS, RigKind, make_rig
+from vislam.sim.worlds import WORLD_NAMES, WORLDS, RigKind, Sensors, make_rig
 from vislam.trajectory import Trajectory
 
 _START_NS = 1_000_000_000_000  # not zero, so that nobody can rely on it
@@ -42,11 +42,14 @@ class SimOptions:
     duration_s: Annotated[float, Field(ge=0.5)] | None = None  # only the first so many seconds
     camera_hz: Annotated[float, Field(gt=0.1, le=120.0)] | None = None  # None: the world's own
     image_width_px: Annotated[int, Field(ge=64, le=1920, multiple_of=4)] = 640  # 4:3
-    exposure_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0  # motion blur of this exposure; 0: none
+    exposure_s: Annotated[float, Field(ge=0.0, le=0.05)] | None = None  # motion blur; 0: none, None: the world's own
     blur_samples: Annotated[int, Field(ge=2, le=16)] = 5
     readout_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0  # from the first to the last row; 0: global shutter
     image_noise: bool = True  # shot and read noise, vignetting
     exposure_changes: bool = True
+    camera_delay_s: Annotated[float, Field(ge=-0.5, le=0.5)] | None = None  # frames are stamped so late; None: as above
+    camera_jitter_s: Annotated[float, Field(ge=0.0, le=0.02)] | None = None  # standard deviation of that
+    camera_drift: Annotated[float, Field(ge=-0.05, le=0.05)] = 0.0  # the camera's clock is so much too fast
     depth_noise: bool = True
     imu_noise: bool = True  # white noise and biases
     mag_hz: Annotated[float, Field(ge=0.0, le=200.0)] = 50.0  # 0: no magnetometer
@@ -105,19 +108,36 @@ class Simulation:
             raise UsageError(f"world '{name}' lasts {whole_s:.1f} s, asked for {options.duration_s} s; ask for less")
         self.duration_s = options.duration_s or whole_s
         self.rig = make_rig(world, options.rig or world.rig, options.image_width_px)
-        self.imu_noise: ImuNoise | None = CONSUMER_IMU
+        sensors = world.sensors
+        self.imu_noise: ImuNoise | None = sensors.imu
         self.problems: dict[str, int] = {}
-        self._imu_s = _times(0.0, self.duration_s, CONSUMER_IMU.rate_hz)
+        self._imu_s = _times(0.0, self.duration_s, sensors.imu.rate_hz)
         imu_motion = self.spline.at(self._imu_s)
         self._imu = sense_imu(
-            imu_motion, CONSUMER_IMU, options.gravity_m_s2, np.random.default_rng(imu_seed), options.imu_noise
-        )
+            imu_motion, sensors.imu, options.gravity_m_s2, np.random.default_rng(imu_seed), options.imu_noise,
+            sensors.turn_on,
+        )  # fmt: skip
         self._mag_s = _times(0.0, self.duration_s, options.mag_hz)
         self._field_ut = sense_field(self.spline.at(self._mag_s), options.mag_sigma_ut, np.random.default_rng(mag_seed))
         self._frame_s = _times(_MARGIN_S, self.duration_s - _MARGIN_S, options.camera_hz or world.camera_hz)
         gains = exposure_gains(self._frame_s, np.random.default_rng(exposure_seed))
         self._gains = gains if options.exposure_changes else np.ones(len(self._frame_s))
         self.frame_count = len(self._frame_s)
+        self._exposure_s = sensors.exposure_s if options.exposure_s is None else options.exposure_s
+        self._stamp_ns = self._stamps(sensors)
+
+    def _stamps(self, sensors: Sensors) -> NDArray[np.int64]:
+        """Return when frames say they were taken: late, with jitter, by a clock that drifts."""
+        o = self.options
+        delay_s = sensors.camera_delay_s if o.camera_delay_s is None else o.camera_delay_s
+        jitter_s = sensors.camera_jitter_s if o.camera_jitter_s is None else o.camera_jitter_s
+        if delay_s == 0.0 and jitter_s == 0.0 and o.camera_drift == 0.0:
+            return _ns(self._frame_s)
+        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(2,)))
+        # no frame overtakes another: a driver that waits for one hands out the next later still
+        late = np.clip(rng.normal(0.0, jitter_s, len(self._frame_s)), -3.0 * jitter_s, 3.0 * jitter_s)
+        stamps = (1.0 + o.camera_drift) * (self._frame_s + delay_s + late)
+        return _ns(np.maximum.accumulate(stamps) + 1e-9 * np.arange(len(stamps)))
 
     @cached_property
     def scene(self) -> Scene:
@@ -146,7 +166,7 @@ class Simulation:
 
     def events(self, from_ns: int | None = None) -> Iterator[Event]:
         """Yield samples and frames in time order, no frame before `from_ns`; each call yields the same again."""
-        frames = self._frames(0 if from_ns is None else int(np.searchsorted(_ns(self._frame_s), from_ns)))
+        frames = self._frames(0 if from_ns is None else int(np.searchsorted(self._stamp_ns, from_ns)))
         try:
             streams: list[Iterator[Event]] = [self._imu_samples(), self._mag_samples(), frames]
             yield from heapq.merge(*streams, key=_stamp)
@@ -178,7 +198,8 @@ class Simulation:
     def render(self, index: int) -> Frame:
         """Render frame `index` (0-based); any order, any thread.
 
-        The stamp is the middle of the exposure of the middle row. Raises UsageError for an index that does not exist.
+        The stamp is the middle of the exposure of the middle row, as the camera's clock has it. Raises
+        UsageError for an index that does not exist.
         """
         if not 0 <= index < self.frame_count:
             raise UsageError(f"world '{self.name}' has frames 0..{self.frame_count - 1}, asked for {index}")
@@ -197,11 +218,11 @@ class Simulation:
                 color = picture
                 if self.rig.has_depth:
                     depth = sense_depth(exact, DepthNoise(), rng) if self.options.depth_noise else exact
-        return Frame(int(_ns(np.array([t_s]))[0]), index, tuple(images), color, depth)
+        return Frame(int(self._stamp_ns[index]), index, tuple(images), color, depth)
 
     def _see(self, renderer: Renderer, T_body_cam: Array, t_s: float) -> tuple[ImageF32, ImageF32]:
         """Return noise-free light (averaged over the exposure) and the exact depth at the stamp."""
-        readout, exposure = self.options.readout_s, self.options.exposure_s
+        readout, exposure = self.options.readout_s, self._exposure_s
         height = renderer.camera.height
         rows_s = t_s + readout * ((np.arange(height) + 0.5) / height - 0.5) if readout > 0.0 else np.array([t_s])
         if exposure == 0.0:
@@ -210,7 +231,8 @@ class Simulation:
         shots = [self._shoot(renderer, T_body_cam, rows_s + exposure * ((k + 0.5) / count - 0.5)) for k in range(count)]
         # Light adds up linearly; squares are close enough to the 2.2 of the display encoding, and fast.
         light = np.sqrt(sum((shot[0] ** 2 for shot in shots), np.zeros((), np.float32)) / np.float32(count))
-        return light.astype(np.float32), self._shoot(renderer, T_body_cam, rows_s)[1]
+        depth = self._shoot(renderer, T_body_cam, rows_s)[1] if self.rig.has_depth else shots[count // 2][1]
+        return light.astype(np.float32), depth
 
     def _shoot(self, renderer: Renderer, T_body_cam: Array, rows_s: Array) -> tuple[ImageF32, ImageF32]:
         poses = self.spline.at(rows_s).T_world_body @ T_body_cam

@@ -10,9 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vislam.camera import Camera, Rig
+from vislam.imu import ImuNoise
 from vislam.messages import Array
 from vislam.sim import corridor, hall, halls, room
 from vislam.sim.scene import SceneBuilder
+from vislam.sim.sensors import CONSUMER_IMU, CONSUMER_TURN_ON, GY85_IMU, GY85_TURN_ON, TurnOn
 from vislam.sim.spline import BodySpline
 
 RigKind = Literal["rgbd", "stereo", "mono"]
@@ -20,6 +22,20 @@ RigKind = Literal["rgbd", "stereo", "mono"]
 _BASELINE_M = 0.11
 # Columns: x right, y down, z forward of a camera that looks along the body's x.
 _R_BODY_CAM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What a world's sensors do to the truth, where an option does not say otherwise."""
+
+    imu: ImuNoise = CONSUMER_IMU
+    turn_on: TurnOn = CONSUMER_TURN_ON
+    exposure_s: float = 0.0
+    camera_delay_s: float = 0.0  # stamps come so late
+    camera_jitter_s: float = 0.0  # standard deviation of that
+
+
+_CART = Sensors(GY85_IMU, GY85_TURN_ON, exposure_s=0.008, camera_delay_s=0.03, camera_jitter_s=0.002)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +49,17 @@ class World:
     camera_hz: float
     camera_offset_m: tuple[float, float, float]  # of cam0 in the body frame
     camera_tilt_deg: float  # downwards
+    sensors: Sensors = Sensors()
 
 
 WORLDS: dict[str, World] = {
     "workshop-cart": World(
         "a cart drives two laps through a furnished workshop of 13 x 9 m: 73 s, RGB-D, many loops",
         hall.build, hall.motion, "rgbd", 15.0, (0.14, 0.03, 0.22), 4.0,
+    ),
+    "cart-drive": World(
+        "a cart drives 105 m through the same workshop, with stops: one webcam 0.6 m above the floor, a GY-85",
+        hall.build, hall.cart_drive, "mono", 15.0, (0.2, 0.02, 0.3), 18.0, _CART,
     ),
     "handheld-room": World(
         "a camera carried by hand around a furnished room of 6 x 4.6 m, six degrees of freedom: 34 s, RGB-D",
