@@ -204,7 +204,7 @@ class EkfConfig:
     tight_points: int = 25  # long tracks kept as points of the state; they stop the drift while little moves
     tight_point_depth_ratio: float = 0.1  # sigma of its distance over it that such a point may have at first
     # on the pixel sigma of such points: real corners err alike in frame after frame; and even with white noise at 1 the
-    # filter is too sure of itself (100 runs: NEES of position 4.6 of 3; at 3 it is 2.7 in 40 runs)
+    # filter is too sure of itself (100 runs: NEES of position 4.6 of 3; at 3 it is 2.7)
     tight_point_inflation: float = 3.0
     tight_point_misses: int = 1  # frames in a row that may not see such a point before it is dropped
     tight_max_tracks: int = 60  # used per frame; bounds its time
