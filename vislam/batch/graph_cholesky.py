@@ -1,0 +1,230 @@
+"""Sparse Cholesky factorisation of a pose graph's normal equations: multifrontal, over BLAS where fronts are large.
+
+Each front is assembled from the blocks of its poses and edges and from what its children leave, in columns; its pivots
+are eliminated and the update goes to the parent. Small fronts are done in compiled loops, for a BLAS call costs more
+than they do. Liu, "The Multifrontal Method for Sparse Matrix Solution", SIAM Review 1992.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from vislam.batch.graph_ordering import Ints
+from vislam.batch.graph_symbolic import Symbolic
+from vislam.batch.native_calls import POTRF, SYRK, TRSM, blas_addresses, call_void
+from vislam.messages import Array
+
+_SMALL = 24  # pivots' columns up to which loops beat BLAS
+_SMALL_WORK = 40_000  # multiplications up to which they do
+
+
+class Factor:
+    """The Cholesky factor of one matrix after another of one structure, with blocks of size d.
+
+    The matrix is given in blocks: `diagonal` [n, d, d] of the free poses, in their order (the lower triangles count), and
+    `off` [E, d, d] of the edges between them: off[e, b, a] is the entry of the a-th component of the edge's later pose
+    and the b-th of the earlier one. Edges between the same poses add up.
+    """
+
+    def __init__(self, symbolic: Symbolic, d: int) -> None:
+        """Allocate the factor; nothing is allocated later but what a solution returns."""
+        self._symbolic, self._d = symbolic, d
+        self._panels = np.empty(symbolic.blocks * d * d)
+        self._stack = np.empty(symbolic.stack_size * d * d)
+        self._node = np.empty(symbolic.count, dtype=np.int64)
+        self._node[symbolic.place] = np.arange(symbolic.count)
+        self._blas = blas_addresses()
+
+    def factorise(self, diagonal: Array, off: Array) -> bool:
+        """Replace the factor by that of another matrix; False where that is not positive definite."""
+        s = self._symbolic
+        return bool(
+            _factorise(
+                self._d, s.first, s.row_begin, s.target, s.parent, s.panel_begin, s.edge_begin, s.edge_of, s.edge_row,
+                s.edge_column, self._node, diagonal, off, self._panels, self._stack, self._blas,
+            )  # fmt: skip
+        )
+
+    def solve(self, rhs: Array) -> Array:
+        """Return x [n, d] with A @ x = rhs [n, d]."""
+        s = self._symbolic
+        y = rhs[self._node].ravel()
+        _solve(self._d, s.first, s.row_begin, s.rows, s.panel_begin, self._panels, y)
+        out = np.empty_like(rhs)
+        out[self._node] = y.reshape(rhs.shape)
+        return out
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _factorise(
+    d, first, row_begin, target, parent, panel_begin, edge_begin, edge_of, edge_row, edge_column, node, diagonal, off,
+    panels, stack, blas,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    fronts = len(parent)
+    update_begin = np.empty(fronts, dtype=np.int64)  # of waiting updates, in the stack
+    child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
+    top = 0
+    integers = np.empty(4, dtype=np.int32)
+    for f in range(fronts):
+        width, below = (first[f + 1] - first[f]) * d, (row_begin[f + 1] - row_begin[f]) * d
+        height = width + below
+        panel = panels[panel_begin[f] * d * d : panel_begin[f + 1] * d * d]
+        panel[:] = 0.0
+        update = stack[top : top + below * below]
+        update[:] = 0.0
+        for k in range(first[f + 1] - first[f]):
+            block = diagonal[node[first[f] + k]]
+            for b in range(d):
+                at = (k * d + b) * height + k * d
+                for a in range(d):
+                    panel[at + a] += block[a, b]
+        for q in range(edge_begin[f], edge_begin[f + 1]):
+            e = edge_of[q]
+            for b in range(d):
+                at = (edge_column[e] * d + b) * height + edge_row[e] * d
+                for a in range(d):
+                    panel[at + a] += off[e, b, a]
+        base = top
+        c = child[f]
+        while c != -1:
+            base = min(base, update_begin[c])
+            _extend_add(d, width, height, panel, update, stack[update_begin[c] :], target[row_begin[c] : row_begin[c + 1]])
+            c = sibling[c]
+        if width <= _SMALL and width * below * below <= _SMALL_WORK:
+            good = _eliminate(width, height, panel, update)
+        else:
+            good = _eliminate_by_blas(width, height, panel, update, blas, integers)
+        if not good:
+            return False
+        if base < top:  # the children's updates are used up
+            for i in range(below * below):
+                stack[base + i] = update[i]
+        update_begin[f] = base
+        top = base + below * below
+        if parent[f] != -1:
+            sibling[f] = child[parent[f]]
+            child[parent[f]] = f
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _extend_add(d: int, width: int, height: int, panel: Array, update: Array, given: Array, target: Ints) -> None:
+    """Add a child's update (columns, lower triangle) to the front."""
+    count = len(target)
+    side, below = count * d, height - width
+    for c in range(count):
+        column = target[c] * d
+        for b in range(d):
+            source = (c * d + b) * side
+            if column < width:
+                at = (column + b) * height
+                for r in range(c, count):
+                    to, come = at + target[r] * d, source + r * d
+                    for a in range(d):
+                        panel[to + a] += given[come + a]
+            else:
+                at = (column - width + b) * below - width
+                for r in range(c, count):
+                    to, come = at + target[r] * d, source + r * d
+                    for a in range(d):
+                        update[to + a] += given[come + a]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _eliminate(width: int, height: int, panel: Array, update: Array) -> bool:
+    """Eliminate the pivots of a small front."""
+    below = height - width
+    for j in range(width):
+        column = panel[j * height : (j + 1) * height]
+        pivot = column[j]
+        if not (pivot > 0.0 and pivot < 1e300):
+            return False
+        scale = 1.0 / math.sqrt(pivot)
+        for i in range(j, height):
+            column[i] *= scale
+        for k in range(j + 1, width):
+            other, factor = panel[k * height : (k + 1) * height], column[k]
+            if factor != 0.0:
+                for i in range(k, height):
+                    other[i] -= factor * column[i]
+    for k in range(below):
+        goal = update[k * below : (k + 1) * below]
+        j = 0
+        while j + 2 < width:
+            p, q, r = panel[j * height + width :], panel[(j + 1) * height + width :], panel[(j + 2) * height + width :]
+            x, y, z = p[k], q[k], r[k]
+            for i in range(k, below):
+                goal[i] -= x * p[i] + y * q[i] + z * r[i]
+            j += 3
+        while j < width:
+            p = panel[j * height + width :]
+            x = p[k]
+            for i in range(k, below):
+                goal[i] -= x * p[i]
+            j += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _eliminate_by_blas(width, height, panel, update, blas, integers):  # type: ignore[no-untyped-def]
+    """Eliminate the pivots of a large front: dpotrf, dtrsm, dsyrk."""
+    letters, numbers = np.array([76, 82, 84, 78], dtype=np.uint8), np.array([1.0, -1.0])  # L R T N
+    text, one, minus = letters.ctypes.data, numbers.ctypes.data, numbers.ctypes.data + 8
+    below = height - width
+    integers[:] = (width, below, height, 0)
+    at = integers.ctypes.data
+    address = panel.ctypes.data
+    call_void(blas[POTRF], (text, at, address, at + 8, at + 12))
+    if integers[3] != 0:
+        return False
+    if below > 0:
+        beneath = address + 8 * width
+        call_void(blas[TRSM], (text + 1, text, text + 2, text + 3, at + 4, at, one, address, at + 8, beneath, at + 8))
+        call_void(blas[SYRK], (text, text + 3, at + 4, at, minus, beneath, at + 8, one, update.ctypes.data, at + 4))
+    return True
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _solve(d: int, first: Ints, row_begin: Ints, rows: Ints, panel_begin: Ints, panels: Array, y: Array) -> None:
+    """Solve in place, forwards and backwards."""
+    fronts = len(first) - 1
+    widest = 0
+    for f in range(fronts):
+        widest = max(widest, row_begin[f + 1] - row_begin[f])
+    beneath = np.empty(widest * d)
+    for f in range(fronts):
+        width, below = (first[f + 1] - first[f]) * d, (row_begin[f + 1] - row_begin[f]) * d
+        height = width + below
+        own, panel = y[first[f] * d : first[f + 1] * d], panels[panel_begin[f] * d * d : panel_begin[f + 1] * d * d]
+        beneath[:below] = 0.0
+        for j in range(width):
+            column = panel[j * height : (j + 1) * height]
+            value = own[j] / column[j]
+            own[j] = value
+            for i in range(j + 1, width):
+                own[i] -= value * column[i]
+            lower = column[width:]
+            for i in range(below):
+                beneath[i] += value * lower[i]
+        for r in range(row_begin[f], row_begin[f + 1]):
+            for a in range(d):
+                y[rows[r] * d + a] -= beneath[(r - row_begin[f]) * d + a]
+    for f in range(fronts - 1, -1, -1):
+        width, below = (first[f + 1] - first[f]) * d, (row_begin[f + 1] - row_begin[f]) * d
+        height = width + below
+        own, panel = y[first[f] * d : first[f + 1] * d], panels[panel_begin[f] * d * d : panel_begin[f + 1] * d * d]
+        for r in range(row_begin[f], row_begin[f + 1]):
+            for a in range(d):
+                beneath[(r - row_begin[f]) * d + a] = y[rows[r] * d + a]
+        for j in range(width - 1, -1, -1):
+            column = panel[j * height : (j + 1) * height]
+            lower = column[width:]
+            value = own[j]
+            for i in range(below):
+                value -= lower[i] * beneath[i]
+            for i in range(j + 1, width):
+                value -= column[i] * own[i]
+            own[j] = value / column[j]
