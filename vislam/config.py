@@ -406,6 +406,18 @@ class BatchConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PoseGraphConfig:
+    """Optimisation of a pose graph from a file."""
+
+    start: Literal["auto", "file", "odometry", "tree", "chordal"] = "auto"  # auto: the one of lowest cost
+    method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
+    robust: Literal["none", "gnc"] = "none"  # gnc: edges that do not join successive ids may be rejected
+    iterations: int = 100  # most of them; 3 to 8 as a rule
+    tolerance: float = 1e-9  # of the cost: the decrease still to come at which to end
+    inlier_probability: float = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
+
+
+@dataclass(frozen=True, slots=True)
 class GraphWorldConfig:
     """A made pose graph, as `vislam simulate --graph` writes it. Noise is white, of odometry and loops alike."""
 

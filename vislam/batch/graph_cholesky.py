@@ -24,7 +24,7 @@ _SMALL_WORK = 40_000  # multiplications up to which they do
 class Factor:
     """The Cholesky factor of one matrix after another of one structure, with blocks of size d.
 
-    The matrix is given in blocks: `diagonal` [n, d, d] of the free poses, in their order (the lower triangles count), and
+    The matrix is given in blocks: `diagonal` [n, d, d] of the free poses in their order (the lower triangles count) and
     `off` [E, d, d] of the edges between them: off[e, b, a] is the entry of the a-th component of the edge's later pose
     and the b-th of the earlier one. Edges between the same poses add up.
     """
@@ -41,12 +41,11 @@ class Factor:
     def factorise(self, diagonal: Array, off: Array) -> bool:
         """Replace the factor by that of another matrix; False where that is not positive definite."""
         s = self._symbolic
-        return bool(
-            _factorise(
-                self._d, s.first, s.row_begin, s.target, s.parent, s.panel_begin, s.edge_begin, s.edge_of, s.edge_row,
-                s.edge_column, self._node, diagonal, off, self._panels, self._stack, self._blas,
-            )  # fmt: skip
-        )
+        good: bool = _factorise(
+            self._d, s.first, s.row_begin, s.target, s.parent, s.panel_begin, s.edge_begin, s.edge_of, s.edge_row,
+            s.edge_column, self._node, diagonal, off, self._panels, self._stack, self._blas,
+        )  # fmt: skip
+        return good
 
     def solve(self, rhs: Array) -> Array:
         """Return x [n, d] with A @ x = rhs [n, d]."""
@@ -59,10 +58,10 @@ class Factor:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _factorise(
+def _factorise(  # type: ignore[no-untyped-def]  # noqa: PLR0912
     d, first, row_begin, target, parent, panel_begin, edge_begin, edge_of, edge_row, edge_column, node, diagonal, off,
     panels, stack, blas,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     fronts = len(parent)
     update_begin = np.empty(fronts, dtype=np.int64)  # of waiting updates, in the stack
     child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
@@ -91,7 +90,8 @@ def _factorise(
         c = child[f]
         while c != -1:
             base = min(base, update_begin[c])
-            _extend_add(d, width, height, panel, update, stack[update_begin[c] :], target[row_begin[c] : row_begin[c + 1]])
+            given, goal = stack[update_begin[c] :], target[row_begin[c] : row_begin[c + 1]]
+            _extend_add(d, width, height, panel, update, given, goal)
             c = sibling[c]
         if width <= _SMALL and width * below * below <= _SMALL_WORK:
             good = _eliminate(width, height, panel, update)
@@ -178,6 +178,9 @@ def _eliminate_by_blas(width, height, panel, update, blas, integers):  # type: i
     at = integers.ctypes.data
     address = panel.ctypes.data
     call_void(blas[POTRF], (text, at, address, at + 8, at + 12))
+    for j in range(width):
+        if not panel[j * height + j] > 0.0:  # dpotrf lets NaN pass
+            return False
     if integers[3] != 0:
         return False
     if below > 0:
@@ -188,7 +191,9 @@ def _eliminate_by_blas(width, height, panel, update, blas, integers):  # type: i
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _solve(d: int, first: Ints, row_begin: Ints, rows: Ints, panel_begin: Ints, panels: Array, y: Array) -> None:
+def _solve(  # noqa: PLR0912
+    d: int, first: Ints, row_begin: Ints, rows: Ints, panel_begin: Ints, panels: Array, y: Array
+) -> None:
     """Solve in place, forwards and backwards."""
     fronts = len(first) - 1
     widest = 0

@@ -126,11 +126,11 @@ def chi2_2d(edges: NDArray[np.int64], poses: Array, measurements: Array, informa
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def linearise_3d(edges, index, later_is_to, poses, measurements, information, weights, diagonal, off, gradient):  # type: ignore[no-untyped-def]
+def linearise_3d(edges, index, later_is_to, poses, measurements, information, weights, diagonal, off, gradient):  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0915
     """Write the normal equations of half the cost: H = J^T W J in blocks, gradient = J^T W r; return the cost.
 
-    `index` [N] is the place of each pose among the free ones, -1 where it is fixed; diagonal [n, 6, 6], off [E, 6, 6] as
-    `Factor` takes them, gradient [n, 6].
+    `index` [N] is the place of each pose among the free ones, -1 where it is fixed; diagonal [n, 6, 6] and
+    off [E, 6, 6] are as `Factor` takes them, gradient is [n, 6].
     """
     diagonal[:] = 0.0
     gradient[:] = 0.0
@@ -264,11 +264,12 @@ def _even_coefficients(angle: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def linearise_2d(edges, index, later_is_to, poses, measurements, information, weights, diagonal, off, gradient):  # type: ignore[no-untyped-def]
+def linearise_2d(edges, index, later_is_to, poses, measurements, information, weights, diagonal, off, gradient):  # type: ignore[no-untyped-def]  # noqa: PLR0912
     """Write the normal equations, as `linearise_3d` does; blocks are 3 by 3."""
     diagonal[:] = 0.0
     gradient[:] = 0.0
-    r, g, M, Q, H, P, Ad = np.empty(3), np.empty(3), np.eye(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.eye(3)
+    r, g, M, Ad = np.empty(3), np.empty(3), np.eye(3), np.eye(3)
+    Q, H, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     cost = 0.0
     for e in range(len(edges)):
         i, j, weight = index[edges[e, 0]], index[edges[e, 1]], weights[e]
@@ -280,10 +281,7 @@ def linearise_2d(edges, index, later_is_to, poses, measurements, information, we
         # M = Jr^-1: [[1, 0, 0], [m_u, h, -angle / 2], [m_v, angle / 2, h]]
         angle, u, v = r[0], r[1], r[2]
         h = _half_cotangent(angle)
-        if abs(angle) < 1e-3:
-            k = angle / 12.0
-        else:
-            k = (1.0 - h) / angle
+        k = angle / 12.0 if abs(angle) < 1e-4 else (1.0 - h) / angle
         M[1, 0], M[1, 1], M[1, 2] = 0.5 * v + k * u, h, -0.5 * angle
         M[2, 0], M[2, 1], M[2, 2] = k * v - 0.5 * u, 0.5 * angle, h
         for a in range(3):
@@ -326,7 +324,7 @@ def retract_2d(poses: Array, free: NDArray[np.int64], step: Array, out: Array) -
     """Write poses @ Exp(step) into out; step [n, 3] is of the poses free [n]."""
     out[:] = poses
     for k in range(len(free)):
-        T, O = poses[free[k]], out[free[k]]
+        T, G = poses[free[k]], out[free[k]]
         w, u, v = step[k, 0], step[k, 1], step[k, 2]
         s, c = math.sin(w), math.cos(w)
         if abs(w) < 1e-4:
@@ -336,10 +334,10 @@ def retract_2d(poses: Array, free: NDArray[np.int64], step: Array, out: Array) -
         x, y = a * u - b * v, b * u + a * v
         C, S = T[0, 0] * c - T[1, 0] * s, T[1, 0] * c + T[0, 0] * s
         scale = 1.5 - 0.5 * (C * C + S * S)  # one Newton step back to the unit circle
-        O[0, 0] = O[1, 1] = C * scale
-        O[1, 0], O[0, 1] = S * scale, -S * scale
-        O[0, 2] = T[0, 2] + T[0, 0] * x - T[1, 0] * y
-        O[1, 2] = T[1, 2] + T[1, 0] * x + T[0, 0] * y
+        G[0, 0] = G[1, 1] = C * scale
+        G[1, 0], G[0, 1] = S * scale, -S * scale
+        G[0, 2] = T[0, 2] + T[0, 0] * x - T[1, 0] * y
+        G[1, 2] = T[1, 2] + T[1, 0] * x + T[0, 0] * y
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -348,7 +346,7 @@ def retract_3d(poses: Array, free: NDArray[np.int64], step: Array, out: Array) -
     out[:] = poses
     E, N = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(free)):
-        T, O = poses[free[n]], out[free[n]]
+        T, G = poses[free[n]], out[free[n]]
         x, y, z, u, v, w = step[n, 0], step[n, 1], step[n, 2], step[n, 3], step[n, 4], step[n, 5]
         angle2 = x * x + y * y + z * z
         angle = math.sqrt(angle2)
@@ -365,7 +363,7 @@ def retract_3d(poses: Array, free: NDArray[np.int64], step: Array, out: Array) -
         p, q, s = y * w - z * v, z * u - x * w, x * v - y * u
         p, q, s = u + b * p + c * (y * s - z * q), v + b * q + c * (z * p - x * s), w + b * s + c * (x * q - y * p)
         for k in range(3):
-            O[k, 3] = T[k, 3] + T[k, 0] * p + T[k, 1] * q + T[k, 2] * s
+            G[k, 3] = T[k, 3] + T[k, 0] * p + T[k, 1] * q + T[k, 2] * s
             for m in range(3):
                 N[k, m] = T[k, 0] * E[0, m] + T[k, 1] * E[1, m] + T[k, 2] * E[2, m]
         # one Newton step back to the rotations: N (3 I - N^T N) / 2
@@ -375,4 +373,4 @@ def retract_3d(poses: Array, free: NDArray[np.int64], step: Array, out: Array) -
                 E[k, m] = (1.5 if k == m else 0.0) - 0.5 * g
         for k in range(3):
             for m in range(3):
-                O[k, m] = N[k, 0] * E[0, m] + N[k, 1] * E[1, m] + N[k, 2] * E[2, m]
+                G[k, m] = N[k, 0] * E[0, m] + N[k, 1] * E[1, m] + N[k, 2] * E[2, m]

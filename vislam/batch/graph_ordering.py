@@ -49,7 +49,7 @@ def adjacency(n: int, a: Ints, b: Ints) -> tuple[Ints, Ints]:
 
 
 @njit(cache=True, nogil=True)
-def minimum_degree(begins: Ints, neighbours: Ints) -> Ints:
+def minimum_degree(begins: Ints, neighbours: Ints) -> Ints:  # noqa: PLR0912, PLR0915
     """Return the nodes [n] of a graph in the order of their elimination; `neighbours` without repetition."""
     n = len(begins) - 1
     # a node is a variable until it is a pivot, then an element; lists hold first elements, then variables
@@ -170,7 +170,9 @@ def minimum_degree(begins: Ints, neighbours: Ints) -> Ints:
         degree[pivot] = boundary
         stamp += n + boundary + 1
 
-        stamp = _merge_alike(space, begin, free, start, length, elements, size, parent, mark, stamp, bucket, bucket_next, hashed)  # fmt: skip
+        stamp = _merge_alike(
+            space, begin, free, start, length, elements, size, parent, mark, stamp, bucket, bucket_next, hashed
+        )
 
         # back into the lists of degrees
         write = begin

@@ -1,4 +1,4 @@
-"""Where to start the optimisation of a pose graph: the file's poses, odometry, a spanning tree, the chordal relaxation."""
+"""Where the optimisation of a pose graph starts: the file's poses, odometry, a spanning tree, chordal relaxation."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from vislam.batch.graph_ordering import Ints
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_structure import Structure
 from vislam.messages import Array
+
+Mask = NDArray[np.bool_]
 
 
 def file_start(problem: PoseGraphProblem) -> Array:
@@ -58,8 +61,7 @@ def _relax(structure: Structure, weights: Array, motions: Array, known: Array) -
     """Return X [n, d, C] of the free poses that minimises the sum of weight |X_to - motion @ X_from|^2."""
     problem, ends = structure.problem, structure.ends
     d, n = motions.shape[1], len(structure.free)
-    total = np.bincount(ends[ends[:, 1] >= 0, 1], weights[ends[:, 1] >= 0], n)
-    total += np.bincount(ends[ends[:, 0] >= 0, 0], weights[ends[:, 0] >= 0], n)
+    total = _per_pose(ends, weights, n)
     rhs = np.zeros((n, *known.shape[1:]))
     scaled = weights[:, None, None] * motions
     from_held = np.flatnonzero((ends[:, 0] < 0) & (ends[:, 1] >= 0))
@@ -73,8 +75,7 @@ def _place(structure: Structure, weights: Array, poses: Array) -> None:
     """Fill the positions of the free poses, given their rotations."""
     problem, ends = structure.problem, structure.ends
     d, n = problem.dimension, len(structure.free)
-    total = np.bincount(ends[ends[:, 1] >= 0, 1], weights[ends[:, 1] >= 0], n)
-    total += np.bincount(ends[ends[:, 0] >= 0, 0], weights[ends[:, 0] >= 0], n)
+    total = _per_pose(ends, weights, n)
     R_from = poses[problem.edges[:, 0], :d, :d]
     moved = weights[:, None] * np.einsum("eij,ej->ei", R_from, problem.measurements[:, :d, d])
     anchored = weights[:, None, None] * poses[:, :d, d][problem.edges]  # [E, 2, d]
@@ -88,6 +89,12 @@ def _place(structure: Structure, weights: Array, poses: Array) -> None:
             rhs[:, c] += np.bincount(ends[here, end], terms[here, c], n)
     solved = _solve(structure, 1, total, -weights[:, None, None], rhs[:, None, :])
     poses[structure.free, :d, d] = solved[:, 0]
+
+
+def _per_pose(ends: Ints, weights: Array, n: int) -> Array:
+    """Return the sum [n] of the weights of the edges at each free pose."""
+    both = np.concatenate([ends[:, 0], ends[:, 1]])
+    return np.bincount(both[both >= 0], np.tile(weights, 2)[both >= 0], n).astype(np.float64)
 
 
 def _solve(structure: Structure, d: int, total: Array, blocks: Array, rhs: Array) -> Array:
@@ -128,7 +135,7 @@ def _harmonic(information: Array) -> Array:
     return np.maximum(harmonic, 1e-6 * mean)
 
 
-def _anchored(problem: PoseGraphProblem) -> np.typing.NDArray[np.bool_]:
+def _anchored(problem: PoseGraphProblem) -> Mask:
     known = np.zeros(len(problem.ids), dtype=np.bool_)
     known[problem.anchors()] = True
     return known
@@ -139,7 +146,7 @@ def _placed_anchors(problem: PoseGraphProblem) -> Array:
     return np.where(problem.has_pose[:, None, None], problem.poses, np.eye(problem.dimension + 1))
 
 
-def _chained(problem: PoseGraphProblem, known: Array, free_of_charge: Array) -> Array:
+def _chained(problem: PoseGraphProblem, known: Mask, free_of_charge: Mask) -> Array:
     poses = _placed_anchors(problem)
     reached = known.copy()
     labels = problem.components()
@@ -150,7 +157,7 @@ def _chained(problem: PoseGraphProblem, known: Array, free_of_charge: Array) -> 
 
 
 @njit(cache=True, nogil=True)
-def _chain(edges: Ints, measurements: Array, free_of_charge: Array, reached: Array, poses: Array) -> None:
+def _chain(edges: Ints, measurements: Array, free_of_charge: Mask, reached: Mask, poses: Array) -> None:
     """Fill the poses not reached along paths with as few edges as possible, those free of charge not counted."""
     n, m = len(reached), len(edges)
     begins = np.zeros(n + 2, dtype=np.int64)
@@ -168,13 +175,9 @@ def _chain(edges: Ints, measurements: Array, free_of_charge: Array, reached: Arr
     layer = np.flatnonzero(reached)
     while len(layer):
         # all that successive edges reach belongs to the same layer
-        stack, following = layer.copy(), np.empty(n, dtype=np.int64)
-        members = np.empty(n, dtype=np.int64)
-        count = 0
-        for k in range(len(layer)):
-            members[count] = layer[k]
-            count += 1
-        at = 0
+        members, following = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+        count, at = len(layer), 0
+        members[:count] = layer
         while at < count:
             i = members[at]
             at += 1
@@ -204,18 +207,18 @@ def _chain(edges: Ints, measurements: Array, free_of_charge: Array, reached: Arr
 def _compose(poses: Array, i: int, j: int, Z: Array, forward: bool, size: int) -> None:
     """Write poses[i] @ Z, or @ Z^-1, into poses[j]."""
     d = size - 1
-    T, O = poses[i], poses[j]
+    T, G = poses[i], poses[j]
     for a in range(d):
         for b in range(d):
             s = 0.0
             for k in range(d):
                 s += T[a, k] * (Z[k, b] if forward else Z[b, k])
-            O[a, b] = s
+            G[a, b] = s
     for a in range(d):
         s = T[a, d]
         for k in range(d):
-            s += T[a, k] * Z[k, d] if forward else -O[a, k] * Z[k, d]
-        O[a, d] = s
+            s += T[a, k] * Z[k, d] if forward else -G[a, k] * Z[k, d]
+        G[a, d] = s
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -55,15 +55,14 @@ class NormalEquations:
         """Form the equations at poses [N, d + 1, d + 1]; `weights` [E] multiply the edges. Return the cost."""
         s = self._structure
         p = s.problem
-        return float(
-            self._linearise(
-                p.edges, s.index, s.symbolic.later_is_to, poses, p.measurements, p.information, weights,
-                self.diagonal, self.off, self.gradient,
-            )  # fmt: skip
-        )
+        cost: float = self._linearise(
+            p.edges, s.index, s.symbolic.later_is_to, poses, p.measurements, p.information, weights,
+            self.diagonal, self.off, self.gradient,
+        )  # fmt: skip
+        return cost
 
     def damped(self, damping: float) -> Array:
-        """Return the diagonal blocks [n, k, k] with their diagonals enlarged by this share of themselves (Marquardt)."""
+        """Return the diagonal blocks [n, k, k], their diagonals enlarged by this share of themselves (Marquardt)."""
         if damping == 0.0:
             return self.diagonal
         out = self.diagonal.copy()
@@ -86,5 +85,3 @@ class NormalEquations:
     def retract(self, poses: Array, step: Array, out: Array) -> None:
         """Write poses @ Exp(step) into out; step [n, k] is of the free poses."""
         self._retract(poses, self._structure.free, step, out)
-
-

@@ -75,7 +75,7 @@ def analyse(count: int, a: Ints, b: Ints) -> Symbolic:
 
 
 @njit(cache=True, nogil=True)
-def _postordered(begins: Ints, neighbours: Ints, order: Ints) -> tuple[Ints, Ints]:
+def _postordered(begins: Ints, neighbours: Ints, order: Ints) -> tuple[Ints, Ints]:  # noqa: PLR0912
     """Return the place [n] of each node in a postorder of the elimination tree, and the parent [n] of each place."""
     n = len(order)
     step = np.empty(n, dtype=np.int64)
@@ -123,7 +123,9 @@ def _postordered(begins: Ints, neighbours: Ints, order: Ints) -> tuple[Ints, Int
 
 
 @njit(cache=True, nogil=True)
-def _fronts(begins: Ints, neighbours: Ints, place: Ints, parent: Ints) -> tuple[Ints, Ints, Ints]:
+def _fronts(  # noqa: PLR0912, PLR0915
+    begins: Ints, neighbours: Ints, place: Ints, parent: Ints
+) -> tuple[Ints, Ints, Ints]:
     """Return the first places [F + 1] of fronts, where their rows begin [F + 1], and the rows."""
     n = len(place)
     node = np.empty(n, dtype=np.int64)

@@ -1,0 +1,132 @@
+"""Pose graphs optimised: from every start, by every method, with parts, fixed poses and what is missing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vislam.batch.graph_g2o import read_g2o
+from vislam.batch.graph_optimize import optimize_pose_graph
+from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.config import PoseGraphConfig
+from vislam.geometry import invert, se3_exp
+
+BEST = {  # chi2; gtsam's Levenberg-Marquardt from certified optima
+    "intel": 45.0042331, "MIT": 41.2069469, "manhattan": 3549.04107, "M3500": 137.914878,
+    "smallGrid3D": 1035.85066, "sphere2500": 1351.40193, "parking-garage": 1.26838480, "tinyGrid3D": 18.627819,
+}  # fmt: skip
+
+
+def world(d, n=60, loops=40, seed=0, sigma=0.02):
+    """Return a problem of a walk with loops, its poses chained from odometry, and the truth."""
+    rng = np.random.default_rng(seed)
+
+    def lift(xi):  # a tangent of the plane as one of space
+        return xi if d == 3 else np.array([0.0, 0.0, xi[0], xi[1], xi[2], 0.0])
+
+    def lower(T):
+        return T if d == 3 else T[np.ix_([0, 1, 3], [0, 1, 3])]
+
+    k = 3 * (d - 1)
+    steps = [
+        se3_exp(lift(np.concatenate([rng.normal(size=k // 2 if d == 3 else 1) * 0.3, [1.0] + [0.0] * (d - 1)])))
+        for _ in range(n - 1)
+    ]
+    truth = [np.eye(4)]
+    for step in steps:
+        truth.append(truth[-1] @ step)
+    pairs = [(i, i + 1) for i in range(n - 1)]
+    while len(pairs) < n - 1 + loops:
+        i, j = rng.integers(0, n, 2).tolist()
+        if abs(i - j) > 1:
+            pairs.append((i, j))
+    Z = [invert(truth[i]) @ truth[j] @ se3_exp(lift(rng.normal(size=k) * sigma)) for i, j in pairs]
+    drifted = [np.eye(4)]
+    for T in Z[: n - 1]:
+        drifted.append(drifted[-1] @ T)
+    information = np.tile(np.eye(k) / sigma**2, (len(pairs), 1, 1))
+    as_array = [np.ascontiguousarray([lower(T) for T in many]) for many in (drifted, Z, truth)]
+    problem = PoseGraphProblem(
+        d, 10 * np.arange(n), as_array[0], np.zeros(n, bool), np.array(pairs), as_array[1], information
+    )  # fmt: skip
+    return problem, as_array[2]
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_all_starts_and_methods_find_the_same_optimum(d):
+    problem, truth = world(d)
+    first = optimize_pose_graph(problem)
+    assert first.converged
+    assert first.start_costs[first.start_name] == min(first.start_costs.values())
+    assert list(first.costs) == sorted(first.costs, reverse=True)
+    freedom = problem.tangent * (len(problem.edges) - len(problem.ids) + 1)
+    assert 0.7 < first.costs[-1] / freedom < 1.4
+    assert np.abs(first.poses - truth)[:, :d, d].max() < 1.0
+    for start in ("file", "odometry", "tree", "chordal"):
+        for method in ("lm", "dogleg"):
+            again = optimize_pose_graph(problem, PoseGraphConfig(start=start, method=method))
+            assert again.costs[-1] == pytest.approx(first.costs[-1], rel=1e-7)
+            assert again.poses == pytest.approx(first.poses, abs=1e-4)
+    for method, tolerance in (("gtsam", 1e-6), ("isam2", 1e-2)):
+        again = optimize_pose_graph(problem, PoseGraphConfig(method=method))
+        assert again.costs[-1] == pytest.approx(first.costs[-1], rel=tolerance)
+    twice = optimize_pose_graph(problem)
+    assert twice.poses.tobytes() == first.poses.tobytes()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_parts_are_anchored_each_and_fixed_poses_stay(d):
+    problem, _ = world(d)
+    keep = np.all((problem.edges < 20) | (problem.edges == 20), axis=1) | np.all(problem.edges > 30, axis=1)
+    fixed = problem.fixed.copy()
+    fixed[[5, 12]] = True
+    poses = problem.poses.copy()
+    poses[12, 0, d] += 0.3
+    apart = replace(
+        problem, fixed=fixed, poses=poses, edges=problem.edges[keep], measurements=problem.measurements[keep],
+        information=problem.information[keep],
+    )  # fmt: skip
+    for method in ("lm", "dogleg", "gtsam"):
+        solution = optimize_pose_graph(apart, PoseGraphConfig(method=method))
+        assert solution.parts == 1 + 10 + 1  # 0 to 20, ten lone ones, 31 to the end
+        assert "12 parts" in " ".join(solution.notes)
+        assert np.allclose(solution.poses[[5, 12, 25, 31]], poses[[5, 12, 25, 31]], atol=1e-9)
+        assert solution.converged
+        assert solution.costs[-1] < apart.chi2(poses)
+
+
+def test_what_has_no_start_gets_one():
+    problem, _ = world(3)
+    poses = problem.poses.copy()
+    poses[[0, 7, 8, 30]] = np.nan
+    best = optimize_pose_graph(problem).costs[-1]
+    for start in ("auto", "file", "odometry"):
+        solution = optimize_pose_graph(problem.with_poses(poses), PoseGraphConfig(start=start))
+        assert solution.costs[-1] == pytest.approx(best, rel=1e-7)
+    nothing = optimize_pose_graph(problem.with_poses(np.full_like(poses, np.nan)))
+    assert nothing.costs[-1] == pytest.approx(best, rel=1e-7)
+    assert "file" not in nothing.start_costs
+
+
+def test_directions_without_information_do_no_harm():
+    problem, _ = world(3)
+    information = problem.information.copy()
+    information[:, 3:, :] = information[:, :, 3:] = 0.0
+    loose = optimize_pose_graph(replace(problem, information=information))
+    assert np.isfinite(loose.poses).all()
+    assert loose.costs[-1] <= optimize_pose_graph(problem).costs[-1]
+    lone = PoseGraphProblem(
+        3, np.array([4]), np.full((1, 4, 4), np.nan), np.zeros(1, bool), np.empty((0, 2), np.int64),
+        np.empty((0, 4, 4)), np.empty((0, 6, 6)),
+    )  # fmt: skip
+    assert optimize_pose_graph(lone).poses.tolist() == [np.eye(4).tolist()]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", BEST)
+def test_the_best_known_cost_is_reached(data_root, name):
+    problem = read_g2o(data_root / "g2o" / f"{name}.g2o")
+    for method in ("lm", "dogleg"):
+        solution = optimize_pose_graph(problem, PoseGraphConfig(method=method))
+        assert solution.costs[-1] <= BEST[name] * (1.0 + 1e-6)
+        assert len(solution.costs) <= 10
