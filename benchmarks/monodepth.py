@@ -170,6 +170,8 @@ def main() -> None:
     parser.add_argument("--fusion", choices=("gaussian", "beta"), default="beta", help="for --tum")
     args = parser.parse_args()
     if args.tum:
+        if args.run is None:
+            parser.error("--tum needs --run, a finished RGB-D run of the recording, for its poses")
         compare_with_sensor(args.tum, args.run, replace(MonoDepthConfig(), fusion=args.fusion))
         return
     count = max(args.frames, args.accuracy_frames) + 1

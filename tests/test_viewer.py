@@ -148,6 +148,59 @@ def test_loops_are_shown_in_the_end_as_they_were_decided_in_the_end(tmp_path):
     ]
 
 
+def voxels_of(path, entity):
+    rows = columns(path, entity)
+    return [np.array(indices) for indices in rows["VoxelGridMap:voxel_indices"]], rows
+
+
+def test_the_map_is_shown_at_times_when_it_changed_and_coarser_when_it_is_large(tmp_path):
+    view = ViewConfig(map_every_s=2.0, map_voxels=500)
+    small = np.array([[3, -2, 1], [4, -2, 1], [3, -2, 9]])
+    large = np.stack(np.meshgrid(*[np.arange(-8, 8)] * 3), axis=-1).reshape(-1, 3)
+    with open_viewer(tmp_path / "run.rrd", rig=RIG, config=view) as viewer:
+        assert viewer.wants_map(5_000_000_000)
+        viewer.log_octree(5_000_000_000, small, 0.05)
+        assert not viewer.wants_map(6_900_000_000)
+        assert viewer.wants_map(6_900_000_000, is_last=True)
+        assert viewer.wants_map(7_000_000_000)
+        viewer.log_octree(7_000_000_000, small, 0.05)  # the same: not written again
+        viewer.log_octree(9_000_000_000, large, 0.05)
+        viewer.log_octree(11_000_000_000, np.zeros((0, 3), np.int64), 0.05)
+    shown, rows = voxels_of(tmp_path / "run.rrd", "/world/octree")
+    assert [len(indices) for indices in shown] == [3, 64, 0]
+    np.testing.assert_array_equal(shown[0], small)
+    sizes = [np.ravel(size)[0] for size in rows["VoxelGridMap:voxel_size"]]
+    assert sizes == pytest.approx([0.05, 0.2, 0.05])
+    heights = np.array(rows["VoxelGridMap:values"][0])
+    np.testing.assert_allclose(heights, (small[:, 2] + 0.5) * 0.05, atol=1e-6)
+
+
+def test_the_grid_lies_on_the_floor_and_obstacles_survive_coarsening(tmp_path):
+    cells = np.full((30, 41), -1, np.int8)
+    cells[10:30, :] = 0
+    cells[20, 40] = 1
+    with open_viewer(tmp_path / "run.rrd", rig=RIG, config=ViewConfig(map_voxels=300)) as viewer:
+        viewer.log_grid(5_000_000_000, cells, 0.1, (-1.0, 2.0), 0.25)
+    (indices,), rows = voxels_of(tmp_path / "run.rrd", "/world/grid")
+    assert len(indices) == 10 * 21  # two cells to one, unknown ones left out
+    colors = np.array(rows["VoxelGridMap:colors"][0])
+    (obstacle,) = indices[colors == colors[np.all(indices == [20, 10, 0], axis=1)]]
+    np.testing.assert_array_equal(obstacle, [20, 10, 0])
+    np.testing.assert_allclose(np.ravel(rows["VoxelGridMap:translation"][0]), [-1.0, 2.0, 0.25])
+    np.testing.assert_allclose(np.ravel(rows["VoxelGridMap:voxel_size"][0])[:2], 0.2)
+
+
+def test_depth_that_comes_late_takes_the_place_of_features(tmp_path):
+    points = np.arange(30.0).reshape(-1, 3)
+    with open_viewer(tmp_path / "run.rrd", rig=RIG, config=ViewConfig(cloud_points=8)) as viewer:
+        viewer.log_keyframe(keyframe(0, depth=False, points=points[:3]), pose(0))
+        viewer.log_cloud(0, points, np.full((10, 3), 200, np.uint8))
+    rows = columns(tmp_path / "run.rrd", "/world/map/kf_0")
+    clouds = [np.array(cloud) for cloud in rows["Points3D:positions"] if cloud]
+    assert [len(cloud) for cloud in clouds] == [3, 5]
+    np.testing.assert_array_equal(clouds[1], points[::2])
+
+
 def test_long_paths_grow_linearly(tmp_path):
     sizes = []
     for count in (500, 2000):

@@ -594,6 +594,8 @@ class ViewConfig:
     jpeg_quality: int = 75
     cloud_points: int = 4000  # per keyframe, from depth; sparse features are all kept
     max_range_m: float = 8.0  # farther depth is noise that hides the scene
+    map_every_s: float = 5.0  # octree and grid are written again so often at most
+    map_voxels: int = 20_000  # at most in each, larger maps get coarser ones; 16 bytes each
 
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]

@@ -223,6 +223,35 @@ class Run:
             self.viewer.move(keyframe.update)
             for candidate in keyframe.candidates:
                 self.viewer.log_loop(candidate)
+            self._show_depth(keyframe)
+        if step.keyframes:
+            self._show_map(frame.t_ns)
+
+    def _show_depth(self, step: KeyframeStep) -> None:
+        """Show the points of keyframes whose depth did not come with the image: from two images, or from one, late."""
+        mapper = None if self.slam.back is None else self.slam.back.mapper
+        if (
+            mapper is None
+            or isinstance(self.viewer, NullViewer)
+            or step.odometry.packet.keyframe.frame.depth_m is not None
+        ):
+            return
+        for keyframe_id, scan in step.scans.items():
+            if scan.depth_png:
+                cloud = mapper.keyframe_cloud(keyframe_id)
+                self.viewer.log_cloud(keyframe_id, cloud.points_m, cloud.colors)
+
+    def _show_map(self, t_ns: int, is_last: bool = False) -> None:
+        """Show octree and grid as they are now, if it is time for that."""
+        mapper = None if self.slam.back is None else self.slam.back.mapper
+        if mapper is None or not self.viewer.wants_map(t_ns, is_last):
+            return
+        with suppress(DataError):  # too many voxels, or too large a grid: said where they are exported
+            octree = mapper.occupancy.max_likelihood_octree()
+            self.viewer.log_octree(t_ns, octree.occupied_voxels(), octree.resolution_m)
+            if self.slam.front.first_state is not None:  # else the map is not level
+                grid = mapper.grid()
+                self.viewer.log_grid(t_ns, grid.cells, grid.resolution_m, grid.origin_m, grid.floor_m)
 
     def _finish(self, start: float) -> dict[str, Any]:
         finish = self.slam.finish()
@@ -274,6 +303,8 @@ class Run:
 
     def _show_result(self, final: Trajectory, truth: Trajectory | None) -> None:
         self.viewer.log_path("graph", final.positions_m)
+        if len(self.log):
+            self._show_map(int(self.log.stamps_ns[-1]), is_last=True)
         if truth is not None and len(final):
             with suppress(VislamError):  # too little in common: metrics say so
                 pairs = associate(truth, final)

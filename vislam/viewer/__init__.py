@@ -7,9 +7,22 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vislam.camera import Rig
 from vislam.config import ViewConfig
-from vislam.messages import Array, Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, Observations, Tracking
+from vislam.messages import (
+    Array,
+    Frame,
+    GraphUpdate,
+    ImageU8,
+    Keyframe,
+    LoopCandidate,
+    LoopDecision,
+    Observations,
+    Tracking,
+)
 
 if TYPE_CHECKING:
     from vislam.viewer.recording import RunViewer
@@ -38,6 +51,21 @@ class NullViewer:
 
     def move(self, update: GraphUpdate) -> None:
         """Ignore a graph update."""
+
+    def log_cloud(self, keyframe_id: int, points_body_m: NDArray[np.floating], colors: ImageU8) -> None:
+        """Ignore a keyframe's points."""
+
+    def wants_map(self, t_ns: int, is_last: bool = False) -> bool:
+        """Return False."""
+        return False
+
+    def log_octree(self, t_ns: int, voxels: NDArray[np.int64], resolution_m: float) -> None:
+        """Ignore an octree."""
+
+    def log_grid(
+        self, t_ns: int, cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, float], floor_m: float
+    ) -> None:
+        """Ignore a grid."""
 
     def log_loop(self, candidate: LoopCandidate) -> None:
         """Ignore a loop candidate."""

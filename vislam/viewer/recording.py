@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import ViewConfig
@@ -31,6 +32,7 @@ from vislam.messages import (
     Observations,
     Tracking,
 )
+from vislam.viewer.map_view import grid_cells, octree_voxels
 
 _PAPER_GREY = 60
 _COLORS = {
@@ -79,6 +81,8 @@ class RunViewer:
         self._paths: dict[str, list[Array]] = {}
         self._loops: dict[LoopDecision, list[tuple[int, int]]] = {}
         self._has_loop_pictures = False
+        self._map_t_ns = -(1 << 62)  # when the map was shown last
+        self._voxels: NDArray[np.int64] | None = None
         self._log_static()
 
     def go_on(self, zero_ns: int, T_map_body: Mapping[int, Array]) -> None:
@@ -148,6 +152,32 @@ class RunViewer:
             self._log_loops(LoopDecision.ACCEPTED)
         if update.note:
             self._stream.log("notes", rr.TextLog(f"graph revision {update.revision}: {update.note}", level="WARN"))
+
+    def log_cloud(self, keyframe_id: int, points_body_m: NDArray[np.floating], colors: ImageU8) -> None:
+        """Show a keyframe's points [N, 3] with RGB [N, 3] in place of those it had; it moves with the keyframe."""
+        step = 1 + len(points_body_m) // self._config.cloud_points
+        points = rr.Points3D(points_body_m[::step].astype(np.float32), colors=colors[::step], radii=0.012)
+        self._stream.log(_keyframe_entity(keyframe_id), points)
+
+    def wants_map(self, t_ns: int, is_last: bool = False) -> bool:
+        """Return whether it is time to show the map again."""
+        return is_last or t_ns - self._map_t_ns >= 1e9 * self._config.map_every_s
+
+    def log_octree(self, t_ns: int, voxels: NDArray[np.int64], resolution_m: float) -> None:
+        """Show the occupied voxels [N, 3] of the map, 0 at its origin, coloured by height, in place of those before."""
+        self._set_time(t_ns)
+        self._map_t_ns = t_ns
+        if self._voxels is None or not np.array_equal(voxels, self._voxels):
+            self._voxels = voxels
+            boxes = octree_voxels(voxels, resolution_m, self._axes()[0], self._config.map_voxels)
+            self._stream.log("world/octree", boxes)
+
+    def log_grid(
+        self, t_ns: int, cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, float], floor_m: float
+    ) -> None:
+        """Show the navigation grid: cells [rows, columns] 1 occupied, 0 free, -1 unknown, row 0 at the lowest y."""
+        self._set_time(t_ns)
+        self._stream.log("world/grid", grid_cells(cells, resolution_m, origin_m, floor_m, self._config.map_voxels))
 
     def log_loop(self, candidate: LoopCandidate) -> None:
         """Draw a loop candidate in the colour of its decision and note its reason."""
@@ -307,13 +337,28 @@ class RunViewer:
         world = rrb.Spatial3DView(
             origin="world",
             name="world",
-            contents=["$origin/**", "- world/loops/rejected", f"- {_CAMERA}/image/**"],
+            contents=[
+                "$origin/**",
+                "- world/loops/rejected",
+                f"- {_CAMERA}/image/**",
+                "- world/octree",
+                "- world/grid",
+            ],
+            background=[20, 22, 26],
+            eye_controls=self._eye(),
+        )
+        solid = rrb.Spatial3DView(
+            origin="world",
+            name="octree and grid",
+            contents=["world/octree", "world/grid", "world/paths/**", "world/live"],
             background=[20, 22, 26],
             eye_controls=self._eye(),
         )
         return rrb.Blueprint(
             rrb.Horizontal(
-                world, rrb.Vertical(*side, row_shares=[4, 1.2, *[2.5] * (len(side) - 3), 1.5]), column_shares=[2.2, 1]
+                rrb.Tabs(world, solid),
+                rrb.Vertical(*side, row_shares=[4, 1.2, *[2.5] * (len(side) - 3), 1.5]),
+                column_shares=[2.2, 1],
             ),
             rrb.TimePanel(state="collapsed"),
             collapse_panels=True,
@@ -326,13 +371,18 @@ class RunViewer:
         positions = np.array([T[:3, 3] for T in self._poses.values()])
         centre = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
         extent = max(float(np.linalg.norm(np.ptp(positions, axis=0))), 2.0)
-        up, back = np.array([0.0, 0.0, 1.0]), np.array([-0.6, -0.8, 0.0])
-        first = next(iter(self._poses.values()))[:3, :3] @ (
-            self._rig.T_body_cams[0][:3, :3] if self._rig else np.eye(3)
-        )
-        if self._rig and -first[2, 1] < 0.3:  # without an IMU the map lies as the first camera did: look from behind it
-            up, back = -first[:, 1], -first[:, 2]
+        up, back = self._axes()
         return rrb.EyeControls3D(position=centre + extent * (1.4 * back + 1.2 * up), look_target=centre, eye_up=up)
+
+    def _axes(self) -> tuple[Array, Array]:
+        """Return where up is in the map, and from which side to look at it."""
+        up, back = np.array([0.0, 0.0, 1.0]), np.array([-0.6, -0.8, 0.0])
+        if self._rig is None or not self._poses:
+            return up, back
+        first = next(iter(self._poses.values()))[:3, :3] @ self._rig.T_body_cams[0][:3, :3]
+        if -first[2, 1] < 0.3:  # without an IMU the map lies as the first camera did: look from behind it
+            return -first[:, 1], -first[:, 2]
+        return up, back
 
 
 def _picture(frame: Frame, rig: Rig | None) -> ImageU8 | None:
