@@ -210,7 +210,7 @@ def test_poisoned_loop_keeps_the_chain(
         failing.armed = failures  # the gate comes after the keyframe and before the loop
         return relative_covariance(i, j)
 
-    monkeypatch.setattr(graph, "relative_covariance", arm)
+    monkeypatch.setattr(graph._loops, "relative_covariance", arm)
     update = graph.add(world.packet(110), [edge])
     assert (7 in update.accepted_loop_ids) == kept
     assert "rebuilt with QR" in update.note

@@ -327,7 +327,7 @@ def test_poisoned_loop_is_given_up_and_the_window_goes_on(world: World, make, mo
         failing.armed = 2
         return relative_covariance(i, j)
 
-    monkeypatch.setattr(graph, "relative_covariance", arm)
+    monkeypatch.setattr(graph._loops, "relative_covariance", arm)
     update = graph.add(world.packet(110), [world.loop(7, 5, 105)])
     assert 7 in update.rejected_loop_ids and "without the new loops" in update.note
     monkeypatch.undo()

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from vislam.config import GraphConfig
 from vislam.errors import DataError
-from vislam.factors.gate import EdgeReport
 from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe_record, loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.joining import weak_link
@@ -57,12 +56,6 @@ def sort_loops(loops: list[OfferedLoop], models: dict[int, LoopModel]) -> dict[L
             model.tie = loop.state.tie
             out[loop.state.place].append(model)
     return out
-
-
-def edge_report(loop: OfferedLoop) -> EdgeReport:
-    """Return what was reported of a loop."""
-    state = loop.state
-    return EdgeReport(state.id, loop.edge.from_id, loop.edge.to_id, state.chi2, 0.0, state.decision, state.reason)
 
 
 def _check_window(memory: GraphMemory, k: int) -> None:

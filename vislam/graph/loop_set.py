@@ -1,0 +1,336 @@
+"""The loops of a graph: tested, parked, let in, reviewed and taken out again, each with a report that says why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vislam.config import GraphConfig
+from vislam.errors import DataError
+from vislam.factors.anchors import Anchors
+from vislam.factors.consensus import Consensus, Verdict
+from vislam.factors.estimator import Estimator
+from vislam.factors.gate import CarPark, EdgeReport
+from vislam.factors.journal import loop_record
+from vislam.factors.keys import X
+from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.travel import Travel
+from vislam.geometry import invert, se3_adjoint
+from vislam.memory import LoopPlace, LoopState, OfferedLoop, Tied
+from vislam.messages import Array, LoopDecision, LoopEdge
+
+_FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
+
+
+class LoopSet:
+    """Decides which loops the estimator holds. Keyframes and odometry are the caller's, with the same estimator.
+
+    A loop is tested against the estimate, parked where it does not fit, and weighed with all others now and then: what
+    several witnesses say against one brings it in or puts it out.
+    """
+
+    def __init__(self, config: GraphConfig, lever_m: Array, estimator: Estimator[LoopModel], travel: Travel) -> None:
+        """Start without loops; `travel` is the odometry between the estimator's keyframes."""
+        self._config = config
+        self._lever_m = lever_m
+        self._estimator = estimator
+        self._travel = travel
+        self._park = CarPark(config)
+        self._consensus = Consensus(config)
+        self._beyond_help: set[int] = set()  # loops that a review brought in and the graph contradicted
+        self._anchors = Anchors(config)
+        self._reports: dict[int, EdgeReport] = {}
+        self._changed: dict[int, None] = {}  # ids of reports since `take_states`
+
+    @property
+    def parked(self) -> int:
+        """Return how many loops are parked."""
+        return len(self._park.edges)
+
+    @property
+    def held(self) -> list[LoopModel]:
+        """Return the loops that the graph holds, with a factor or in spare."""
+        return [*self._estimator.loops.values(), *self._estimator.spare.values()]
+
+    def reports(self) -> list[EdgeReport]:
+        """Return what became of every offered loop, by loop id, with the weight it has now."""
+        out = []
+        for loop_id in sorted(self._reports):
+            edge = self._estimator.loops.get(loop_id)
+            weight = 0.0 if edge is None else edge.weight(*self._ends(edge))
+            out.append(replace(self._reports[loop_id], weight=weight))
+        return out
+
+    def take_states(self, waiting: Sequence[LoopModel]) -> tuple[LoopState, ...]:
+        """Return where the loops are now that were decided about since the last call; some wait elsewhere."""
+        apart = {model.record.id: LoopPlace.PARKED for model in self._park.edges}
+        apart |= {model.record.id: LoopPlace.WAITING for model in waiting}
+        states = tuple(self._loop_state(n, apart) for n in self._changed)
+        self._changed = {}
+        return states
+
+    def take_ties(self) -> tuple[Tied, ...]:
+        """Return what became known of anchors since the last call."""
+        return self._anchors.take_news()
+
+    def restore(
+        self, models: Sequence[LoopModel], by_place: dict[LoopPlace, list[LoopModel]], ties: Sequence[Tied]
+    ) -> None:
+        """Take over the loops of an earlier run; the estimator has those that it held."""
+        for tied in ties:
+            self._anchors.tie(tied)
+        for model in by_place[LoopPlace.PARKED]:
+            self._park.park(model)
+        apart = {model.id for place in (LoopPlace.WAITING, LoopPlace.UNDONE) for model in by_place[place]}
+        for model in (m for m in models if m.id not in apart):
+            self._consensus.offer(model, model.id not in self._held_ids, self._travel)
+
+    def restore_reports(self, loops: Sequence[OfferedLoop]) -> None:
+        """Take over what was reported of the loops of an earlier run."""
+        self._reports = {loop.state.id: edge_report(loop) for loop in loops}
+
+    def admit(self, edge: LoopEdge, newest_id: int) -> LoopModel | None:
+        """Return an edge as the graph takes it; one that cannot be used is reported as rejected, not raised."""
+        try:
+            if edge.id in self._reports:
+                raise DataError(f"loop {edge.id}: its id was used before")
+            record = loop_record(edge, newest_id)
+        except DataError as error:
+            bad = EdgeReport(
+                edge.id, edge.from_id, edge.to_id, float("nan"), 0.0, LoopDecision.REJECTED, str(error)
+            )  # fmt: skip
+            if edge.id not in self._reports:
+                self._set_report(bad)
+            return None
+        return LoopModel(record, self._config, self._lever_m)
+
+    def wait(self, model: LoopModel) -> None:
+        """Report that a loop waits for others, outside of this set."""
+        record = model.record
+        reason = "between pieces that are not joined, waits for loops of other frames that agree"
+        ends = record.from_id, record.to_id
+        self._set_report(EdgeReport(record.id, *ends, float("nan"), 0.0, LoopDecision.PARKED, reason))
+
+    def offer(self, model: LoopModel) -> None:
+        """Give a loop that fits to the next review."""
+        self._consensus.offer(model, False, self._travel)
+
+    def park(self, models: Sequence[LoopModel]) -> list[int]:
+        """Park loops that do not fit; return the ids of those that had to leave for them."""
+        gone = [evicted for model in models if (evicted := self._park.park(model)) is not None]
+        for model in gone:
+            self.report(model, LoopDecision.REJECTED, "left the full car park")
+        return [model.record.id for model in gone]
+
+    def review(self, notes: list[str]) -> list[int]:
+        """Let the review of all loops work for a while; return the ids about which it decided."""
+        if self._consensus.is_due:
+            self._look_for_doubts()
+        verdict = self._consensus.step(self._travel, self._scale_left, self._held_ids)
+        return [] if verdict is None else self._apply(verdict, notes)
+
+    def finish(self, notes: list[str]) -> list[int]:
+        """Review all loops to the end; return the ids about which it decided."""
+        self._look_for_doubts()
+        verdict = self._consensus.finish(self._travel, self._scale_left, self._held_ids)
+        return [] if verdict is None else self._apply(verdict, notes)
+
+    def relative_covariance(self, i: int, j: int) -> Array:
+        """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
+        joint = self._estimator.joint_covariance([X(i), X(j)])
+        if joint is None:
+            return self._travel.relative_covariance(i, j)
+        return relative_covariance(self._estimator.poses[i], self._estimator.poses[j], joint)
+
+    def split(self, touched: list[int]) -> tuple[list[int], list[int]]:
+        """Return the ids of accepted and of refused loops among those about which something was decided."""
+        decided = sorted(set(touched))
+        accepted = [n for n in decided if self._reports[n].decision is LoopDecision.ACCEPTED]
+        return accepted, [n for n in decided if n not in accepted]
+
+    def test(self, model: LoopModel) -> bool:
+        """Test an edge against the current estimate, and give it to the next review."""
+        inside = self._gate(model)
+        self._consensus.offer(model, not inside, self._travel)
+        return inside
+
+    def accept(self, fresh: list[LoopModel], notes: list[str], reason: str) -> list[LoopModel]:
+        """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
+        fresh = [m for m in fresh if m.record.id not in self._estimator.spare]
+        if not fresh:
+            return []
+        far = any(self._is_far(m) for m in fresh)
+        fits = not far and all(m.weight(*self._ends(m)) >= _FITS for m in fresh)
+        notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._estimator.is_long))
+        contradicted = self._judge(fresh, reason)
+        if contradicted:
+            notes.append(self._estimator.drop(contradicted))
+        return contradicted
+
+    def report(self, model: LoopModel, decision: LoopDecision, reason: str) -> None:
+        """Add a decision and its reason to what was reported of a loop."""
+        old = self._reports[model.record.id]
+        self._set_report(replace(old, decision=decision, reason=f"{old.reason}; {reason}"))
+
+    @property
+    def _scale_left(self) -> float:
+        """Return by how much the sigmas of odometry may still be inflated."""
+        return self._config.vo_scale_max / self._estimator.vo_scale
+
+    @property
+    def _held_ids(self) -> set[int]:
+        """Return the ids of the loops that the graph holds, with a factor or in spare."""
+        return self._estimator.loops.keys() | self._estimator.spare.keys()
+
+    def _ends(self, edge: LoopModel) -> tuple[Array, Array]:
+        poses = self._estimator.poses
+        return poses[edge.record.from_id], poses[edge.record.to_id]
+
+    def _loop_state(self, loop_id: int, apart: dict[int, LoopPlace]) -> LoopState:
+        report, estimator = self._reports[loop_id], self._estimator
+        place, tie = apart.get(loop_id, LoopPlace.OUT), None
+        if loop_id in estimator.loops:
+            place, tie = LoopPlace.GRAPH, estimator.loops[loop_id].tie
+        elif loop_id in estimator.spare:
+            place = LoopPlace.SPARE
+        return LoopState(loop_id, report.decision, report.reason, report.chi2, place, tie)
+
+    def _gate(self, model: LoopModel) -> bool:
+        """Test an edge against the current estimate and note the chi-square.
+
+        On long runs one that passes, and of whose relative pose the graph is as sure as the loop, is kept in spare.
+        """
+        record = model.record
+        to_anchor = self._tie(model)
+        if model.tie is None or to_anchor is None:
+            known = self.relative_covariance(record.from_id, record.to_id)
+        else:  # an upper bound, as if the two ways shared nothing
+            T_map_older, T_map_newer = self._ends(model)
+            carry = se3_adjoint(invert(T_map_newer) @ T_map_older)
+            known = self.relative_covariance(model.tie.from_id, record.to_id) + carry @ to_anchor @ carry.T
+        chi2 = model.chi2(*self._ends(model), known)
+        inside = bool(chi2 <= model.threshold)
+        decision = LoopDecision.ACCEPTED if inside else LoopDecision.PARKED
+        reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
+        self._set_report(EdgeReport(record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason))
+        gain = model.gain(known)
+        if inside and self._estimator.is_long and gain < self._config.loop_gain_min:
+            self._estimator.spare[record.id] = model
+            self.report(model, decision, f"redundant, the graph has {gain:.2f} times its variance")
+        return inside
+
+    def _set_report(self, report: EdgeReport) -> None:
+        self._reports[report.loop_id] = report
+        self._changed[report.loop_id] = None
+
+    def _judge(self, fresh: list[LoopModel], reason: str, reviewed: bool = False) -> list[LoopModel]:
+        """Report on loops that were put into the graph; return those that the optimised graph contradicts."""
+        contradicted = []
+        for model in fresh:
+            if model.record.id not in self._estimator.loops:
+                self.report(model, LoopDecision.REJECTED, "the solver refused it")
+            elif self._is_torn(model):
+                contradicted.append(model)
+                decision = LoopDecision.REJECTED if reviewed else LoopDecision.PARKED
+                weight = model.weight(*self._ends(model))
+                self.report(model, decision, f"contradicted by the graph, weight {weight:.3f}")
+            else:
+                way = "" if model.tie is None else f", by way of keyframe {model.tie.from_id}"
+                self.report(model, LoopDecision.ACCEPTED, reason + way)
+                self._remember(model)
+        return contradicted
+
+    def _is_torn(self, model: LoopModel) -> bool:
+        """Return whether the graph contradicts a loop that is in it."""
+        return model.weight(*self._ends(model)) < self._config.loop_min_weight
+
+    def _remember(self, model: LoopModel) -> None:
+        """Take note of which anchor an accepted loop ties its newer end to."""
+        older, newer = model.record.from_id, model.record.to_id
+        if not model.record.has_scale:
+            return
+        anchor = self._anchors.of(older) if model.tie is None else model.tie.from_id
+        if anchor == older:
+            self._anchors.tie(Tied(older, older, np.zeros((6, 6))))
+        self._anchors.tie(Tied(newer, anchor, self.relative_covariance(anchor, newer)))
+
+    def _tie(self, model: LoopModel) -> Array | None:
+        """Where loops are many, let an anchor stand for the older end; return the covariance [6, 6] of T_anchor_older.
+
+        Otherwise each visit of a place would tie to all others, and the work of an update would grow with their number.
+        What was known when the older end was tied does mostly; an exact marginal takes long where loops are many.
+        """
+        model.tie = None
+        older = model.record.from_id
+        near = self._anchors.near(older) if len(self._estimator.loops) >= self._config.anchor_after else None
+        if near is None or near.anchor_id in (older, model.record.to_id):
+            return None
+        anchor = near.anchor_id
+        self._estimator.look_at([anchor, near.id])
+        T_map_anchor, T_map_near, T_map_older = (self._estimator.poses[k] for k in (anchor, near.id, older))
+        carry = se3_adjoint(invert(T_map_older) @ T_map_near)
+        covariance = carry @ near.covariance @ carry.T
+        if near.id != older:
+            covariance += self._travel.relative_covariance(near.id, older)
+        if not model.tie_to(anchor, invert(T_map_anchor) @ T_map_older, covariance):
+            covariance = self.relative_covariance(anchor, older)
+            model.tie_to(anchor, invert(T_map_anchor) @ T_map_older, covariance)
+        return None if model.tie is None else covariance
+
+    def _is_far(self, model: LoopModel) -> bool:
+        """Return whether a loop asks for a correction beyond what incremental steps should try."""
+        residual, _ = model.residual(*self._ends(model))
+        turn = float(np.linalg.norm(residual[:3])) > np.deg2rad(self._config.loop_batch_deg)
+        return turn or (model.record.has_scale and float(np.linalg.norm(residual[3:])) > self._config.loop_batch_m)
+
+    def _apply(self, verdict: Verdict, notes: list[str]) -> list[int]:
+        """Do as a review of all loops says; return the ids about which it decided something else than before."""
+        estimator, newest, held = self._estimator, len(self._estimator.poses) - 1, self._held_ids
+        out = [m for m, _ in verdict.put_out if m.id in held]
+        back = [m for m in verdict.let_in if m.id not in held and m.id not in self._beyond_help]
+        for model, chi2 in verdict.put_out:
+            if model.id in held:
+                estimator.spare.pop(model.id, None)
+                says = f"{verdict.places} places say otherwise, chi2 {chi2:.1f}"
+                self.report(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {says}")
+        if verdict.scale > 1.0 and back:  # several witnesses against the odometry say that it knows less than it says
+            estimator.distrust_odometry(verdict.scale)
+            self._travel.scale(verdict.scale)
+        self._park.remove(back)
+        self._rebuild(out, back, notes)
+        torn = self._judge(back, f"let in at keyframe {newest}: it agrees with {verdict.places} places", True)
+        self._beyond_help |= {m.id for m in torn}
+        if torn:
+            notes.append(estimator.drop(torn))
+        return [m.id for m in (*out, *back)]
+
+    def _look_for_doubts(self) -> None:
+        """Tell the next review if loops that were let in do not fit any more: the kernel keeps them without a say."""
+        if any(m.chi2(*self._ends(m)) > m.threshold for m in self._estimator.loops.values()):
+            self._consensus.doubt()
+
+    def _rebuild(self, out: list[LoopModel], back: list[LoopModel], notes: list[str]) -> None:
+        """Take loops out of the graph and others into it.
+
+        Where one is out, places may have been tied together that are not the same: all loops are as measured again.
+        """
+        estimator = self._estimator
+        tied = [m for m in (*estimator.loops.values(), *back) if m.tie is not None]
+        for model in tied if out or back else []:
+            model.tie = None
+            self._changed[model.id] = None
+        if out:
+            self._anchors.forget()
+        held = [m for m in out if m.id in estimator.loops]
+        if back or (held and tied):
+            notes.append(estimator.revise(held, back))
+        elif held:
+            notes.append(estimator.drop(held))
+
+
+def edge_report(loop: OfferedLoop) -> EdgeReport:
+    """Return what was reported of a loop."""
+    state = loop.state
+    return EdgeReport(state.id, loop.edge.from_id, loop.edge.to_id, state.chi2, 0.0, state.decision, state.reason)
