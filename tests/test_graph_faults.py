@@ -204,7 +204,7 @@ def test_poisoned_loop_keeps_the_chain(
     graph = started(world, 110)
 
     edge = world.loop(7, 5, 105)
-    relative_covariance = graph.relative_covariance
+    relative_covariance = graph._loops.relative_covariance
 
     def arm(i: int, j: int) -> np.ndarray:
         failing.armed = failures  # the gate comes after the keyframe and before the loop

@@ -321,7 +321,7 @@ def test_poisoned_loop_is_given_up_and_the_window_goes_on(world: World, make, mo
     failing = Failing(monkeypatch)
     graph, _ = make(world)
     feed(graph, world, 0, 110)
-    relative_covariance = graph.relative_covariance
+    relative_covariance = graph._loops.relative_covariance
 
     def arm(i: int, j: int) -> np.ndarray:
         failing.armed = 2
