@@ -194,6 +194,10 @@ class EkfConfig:
     reset_accel_bias_m_s2: float = 0.2
     zero_velocity_sigma_m_s: float = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: float = 0.005  # one gyro sample at rest against the bias
+    nonholonomic: bool = False  # a cart: its axle goes neither sideways nor up; loose coupling only
+    nonholonomic_sigma_m_s: float = 0.02  # slip, and the mounting of the IMU: 1 degree at 1 m/s
+    axle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # middle of the axle that does not steer, in the body frame
+    floor_sigma_m: float | None = None  # a cart on one level floor: its height varies by so much; None: not used
     rest_sigma_m: float = 0.002  # sway against the pose at which rest began
     rest_sigma_deg: float = 0.05
     vision_delay_s: float = 0.0  # for experiments: vision reaches the filter so much later than it was seen
@@ -331,6 +335,9 @@ class GraphConfig:
     rest_speed_sigma_m_s: float = 0.005
     rest_sigma_m: float = 0.001  # sway of a keyframe at rest against the one at which rest began
     rest_sigma_deg: float = 0.05
+    floor_sigma_m: float | None = None  # a cart on one level floor: keyframes are at one height; None: not used
+    nonholonomic_sigma_m_s: float | None = None  # a cart: slip of its axle, with loose coupling; None: not used
+    axle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # as in `ekf`
 
     loop_gate_probability: float = 0.999  # chi-square of a loop against the joint covariance of its two keyframes
     loop_cauchy_k: float = 2.0  # whitened norm

@@ -102,6 +102,8 @@ class Front:
             self.ekf_coupling = config.ekf.coupling
             if self.ekf_coupling == "auto":
                 self.ekf_coupling = "tight" if self.frontend.mode == "mono" else "loose"
+            if config.ekf.nonholonomic and self.ekf_coupling == "tight":
+                raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
             readout_s = config.ekf.tight_readout_s
             readout_s = config.frontend.readout_s if readout_s is None else readout_s
             ekf_config = replace(config.ekf, coupling=self.ekf_coupling, tight_readout_s=readout_s)
@@ -415,6 +417,8 @@ class Front:
         ekf.update_vision(track.vo, track.observations)
         if at_rest:
             ekf.update_zero_velocity(t_ns)
+        elif self._config.ekf.nonholonomic and isinstance(ekf, Ekf):
+            ekf.update_nonholonomic(t_ns)
         if track.keyframe is not None:
             ekf.add_keyframe(track.keyframe.id, t_ns)
 

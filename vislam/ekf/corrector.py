@@ -14,6 +14,7 @@ from vislam.ekf.measurements import (
     absolute_pose,
     biases,
     chi_square_limit,
+    on_wheels,
     relative_motion,
     where_rest_began,
     with_shared_error,
@@ -33,6 +34,7 @@ class Corrector:
         per_sample = config.imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
         self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
         self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)]
+        self._axle = np.array(config.axle_m, dtype=np.float64)
         self._reset_sigmas = reset_sigmas(config)
 
     def apply(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
@@ -46,6 +48,12 @@ class Corrector:
             return self._apply_vo(event, x, P, ledger)
         if event.kind is Kind.ZERO_VELOCITY:
             return self._apply_rest(event, x, P, ledger, gyro_rad_s)
+        if event.kind is Kind.NONHOLONOMIC:
+            config = self._config
+            floor = None if config.floor_sigma_m is None else (ledger.floor_z_m, config.floor_sigma_m)
+            sigma_m_s = config.nonholonomic_sigma_m_s
+            self._correct(event, on_wheels(x, gyro_rad_s, self._axle, sigma_m_s, floor), x, P, "nonholonomic")
+            return ledger
         assert event.bias is not None
         known = biases(x, event.bias[:3], event.bias[3:6], event.bias[6:])
         self._correct(event, known, x, P, "bias", only=slice(9, 15))

@@ -134,7 +134,7 @@ class Ekf:
             self._P[15:] = self._P[:, 15:] = 0.0  # no clone: the 16 numbers of the paper
         self._t_ns = state.t_ns
         self._applied = 0
-        self._ledger = Ledger(last_vo_t_ns=state.t_ns)
+        self._ledger = Ledger(last_vo_t_ns=state.t_ns, floor_z_m=float(x[2]))
         if vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo):
             self._place_keyframe(vo)
         self._series.extra[:] = np.nan
@@ -194,6 +194,14 @@ class Ekf:
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:
         """Tell the filter that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""
         return self._insert(Event(t_ns, Kind.ZERO_VELOCITY))
+
+    def update_nonholonomic(self, t_ns: int) -> UpdateResult:
+        """Tell the filter that a cart's axle goes neither sideways nor up at `t_ns`, and that its floor is level.
+
+        See `ekf.nonholonomic_sigma_m_s`, `ekf.axle_m` and `ekf.floor_sigma_m`. Ten times a second is enough: slip goes
+        on for a while, and more of the same would be taken for news.
+        """
+        return self._insert(Event(t_ns, Kind.NONHOLONOMIC))
 
     def feed_back(
         self,

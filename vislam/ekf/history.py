@@ -22,6 +22,8 @@ OUTCOMES = (  # every counter a measurement can end in, and what they cause
     "vo_invalid",
     "zero_velocity_accepted",
     "zero_velocity_gated",
+    "nonholonomic_accepted",
+    "nonholonomic_gated",
     "bias_accepted",
     "bias_gated",
     "bias_invalid",
@@ -39,6 +41,7 @@ class Kind(StrEnum):
     KEYFRAME = "keyframe"
     VO = "vo"
     ZERO_VELOCITY = "zero_velocity"
+    NONHOLONOMIC = "nonholonomic"
     BIAS = "bias"
 
 
@@ -74,6 +77,7 @@ class Ledger:
     T_odom_keyframe: Array | None = None  # [4, 4] where accumulated vision has the keyframe
     T_odom_vo: Array | None = None  # [4, 4] where it had the body last, and when
     vo_t_ns: int = 0
+    floor_z_m: float = 0.0  # height of the body in `odom` at the start, where a floor keeps it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from scipy.special import gammaincinv
 
 from vislam.ekf.kernels import ERRORS, pose
-from vislam.geometry import so3_left_jacobian_inverse, so3_log
+from vislam.geometry import skew, so3_left_jacobian_inverse, so3_log
 from vislam.messages import Array, VoMeasurement
 from vislam.relative_motion import direction_noise, direction_residual, metric_residual
 
@@ -125,6 +125,30 @@ def zero_velocity(x: Array, gyro_rad_s: Array, sigma_m_s: float, sigma_rad_s: fl
     H[3:, 9:12] = np.eye(3)
     residual = np.concatenate([-x[3:6], gyro_rad_s - x[13:16]])
     return LinearMeasurement(residual, H, np.diag(np.repeat([sigma_m_s**2, sigma_rad_s**2], 3)))
+
+
+def on_wheels(
+    x: Array, gyro_rad_s: Array, axle_m: Array, sigma_m_s: float, floor: tuple[float, float] | None
+) -> LinearMeasurement:
+    """Return "on wheels": the axle, at `axle_m` [3] in the body frame, goes neither sideways nor up (NHC).
+
+    Args:
+        x: nominal state [23].
+        gyro_rad_s: rate [3] as measured.
+        axle_m: where the wheels cannot slip.
+        sigma_m_s: how much they do all the same.
+        floor: height of the body in `odom` and its sigma, in metres; None: not known.
+    """
+    R = pose(x, 0, 6)[:3, :3]
+    forward = R.T @ x[3:6]
+    velocity = forward + np.cross(gyro_rad_s - x[13:16], axle_m)
+    H = np.zeros((3, ERRORS))
+    H[:2, :3], H[:2, 6:9], H[:2, 9:12] = skew(forward)[1:], R.T[1:], skew(axle_m)[1:]
+    if floor is None:
+        return LinearMeasurement(-velocity[1:], H[:2], np.eye(2) * sigma_m_s**2)
+    H[2, 5] = 1.0
+    residual = np.array([-velocity[1], -velocity[2], floor[0] - x[2]])
+    return LinearMeasurement(residual, H, np.diag([sigma_m_s**2, sigma_m_s**2, floor[1] ** 2]))
 
 
 def where_rest_began(x: Array, at_rest: LinearMeasurement, sigma_rad: float, sigma_m: float) -> LinearMeasurement:

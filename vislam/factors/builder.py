@@ -66,12 +66,13 @@ class Builder:
         last_motion: Array,
         has_imu: bool,
         vo_scale: float,
+        floor_m: float = 0.0,
     ) -> Step:
         """Return the factors that tie a keyframe to the previous one, whose state is `before`.
 
         `last_motion` [4, 4] is the motion of the step before, the guess where neither vision nor IMU saw this one.
-        `vo_scale` multiplies the sigma of visual odometry: what loops taught about it. Every variable gets at least
-        one factor that bounds it, whatever is missing.
+        `vo_scale` multiplies the sigma of visual odometry: what loops taught about it. `floor_m` is the height in map
+        at which a floor keeps the body. Every variable gets at least one factor that bounds it, whatever is missing.
         """
         config = self._config
         duration_s = (record.t_ns - previous.t_ns) * 1e-9
@@ -102,12 +103,26 @@ class Builder:
             factors.append(motion.no_motion(record.rest_from, record.id, config))
             if has_imu:
                 factors.append(motion.zero_velocity(record.id, config.rest_speed_sigma_m_s))
+        factors += self._on_wheels(record, before, has_imu, floor_m)
         if record.covariance is None or not record.has_scale:
             variances = (loose_rad**2, loose_m**2)
         else:
             covariance = self._visual_covariance(record, vo_scale)
             variances = (float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0)
         return Step(factors, guess, *variances, note="; ".join(notes))
+
+    def _on_wheels(
+        self, record: KeyframeRecord, before: Guess, has_imu: bool, floor_m: float
+    ) -> list[gtsam.NonlinearFactor]:
+        """Return what is known of a cart on its floor, where the configuration says that this is one."""
+        config, out = self._config, list[gtsam.NonlinearFactor]()
+        if config.floor_sigma_m is not None:
+            out.append(motion.on_floor(record.id, floor_m, config.floor_sigma_m))
+        if config.nonholonomic_sigma_m_s is not None and has_imu and record.imu is not None and len(record.imu.t_ns):
+            rate = record.imu.gyro_rad_s[-1] - np.array(before.bias.gyroscope())
+            by_turn = np.cross(rate, np.array(config.axle_m))
+            out.append(motion.nonholonomic(record.id, by_turn, config.nonholonomic_sigma_m_s))
+        return out
 
     def _visual_covariance(self, record: KeyframeRecord, vo_scale: float) -> Array:
         assert record.covariance is not None

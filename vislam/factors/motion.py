@@ -8,6 +8,7 @@ import numpy as np
 from vislam.config import GraphConfig
 from vislam.factors.keys import B, V, X
 from vislam.factors.noise import sigmas
+from vislam.geometry import skew
 from vislam.messages import Array
 
 
@@ -23,6 +24,36 @@ def no_motion(rest_from: int, k: int, config: GraphConfig) -> gtsam.BetweenFacto
     """
     spread = np.repeat([np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m], 3)
     return gtsam.BetweenFactorPose3(X(rest_from), X(k), gtsam.Pose3(), sigmas(spread))
+
+
+def on_floor(k: int, height_m: float, sigma_m: float) -> gtsam.CustomFactor:
+    """Return the factor that keyframe k is at a height in map: a cart on one level floor."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        pose = values.atPose3(X(k))
+        if jacobians is not None:
+            jacobians[0] = np.concatenate([np.zeros(3), pose.rotation().matrix()[2]])[None]
+        return np.array([pose.z() - height_m])
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma_m), [X(k)], error)
+
+
+def nonholonomic(k: int, by_turn_m_s: Array, sigma_m_s: float) -> gtsam.CustomFactor:
+    """Return the factor that the axle of a cart goes neither sideways nor up at keyframe k.
+
+    `by_turn_m_s` [3] is the velocity of the axle against the body's origin, in body axes: the rate of turn times its
+    lever arm.
+    """
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(X(k)).rotation().matrix()
+        velocity = R.T @ values.atVector(V(k))
+        if jacobians is not None:
+            jacobians[0] = np.hstack([skew(velocity), np.zeros((3, 3))])[1:]
+            jacobians[1] = R.T[1:].copy()
+        return np.asarray((velocity + by_turn_m_s)[1:])
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(2, sigma_m_s), [X(k), V(k)], error)
 
 
 def loose_motion(k: int, T_guess: Array, sigma_rad: float, sigma_m: float) -> gtsam.BetweenFactorPose3:

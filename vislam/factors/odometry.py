@@ -66,8 +66,9 @@ class MotionOdometry:
     def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
         """See Odometry."""
         record, previous = self._records[k], self._records[k - 1]
+        floor_m = 0.0 if self._start is None else float(self._start.T_map_body[2, 3])
         return self._builder.keyframe(
-            record, previous, before, last_motion=last_motion, has_imu=self.has_imu, vo_scale=vo_scale
+            record, previous, before, last_motion=last_motion, has_imu=self.has_imu, vo_scale=vo_scale, floor_m=floor_m
         )
 
     def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:

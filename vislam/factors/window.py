@@ -11,7 +11,7 @@ from vislam.config import GraphConfig
 from vislam.factors.builder import Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, StartRecord
 from vislam.factors.keys import X, bias_of, nearest_rigid
-from vislam.factors.motion import no_motion
+from vislam.factors.motion import no_motion, on_floor
 from vislam.factors.noise import gaussian, huber, inflated
 from vislam.factors.priors import pose_covariance
 from vislam.factors.visual import pose_factor
@@ -92,6 +92,8 @@ class WindowOdometry:
         rest_from, still = self._rest_from[k], list[gtsam.NonlinearFactor]()
         if rest_from is not None:
             still.append(no_motion(rest_from, k, self._config))
+        if self._config.floor_sigma_m is not None and self._start is not None:
+            still.append(on_floor(k, float(self._start.T_map_body[2, 3]), self._config.floor_sigma_m))
         note = self._newest.note if k == self._newest.id else ""
         guess = Guess(T, before.velocity_map_m_s, before.bias)
         return Step(still, guess, *self._variances(edge, vo_scale), note=note, named=named)

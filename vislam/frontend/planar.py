@@ -23,7 +23,7 @@ from vislam.frontend.epipolar import from_epipolar_segment
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.landmarks import UNKNOWN_RHO, Landmarks, fuse, move
-from vislam.frontend.planar_fit import Fit, FloorPair, camera_motion, joint_fit, scale_sigma, split_fit
+from vislam.frontend.planar_fit import Fit, FloorPair, camera_motion, joint_fit, no_fit, scale_sigma, split_fit
 from vislam.frontend.planar_floor import Mount, Regions, Tilt, Turn, make_mount
 from vislam.frontend.prediction import body_motion
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
@@ -200,17 +200,21 @@ class PlanarFrontEnd:
         with np.errstate(invalid="ignore"):
             above = (self._tracker.pixels[:, 1] < self._regions.horizon_px) & np.isfinite(pair.seen[:, 0])
         prior = self._tilt_prior()
-        return split_fit(pair, use, above, self._planar.sigma_px, prior, _FEW, self._frame_seed(frame))
+        return split_fit(
+            pair, use, above, self._planar.sigma_px, prior, self._planar.heave_m, _FEW, self._frame_seed(frame)
+        )
 
     def _joint(self, pair: FloorPair, use: Bools, guess: Array, frame: Frame) -> Fit:
         """Fit from the motion that most points agree on; the gyroscope's yaw counts as far as it is known."""
         if np.count_nonzero(use) < self._planar.min_points:
             reason = f"only {np.count_nonzero(use)} points on the floor found"
-            nothing = np.zeros(len(use), dtype=np.bool_)
-            return Fit(guess, np.zeros(4), np.full((7, 7), np.nan), nothing, np.inf, reason)
+            return no_fit(guess, len(use), reason)
         known = bool(np.isfinite(self._yaw_sigma_rad))
         start = pair.searched(use, self._yaw_rad if known else None, self._frame_seed(frame))
-        return joint_fit(pair, use, start, self._planar.sigma_px, self._config.cauchy, self._tilt_prior(), self._yaw())
+        planar = self._planar
+        return joint_fit(
+            pair, use, start, planar.sigma_px, self._config.cauchy, self._tilt_prior(), planar.heave_m, self._yaw()
+        )
 
     def _yaw(self) -> tuple[float, float] | None:
         if not np.isfinite(self._yaw_sigma_rad):
@@ -227,7 +231,7 @@ class PlanarFrontEnd:
 
     def _placed(self, pixels: Array, xy: Array, fit: Fit, use: Bools, pair: FloorPair) -> _Place:
         candidates = int(np.count_nonzero(use))
-        T, covariance = camera_motion(fit, pair.R_key, pair.R_now, self._planar.heave_m)
+        T, covariance = camera_motion(fit, pair.R_key, pair.R_now)
         failure = fit.failure or self._failure(fit, candidates)
         good = fit.inliers.copy()
         if not failure:

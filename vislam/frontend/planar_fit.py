@@ -1,9 +1,10 @@
 """Motion of a cart from floor points: the joint fit, and the split at the horizon of Karpov 2026.
 
 A floor point of the keyframe is where its ray meets the plane z = -H of the level frame; after the motion (theta, x, y)
-the camera sees it again. The joint fit looks for the motion and for what the tilts of both images are off, so that the
-points appear where they are seen. On the floor one pixel is worth d^2 / H; in the image all pixels are worth the same,
-so the weights by distance come by themselves. H only scales the answer.
+the camera sees it again. The joint fit looks for the motion, for what the tilts of both images are off and for how far
+the springs lifted the camera between them, so that the points appear where they are seen. On the floor one pixel is
+worth d^2 / H; in the image all pixels are worth the same, so the weights by distance come by themselves. H only scales
+the answer.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from vislam.messages import Array
 
 Bools = NDArray[np.bool_]
 
-_UNKNOWNS = 7  # theta, x, y, then rotations about x and y: common to both images, and of the newer one beside that
+_UNKNOWNS = 8  # theta, x, y; rotations about x and y, common to both images, and of the newer one beside that; lift
 _STEPS = 30
 _CONVERGED = 1e-6  # rad and m
 _STEEPEST = 1e-3  # sine under the horizon below which a ray does not meet the floor
@@ -37,7 +38,8 @@ class Fit:
 
     motion: Array  # [3] theta, x, y
     tilt: Array  # [4] common [2], then of the newer image beside that [2]
-    covariance: Array  # [7, 7] of both
+    lift_m: float  # of the camera since the keyframe
+    covariance: Array  # [8, 8] of all, in this order
     inliers: Bools  # [N]
     variance: float  # of residuals over what was expected
     failure: str  # empty when the motion can be trusted
@@ -63,6 +65,9 @@ def _derivative(unknown: int, c: float, s: float, q: Array, r: Array, height_m: 
     `c` and `s` are of theta; `r` is the point's ray in the keyframe's level frame.
     """
     out[:] = 0.0
+    if unknown == 7:
+        out[2] = -1.0
+        return
     if unknown == 0:
         out[0], out[1] = q[1], -q[0]
         return
@@ -88,7 +93,10 @@ def _equations(
     rays: Array, seen: Array, R_key: Array, R_now: Array, motion: Array, height_m: float, sigma: float, cauchy: float,
     A: Array, g: Array, squares: Array,
 ) -> float:  # fmt: skip
-    """Sum up the normal equations A [7, 7], g [7] at a motion; `squares` [N] gets the residuals in sigmas, squared."""
+    """Sum up the normal equations A [8, 8], g [8] at a motion; `squares` [N] gets the residuals in sigmas, squared.
+
+    `motion` [4] is theta, x, y and the lift.
+    """
     c, s = np.cos(motion[0]), np.sin(motion[0])
     A[:], g[:] = 0.0, 0.0
     J, dm, r, q, step, m = np.empty((2, _UNKNOWNS)), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -101,7 +109,7 @@ def _equations(
             continue
         scale = -height_m / r[2]
         dx, dy = scale * r[0] - motion[1], scale * r[1] - motion[2]
-        q[0], q[1], q[2] = c * dx + s * dy, -s * dx + c * dy, -height_m
+        q[0], q[1], q[2] = c * dx + s * dy, -s * dx + c * dy, -height_m - motion[3]
         for k in range(3):
             m[k] = R_now[0, k] * q[0] + R_now[1, k] * q[1] + R_now[2, k] * q[2]
         if m[2] < 1e-3:
@@ -135,13 +143,14 @@ def _solve(
     rays: Array, seen: Array, R_key: Array, R_now: Array, start: Array, height_m: float, sigma: float, cauchy: float,
     prior: Array, mean: Array,
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
-    """Minimise over the seven unknowns from `start` [7] by Gauss-Newton; `prior` [7, 7] is information about `mean`."""
-    x = start.copy()
+    """Minimise over the unknowns from `start` [8] by Gauss-Newton; `prior` [8, 8] is information about `mean`."""
+    x, motion = start.copy(), np.empty(4)
     A, g, squares = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS), np.empty(len(rays))
     settled = False
     for _ in range(_STEPS):
         key, now = _turned(R_key, x[3], x[4]), _turned(R_now, x[3] + x[5], x[4] + x[6])
-        _equations(rays, seen, key, now, x[:3], height_m, sigma, cauchy, A, g, squares)
+        motion[:3], motion[3] = x[:3], x[7]
+        _equations(rays, seen, key, now, motion, height_m, sigma, cauchy, A, g, squares)
         H = A + prior
         d = np.linalg.solve(H, g + prior @ (mean - x))
         x += d
@@ -149,7 +158,8 @@ def _solve(
             settled = True
             break
     key, now = _turned(R_key, x[3], x[4]), _turned(R_now, x[3] + x[5], x[4] + x[6])
-    _equations(rays, seen, key, now, x[:3], height_m, sigma, cauchy, A, g, squares)
+    motion[:3], motion[3] = x[:3], x[7]
+    _equations(rays, seen, key, now, motion, height_m, sigma, cauchy, A, g, squares)
     return x, A, squares, settled
 
 
@@ -211,7 +221,7 @@ class FloorPair:
 
 
 def joint_fit(
-    pair: FloorPair, use: Bools, start: Array, sigma_px: float, cauchy: float, tilt_prior: Array,
+    pair: FloorPair, use: Bools, start: Array, sigma_px: float, cauchy: float, tilt_prior: Array, heave_m: float,
     yaw: tuple[float, float] | None = None,
 ) -> Fit:  # fmt: skip
     """Fit motion and tilts together.
@@ -223,13 +233,14 @@ def joint_fit(
         sigma_px: of where a point is seen; what the residuals show widens it.
         cauchy: scale of the robust kernel in standard deviations.
         tilt_prior: covariance [4, 4] of the common tilt error and of the newer image's beside it, both zero at best.
+        heave_m: sigma of the lift.
         yaw: theta by the gyroscope and its sigma in rad; None: not used.
     """
     prior, mean = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS)
-    prior[3:, 3:] = np.linalg.inv(tilt_prior)
+    prior[3:7, 3:7], prior[7, 7] = np.linalg.inv(tilt_prior), 1.0 / heave_m**2
     if yaw is not None:
         mean[0], prior[0, 0] = yaw[0], 1.0 / yaw[1] ** 2
-    x = np.concatenate([start, np.zeros(4)])
+    x = np.concatenate([start, np.zeros(_UNKNOWNS - 3)])
     rays, seen = np.ascontiguousarray(pair.rays[use]), np.ascontiguousarray(pair.seen[use])
     sigma, variance, settled = sigma_px * pair.px, 1.0, False
     A, squares = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.full(len(rays), np.inf)
@@ -243,12 +254,19 @@ def joint_fit(
             variance = float(np.clip(_variance(squares), _MIN_VARIANCE, _MAX_VARIANCE))
         covariance = np.linalg.inv(A + prior)
     except np.linalg.LinAlgError:
-        return Fit(x[:3], x[3:], np.full((7, 7), np.nan), none, np.inf, "the floor does not determine the motion")
+        return no_fit(x[:3], len(use), "the floor does not determine the motion")
     inliers = none.copy()
     inliers[use] = squares < _GATE**2 * 2.0
     total = (sigma / (sigma_px * pair.px)) ** 2 * variance
     failure = "" if settled and np.isfinite(x).all() else "the motion over the floor does not converge"
-    return Fit(x[:3], x[3:], 0.5 * (covariance + covariance.T), inliers, float(total), failure)
+    symmetric = 0.5 * (covariance + covariance.T)
+    return Fit(x[:3], x[3:7], float(x[7]), symmetric, inliers, float(total), failure)
+
+
+def no_fit(motion: Array, count: int, failure: str) -> Fit:
+    """Return the answer for so many points that say nothing."""
+    covariance: Array = np.full((_UNKNOWNS, _UNKNOWNS), np.nan)
+    return Fit(motion, np.zeros(4), 0.0, covariance, np.zeros(count, dtype=np.bool_), np.inf, failure)
 
 
 def _variance(squares: Array) -> float:
@@ -258,20 +276,19 @@ def _variance(squares: Array) -> float:
 
 
 def split_fit(
-    pair: FloorPair, use: Bools, above: Bools, sigma_px: float, tilt_prior: Array, least: int, seed: int
+    pair: FloorPair, use: Bools, above: Bools, sigma_px: float, tilt_prior: Array, heave_m: float, least: int, seed: int
 ) -> Fit:
     """Fit as Karpov 2026, section 3.3: theta from directions above the horizon, then x and y from the floor.
 
     `use` and `above` [N] say which rows are where. Weights by distance are not in the paper; without them far points
     spoil its answer. The covariance is that of scattered points; tilts are as calibrated, with the covariance [4, 4] of
-    `joint_fit`.
+    `joint_fit`, as is the lift.
     """
-    none = np.zeros(len(use), dtype=np.bool_)
     azimuth = _azimuth(pair.rays[above], pair.R_key) - _azimuth(pair.seen[above], pair.R_now)
     azimuth = (azimuth + np.pi) % (2.0 * np.pi) - np.pi
     if len(azimuth) < least or np.count_nonzero(use) < least:
         reason = f"{len(azimuth)} points above the horizon and {np.count_nonzero(use)} on the floor, needs {least} each"
-        return Fit(np.zeros(3), np.zeros(4), np.full((7, 7), np.nan), none, np.inf, reason)
+        return no_fit(np.zeros(3), len(use), reason)
     middle = float(np.median(azimuth))
     spread = max(1.4826 * float(np.median(np.abs(azimuth - middle))), 0.1 * pair.px)
     agree = np.abs(azimuth - middle) < _TRIMMED * spread
@@ -284,22 +301,22 @@ def split_fit(
     sigma = sigma_px * pair.px * ((now**2).sum(axis=1) + pair.height_m**2) / pair.height_m
     near = np.linalg.norm(moved - motion[1:], axis=1) < np.maximum(_RANSAC_PX / sigma_px, 3.0) * sigma
     if np.count_nonzero(near) < least:
-        return Fit(motion, np.zeros(4), np.full((7, 7), np.nan), none, np.inf, "the floor points do not agree")
+        return no_fit(motion, len(use), "the floor points do not agree")
     weight = 1.0 / sigma[near] ** 2
     xy = (weight[:, None] * moved[near]).sum(axis=0) / weight.sum()
     off = (moved[near] - xy) / sigma[near][:, None]
     variance = max(float((off**2).sum() / (2 * len(off) - 2)), _MIN_VARIANCE)
-    covariance = np.zeros((7, 7))
-    covariance[3:, 3:] = tilt_prior
+    covariance = np.zeros((_UNKNOWNS, _UNKNOWNS))
+    covariance[3:7, 3:7], covariance[7, 7] = tilt_prior, heave_m**2
     covariance[0, 0] = theta_variance
     covariance[1:3, 1:3] = np.eye(2) * variance / weight.sum()
     lever = now[near].mean(axis=0)  # an error of theta turns the floor about the camera
     across = np.array([s * lever[0] + c * lever[1], -c * lever[0] + s * lever[1]])
     covariance[1:3, 1:3] += theta_variance * np.outer(across, across)
     covariance[1:3, 0] = covariance[0, 1:3] = theta_variance * across
-    inliers = none.copy()
+    inliers = np.zeros(len(use), dtype=np.bool_)
     inliers[np.flatnonzero(use)[near]] = True
-    return Fit(np.array([theta, xy[0], xy[1]]), np.zeros(4), covariance, inliers, variance, "")
+    return Fit(np.array([theta, xy[0], xy[1]]), np.zeros(4), 0.0, covariance, inliers, variance, "")
 
 
 def _azimuth(rays: Array, R_level_cam: Array) -> Array:
@@ -307,18 +324,18 @@ def _azimuth(rays: Array, R_level_cam: Array) -> Array:
     return np.asarray(np.arctan2(level[:, 1], level[:, 0]))
 
 
-def camera_motion(fit: Fit, R_key: Array, R_now: Array, heave_m: float) -> tuple[Array, Array]:
+def camera_motion(fit: Fit, R_key: Array, R_now: Array) -> tuple[Array, Array]:
     """Return T_key_now [4, 4] of cam0 and its covariance [6, 6], rotation first, perturbed on the newer side.
 
-    The tilts that were fitted are in both; `heave_m` is the sigma of the height of the camera between the two.
+    The tilts and the lift that were fitted are in both.
     """
     theta, xy, common, extra = fit.motion[0], fit.motion[1:], fit.tilt[:2], fit.tilt[2:]
     key, now = _turned(R_key, common[0], common[1]), _turned(R_now, common[0] + extra[0], common[1] + extra[1])
     yaw = np.asarray(so3_exp(np.array([0.0, 0.0, theta])))
-    t = np.array([xy[0], xy[1], 0.0])
+    t = np.array([xy[0], xy[1], fit.lift_m])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = key.T @ yaw @ now, key.T @ t
-    J = np.zeros((6, _UNKNOWNS + 1))
+    J = np.zeros((6, _UNKNOWNS))
     to_now = now.T @ yaw.T  # from the key's level frame to the newer camera
     J[:3, 0] = now.T[:, 2]
     J[3:, 1], J[3:, 2], J[3:, 7] = to_now[:, 0], to_now[:, 1], to_now[:, 2]
@@ -328,10 +345,7 @@ def camera_motion(fit: Fit, R_key: Array, R_now: Array, heave_m: float) -> tuple
         J[:3, 3 + axis] = now.T @ unit - to_now @ unit
         J[3:, 3 + axis] = -to_now @ np.cross(unit, t)
         J[:3, 5 + axis] = now.T @ unit
-    covariance = np.zeros((_UNKNOWNS + 1, _UNKNOWNS + 1))
-    covariance[:_UNKNOWNS, :_UNKNOWNS] = fit.covariance
-    covariance[7, 7] = heave_m**2
-    out = J @ covariance @ J.T
+    out = J @ fit.covariance @ J.T
     return T, 0.5 * (out + out.T)
 
 
@@ -347,6 +361,7 @@ def scale_sigma(fit: Fit, height_sigma: float, tilt_covariance: Array) -> float:
     if length < 1e-3 or not np.isfinite(fit.covariance).all():
         return height_sigma
     information = np.linalg.inv(fit.covariance + 1e-18 * np.eye(_UNKNOWNS))
-    by_tilt = np.linalg.solve(information[:3, :3], -information[:3, 3:5])
-    along = fit.motion[1:] @ by_tilt[1:] / length**2
+    free = np.array([0, 1, 2, 5, 6, 7])  # what is fitted anew where the common tilt [3:5] is another one
+    by_tilt = np.linalg.solve(information[np.ix_(free, free)], -information[free, 3:5])
+    along = fit.motion[1:] @ by_tilt[1:3] / length**2
     return float(np.sqrt(height_sigma**2 + along @ tilt_covariance @ along))
