@@ -419,6 +419,8 @@ def _compare(arguments: list[str]) -> int:
 
 
 def _optimize(arguments: list[str]) -> int:
+    if any(Path(argument).is_file() or argument.endswith(".g2o") for argument in arguments):
+        return _optimize_graph(arguments)
     from vislam.optimize import optimize
     from vislam.options import OptimizeOptions
     from vislam.report import write_report
@@ -442,6 +444,34 @@ def _optimize(arguments: list[str]) -> int:
         _print_evaluation({f"{options.out_name} ({mode})": entry["accuracy"][mode] for mode in entry["accuracy"]})
     print(f"trajectory: {options.run / f'trajectory_{options.out_name}.tum'}")
     return 0
+
+
+def _optimize_graph(arguments: list[str]) -> int:
+    from vislam.optimize_graph import optimize_graph_file
+    from vislam.options import OptimizeGraphOptions
+    from vislam.report.graph_page import write_graph_report
+
+    options = _parse(OptimizeGraphOptions, arguments, "optimize")
+    out = options.out or Path(f"{options.file.stem}_optimized")
+    limit = options.settings.iterations
+    with _progress(options.file.stem, "iterations") as bar:
+        show = None if bar is None else (lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}"))
+        result = optimize_graph_file(options.file, out, options.settings, show)
+    if options.report:
+        write_graph_report(result.problem, result.solution, options.file.stem, out / "report.html")
+    summary = result.summary
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(
+            f"{summary['poses']} poses, {summary['edges']} edges ({len(summary['rejected'])} found false); chi2 "
+            f"{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
+            f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
+        )
+        for warning in summary["warnings"]:
+            print(f"warning: {warning}")
+        print(f"results: {out}")
+    return 0 if summary["converged"] else TrackingLostError.exit_code
 
 
 def _map(arguments: list[str]) -> int:

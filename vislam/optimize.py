@@ -58,7 +58,7 @@ def _placed(log: FactorLog, states: Sequence[NavState], max_gap_s: float) -> Tra
 
 def _check(run: Path, name: str) -> None:
     if run.suffix == ".g2o" or run.is_file():
-        raise UsageError(f"{run} is a file; optimize takes a run folder for now, pose graph files (g2o) come later")
+        raise UsageError(f"{run} is a file; `vislam optimize FILE` and `optimize_graph_file` take pose graphs")
     if not run.is_dir():
         raise DataError(f"{run} is no run folder; `vislam run SOURCE --out {run}` makes one")
     if not re.fullmatch(r"[a-z0-9_]+", name) or name in _TAKEN:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from vislam.config import BatchConfig, Config, GraphWorldConfig, LoopTruthConfig, MapConfig
+from vislam.config import BatchConfig, Config, GraphWorldConfig, LoopTruthConfig, MapConfig, PoseGraphConfig
 
 
 @dataclass(frozen=True)
@@ -171,6 +171,22 @@ class OptimizeOptions:
     """Names the files: trajectory_NAME.tum, states_NAME.csv"""
     json: bool = False
     """Print the entry of metrics.json instead of the summary"""
+
+
+@dataclass(frozen=True)
+class OptimizeGraphOptions:
+    """Options of `vislam optimize FILE`: a pose graph in g2o, TORO or iSAM format."""
+
+    file: Positional[Path]
+    """Pose graph; what is no format's ending .g2o, .toro or .isam is told by its contents"""
+    settings: Annotated[PoseGraphConfig, tyro.conf.arg(name="")] = field(default_factory=PoseGraphConfig)
+    out: Path | None = None
+    """Folder for optimized.g2o, trajectory.tum, trajectory_kitti.txt, poses.csv, edges.csv, summary.json and
+    report.html; None: NAME_optimized in the working folder"""
+    report: bool = True
+    """Write report.html, with pictures of before and after"""
+    json: bool = False
+    """Print summary.json instead of the summary"""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,58 @@
+"""`vislam optimize FILE.g2o`: what it writes, what it says, and how it ends."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from test_graph_optimize import world
+
+from vislam.batch.graph_g2o import read_g2o, write_g2o
+from vislam.cli import run_verb
+from vislam.trajectory import read_kitti, read_tum
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_file_gets_its_optimum_in_all_formats(tmp_path, capsys, d):
+    problem, _ = world(d)
+    path, out = tmp_path / "walk.g2o", tmp_path / "out"
+    write_g2o(problem, path)
+    assert run_verb(["optimize", str(path), "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == json.loads((out / "summary.json").read_text())
+    optimum = read_g2o(out / "optimized.g2o")
+    assert optimum.chi2(optimum.poses) == pytest.approx(told["chi2_after"], rel=1e-9)
+    assert told["chi2_after"] < told["chi2_before"] < problem.chi2(problem.poses)
+    tum = read_tum(out / "trajectory.tum")
+    assert tum.t_ns.tolist() == (problem.ids * 10**9).tolist()
+    kitti = read_kitti(out / "trajectory_kitti.txt", tum.t_ns)
+    assert np.allclose(kitti.T_world_body, tum.T_world_body, atol=1e-8)
+    assert np.allclose(tum.positions_m[:, :d], optimum.poses[:, :d, d], atol=1e-8)
+    rows = list(csv.DictReader((out / "poses.csv").open()))
+    assert [int(row["id"]) for row in rows] == problem.ids.tolist()
+    assert np.allclose([float(row["y_m"]) for row in rows], optimum.poses[:, 1, d], atol=1e-12)
+    edges = list(csv.DictReader((out / "edges.csv").open()))
+    assert sum(float(row["chi2_after"]) for row in edges) == pytest.approx(told["chi2_after"], rel=1e-6)
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 3
+    first = {p.name: p.read_bytes() for p in out.iterdir() if p.suffix not in (".html", ".json")}
+    assert run_verb(["optimize", str(path), "--out", str(out)]) == 0
+    assert "chi2" in capsys.readouterr().out
+    assert first == {p.name: p.read_bytes() for p in out.iterdir() if p.name in first}
+
+
+def test_exit_codes(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    problem, _ = world(2)
+    path = tmp_path / "walk.g2o"
+    write_g2o(problem, path)
+    assert run_verb(["optimize", "walk.g2o", "--no-report", "--iterations", "1", "--start", "odometry"]) == 4
+    assert "not converged" in capsys.readouterr().out
+    assert not (tmp_path / "walk_optimized" / "report.html").exists()
+    path.write_text(path.read_text()[:-30])
+    assert run_verb(["optimize", "walk.g2o"]) == 3
+    assert "walk.g2o:" in capsys.readouterr().err
+    assert run_verb(["optimize", "absent.g2o"]) == 3
+    with pytest.raises(SystemExit) as left:
+        run_verb(["optimize", "walk.g2o", "--method", "magic"])
+    assert left.value.code == 2

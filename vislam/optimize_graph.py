@@ -1,0 +1,116 @@
+"""A pose-graph file optimised and what its folder gets of it: the library's side of `vislam optimize FILE`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.batch.graph_files import read_pose_graph
+from vislam.batch.graph_g2o import write_g2o
+from vislam.batch.graph_optimize import PoseGraphSolution, optimize_pose_graph
+from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.batch.graph_solver import Progress
+from vislam.config import PoseGraphConfig
+from vislam.errors import StorageError
+from vislam.geometry import quaternion_xyzw_from_rotation
+from vislam.messages import Array
+from vislam.runfolder import write_json
+from vislam.trajectory import Trajectory, write_kitti, write_text, write_tum
+
+_MAX_ID_S = 9_000_000_000  # an id beyond does not fit into a stamp of nanoseconds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OptimizedGraph:
+    """A pose graph, its optimum, and the summary that summary.json holds."""
+
+    problem: PoseGraphProblem
+    solution: PoseGraphSolution
+    summary: dict[str, Any]
+
+
+def optimize_graph_file(
+    path: Path, out: Path, config: PoseGraphConfig, progress: Progress | None = None
+) -> OptimizedGraph:
+    """Optimise a g2o, TORO or iSAM file and write optimized.g2o, the trajectory in other formats and summary.json.
+
+    Everything is computed before anything is written. Raises DataError, UsageError, StorageError.
+    """
+    begun = time.perf_counter()
+    problem = read_pose_graph(path)
+    solution = optimize_pose_graph(problem, config, progress)
+    make_folder(out)
+    write_g2o(problem, out / "optimized.g2o", solution.poses)
+    _write_trajectories(problem, solution.poses, out)
+    _write_edges(problem, solution, out / "edges.csv")
+    summary = summarise(problem, solution) | {"source": str(path), "config": asdict(config)}
+    summary["wall_s"] = time.perf_counter() - begun
+    write_json(out / "summary.json", summary)
+    return OptimizedGraph(problem, solution, summary)
+
+
+def make_folder(out: Path) -> None:
+    """Make a folder for results. Raises StorageError."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{out} cannot be made: {error.strerror or error}; choose another --out") from error
+
+
+def summarise(problem: PoseGraphProblem, solution: PoseGraphSolution) -> dict[str, Any]:
+    """Return what an optimisation came to, for summary.json and --json."""
+    return {
+        "dimension": problem.dimension,
+        "poses": len(problem.ids),
+        "edges": len(problem.edges),
+        "parts": solution.parts,
+        "start": solution.start_name,
+        "start_chi2": {name: cost if np.isfinite(cost) else None for name, cost in solution.start_costs.items()},
+        "chi2_before": solution.costs[0],
+        "chi2_after": solution.costs[-1],
+        "iterations": len(solution.costs) - 1,
+        "converged": solution.converged,
+        "rejected": [problem.ids[problem.edges[e]].tolist() for e in solution.rejected.tolist()],
+        "solve_s": solution.solve_s,
+        "warnings": list(solution.notes),
+    }
+
+
+def _in_space(problem: PoseGraphProblem, poses: Array) -> Array:
+    """Return transforms [N, 4, 4]; those of the plane at height zero."""
+    if problem.dimension == 3:
+        return poses
+    out = np.tile(np.eye(4), (len(poses), 1, 1))
+    out[:, :2, :2], out[:, :2, 3] = poses[:, :2, :2], poses[:, :2, 2]
+    return out
+
+
+def _write_trajectories(problem: PoseGraphProblem, poses: Array, out: Path) -> None:
+    """Write poses.csv, trajectory.tum (a pose's id is its time in seconds) and trajectory_kitti.txt."""
+    T = _in_space(problem, poses)
+    q = quaternion_xyzw_from_rotation(T[:, :3, :3])
+    row = "%d," + ",".join(["%.15g"] * 7)
+    lines = [row % (i, *p, *o) for i, p, o in zip(problem.ids.tolist(), T[:, :3, 3].tolist(), q.tolist(), strict=True)]
+    write_text(out / "poses.csv", "\n".join(["id,x_m,y_m,z_m,qx,qy,qz,qw", *lines]) + "\n")
+    fits = int(problem.ids[-1]) <= _MAX_ID_S
+    stamps = (problem.ids if fits else np.arange(len(problem.ids))) * 1_000_000_000
+    trajectory = Trajectory(stamps, T)
+    write_tum(trajectory, out / "trajectory.tum")
+    write_kitti(trajectory, out / "trajectory_kitti.txt")
+
+
+def _write_edges(problem: PoseGraphProblem, solution: PoseGraphSolution, path: Path) -> None:
+    """Write which edges were kept, with their chi2 before and after."""
+    columns = zip(
+        problem.ids[problem.edges].tolist(),
+        problem.edge_chi2(solution.start).tolist(),
+        problem.edge_chi2(solution.poses).tolist(),
+        solution.weights.tolist(),
+        strict=True,
+    )
+    lines = [f"{a},{b},{before:.9g},{after:.9g},{kept:.0f}" for (a, b), before, after, kept in columns]
+    write_text(path, "\n".join(["from,to,chi2_before,chi2_after,kept", *lines]) + "\n")

@@ -1,0 +1,110 @@
+"""The report of an optimised pose graph: before and after, the cost, and what was found false."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from vislam.batch.graph_optimize import PoseGraphSolution
+from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.messages import Array
+from vislam.report.html import bullets, card, escape, folded, grid, note, number, section, table, tile
+from vislam.report.style import CODE, RC, stylesheet, svg
+from vislam.trajectory import write_text
+
+_MAX_LINES = 3000  # edges drawn of a picture: more cannot be seen and only makes the file heavy
+_MAX_ROWS = 300  # rejected edges in the table; edges.csv has them all
+
+
+def write_graph_report(problem: PoseGraphProblem, solution: PoseGraphSolution, name: str, path: Path) -> None:
+    """Write report.html of an optimised pose graph. Raises StorageError."""
+    unit = "ms" if solution.solve_s < 1.0 else "s"
+    took = solution.solve_s * (1000.0 if unit == "ms" else 1.0)
+    tiles = (
+        tile(number(len(problem.ids), 0), "", f"poses, {problem.dimension}D"),
+        tile(number(len(problem.edges), 0), "", "edges"),
+        tile(f"{solution.costs[-1]:.6g}", "", f"chi², from {solution.costs[0]:.6g}"),
+        tile(number(took, 1), unit, f"to solve, {len(solution.costs) - 1} iterations"),
+        tile(number(len(solution.rejected), 0), "", "edges found false"),
+    )
+    pictures = grid(
+        card(_picture(problem, solution, solution.start, "before"), title=f"Before: start '{solution.start_name}'"),
+        card(_picture(problem, solution, solution.poses, "after"), title="After"),
+    )
+    starts = table(("start", "chi²"), [(k, f"{v:.6g}") for k, v in solution.start_costs.items()])
+    body = "".join(
+        (
+            f"<header><h1>{escape(name)}</h1></header>",
+            f'<div class="tiles">{"".join(tiles)}</div>',
+            section("Trajectory", pictures),
+            section(
+                "Cost", grid(card(_cost_curve(solution), title="chi² over iterations"), card(starts, title="Starts"))
+            ),
+            _rejected(problem, solution),
+            section("Notes", bullets(solution.notes)) if solution.notes else "",
+        )
+    )
+    page = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(f'vislam: {name}')}</title><style>{stylesheet()}</style></head><body><main>{body}"
+        "<footer>Made by vislam optimize.</footer></main></body></html>\n"
+    )
+    write_text(path, page)
+
+
+def _picture(problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Array, name: str) -> str:
+    """Draw the poses in the plane in which they spread most, with their edges."""
+    d = problem.dimension
+    spread = np.ptp(solution.poses[:, :d, d], axis=0)
+    first, second = np.sort(np.argsort(-spread, kind="stable")[:2]).tolist()
+    points = poses[:, [first, second], d]
+    successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
+    with mpl.rc_context(RC):
+        figure = Figure(figsize=(5.5, 4.7), layout="constrained")
+        axes = figure.add_subplot()
+        rejected = solution.weights == 0.0
+        _lines(axes, points, problem.edges[rejected], CODE["bad"], 0.4, 0.5)
+        _lines(axes, points, problem.edges[~successive & ~rejected], CODE["muted"], 0.4, 0.5)
+        _lines(axes, points, problem.edges[successive], CODE["graph"], 1.2, 1.0)
+        axes.autoscale_view()
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]")
+        return svg(figure, name)
+
+
+def _lines(axes: Axes, points: Array, edges: Array, color: str, width: float, alpha: float) -> None:
+    step = max(1, -(-len(edges) // _MAX_LINES))
+    axes.add_collection(LineCollection(list(points[edges[::step]]), colors=color, linewidths=width, alpha=alpha))
+
+
+def _cost_curve(solution: PoseGraphSolution) -> str:
+    costs = np.maximum(np.array(solution.costs), 1e-12)
+    with mpl.rc_context(RC):
+        figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+        axes = figure.add_subplot()
+        axes.plot(np.arange(len(costs)), costs, color=CODE["graph"], marker="o", markersize=3.0)
+        axes.set_yscale("log")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set(xlabel="iteration", ylabel="chi²")
+        return svg(figure, "cost")
+
+
+def _rejected(problem: PoseGraphProblem, solution: PoseGraphSolution) -> str:
+    if not len(solution.rejected):
+        return ""
+    errors = problem.edge_chi2(solution.poses)
+    worst = solution.rejected[np.argsort(-errors[solution.rejected], kind="stable")]
+    rows = [
+        (str(problem.ids[problem.edges[e, 0]]), str(problem.ids[problem.edges[e, 1]]), f"{errors[e]:.4g}")
+        for e in worst[:_MAX_ROWS].tolist()
+    ]
+    rest = note(f"The worst {_MAX_ROWS} of {len(worst)}; edges.csv has all.") if len(worst) > _MAX_ROWS else ""
+    title = f"{len(worst)} edges"
+    return section("Edges found false", folded(title, table(("from", "to", "chi² at the end"), rows) + rest))
