@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -597,6 +599,53 @@ def _calibrate(arguments: list[str]) -> int:
     return 0
 
 
+def _record(arguments: list[str]) -> int:
+    from vislam.config import load_sensors
+    from vislam.options import RecordOptions, record_options
+    from vislam.record import Recorded, record
+
+    config_path = _take_option(arguments, "--config")
+    base = load_sensors(Path(config_path) if config_path else None)
+    options = _parse(RecordOptions, arguments, "record", record_options(base))
+
+    def progress(recorded: Recorded) -> None:
+        if sys.stderr.isatty():
+            print(f"\r{recorded.line()}\033[K", end="", file=sys.stderr)
+
+    with _stopped_by_signals() as stop:
+        recorded = record(
+            options.out, options.imu, options.camera, options.sensors, options.settings, options.seconds,
+            not options.full_speed, stop, progress,
+        )  # fmt: skip
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    if options.json:
+        print((options.out / "recording.json").read_text(encoding="utf-8"), end="")
+        return 0
+    print(recorded.line())
+    for note in (*recorded.notes, recorded.ended):
+        print(note)
+    print(f"next: vislam doctor {options.out}")
+    return 0
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[threading.Event]:
+    """Give an event that Ctrl-C and SIGTERM set; a second Ctrl-C interrupts as usual."""
+    stop = threading.Event()
+
+    def ask(number: int, frame: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -635,6 +684,11 @@ _VERBS = {
         _calibrate,
         "find what camera, IMU, magnetometer and floor are like; each WHAT has its --help",
         "vislam calibrate noise recordings/still --out calibration",
+    ),
+    "record": _Verb(
+        _record,
+        "record the cart's IMU and camera",
+        "vislam record --out recordings/ride --imu serial:/dev/ttyUSB0 --camera 0",
     ),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

@@ -736,6 +736,32 @@ class WebcamConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorsConfig:
+    """The sensors of a cart, for `vislam record`; a TOML file with these sections describes one cart."""
+
+    gy85: Gy85Config = field(default_factory=Gy85Config)
+    serial: SerialConfig = field(default_factory=SerialConfig)
+    webcam: WebcamConfig = field(default_factory=WebcamConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    gyro_noise_density: float = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
+    accel_noise_density: float = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis
+    gyro_bias_walk: float = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet tells it
+    accel_bias_walk: float = 2e-4  # m/s^3/sqrt(Hz), as well
+    hfov_deg: float = 70.0  # horizontal field of view without a camera file; webcams have 60 to 80
+
+
+@dataclass(frozen=True, slots=True)
+class RecordConfig:
+    """Recording of live sensors to a disk that may be slow or full."""
+
+    max_gb: float = 8.0  # the recording ends at this size; an hour of 640x480 JPEG at 30 Hz takes about 6
+    min_free_gb: float = 1.0  # and when the disk has less left: a full root disk stops the machine
+    image_format: Literal["jpg", "png"] = "jpg"  # what an MJPG camera gave; png keeps every bit in 6 times the space
+    image_queue: int = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
+    imu_queue: int = 8000  # samples that may wait: 18 s at 450 Hz
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole configuration of a run."""
 
@@ -763,12 +789,7 @@ def load(path: Path | None = None, overrides: dict[str, Any] | None = None) -> C
 
     Raises UsageError naming the field, what was asked and what is allowed.
     """
-    data: dict[str, Any] = {}
-    if path is not None:
-        try:
-            data = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise UsageError(f"config {path} cannot be read: {error}; see docs/config.md for an example") from error
+    data = {} if path is None else _read_toml(path)
     for dotted, value in (overrides or {}).items():
         *sections, name = dotted.split(".")
         node = data
@@ -776,6 +797,20 @@ def load(path: Path | None = None, overrides: dict[str, Any] | None = None) -> C
             node = node.setdefault(section, {})
         node[name] = value
     return from_data(data, source=str(path) if path else "overrides")
+
+
+def load_sensors(path: Path | None = None) -> SensorsConfig:
+    """Return the sensors of a cart as a TOML file describes them; raises UsageError as `load` does."""
+    data = {} if path is None else _read_toml(path)
+    _refuse_unknown(data, SensorsConfig, str(path))
+    return validated(SensorsConfig, data, str(path))
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"config {path} cannot be read: {error}; see docs/config.md for an example") from error
 
 
 def from_data(data: dict[str, Any], source: str) -> Config:

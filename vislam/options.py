@@ -9,7 +9,16 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from vislam.config import BatchConfig, Config, GraphWorldConfig, LoopTruthConfig, MapConfig, PoseGraphConfig
+from vislam.config import (
+    BatchConfig,
+    Config,
+    GraphWorldConfig,
+    LoopTruthConfig,
+    MapConfig,
+    PoseGraphConfig,
+    RecordConfig,
+    SensorsConfig,
+)
 
 
 @dataclass(frozen=True)
@@ -248,6 +257,31 @@ class VocabularyOptions:
     """That the tree grows on, taken evenly"""
     seed: int = 0
     """Same seed, same bytes"""
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """Options of `vislam record`."""
+
+    out: Path
+    """Folder to make for the recording (ASL layout)"""
+    imu: str = "gy85"
+    """gy85[:/dev/i2c-1], serial[:/dev/ttyUSB0], or none"""
+    camera: str = "0"
+    """Index, /dev/v4l/by-id/..., a video file in place of a camera, or none"""
+    seconds: float | None = None
+    """How long; None: until Ctrl-C"""
+    settings: Annotated[RecordConfig, tyro.conf.arg(name="")] = field(default_factory=RecordConfig)
+    sensors: Annotated[SensorsConfig, tyro.conf.arg(name="")] = field(default_factory=SensorsConfig)
+    full_speed: bool = False
+    """Read a video as fast as it can be written, not in its own time"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+def record_options(base: SensorsConfig) -> RecordOptions:
+    """Return the options of `vislam record` to parse into, with `base` for every setting that is not given."""
+    return RecordOptions(out=tyro.MISSING, sensors=base)
 
 
 @dataclass(frozen=True)

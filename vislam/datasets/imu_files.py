@@ -45,8 +45,12 @@ def read_noise(path: Path) -> ImuNoise:
 
 def imu_calibration_text(calibration: ImuCalibration, comment: str) -> str:
     """Return the file of an IMU's calibration."""
+    return f"sensor_type: imu\ncomment: {json.dumps(comment)}\n{imu_calibration_keys(calibration)}"
+
+
+def imu_calibration_keys(calibration: ImuCalibration) -> str:
+    """Return the lines that say, in any sensor file, that samples are raw and how they are calibrated."""
     return (
-        f"sensor_type: imu\ncomment: {json.dumps(comment)}\n"
         "# calibrated = matrix @ (raw - bias); matrices by row\n"
         f"gyro_bias_rad_s: {list_text(calibration.gyro_bias_rad_s)}\n"
         f"gyro_matrix: {_rows(calibration.gyro_matrix)}\n"
@@ -57,8 +61,12 @@ def imu_calibration_text(calibration: ImuCalibration, comment: str) -> str:
 
 def mag_calibration_text(calibration: MagCalibration, comment: str) -> str:
     """Return the file of a magnetometer's calibration."""
+    return f"sensor_type: magnetometer\ncomment: {json.dumps(comment)}\n{mag_calibration_keys(calibration)}"
+
+
+def mag_calibration_keys(calibration: MagCalibration) -> str:
+    """Return the lines that say, in any sensor file, that the field is raw and how it is calibrated."""
     return (
-        f"sensor_type: magnetometer\ncomment: {json.dumps(comment)}\n"
         "# calibrated = matrix @ (raw - bias); matrix by row\n"
         f"mag_bias_ut: {list_text(calibration.bias_ut)}\n"
         f"mag_matrix: {_rows(calibration.matrix)}\n"

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.datasets.calibration import DEPTH_UNITS_PER_M, camera_text, depth_text, imu_text, pose_text
+from vislam.datasets.imu_files import imu_calibration_keys, mag_calibration_keys
 from vislam.datasets.tables import Problems
 from vislam.errors import DataError, StorageError, UsageError
 from vislam.geometry import quaternion_wxyz
-from vislam.imu import ImuNoise
+from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.messages import Frame, ImageF32, ImageU8, ImuSample, MagSample
 from vislam.recording import Recording
 
@@ -48,19 +49,24 @@ class Recorder:
     """Writes samples, frames and true poses into a new ASL folder; use it as a context manager.
 
     `problems` counts what could not be written as it came: frames whose stamp does not rise, depth beyond 16 bits.
+    `bytes_written` is how much was written, without what the file system adds.
     """
 
     def __init__(
         self,
         folder: Path,
-        rig: Rig,
+        rig: Rig | None,
         imu_noise: ImuNoise | None,
         *,
         image_format: ImageFormat = "png",
         depth_units_per_m: float = DEPTH_UNITS_PER_M,
         comment: str = "recorded by vislam",
+        imu_calibration: ImuCalibration | None = None,
+        mag_calibration: MagCalibration | None = None,
     ) -> None:
-        """Make the folder and its sensor files.
+        """Make the folder and its sensor files. Without a rig there will be no frames, without noise no IMU samples.
+
+        Where a calibration is given, samples are written raw and readers apply it.
 
         Raises:
             UsageError: the folder already holds something; a recording is never overwritten.
@@ -69,8 +75,10 @@ class Recorder:
         self.problems = Problems()
         self.counts = {"frames": 0, "imu samples": 0, "mag samples": 0, "true poses": 0}
         self._root = folder / "mav0"
+        self.bytes_written = 0
         self._rig = rig
         self._has_imu = imu_noise is not None
+        self._mag_keys = "" if mag_calibration is None else mag_calibration_keys(mag_calibration)
         self._image_format: ImageFormat = image_format
         self._depth_units_per_m = depth_units_per_m
         self._logs: dict[str, _RowLog] = {}
@@ -79,7 +87,8 @@ class Recorder:
         try:
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 raise UsageError(f"{folder} already holds something; choose a new folder for the recording")
-            self._make_folders(rig, imu_noise, comment)
+            imu_keys = "" if imu_calibration is None else imu_calibration_keys(imu_calibration)
+            self._make_folders(rig, imu_noise, comment, imu_keys)
         except OSError as error:
             raise self._storage_error(error, folder) from error
 
@@ -100,7 +109,7 @@ class Recorder:
             if isinstance(value, ImuSample):
                 self._write_imu(value)
             elif isinstance(value, MagSample):
-                self._log("mag0", _MAG_HEADER).append(value.t_ns, value.field_ut)
+                self.bytes_written += self._log("mag0", _MAG_HEADER).append(value.t_ns, value.field_ut)
                 self.counts["mag samples"] += 1
             else:
                 self._write_frame(value)
@@ -114,7 +123,7 @@ class Recorder:
         quaternion = quaternion_wxyz(np.ascontiguousarray(T_world_body[:3, :3]))
         try:
             log = self._log("mocap0", _TRUTH_HEADER)
-            log.append(t_ns, np.concatenate([T_world_body[:3, 3], quaternion]))
+            self.bytes_written += log.append(t_ns, np.concatenate([T_world_body[:3, 3], quaternion]))
         except OSError as error:
             self.close()
             raise self._storage_error(error, self._root) from error
@@ -126,14 +135,15 @@ class Recorder:
         for log in logs.values():
             log.close()
 
-    def _make_folders(self, rig: Rig, noise: ImuNoise | None, comment: str) -> None:
+    def _make_folders(self, rig: Rig | None, noise: ImuNoise | None, comment: str, imu_keys: str) -> None:
         self._root.mkdir(parents=True)
-        for i, (camera, T_body_cam) in enumerate(zip(rig.cameras, rig.T_body_cams, strict=True)):
-            self._make_images(f"cam{i}", camera_text(camera, T_body_cam, comment))
-        if rig.has_depth:
-            self._make_images("depth0", depth_text(rig.cameras[0], self._depth_units_per_m))
+        if rig is not None:
+            for i, (camera, T_body_cam) in enumerate(zip(rig.cameras, rig.T_body_cams, strict=True)):
+                self._make_images(f"cam{i}", camera_text(camera, T_body_cam, comment))
+            if rig.has_depth:
+                self._make_images("depth0", depth_text(rig.cameras[0], self._depth_units_per_m))
         if noise is not None:
-            self._make_sensor("imu0", imu_text(noise, comment))
+            self._make_sensor("imu0", imu_text(noise, comment) + imu_keys)
             self._log("imu0", _IMU_HEADER)
 
     def _make_images(self, name: str, sensor_text: str) -> None:
@@ -152,29 +162,34 @@ class Recorder:
                 raise UsageError(f"the recording {self._root.parent} is closed; begin a new one")
             folder = self._root / name
             if not folder.is_dir():
-                self._make_sensor(name, f"sensor_type: {name.rstrip('0')}\n{pose_text(np.eye(4))}")
+                keys = self._mag_keys if name == "mag0" else ""
+                self._make_sensor(name, f"sensor_type: {name.rstrip('0')}\n{pose_text(np.eye(4))}{keys}")
             self._logs[name] = _RowLog(folder / "data.csv", header)
         return self._logs[name]
 
     def _write_imu(self, sample: ImuSample) -> None:
         if not self._has_imu:
             raise DataError("an IMU sample came, but the recording was begun without the noise model of an IMU")
-        self._log("imu0", _IMU_HEADER).append(sample.t_ns, np.concatenate([sample.gyro_rad_s, sample.accel_m_s2]))
+        values = np.concatenate([sample.gyro_rad_s, sample.accel_m_s2])
+        self.bytes_written += self._log("imu0", _IMU_HEADER).append(sample.t_ns, values)
         self.counts["imu samples"] += 1
 
     def _write_frame(self, frame: Frame) -> None:
+        rig = self._rig
+        if rig is None:
+            raise DataError("a frame came, but the recording was begun without a camera")
         if self._last_frame_ns is not None and frame.t_ns <= self._last_frame_ns:
             self.problems.count("frame whose stamp does not rise", f"{frame.t_ns} ns")
             return
-        if len(frame.images) != len(self._rig.cameras):
-            raise DataError(f"a frame of {len(frame.images)} images came for a rig of {len(self._rig.cameras)} cameras")
-        if frame.depth_m is not None and not self._rig.has_depth:
+        if len(frame.images) != len(rig.cameras):
+            raise DataError(f"a frame of {len(frame.images)} images came for a rig of {len(rig.cameras)} cameras")
+        if frame.depth_m is not None and not rig.has_depth:
             raise DataError("a frame with depth came, but the recording was begun with a rig without depth")
-        for camera, image in zip(self._rig.cameras, frame.images, strict=True):
+        for camera, image in zip(rig.cameras, frame.images, strict=True):
             camera.check_image(image)
         for extra in (frame.color, frame.depth_m):
             if extra is not None:
-                self._rig.cameras[0].check_image(extra)
+                rig.cameras[0].check_image(extra)
         images: list[ImageU8] = list(frame.images)
         if frame.color is not None:
             images[0] = frame.color  # the grey image is made from it on reading
@@ -203,7 +218,8 @@ class Recorder:
             with suppress(OSError):
                 path.unlink()
             raise OSError(error.errno, error.strerror, str(path)) from error
-        log.append_text(f"{t_ns},{path.name}")
+        self.bytes_written += len(encoded)
+        self.bytes_written += log.append_text(f"{t_ns},{path.name}")
 
     def _storage_error(self, error: OSError, where: Path) -> StorageError:
         reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
@@ -224,12 +240,12 @@ class _RowLog:
         self._size = 0
         self.append_text(header)
 
-    def append(self, t_ns: int, values: Array) -> None:
-        """Append a stamp and numbers, written so that reading gives the same bits."""
-        self.append_text(f"{t_ns}," + ",".join(repr(float(value)) for value in values))
+    def append(self, t_ns: int, values: Array) -> int:
+        """Append a stamp and numbers, written so that reading gives the same bits; return how many bytes that took."""
+        return self.append_text(f"{t_ns}," + ",".join(repr(float(value)) for value in values))
 
-    def append_text(self, row: str) -> None:
-        """Append one row; raises OSError naming the file, with the row taken back."""
+    def append_text(self, row: str) -> int:
+        """Append one row and return its bytes; raises OSError naming the file, with the row taken back."""
         data = row.encode("utf-8") + b"\n"
         try:
             written = self._file.write(data)
@@ -243,6 +259,7 @@ class _RowLog:
                 self._file.truncate(self._size)
             raise OSError(error.errno, error.strerror, str(self._path)) from error
         self._size += len(data)
+        return len(data)
 
     def close(self) -> None:
         """Force what was written onto the disk and close the file."""

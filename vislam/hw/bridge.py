@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 _READ_BYTES = 4096
+_GLANCE_S = 0.05  # while the first sample is waited for, a port that cannot be opened is told so soon
 _BITS_PER_BYTE = 10  # start, eight, stop
 _NOMINAL_HZ = 400.0  # until the device says it
 _SEQUENCES = 2**16
@@ -167,7 +168,7 @@ class SerialBridge:
         found: list[ImuSample | MagSample] = []
         while not self._newest_ns:
             left_ns = end_ns - time.monotonic_ns()
-            found += self.read(max(left_ns, 0) / _NS)
+            found += self.read(min(max(left_ns / _NS, 0.0), _GLANCE_S))
             if left_ns <= 0 or (self._port is None and self._counts["opened"] == 0):
                 problem = self.problem if self._port is None else self._diagnosis()[1]
                 self.close()
