@@ -72,7 +72,9 @@ def _cast(ox: Any, oy: Any, oz: Any, ex: Any, ey: Any, ez: Any, resolution: floa
         t0 += d0 if take_x else 0.0
         t1 += d1 if take_y else 0.0
         t2 += d2 if take_z else 0.0
-        if index == end or min(t0, t1, t2) > length:
+        if index == end:
+            return end
+        if t0 > length and t1 > length and t2 > length:
             return end
         grid[index] = FREE_MARK
 
@@ -80,19 +82,34 @@ def _cast(ox: Any, oy: Any, oz: Any, ex: Any, ey: Any, ez: Any, resolution: floa
 @njit(cache=True, nogil=True)
 def finite_points(points: _F32) -> tuple[_F32, NDArray[np.float64], NDArray[np.float64]]:
     """Return the finite ones of points [N, 3] and the lowest and highest corner [3] of their bounding box."""
-    kept = np.empty((len(points), 3), np.float32)
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    count = 0
+    bits, exponent = points.view(np.uint32), np.uint32(0x7F800000)
+    damaged = 0
+    for i in range(len(points)):  # the common case first: without branches the loop is vectorised
+        for axis in range(3):
+            damaged += (bits[i, axis] & exponent) == exponent
+    kept = points
+    if damaged > 0:
+        count = 0
+        kept = np.empty((len(points), 3), np.float32)
+        for i in range(len(points)):
+            if np.isfinite(points[i, 0]) and np.isfinite(points[i, 1]) and np.isfinite(points[i, 2]):
+                kept[count] = points[i]
+                count += 1
+        kept = kept[:count]
+    low, high = _bounds(kept)
+    return kept, low, high
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan"})
+def _bounds(points: _F32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = np.full(3, np.float32(np.inf), np.float32), np.full(3, np.float32(-np.inf), np.float32)
+    a0, a1, a2, b0, b1, b2 = low[0], low[1], low[2], high[0], high[1], high[2]
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
-            continue
-        kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
-        count += 1
-        for axis in range(3):
-            value = np.float64(points[i, axis])
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-    return kept[:count], low, high
+        a0, a1, a2 = min(a0, x), min(a1, y), min(a2, z)
+        b0, b1, b2 = max(b0, x), max(b1, y), max(b2, z)
+    low[0], low[1], low[2], high[0], high[1], high[2] = a0, a1, a2, b0, b1, b2
+    return low.astype(np.float64), high.astype(np.float64)
 
 
 @njit(cache=True, nogil=True)
