@@ -16,12 +16,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
+from vislam.errors import DataError, HardwareError, TrackingLostError, UsageError, VislamError
 
 if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets.inspect import Inspection
-    from vislam.options import EvalOptions, MapOptions
+    from vislam.findings import Finding
+    from vislam.hw.doctor import HardwareReport
+    from vislam.options import DoctorOptions, EvalOptions, MapOptions
     from vislam.runfolder import MapChoice
 
 # the matrices here are small: threads cost more than they bring, and replay must not depend on them
@@ -378,6 +380,10 @@ def _doctor(arguments: list[str]) -> int:
     from vislam.options import DoctorOptions
 
     options = _parse(DoctorOptions, arguments, "doctor")
+    if not options.source:
+        return _doctor_hardware(options)
+    if options.i2c or options.serial or options.camera:
+        raise UsageError(f"doctor examines {options.source} or the sensors of this machine, not both; leave one out")
     from vislam.datasets.inspect import inspect
 
     inspection = inspect(options.source)
@@ -386,6 +392,58 @@ def _doctor(arguments: list[str]) -> int:
     else:
         _print_inspection(inspection)
     return DataError.exit_code if inspection.worst == "error" else 0
+
+
+def _doctor_hardware(options: DoctorOptions) -> int:
+    """Examine the sensors of this machine."""
+    if not 0.5 <= options.seconds <= 60.0:
+        raise UsageError(f"--seconds must be 0.5 to 60, got {options.seconds:g}")
+    from vislam.hw.doctor import Wanted, examine
+
+    report = examine(Wanted(options.i2c, options.serial, options.camera), options.seconds)
+    if options.json:
+        print(json.dumps(asdict(report)))
+    else:
+        _print_hardware(report)
+    return HardwareError.exit_code if report.worst == "error" else 0
+
+
+def _print_hardware(report: HardwareReport) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for title, columns, rows in (
+        ("found", ("what", "where", "name"), [(d.kind, d.path, d.name) for d in report.devices]),
+        (
+            "measured",
+            ("stream", "samples", "rate [Hz]", "jitter [ms]", "longest gap [ms]"),
+            [
+                (t.name, str(t.count), _number(t.rate_hz, 1), _number(t.jitter_ms, 2), _number(t.longest_gap_ms, 1))
+                for t in report.timings
+            ],
+        ),
+    ):
+        if rows:
+            table = Table(title=title)
+            for k, column in enumerate(columns):
+                table.add_column(column, justify="right" if title == "measured" and k else "left")
+            for row in rows:
+                table.add_row(*row)
+            console.print(table)
+    _print_findings(report.findings)
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    from rich.console import Console
+
+    console = Console()
+    styles = {"ok": "green", "warning": "yellow", "error": "red"}
+    for finding in findings:
+        console.print(f"{finding.severity:<8}", style=styles[finding.severity], end="")
+        console.print(f"{finding.what} ({finding.where})", soft_wrap=True, highlight=False, markup=False)
+        if finding.next_step:
+            console.print(f"        -> {finding.next_step}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _print_inspection(inspection: Inspection) -> None:
@@ -401,12 +459,7 @@ def _print_inspection(inspection: Inspection) -> None:
     for stream in inspection.streams:
         table.add_row(stream.name, str(stream.count), f"{stream.rate_hz:.1f}", f"{stream.longest_gap_s:.3f}")
     console.print(table)
-    styles = {"ok": "green", "warning": "yellow", "error": "red"}
-    for finding in inspection.findings:
-        console.print(f"{finding.severity:<8}", style=styles[finding.severity], end="")
-        console.print(f"{finding.what} ({finding.where})", soft_wrap=True, highlight=False, markup=False)
-        if finding.next_step:
-            console.print(f"        -> {finding.next_step}", soft_wrap=True, highlight=False, markup=False)
+    _print_findings(inspection.findings)
 
 
 def _compare(arguments: list[str]) -> int:
@@ -667,7 +720,11 @@ _VERBS = {
     ),
     "eval": _Verb(_eval, "compare a trajectory with the truth", "vislam eval runs/desk"),
     "compare": _Verb(_compare, "compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
-    "doctor": _Verb(_doctor, "say what a recording holds and what is wrong with it", "vislam doctor euroc:PATH"),
+    "doctor": _Verb(
+        _doctor,
+        "say what is wrong with a recording, or with the sensors of this machine",
+        "vislam doctor euroc:PATH; vislam doctor --i2c /dev/i2c-1 --camera 0",
+    ),
     "optimize": _Verb(_optimize, "estimate a run again in batch, from its factor log", "vislam optimize runs/desk"),
     "map": _Verb(
         _map,

@@ -163,8 +163,16 @@ class CompareOptions:
 class DoctorOptions:
     """Options of `vislam doctor`."""
 
-    source: Positional[str]
-    """Recording to examine, as for `run`"""
+    source: Positional[str] = ""
+    """Recording to examine, as for `run`; without one, the sensors of this machine are examined"""
+    i2c: str | None = None
+    """A GY-85 must be on this bus, such as /dev/i2c-1; without, every bus is looked at"""
+    serial: str | None = None
+    """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that nobody names are not opened"""
+    camera: str | None = None
+    """This camera must give images: its index or device file"""
+    seconds: float = 3.0
+    """How long each is measured; stand still"""
     json: bool = False
     """Print JSON instead of lines"""
 

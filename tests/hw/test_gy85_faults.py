@@ -221,6 +221,21 @@ def test_a_failed_self_test_stays_in_the_health_word() -> None:
         assert driver.health() == Health.ACCEL_FAULT
 
 
+@pytest.mark.parametrize("every", [3, 5, 11, 29, 60])
+def test_a_self_test_that_breaks_off_leaves_no_stimulus_on(every: int) -> None:
+    with board(truth=still) as (driver, virtual, clock):
+        collect(driver, clock, 0.2)
+        virtual.nack_every = every
+        driver.run_self_tests()
+        virtual.nack_every = 0
+        inertial, _ = collect(driver, clock, 1.5)
+        accel = np.array([s.accel_m_s2 for s in inertial])
+        assert len(inertial) > 300
+        assert abs(accel - [0.0, 0.0, 9.80665]).max() < 0.6, "0.9 g would be the push"
+        magnetic = collect(driver, clock, 1.0)[1]
+        np.testing.assert_allclose(np.mean([m.field_ut for m in magnetic], axis=0), FIELD_UT, atol=2.0)
+
+
 def test_random_faults_for_a_minute_never_raise_and_never_lie() -> None:
     rng = np.random.default_rng(11)
     print("seed 11")

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,9 @@ from vislam.datasets.plausibility import (
 from vislam.datasets.stream import Survey, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
 from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
 from vislam.errors import DataError
+from vislam.findings import Finding, Severity, worst
 from vislam.imu import ImuNoise
 
-Severity = Literal["ok", "warning", "error"]
 Stamps = NDArray[np.int64]
 
 _GRAVITY_M_S2 = 9.81
@@ -45,16 +44,6 @@ _MIN_TURNS = 3
 _POOR_TURNS, _WRONG_TURNS = 0.3, 0.5  # of the turn: 0.5 is an axis 30 deg off; MH_01 has 0.07, inverted it has 1.8
 _MIN_MATCHES = 60
 _MIN_ON_LINE = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was checked: what came out, where, and what to do about it (empty when nothing)."""
-
-    severity: Severity
-    what: str
-    where: str
-    next_step: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +72,7 @@ class Inspection:
     @property
     def worst(self) -> Severity:
         """The worst severity among the findings."""
-        return max((f.severity for f in self.findings), key=("ok", "warning", "error").index, default="ok")
+        return worst(self.findings)
 
 
 def _camera_of(rig: Rig | None, index: int) -> Camera | None:

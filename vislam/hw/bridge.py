@@ -12,6 +12,7 @@ import numpy as np
 
 from vislam.config import SerialConfig
 from vislam.errors import HardwareError
+from vislam.hw.affine import Affine
 from vislam.hw.bridge_clock import DeviceClock
 from vislam.hw.bridge_protocol import (
     PROTOCOL_VERSION,
@@ -23,7 +24,6 @@ from vislam.hw.bridge_protocol import (
     RawSample,
     Status,
 )
-from vislam.hw.gy85 import Affine
 from vislam.hw.health import Health
 from vislam.messages import ImuSample, MagSample
 

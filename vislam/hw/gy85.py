@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vislam.config import Axes, Gy85Config, Matrix3, Vector3
+from vislam.config import Gy85Config
 from vislam.errors import HardwareError
 from vislam.hw import adxl345, itg3205
 from vislam.hw.adxl345 import Adxl345
-from vislam.hw.bus import BusError, I2cBus, SettingsLostError, kernel_driver
+from vislam.hw.affine import Affine
+from vislam.hw.bus import BusError, I2cBus, SettingsLostError, kernel_driver, unbind_command
 from vislam.hw.field import Magnetometer
 from vislam.hw.health import Health
 from vislam.hw.hmc5883l import Hmc5883l
@@ -24,31 +25,10 @@ from vislam.hw.track import SampleTrack
 from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
+_START_ATTEMPTS = 3  # a wire may be disturbed just then
 _G_M_S2 = 9.80665
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
 _SILENT_MAG_READS = 20  # in a row without anything new, of a chip that measures faster than it is asked
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Affine:
-    """From counts or chip units to calibrated body axes: `matrix @ value + offset`."""
-
-    matrix: Array  # [3, 3]
-    offset: Array  # [3]
-
-    @staticmethod
-    def of(axes: Axes, matrix: Matrix3, bias: Vector3, unit: float) -> Affine:
-        """Return the map from a chip's values of `unit` each; see `config.SensorCalibration`.
-
-        Raises HardwareError if the axes name one axis of the chip twice.
-        """
-        turned = np.zeros((3, 3))
-        for row, axis in enumerate(axes):
-            turned[row, "xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
-        if abs(np.linalg.det(turned)) < 0.5:
-            raise HardwareError(f"axes {axes} name an axis of the chip twice; each of x, y, z is needed once")
-        left = np.array(matrix)
-        return Affine(left @ turned * unit, -left @ np.array(bias))
 
 
 @dataclass(slots=True)
@@ -122,6 +102,11 @@ class Gy85:
         self._next_mag_ns = 0
         self._retry_bus_ns = 0
         problem = self._connect(self._clock.now_ns())
+        for _ in range(_START_ATTEMPTS - 1):
+            if problem is None or not must_be_there:
+                break
+            self._clock.sleep_until(self._clock.now_ns() + round(config.reopen_s * _NS))
+            problem = self._connect(self._clock.now_ns())
         if must_be_there and problem is not None:
             self.close()
             raise problem
@@ -148,18 +133,8 @@ class Gy85:
 
     def run_self_tests(self) -> tuple[SelfTest, ...]:
         """Test accelerometer and magnetometer by their own means; about 2 s, standing still, no samples meanwhile."""
-        found = []
-        for chip, link in ((self._accel, self._accel_link), (self._mag, self._mag_link)):
-            if chip is None or not link.is_up:
-                continue
-            try:
-                if isinstance(chip, Adxl345):
-                    link.self_test = chip.self_test(self._clock, self._config.supply_v)
-                else:
-                    link.self_test = chip.self_test(self._clock)
-                found.append(link.self_test)
-            except BusError as error:
-                self._failed(link, error)
+        tests = [self._self_tested(self._accel_link), self._self_tested(self._mag_link)]
+        self.self_tests = tuple(test for test in tests if test is not None)
         with suppress(BusError):
             if self._accel is not None and self._accel_link.is_up:
                 self._accel.read_fifo()  # what came in meanwhile
@@ -169,8 +144,25 @@ class Gy85:
         self._next_ns = now
         for link in (self._accel_link, self._mag_link):
             link.newest_ns = now
-        self.self_tests = tuple(found)
         return self.self_tests
+
+    def _self_tested(self, link: _Link) -> SelfTest | None:
+        if not link.is_up:
+            return None
+        for _ in range(_START_ATTEMPTS):
+            self._clock.sleep_until(link.retry_ns if not link.is_up else 0)
+            self._connect(self._clock.now_ns())
+            try:
+                if link is self._accel_link and link.is_up and self._accel is not None:
+                    link.self_test = self._accel.self_test(self._clock, self._config.supply_v)
+                elif link.is_up and self._mag is not None:
+                    link.self_test = self._mag.self_test(self._clock)
+            except BusError as error:
+                self._failed(link, error)
+                self._drop(link, self._clock.now_ns())  # its stimulus may still be on: set it up again
+            else:
+                return link.self_test
+        return None
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
@@ -451,8 +443,7 @@ class Gy85:
 def _refuse_shared(bus: I2cBus, address: int) -> None:
     driver = kernel_driver(bus.path, address)
     if driver is not None:
-        device = f"{bus.path.rpartition('-')[2]}-{address:04x}"
         raise HardwareError(
             f"{bus.path}: the kernel's driver {driver} owns the chip at 0x{address:02x}; release it: "
-            f"echo {device} | sudo tee /sys/bus/i2c/drivers/{driver}/unbind"
+            f"{unbind_command(bus.path, address, driver)}"
         )

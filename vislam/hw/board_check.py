@@ -1,0 +1,101 @@
+"""Whether a GY-85 that stands still measures what the world has: gravity, no rotation, the earth's field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vislam.findings import Finding, Severity
+from vislam.hw.gy85 import Gy85
+from vislam.hw.health import Health
+from vislam.messages import ImuSample, MagSample
+
+Add = Callable[..., None]
+
+_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = 9.81, 0.5
+_MAX_RATE_DEG_S = 40.0  # zero-rate output of the data sheet
+_MAX_GYRO_STD_DEG_S, _MAX_ACCEL_STD_M_S2 = 1.0, 0.3  # three times the noise of the chips
+_FIELD_UT = (22.0, 67.0)  # of the earth, anywhere
+_TEMPERATURE_C = (-40.0, 85.0)
+_MIN_SAMPLES = 50
+_EXPLAINED = {
+    "nack": "a chip did not acknowledge: short wires, pull-ups of 2 to 4.7 kOhm, 400 kHz at most",
+    "timeout": "a line was held low: look for a loose or shorted wire",
+    "rounds_missed": "the machine was too busy to ask in time: free it, or use the serial bridge",
+    "accel_overrun": "the accelerometer's FIFO ran over: the machine was busy for more than 80 ms",
+    "settings_lost": "a chip lost its power for a moment: check the plug",
+    "reopened": "a chip went away and came back: check the plug",
+}
+
+
+def check_board(board: Gy85, inertial: list[ImuSample], magnetic: list[MagSample], where: str) -> list[Finding]:
+    """Return what the self-tests, the fault counters and some seconds of samples at rest say."""
+    findings: list[Finding] = []
+
+    def add(severity: Severity, what: str, next_step: str = "") -> None:
+        findings.append(Finding(severity, what, where, next_step))
+
+    for test in board.self_tests:
+        if test.passed is None:
+            add("warning", f"{test.chip}: {test.what}", "stand still and try again" if test.measured else "")
+        elif test.passed:
+            add("ok", f"{test.chip} passes its self-test: {test.what}")
+        else:
+            add(
+                "warning",
+                f"{test.chip} fails its self-test: {test.what}",
+                "check its supply (3.3 V); replace the board",
+            )
+    for name, count in sorted(board.counters().items()):
+        add("warning", f"{name}: {count}", _EXPLAINED.get(name, "docs/cart.md says what it means"))
+    word = board.health() & ~Health.MAG_FAULT
+    if word:
+        add("warning", f"health: {word.name}", "docs/cart.md says what each bit means")
+    if len(inertial) >= _MIN_SAMPLES:
+        _check_rest(inertial, add)
+    if board.temperature_c is not None:
+        low, high = _TEMPERATURE_C
+        is_possible = low < board.temperature_c < high
+        add("ok" if is_possible else "warning", f"the gyro has {board.temperature_c:.1f} deg C")
+    _check_field(board, magnetic, add)
+    return findings
+
+
+def _check_rest(inertial: list[ImuSample], add: Add) -> None:
+    gyro = np.rad2deg([sample.gyro_rad_s for sample in inertial])
+    accel = np.array([sample.accel_m_s2 for sample in inertial])
+    gyro_std, accel_std = float(gyro.std(axis=0).max()), float(accel.std(axis=0).max())
+    if gyro_std > _MAX_GYRO_STD_DEG_S or accel_std > _MAX_ACCEL_STD_M_S2:
+        what = f"it moved: {gyro_std:.1f} deg/s and {accel_std:.2f} m/s^2 rms"
+        add("warning", f"{what}; what is said about rest means nothing", "stand still and try again")
+        return
+    rate, force = gyro.mean(axis=0), accel.mean(axis=0)
+    norm = float(np.linalg.norm(force))
+    if abs(norm - _GRAVITY_M_S2) > _GRAVITY_TOLERANCE_M_S2:
+        add("warning", f"gravity is measured as {norm:.2f} m/s^2", "vislam calibrate imu")
+    else:
+        add("ok", f"gravity is measured as {norm:.2f} m/s^2, along {np.round(force, 1).tolist()}")
+    axes = " ".join(f"{value:.2f}" for value in rate)
+    if abs(rate).max() > _MAX_RATE_DEG_S:
+        add("warning", f"the gyro's zero is at {axes} deg/s, {_MAX_RATE_DEG_S:g} allowed", "replace the board")
+    else:
+        add("ok", f"the gyro's zero is at {axes} deg/s, noise {gyro_std:.2f} deg/s rms")
+
+
+def _check_field(board: Gy85, magnetic: list[MagSample], add: Add) -> None:
+    name = board.magnetometer_name
+    if name is None:
+        add("warning", "there is no magnetometer", "nothing to do: it is optional")
+        return
+    if not magnetic:
+        add("warning", f"the {name} gives no samples", "keep magnets away; docs/cart.md")
+        return
+    if name != "HMC5883L":
+        add("ok", f"the magnetometer is a {name}, sold as HMC5883L: check its axes, docs/cart.md")
+    norm = float(np.linalg.norm(np.mean([sample.field_ut for sample in magnetic], axis=0)))
+    low, high = _FIELD_UT
+    if low <= norm <= high:
+        add("ok", f"the field is {norm:.0f} uT")
+    else:
+        add("warning", f"the field is {norm:.0f} uT, the earth's is {low:g} to {high:g}", "vislam calibrate mag")
