@@ -274,9 +274,9 @@ class RecordOptions:
     out: Path
     """Folder to make for the recording (ASL layout)"""
     imu: str = "gy85"
-    """gy85[:/dev/i2c-1], serial[:/dev/ttyUSB0], or none"""
-    camera: str = "0"
-    """Index, /dev/v4l/by-id/..., a video file in place of a camera, or none"""
+    """gy85[:/dev/i2c-1], serial[:/dev/ttyUSB0] (without a path as the settings say), or none"""
+    camera: str = "webcam"
+    """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), a video file in place of a camera, or none"""
     seconds: float | None = None
     """How long; None: until Ctrl-C"""
     settings: Annotated[RecordConfig, tyro.conf.arg(name="")] = field(default_factory=RecordConfig)

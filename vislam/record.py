@@ -85,7 +85,7 @@ def record(
     Args:
         out: folder to make.
         imu: `gy85[:BUS]`, `serial[:PORT]` or `none`.
-        camera: index, device file, video file or `none`.
+        camera: index, device file, `webcam`, video file or `none`.
         sensors: settings of both.
         config: budget and queues.
         seconds: length, None: until stopped.
@@ -376,7 +376,6 @@ def _calibrations(files: CalibrationConfig, known: SensorCalibration) -> tuple[I
 
 def _video_stamps(camera: str) -> list[int] | None:
     """Return the stamps in the table beside a video, None where there is none."""
-    table = Path(camera).with_suffix(".csv")
-    if not is_video(camera) or not table.is_file():
+    if not is_video(camera) or not (table := Path(camera).with_suffix(".csv")).is_file():
         return None
     return [t_ns for t_ns, _ in read_frame_stamps(table, Problems())]

@@ -45,7 +45,7 @@ def open_camera(
     stamps_ns: Sequence[int] | None = None,
     in_real_time: bool = True,
 ) -> Webcam | VideoCamera:
-    """Open a camera by its index or device file, or a video file in its place, see `VideoCamera`.
+    """Open a camera by its index or device file, `webcam` as in the settings, or a video in its place (`VideoCamera`).
 
     Raises HardwareError when it is missing and must be there.
     """
@@ -55,12 +55,12 @@ def open_camera(
         return VideoCamera(Path(name), stamps_ns, in_real_time)
     from vislam.hw.webcam import Webcam
 
-    return Webcam(replace(config.webcam, device=name) if name else config.webcam, must_be_there)
+    return Webcam(config.webcam if name == "webcam" else replace(config.webcam, device=name), must_be_there)
 
 
 def is_video(name: str) -> bool:
     """Return whether a camera's name is that of a video file."""
-    return not name.isdigit() and not name.startswith("/dev/") and bool(Path(name).suffix)
+    return not name.startswith("/dev/") and Path(name).suffix != ""
 
 
 def with_raw_samples(config: SensorsConfig) -> SensorsConfig:
