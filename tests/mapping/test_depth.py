@@ -1,3 +1,5 @@
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from vislam.geometry import so3_exp, transform, transform_points
 from vislam.mapping.depth import filter_depth, rgbd_view, scan_points, surface_points
 from vislam.mapping.stereo import DenseStereo
 from vislam.mapping.store import KeyframeStore, Scan
+from vislam.memory import PackedScan
 
 VIEW = rgbd_view(RIG, CONFIG)
 FLAT = np.full((120, 160), 2.0, np.float32)
@@ -90,8 +93,8 @@ def test_depth_of_another_size_is_refused(shape):
 
 
 def test_stored_scans_come_back_exactly_and_small():
-    store = KeyframeStore()
     depth = filtered(depth_image(pose(1)))
+    store = KeyframeStore(depth.shape[::-1])
     colors = np.full((*depth.shape, 3), (200, 30, 10), np.uint8)
     store.add(4, 17, Scan(depth, None, colors))
     back = store.scan(4)
@@ -104,7 +107,7 @@ def test_stored_scans_come_back_exactly_and_small():
 
 
 def test_sparse_scans_come_back_exactly():
-    store, rng = KeyframeStore(), np.random.default_rng(0)
+    store, rng = KeyframeStore((320, 240)), np.random.default_rng(0)
     points = rng.normal(size=(50, 3)).astype(np.float32)
     colors = rng.integers(0, 256, (50, 3), dtype=np.uint8)
     store.add(0, 0, Scan(None, points, colors))
@@ -114,11 +117,44 @@ def test_sparse_scans_come_back_exactly():
 
 
 def test_noise_bounds_the_memory_of_a_keyframe():
-    store, rng = KeyframeStore(), np.random.default_rng(0)
+    store, rng = KeyframeStore((320, 240)), np.random.default_rng(0)
     noise = rng.integers(0, 65536, (240, 320)).astype(np.uint16)
     store.add(0, 0, Scan(noise, None, rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)))
     assert store.nbytes < 1.1 * (noise.nbytes + noise.size * 3)
     np.testing.assert_array_equal(store.scan(0).depth, noise)
+
+
+def png(image):
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+DEPTH, COLORS = np.full((240, 320), 1000, np.uint16), np.full((240, 320, 3), 90, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("packed", "words"),
+    [
+        (PackedScan(0, b"\0\x11", b"", png(COLORS)), "320 x 240"),
+        (PackedScan(0, png(DEPTH)[:-300], b"", png(COLORS)), "320 x 240"),
+        (PackedScan(0, png(DEPTH[:100]), b"", png(COLORS)), "320 x 240"),
+        (PackedScan(0, png(DEPTH.astype(np.uint8)), b"", png(COLORS)), "320 x 240"),
+        (PackedScan(0, png(COLORS), b"", png(COLORS)), "320 x 240"),
+        (PackedScan(0, png(DEPTH)[:16] + b"\xff" * 8 + png(DEPTH)[24:], b"", png(COLORS)), "320 x 240"),
+        (PackedScan(0, png(DEPTH), b"", b""), "colours"),
+        (PackedScan(0, png(DEPTH), b"", b"no image"), "colours"),
+        (PackedScan(0, png(DEPTH), b"", png(COLORS[:50])), "colours"),
+        (PackedScan(0, b"", b"no zlib", b""), "unpacked"),
+        (PackedScan(0, b"", zlib.compress(bytes(25)), bytes(6)), "cut"),
+        (PackedScan(0, b"", zlib.compress(bytes(24)), bytes(7)), "colours"),
+        (PackedScan(0, b"", zlib.compress(bytes(10**7)), bytes(6)), "colours"),
+        (PackedScan(0, "text", b"", b""), "bytes"),
+    ],
+)
+def test_damaged_stored_scans_are_errors(packed, words):
+    store = KeyframeStore((320, 240))
+    with pytest.raises(DataError, match=f"keyframe 3 is damaged.*{words}"):
+        store.put(3, packed)
+        store.scan(3)
 
 
 def stereo_images(rig, distance_m, seed=2):

@@ -238,6 +238,35 @@ def test_what_moved_away_is_not_in_the_cloud():
     assert np.linalg.norm(seen_once.cloud().points_m - camera, axis=1).min() < 1.3
 
 
+@pytest.mark.parametrize("depth_m", [0.0, np.nan, np.inf, -1.0])
+def test_scans_without_a_point_change_nothing_and_may_be_moved(depth_m):
+    mapper = mapper_at(TRUE[:3])
+    before = digest(mapper)
+    mapper.add(keyframe(3, depth_m=np.full((CAMERA.height, CAMERA.width), depth_m, np.float32)), TRUE[3])
+    mapper.move(update([3], [TRUE[5]]))
+    mapper.finish()
+    assert digest(mapper) == before
+    assert len(mapper.cloud()) > 0
+
+
+def test_a_keyframe_beyond_the_reach_of_keys_is_left_out_and_named(tmp_path):
+    mapper = mapper_at(TRUE[:3], replace(CONFIG, products=("octomap",)))
+    before = digest(mapper)
+    wild = TRUE[3] @ se3_exp(np.array([0.0, 0.0, 0.0, 1e6, 0.0, 0.0]))
+    mapper.add(SEEN[3], wild)
+    assert digest(mapper) == before
+    mapper.export(tmp_path)
+    assert "16-bit keys" in mapper.notes["occupancy of 1 keyframes"]
+    mapper.move(update([1, 3], [wild, TRUE[3]]))
+    mapper.finish()
+    assert digest(mapper) == digest(mapper_at([TRUE[0], wild, *TRUE[2:4]]))
+    mapper.move(update([1], [TRUE[1]]))
+    mapper.finish()
+    assert digest(mapper) == digest(mapper_at(TRUE[:4]))
+    assert set(mapper.export(tmp_path)) == {"octomap"}
+    assert mapper.notes == {}
+
+
 @pytest.mark.parametrize(
     "bad",
     [

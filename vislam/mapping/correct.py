@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import MapConfig
+from vislam.errors import DataError
 from vislam.mapping.blocks import BLOCK_VOXELS, BlockPool
 from vislam.mapping.depth import DepthView, scan_points
 from vislam.mapping.occupancy import NO_MARKS, OccupancyMap, ScanMarks
@@ -65,6 +66,7 @@ class CorrectedOccupancy:
         self._said: dict[int, _Said] = {}  # by the keyframes that are in the map
         self._occupancy = _new_map(config)
         self._patch: _Patch | None = None
+        self.left_out: dict[int, str] = {}  # keyframes whose scan no octree can hold where they are, and why
         self.counters = {"rebuilds": 0, "keyframes_integrated_again": 0, "marks_bytes": 0}
 
     @property
@@ -80,7 +82,7 @@ class CorrectedOccupancy:
     def add(self, keyframe_id: int, scan: Scan, T_map_body: Array) -> None:
         """Integrate a new keyframe, which is in the store already."""
         self._poses[keyframe_id] = T_map_body
-        marks = self._trace(scan, T_map_body)
+        marks = self._trace(keyframe_id, scan, T_map_body)
         self._occupancy.apply(marks)
         self._remember(keyframe_id, _Said.of(T_map_body, marks))
 
@@ -136,7 +138,7 @@ class CorrectedOccupancy:
         now = patch.waiting[:max_keyframes]
         for keyframe_id in now:
             T = self._poses[keyframe_id]
-            patch.moved[keyframe_id] = _Said.of(T, self._trace(self._store.geometry(keyframe_id), T))
+            patch.moved[keyframe_id] = _Said.of(T, self._trace(keyframe_id, self._store.geometry(keyframe_id), T))
         patch.waiting = patch.waiting[len(now) :]
         self.counters["keyframes_integrated_again"] += len(now)
         if patch.waiting:
@@ -173,7 +175,16 @@ class CorrectedOccupancy:
         self.counters["marks_bytes"] -= 0 if old is None else old.blocks.nbytes + len(old.packed)
         self._said[keyframe_id] = said
 
-    def _trace(self, scan: Scan, T_map_body: Array) -> ScanMarks:
+    def _trace(self, keyframe_id: int, scan: Scan, T_map_body: Array) -> ScanMarks:
+        """Return what a scan says; nothing where no octree can hold it: a wild pose must not cost the whole map."""
+        self.left_out.pop(keyframe_id, None)
+        try:
+            return self._marks(scan, T_map_body)
+        except DataError as error:
+            self.left_out[keyframe_id] = str(error)
+            return NO_MARKS
+
+    def _marks(self, scan: Scan, T_map_body: Array) -> ScanMarks:
         config = self._config
         if scan.depth is not None:
             points, origin = scan_points(scan.depth, self._view, T_map_body, config.resolution_m)

@@ -44,7 +44,7 @@ class Mapper:
         self._config = config
         self._one_camera = one_camera
         self._extractor = ScanExtractor(config, rig, one_camera)
-        self._store = KeyframeStore()
+        self._store = KeyframeStore(self._extractor.view.size)
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
         self._drive = DriveMap(config)
         self._surfels = SurfelMap(config.surfel_m)
@@ -185,6 +185,8 @@ class Mapper:
         when one cannot be written.
         """
         written, self.notes = write_products(self, folder, self._config, step)
+        if left_out := self._occupancy.left_out:
+            self.notes[f"occupancy of {len(left_out)} keyframes"] = next(iter(left_out.values()))
         return written
 
     def _scans(self) -> Iterator[tuple[Scan, Array]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,7 +36,9 @@ class Scan:
 class KeyframeStore:
     """Keyframe id -> compressed scan; memory per keyframe is bounded by the size of a depth image."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: tuple[int, int]) -> None:
+        """Prepare for depth images of one size: width, height."""
+        self._size = size
         self._packed: dict[int, PackedScan] = {}
 
     def __len__(self) -> int:
@@ -63,7 +66,9 @@ class KeyframeStore:
         return self._packed.get(keyframe_id)
 
     def put(self, keyframe_id: int, packed: PackedScan) -> None:
-        """Keep a scan that `packed` gave."""
+        """Keep a scan that `packed` gave. Raises DataError when it is none."""
+        if not all(isinstance(part, bytes) for part in (packed.depth_png, packed.points, packed.colors)):
+            raise _damaged(keyframe_id, "it is no sequence of bytes")
         self._packed[keyframe_id] = packed
 
     def add(self, keyframe_id: int, t_ns: int, scan: Scan) -> None:
@@ -81,23 +86,53 @@ class KeyframeStore:
             self._packed[keyframe_id] = PackedScan(t_ns, b"", zlib.compress(points.tobytes(), 1), colors)
 
     def scan(self, keyframe_id: int) -> Scan:
-        """Return the scan of a stored keyframe; depth is exactly what was added."""
-        packed = self._packed[keyframe_id]
-        if packed.depth_png:
-            depth = cv2.imdecode(np.frombuffer(packed.depth_png, np.uint8), cv2.IMREAD_UNCHANGED)
-            bgr = cv2.imdecode(np.frombuffer(packed.colors, np.uint8), cv2.IMREAD_COLOR)
-            return Scan(np.asarray(depth, np.uint16), None, np.ascontiguousarray(np.asarray(bgr, np.uint8)[..., ::-1]))
-        points = np.frombuffer(zlib.decompress(packed.points), np.float32).reshape(-1, 3)
-        return Scan(None, points, np.frombuffer(packed.colors, np.uint8).reshape(-1, 3))
+        """Return the scan of a stored keyframe; depth is exactly what was added.
+
+        Raises DataError when what an earlier run stored is damaged.
+        """
+        geometry, colors = self.geometry(keyframe_id), self._packed[keyframe_id].colors
+        if geometry.depth is not None:
+            bgr = _decode(colors, cv2.IMREAD_COLOR)
+            if bgr is None or bgr.shape[:2] != geometry.depth.shape:
+                raise _damaged(keyframe_id, "its colours are no image of the size of its depth")
+            return replace(geometry, colors=np.ascontiguousarray(np.asarray(bgr, np.uint8)[..., ::-1]))
+        if geometry.points_body_m is None or len(colors) != 3 * len(geometry.points_body_m):
+            raise _damaged(keyframe_id, "it has not as many colours as points")
+        return replace(geometry, colors=np.frombuffer(colors, np.uint8).reshape(-1, 3))
 
     def geometry(self, keyframe_id: int) -> Scan:
-        """Return the scan without decoding its colours (they are empty): all that occupancy needs."""
-        packed = self._packed[keyframe_id]
-        none = np.zeros((0, 3), np.uint8)
+        """Return the scan without decoding its colours (they are empty): all that occupancy needs.
+
+        Raises DataError as `scan`.
+        """
+        packed, none = self._packed[keyframe_id], np.zeros((0, 3), np.uint8)
         if packed.depth_png:
-            depth = cv2.imdecode(np.frombuffer(packed.depth_png, np.uint8), cv2.IMREAD_UNCHANGED)
+            # the header tells the size: no memory is taken for an image that cannot be one of ours
+            size = struct.unpack(">II", packed.depth_png[16:24]) if len(packed.depth_png) >= 24 else None
+            depth = _decode(packed.depth_png, cv2.IMREAD_UNCHANGED) if size == self._size else None
+            if depth is None or depth.dtype != np.uint16 or depth.shape != self._size[::-1]:
+                raise _damaged(keyframe_id, "its depth is no image of 16 bits of {} x {}".format(*self._size))
             return Scan(np.asarray(depth, np.uint16), None, none)
-        return Scan(None, np.frombuffer(zlib.decompress(packed.points), np.float32).reshape(-1, 3), none)
+        try:
+            data = zlib.decompressobj().decompress(packed.points, 12 * _MAX_SPARSE_POINTS)
+        except zlib.error as error:
+            raise _damaged(keyframe_id, f"its points cannot be unpacked ({error})") from error
+        if len(data) % 12:
+            raise _damaged(keyframe_id, "its points are cut")
+        return Scan(None, np.frombuffer(data, np.float32).reshape(-1, 3), none)
+
+
+def _damaged(keyframe_id: int, why: str) -> DataError:
+    return DataError(f"what is stored of keyframe {keyframe_id} is damaged: {why}; run the recording again")
+
+
+def _decode(data: bytes, kind: int) -> NDArray[np.generic] | None:
+    """Return an image, None when it is not one."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
+    except cv2.error:  # of no bytes, or of an absurd size
+        return None
+    return None if image is None else np.asarray(image)
 
 
 def _encode(kind: str, image: NDArray[np.generic], options: list[int]) -> bytes:
