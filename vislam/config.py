@@ -637,7 +637,7 @@ class Gy85Config:
 
     bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
     bus_timeout_s: float = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
-    rate_hz: float = 400.0  # of samples; 28 % of a 400 kHz bus. On a 100 kHz bus ask for 100
+    rate_hz: float = 400.0  # of samples; 30 % of a 400 kHz bus. On a 100 kHz bus ask for 100
     gyro_bandwidth_hz: Literal[256, 188, 98, 42, 20, 10, 5] = 98  # below half the rate: the chip cannot be aliased
     gyro_delay_s: float | None = None  # of that filter, taken off the stamps; None: what its makers state
     accel_rate_hz: Literal[100, 200, 400, 800] = 400  # 1600 and more lose the last bit, less than 100 no self-test

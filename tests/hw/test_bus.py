@@ -51,6 +51,19 @@ def test_twenty_one_reads_fit_one_system_call_and_no_more_are_taken() -> None:
                 bus.prepare(wrong)
 
 
+def test_an_adapter_that_takes_one_read_per_call_is_asked_so() -> None:
+    with emulated_bus(memory_bus(one_read=True)) as virtual:
+        bus = I2cBus(virtual.path, 0.02)
+        reads = bus.prepare([(0x50, 1, 2), (0x50, 8, 3), (0x50, 0x20, 1)])
+        for _ in range(2):
+            before = virtual.transfers
+            assert reads.run() == bytes([1, 2, 8, 9, 10, 0x20])
+            assert not bus.is_chained
+        assert virtual.transfers - before == 3
+        assert reads.run(2) == bytes([1, 2, 8, 9, 10])
+        assert bus.counters.total() == 0
+
+
 @pytest.mark.parametrize("smbus_only", [False, True])
 def test_errors_have_a_kind_are_counted_and_end_with_exit_code_5(smbus_only: bool) -> None:
     with emulated_bus(memory_bus(smbus_only=smbus_only)) as virtual:

@@ -15,9 +15,10 @@ from vislam.imu.noise import ImuNoise
 
 
 @pytest.mark.parametrize("rate_error", [-0.02, 0.0, 0.02])
-@pytest.mark.parametrize("smbus_only", [False, True])
-def test_samples_are_the_truth_at_their_own_stamps(rate_error: float, smbus_only: bool) -> None:
-    with board(grade="exact", rate_error=rate_error, smbus_only=smbus_only, magnetometer="none") as parts:
+@pytest.mark.parametrize("adapter", ["full", "one_read", "smbus_only"])
+def test_samples_are_the_truth_at_their_own_stamps(rate_error: float, adapter: str) -> None:
+    kind = {} if adapter == "full" else {adapter: True}
+    with board(grade="exact", rate_error=rate_error, magnetometer="none", **kind) as parts:
         driver, _, clock = parts
         source: InertialSource = driver
         inertial, _ = collect(driver, clock, 10.0)

@@ -64,10 +64,13 @@ def _load_smbus2() -> Any:
 class I2cBus:
     """One adapter, such as /dev/i2c-1; one thread, one user.
 
-    Where the kernel offers plain I2C, reads are combined messages (I2C_RDWR); else SMBus block reads, one by one.
+    Where the kernel offers plain I2C, reads are combined messages (I2C_RDWR); else SMBus block reads, one by one. The
+    adapter of a Raspberry Pi (i2c-bcm2835) takes one read per call: that shows at the first longer one.
 
     Attributes:
         path: of the device file.
+        is_combined: there are combined messages.
+        is_chained: several reads fit one call.
         counters: failed transfers by kind; pass a counter in to go on counting after a reopening.
     """
 
@@ -86,6 +89,7 @@ class I2cBus:
         except OSError as error:
             raise self._failed("it cannot be opened", error) from error
         self.is_combined = bool(self._bus.funcs & self._smbus2.I2cFunc.I2C)
+        self.is_chained = self.is_combined
         for request, value in ((_I2C_TIMEOUT, max(round(timeout_s * 100.0), 1)), (_I2C_RETRIES, 0)):
             try:
                 self._smbus2.ioctl(self._bus.fd, request, value)
@@ -97,7 +101,7 @@ class I2cBus:
         return self.prepare([(address, register, length)]).run()
 
     def prepare(self, reads: Sequence[tuple[int, int, int]]) -> Reads:
-        """Return reads of (address, register, length) that can be run again and again, in one system call each time."""
+        """Return reads of (address, register, length) that run again and again, in one system call if possible."""
         return Reads(self, reads)
 
     def write(self, address: int, register: int, value: int) -> None:
@@ -190,7 +194,15 @@ class Reads:
         """As `run`, but lets the kernel's OSError through, uncounted."""
         bus = self._bus
         if bus.is_combined:
-            bus._bus.i2c_rdwr(*self._messages[: 2 * count])
+            chained = count if bus.is_chained else 1
+            for first in range(0, 2 * count, 2 * chained):
+                try:
+                    bus._bus.i2c_rdwr(*self._messages[first : first + 2 * chained])
+                except OSError as error:
+                    if error.errno != errno.EOPNOTSUPP or chained == 1:
+                        raise
+                    bus.is_chained = False
+                    return self.transfer(count)
             return ctypes.string_at(self._buffer, self._ends[count - 1])
         return b"".join(bytes(bus._bus.read_i2c_block_data(*read)) for read in self._reads[:count])
 

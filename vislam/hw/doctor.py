@@ -139,7 +139,7 @@ def _examine_buses(notes: _Notes, wanted: str | None, seconds: float, clock: Clo
 
 def _examine_chips(notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severity: Severity) -> bool:
     """Note the chips of a bus; return whether gyro and accelerometer of a GY-85 are there and free."""
-    notes.devices.append(Device("bus", bus.path, "I2C" if bus.is_combined else "SMBus only: slower, one call per read"))
+    notes.devices.append(Device("bus", bus.path, "I2C" if bus.is_combined else "SMBus only"))
     found: set[str] = set()
     for chip in identify(bus):
         notes.devices.append(Device("chip", f"{bus.path} 0x{chip.address:02x}", chip.name))

@@ -33,6 +33,7 @@ def emulated_gy85(
     rate_error: float = 0.0,
     path: str = "/dev/i2c-emulated",
     smbus_only: bool = False,
+    one_read: bool = False,
     stepped: SteppedClock | None = None,
 ) -> EmulatedBus:
     """Return a bus with the three chips of one board; same seed, same board, same noise.
@@ -48,6 +49,7 @@ def emulated_gy85(
         rate_error: of the chips' own clocks, relative; the data sheets allow 0.02.
         path: of the device file.
         smbus_only: an adapter that has no combined messages.
+        one_read: an adapter that takes one read per call, as a Raspberry Pi's.
         stepped: a clock that transfers move on.
     """
     rng = np.random.default_rng(seed)
@@ -76,4 +78,4 @@ def emulated_gy85(
         chips[0x1E] = VirtualHmc5883l(truth, now_ns, mag, seed + 3, status_works=magnetometer == "HMC5883L")
     elif magnetometer != "none":
         chips[_ADDRESSES[magnetometer]] = VirtualQmc5883(truth, now_ns, mag, seed + 3, magnetometer[-1])
-    return EmulatedBus(chips, path, smbus_only, stepped)
+    return EmulatedBus(chips, path, smbus_only, one_read, stepped)

@@ -36,10 +36,14 @@ class EmulatedBus:
         chips: Mapping[int, Chip],
         path: str = "/dev/i2c-emulated",
         smbus_only: bool = False,
+        one_read: bool = False,
         clock: SteppedClock | None = None,
         bus_hz: float = 400_000.0,
     ) -> None:
-        """Take the chips; with a stepped clock, transfers take the time that they need at `bus_hz`."""
+        """Take the chips; with a stepped clock, transfers take the time that they need at `bus_hz`.
+
+        `smbus_only`: no combined messages; `one_read`: a read must be the last of them, as on a Raspberry Pi.
+        """
         self.chips = dict(chips)
         self.path = path
         self.nack_every = 0
@@ -47,7 +51,7 @@ class EmulatedBus:
         self.busy: set[int] = set()
         self.transfers = 0
         self.bytes_read = 0
-        self._smbus_only, self._clock, self._bit_ns = smbus_only, clock, 1e9 / bus_hz
+        self._smbus_only, self._one_read, self._clock, self._bit_ns = smbus_only, one_read, clock, 1e9 / bus_hz
         self._is_plugged = True
         self._address = -1
         self._timeout_ns = 1_000_000_000
@@ -109,7 +113,11 @@ class EmulatedBus:
         return chip
 
     def _combined(self, transfer: Any) -> None:
-        for k in range(transfer.nmsgs):
+        count = transfer.nmsgs
+        if count > 42 or (self._one_read and any(transfer.msgs[k].flags & 1 for k in range(count - 1))):
+            error = errno.EINVAL if count > 42 else errno.EOPNOTSUPP
+            raise OSError(error, os.strerror(error))
+        for k in range(count):
             message = transfer.msgs[k]
             chip = self._chip(message.addr, message.len)
             if message.flags & 1:
