@@ -42,6 +42,7 @@ class Drive:
     speed_m_s: float = 0.6
     turn_rad_s: float = 0.25
     shake_deg: float = 0.0
+    rest_s: float = 0.0  # at the end
     start: tuple[float, float, float] = (-2.0, -2.0, 0.3)
     times_s: Array = field(init=False)
 
@@ -52,6 +53,8 @@ class Drive:
         """Return the poses [N, 4, 4] at times [N]; the body is 0.4 m above the floor, 0.2 m under the camera."""
         fine = np.linspace(0.0, self.seconds, round(self.seconds * 1000) + 1)
         ramp = np.clip(fine / 0.5, 0.0, 1.0)
+        if self.rest_s > 0.0:
+            ramp = np.minimum(ramp, np.clip((self.seconds - self.rest_s - fine) / 0.5, 0.0, 1.0))
         yaw = self.start[2] + self.turn_rad_s * np.sin(0.9 * fine) / 0.9
         x = self.start[0] + np.cumsum(self.speed_m_s * ramp * np.cos(yaw)) * 1e-3
         y = self.start[1] + np.cumsum(self.speed_m_s * ramp * np.sin(yaw)) * 1e-3

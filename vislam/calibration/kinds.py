@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vislam.calibration import options as o
+from vislam.calibration.floor import calibrate_floor
 from vislam.calibration.imu import calibrate_imu
 from vislam.calibration.noise import calibrate_noise
 from vislam.calibration.outcome import Outcome
@@ -22,6 +23,7 @@ class Kind:
 
 
 KINDS = {
+    "floor": Kind(o.FloorOptions, calibrate_floor, "tilt and height of a cart's camera, from a short drive"),
     "imu": Kind(o.ImuOptions, calibrate_imu, "scale, axes and bias of an IMU, from poses held by hand"),
     "noise": Kind(o.NoiseOptions, calibrate_noise, "white noise and bias walk of an IMU that stands still"),
 }

@@ -26,6 +26,32 @@ class NoiseOptions:
 
 
 @dataclass(frozen=True)
+class FloorOptions:
+    """Options of `vislam calibrate floor`."""
+
+    source: Positional[str]
+    """Recording (or sim:WORLD) in which the cart drives 3 m or more over a level floor with texture"""
+    distance_m: float | None = None
+    """How far the cart is from where it began, by tape, at the end of the recording; driven straight"""
+    distance_sigma_m: float = 0.005
+    """How well that was measured: 5 mm for a tape between two marks under the cart"""
+    height_m: float | None = None
+    """Height of the lens above the floor, by tape, where no distance was measured"""
+    height_sigma_m: float = 0.003
+    """How well that was measured; the middle of a lens is hard to find"""
+    begin_s: float = 0.0
+    """Leave out so much of the recording at its beginning"""
+    duration_s: float | None = None
+    """Take so much of it; None: all"""
+    out: Path = Path("calibration")
+    """Folder for floor.toml, floor.png and floor.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
 class ImuOptions:
     """Options of `vislam calibrate imu`."""
 

@@ -74,6 +74,7 @@ class PlanarFrontEnd:
         self._px = 2.0 / (self._camera.fx + self._camera.fy)
         mount = make_mount(self._planar, np.ascontiguousarray(self._T_body_cam[:3, :3]))
         self._height_m = mount.height_m
+        self._max_distance_m = self._planar.max_distance_heights * mount.height_m
         self._tilt = Tilt(self._planar, mount)
         self._regions = Regions(self._planar, self._camera, mount)
         self._intake = Intake(rig, seed)
@@ -175,7 +176,7 @@ class PlanarFrontEnd:
         pixels = self._step(frame) if self._is_split else self._warped(frame, where, T_guess)
         xy = self._camera.normalise(pixels)
         pair = FloorPair(self._landmarks.mean[:, :2], xy, self._R_key, R_now, self._height_m, self._px)
-        use = pair.usable(self._planar.max_distance_m) & ~self._off_floor
+        use = pair.usable(self._max_distance_m) & ~self._off_floor
         if self._is_split:
             return self._placed(pixels, xy, self._split(pair, use, frame), use, pair)
         return self._placed(pixels, xy, self._joint(pair, use, guess, frame), use, pair)
@@ -414,7 +415,7 @@ class PlanarFrontEnd:
         """Return which tracks [N] of the keyframe lie where the floor should be."""
         rays, R = self._landmarks.mean[:, :2], self._tilt.R_level_cam
         pair = FloorPair(rays, rays, R, R, self._height_m, self._px)
-        return pair.usable(self._planar.max_distance_m) & ~self._off_floor
+        return pair.usable(self._max_distance_m) & ~self._off_floor
 
     def _continue_from(self, frame: Frame, place: _Place) -> tuple[Keyframe, Observations]:
         """Make the frame a keyframe: learn the tilt, carry tracks on, fill the gaps."""
@@ -461,7 +462,7 @@ class PlanarFrontEnd:
         """Return the inverse z-depth [N] in 1/m of the floor in directions [N, 2] of the newest frame; NaN above it."""
         down = -(np.column_stack([xy, np.ones(len(xy))]) @ self._tilt.R_level_cam[2])
         rho = down / self._height_m
-        return np.where(rho * self._planar.max_distance_m > 1.0, rho, np.nan)
+        return np.where(rho * self._max_distance_m > 1.0, rho, np.nan)
 
     def _observed(self, which: Bools, pixels: Array, T_key_cam: Array) -> Observations:
         """Return the tracks `which` [N] at `pixels` [N, 2], with the depth of those known to be on the floor."""
