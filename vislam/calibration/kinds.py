@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from vislam.calibration import options as o
+from vislam.calibration.board import print_board
+from vislam.calibration.camera import calibrate_camera
 from vislam.calibration.floor import calibrate_floor
 from vislam.calibration.imu import calibrate_imu
 from vislam.calibration.noise import calibrate_noise
@@ -23,6 +25,8 @@ class Kind:
 
 
 KINDS = {
+    "board": Kind(o.BoardFile, print_board, "draw a calibration board to print"),
+    "camera": Kind(o.CameraOptions, calibrate_camera, "focal length, centre and distortion, from views of a board"),
     "floor": Kind(o.FloorOptions, calibrate_floor, "tilt and height of a cart's camera, from a short drive"),
     "imu": Kind(o.ImuOptions, calibrate_imu, "scale, axes and bias of an IMU, from poses held by hand"),
     "noise": Kind(o.NoiseOptions, calibrate_noise, "white noise and bias walk of an IMU that stands still"),

@@ -2,11 +2,68 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+import tyro
 from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class BoardOptions:
+    """The calibration board."""
+
+    kind: Literal["charuco", "chessboard"] = "charuco"
+    """charuco may be seen in part, up to the corners of the image; a chessboard only whole"""
+    columns: int = 9
+    """Squares along the longer side"""
+    rows: int = 6
+    """Squares along the shorter side"""
+    square_mm: float = 30.0
+    """Side of a square, as measured on the print"""
+    marker_share: float = 0.75
+    """Side of a marker over that of a square"""
+    dictionary: str = "5X5_100"
+    """Of the markers: OpenCV's DICT_..., such as 4X4_50, 5X5_100, 6X6_250, APRILTAG_36h11"""
+
+
+@dataclass(frozen=True)
+class BoardFile:
+    """Options of `vislam calibrate board`."""
+
+    board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
+    paper: Literal["a4", "a3", "a2", "letter"] | None = None
+    """Paper, lying; None: the smallest that holds the board"""
+    out: Path = Path("calibration")
+    """Folder for board.png, board.pdf and board.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Options of `vislam calibrate camera`."""
+
+    source: Positional[str]
+    """Folder of images, video file, recording (its cam0), or webcam:DEVICE for a live one"""
+    board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
+    model: Literal["radtan", "radtan5", "equidistant"] = "radtan"
+    """radtan: k1 k2 p1 p2; radtan5: and k3, which Kalibr does not know; equidistant: lenses of over 100 degrees"""
+    max_images: int = 300
+    """So many images, evenly spaced, are searched for the board"""
+    max_views: int = 40
+    """So many of those that show it, as different as possible, are used"""
+    live_s: float = 60.0
+    """How long a live camera is looked at; move the board slowly, hold it still now and then"""
+    out: Path = Path("calibration")
+    """Folder for camchain.yaml (Kalibr), camera.yaml (ASL), camera_info.yaml (ROS), camera.png and camera.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
