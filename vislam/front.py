@@ -16,7 +16,7 @@ from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
-from vislam.frontend.result import identity_motion, lost_motion
+from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
 from vislam.frontend.uniform_motion import UniformMotion
 from vislam.geometry import invert, level_rotation, transform
@@ -490,11 +490,3 @@ class Front:
         released = self._release(self._T_upright)
         self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
         return released
-
-
-def scaled_motion(vo: VoMeasurement) -> Array:
-    """Return the motion [4, 4] since the keyframe as far as it is known: without scale, its rotation alone."""
-    assert vo.T_keyframe_body is not None
-    if vo.has_scale:
-        return vo.T_keyframe_body
-    return transform(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]), np.zeros(3))

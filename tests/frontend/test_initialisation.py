@@ -109,6 +109,19 @@ def test_from_rest() -> None:
     assert np.linalg.eigvalsh(answer.last.covariance)[0] > 0.0
 
 
+def test_a_direction_without_length_is_no_motion_at_rest() -> None:
+    """One camera reports which way the image moves, however little: a unit vector, which must not become a metre."""
+    feed = Feed.still()
+    sideways = transform(np.eye(3), np.array([0.0, 1.0, 0.0]))
+    feed.motions = [replace(vo, T_keyframe_body=sideways, has_scale=False) for vo in feed.motions]
+    answer, _ = feed.run(initialiser(), still=True)
+    assert answer.status == "static" and answer.first is not None and answer.last is not None
+    np.testing.assert_allclose(answer.first.T_world_body[:3, 3], 0.0)
+    np.testing.assert_allclose(answer.last.T_world_body[:3, 3], 0.0)
+    assert answer.T_odom_body is not None
+    np.testing.assert_allclose(answer.T_odom_body[:, :3, 3], 0.0)
+
+
 def test_rest_covariance_ties_tilt_to_the_accelerometer_bias() -> None:
     """Tilt is known to bias over gravity, 1.2 deg, but tilt and bias together far better: the mean force is exact."""
     answer, _ = Feed.still().run(initialiser(), still=True)

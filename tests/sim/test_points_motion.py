@@ -51,8 +51,8 @@ def test_motion_from_a_tenth_of_a_second_of_truth_hits_the_poses_between(
     R = T[:, :3, :3].transpose(0, 2, 1) @ data.truth.T_world_body[known, :3, :3]
     error_rad = angles_rad(R[::7])
     print(f"{name}: {np.sqrt(np.mean(error_m**2)) * 1e6:.0f} um, {np.sqrt(np.mean(error_rad**2)) * 1e6:.0f} urad rms")
-    # a tenth of a pixel is 0.2 mrad; the truth of v201 has rough places of its own
-    assert np.sqrt(np.mean(error_rad**2)) < 1e-4 and error_rad.max() < 1.5e-3
+    # in rotation it is the gyroscope that is believed over seconds, and motion capture that errs
+    assert np.sqrt(np.mean(error_rad**2)) < np.deg2rad(0.4) and error_rad.max() < np.deg2rad(2.0)
     assert np.sqrt(np.mean(error_m**2)) < 1e-4 and error_m.max() < 1e-3
 
 
@@ -65,6 +65,27 @@ def turned_by_gyro(data: MeasuredInertial, begin_ns: int, end_ns: int, bias: Arr
     for k, dt_s in enumerate(np.diff(stamps) * 1e-9):
         R = R @ so3_exp(0.5 * (rates[k] + rates[k + 1]) * dt_s)
     return R
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["v101", "v201"])
+def test_gyroscope_and_motion_agree_over_seconds(data_root: Path, name: str) -> None:
+    """Where they did not, simulated vision would contradict the inertial data, as the true rotations do by 0.4 deg."""
+    data = recorded(data_root, name)
+    motion = motion_of(data)
+    apart = {"motion": [], "truth": []}
+    for begin_s in np.arange(2.0, motion.end_s - 8.0, 2.0):
+        ends_ns = motion.zero_ns + (np.array([begin_s, begin_s + 5.0]) * 1e9).astype(np.int64)
+        gyro = turned_by_gyro(data, *ends_ns.tolist(), motion.gyro_bias_rad_s)
+        for name_of, T in (
+            ("motion", motion.at((ends_ns - motion.zero_ns) * 1e-9).T_world_body),
+            ("truth", data.truth.at(ends_ns)),
+        ):
+            apart[name_of].append(gyro.T @ T[0, :3, :3].T @ T[1, :3, :3])
+    rms_deg = {k: np.rad2deg(np.sqrt(np.mean(angles_rad(np.array(v)) ** 2))) for k, v in apart.items()}
+    print(f"{name}: over 5 s the gyroscope parts from the motion by {rms_deg['motion']:.3f} deg, the truth {rms_deg}")
+    assert rms_deg["motion"] < 0.25  # the rest: its bias is taken as constant here
+    assert rms_deg["truth"] > 1.9 * rms_deg["motion"]
 
 
 @pytest.mark.data

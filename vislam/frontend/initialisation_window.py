@@ -10,6 +10,7 @@ import numpy as np
 
 from vislam.camera import Camera
 from vislam.frontend.initialisation_bundle import Tracks
+from vislam.frontend.result import scaled_motion
 from vislam.geometry import invert, se3_adjoint
 from vislam.imu import join
 from vislam.inertial_alignment import VisualMotion
@@ -38,7 +39,7 @@ class Entry:
 
 
 class FrameWindow:
-    """Chains visual motions to poses in the visual frame and keeps the newest entries."""
+    """Chains visual motions (without scale: rotations) to poses in the visual frame; keeps the newest entries."""
 
     def __init__(self) -> None:
         """Start empty."""
@@ -56,13 +57,12 @@ class FrameWindow:
 
     def append(self, span: ImuSpan | None, vo: VoMeasurement, observations: Observations | None, still: bool) -> None:
         """Take a frame whose motion is known. After a loss the chain goes on from the last good pose."""
-        assert vo.T_keyframe_body is not None
         number = self._count
         if vo.keyframe_id != self._keyframe_id:  # the frame before became the keyframe
             self._T_vo_keyframe = self._T_vo_body
             self._keyframe_number = number if self._keyframe_id is None else number - 1  # the first is its own
             self._keyframe_id = vo.keyframe_id
-        self._T_vo_body = self._T_vo_keyframe @ vo.T_keyframe_body
+        self._T_vo_body = self._T_vo_keyframe @ scaled_motion(vo)
         T = self._T_vo_body.copy()
         self.entries.append(Entry(span, vo, observations, T, self._keyframe_number, number, still))
         self._count += 1

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from vislam.geometry import transform
 from vislam.memory import FrontNews
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 
@@ -80,3 +81,11 @@ def too_few(frame: Frame, corners: int) -> str:
 def no_observations() -> Observations:
     """Return observations of nothing."""
     return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+
+def scaled_motion(vo: VoMeasurement) -> Array:
+    """Return the motion [4, 4] since the keyframe as far as it is known: without scale, its rotation alone."""
+    assert vo.T_keyframe_body is not None
+    if vo.has_scale:
+        return vo.T_keyframe_body
+    return transform(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]), np.zeros(3))
