@@ -236,12 +236,12 @@ def test_a_self_test_that_breaks_off_leaves_no_stimulus_on(every: int) -> None:
         np.testing.assert_allclose(np.mean([m.field_ut for m in magnetic], axis=0), FIELD_UT, atol=2.0)
 
 
-def test_random_faults_for_a_minute_never_raise_and_never_lie() -> None:
+def test_random_faults_never_raise_and_never_lie() -> None:
     rng = np.random.default_rng(11)
     print("seed 11")
     with board() as (driver, virtual, clock):
         inertial = []
-        for _ in range(60):
+        for _ in range(40):
             choice = rng.integers(8)
             virtual.is_stuck = choice == 0
             virtual.nack_every = int(rng.integers(2, 40)) if choice < 4 else 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vislam.config import Gy85Config
-from vislam.errors import HardwareError
+from vislam.errors import HardwareError, UsageError
 from vislam.hw import adxl345, itg3205
 from vislam.hw.adxl345 import Adxl345
 from vislam.hw.affine import Affine
@@ -25,6 +25,7 @@ from vislam.hw.track import SampleTrack
 from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
+_MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 1000.0  # the gyro samples at 1 kHz inside
 _START_ATTEMPTS = 3  # a wire may be disturbed just then
 _G_M_S2 = 9.80665
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
@@ -69,8 +70,12 @@ class Gy85:
         With `must_be_there` False a missing board is not an error: it is looked for as after unplugging.
 
         Raises:
+            UsageError: a rate that no such board has.
             HardwareError: bus, gyro or accelerometer is missing or is another chip; smbus2 is not installed.
         """
+        for name, rate_hz in (("rate_hz", config.rate_hz), ("mag_rate_hz", config.mag_rate_hz)):
+            if not _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ:
+                raise UsageError(f"gy85.{name} must be {_MIN_RATE_HZ:g} to {_MAX_RATE_HZ:g}, got {rate_hz:g}")
         self._config = config
         self._clock: Clock = HostClock() if clock is None else clock
         self.rate_hz = config.rate_hz
