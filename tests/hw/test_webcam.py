@@ -152,7 +152,7 @@ def test_the_newest_image_wins_and_the_others_are_counted(config: WebcamConfig) 
 def test_a_camera_that_goes_away_comes_back(config: WebcamConfig) -> None:
     devices = [FakeCapture()]
     camera = Webcam(config, open_capture=lambda _: devices[-1])
-    assert camera.health() == Health(0)
+    wait_for(lambda: camera.health() == Health(0))
     Path(config.device).unlink()
     devices[0].unplugged = True
     wait_for(lambda: camera.counters().get("open_failures", 0) > 1)
