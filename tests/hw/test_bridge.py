@@ -4,6 +4,7 @@ import errno
 import math
 import os
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -239,6 +240,21 @@ def test_saturation_and_temperature_are_told(config: SerialConfig) -> None:
     assert counts["gyro_saturated"] > 0 < counts["accel_saturated"]
     assert counts["mag_overflow"] > 0
     assert not any(isinstance(sample, MagSample) for sample in samples)
+
+
+def test_a_board_may_go_away_while_it_is_opened(
+    config: SerialConfig, board: BridgeEmulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def vanish(*_: object, **__: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    bridge = SerialBridge(config, must_be_there=False)
+    with monkeypatch.context() as patch:
+        patch.setattr("serial.Serial", vanish)
+        assert bridge.read(0.1) == []
+    assert bridge.counters()["open_failures"] >= 1
+    collect(bridge, lambda found: len(imu(found)) > 10)
+    bridge.close()
 
 
 def test_one_port_has_one_reader(config: SerialConfig, board: BridgeEmulator) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import select
+import termios
 import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     import serial
 
 _NS = 1_000_000_000
+# pyserial raises all of them at a device that goes away; its own SerialException is an OSError
+_PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
 _READ_BYTES = 4096
 _GLANCE_S = 0.05  # while the first sample is waited for, a port that cannot be opened is told so soon
 _BITS_PER_BYTE = 10  # start, eight, stop
@@ -141,7 +144,7 @@ class SerialBridge:
         if port is not None:
             try:
                 port.close()
-            except OSError:  # a device that is gone
+            except _PORT_ERRORS:
                 self._counts["close_failures"] += 1
 
     # ---- the port ---------------------------------------------------------------------------------------------
@@ -153,7 +156,7 @@ class SerialBridge:
         try:
             # exclusive: two programs on one port would each get half of the bytes
             self._port = self._serial.Serial(config.port, config.baud, timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        except _PORT_ERRORS as error:
             self._counts["open_failures"] += 1
             self.problem = _why_not_open(config, error)
             return
@@ -205,7 +208,7 @@ class SerialBridge:
         try:
             ready, _, _ = select.select([port.fileno()], [], [], timeout_s)
             data = port.read(_READ_BYTES) if ready else b""
-        except (OSError, ValueError, TypeError) as error:  # pyserial raises all of them at a device that went away
+        except _PORT_ERRORS as error:
             self._lose("port_lost", f"{config.port} went away: {error}; plug it in again")
             return []
         arrival_ns = time.monotonic_ns()
