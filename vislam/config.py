@@ -754,9 +754,9 @@ class SensorsConfig:
 class RecordConfig:
     """Recording of live sensors to a disk that may be slow or full."""
 
-    max_gb: float = 8.0  # the recording ends at this size; 640x480 JPEG at 30 Hz takes 9 an hour (TUM's desk)
+    max_gb: float = 8.0  # the recording ends at this size; 640x480 JPEG at 30 Hz takes 9 an hour
     min_free_gb: float = 1.0  # and when the disk has less left: a full root disk stops the machine
-    image_format: Literal["jpg", "png"] = "jpg"  # an MJPG camera gave no more; png keeps every bit in five times the space
+    image_format: Literal["jpg", "png"] = "jpg"  # MJPG cameras give no more; png takes five times the space
     image_queue: int = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
     imu_queue: int = 8000  # samples that may wait: 18 s at 450 Hz
 
