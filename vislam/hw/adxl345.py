@@ -20,7 +20,7 @@ _RATES = {100: 0x0A, 200: 0x0B, 400: 0x0C, 800: 0x0D}
 _RANGES = {2: 0, 4: 1, 8: 2, 16: 3}
 _SELF_TEST, _FULL_RESOLUTION, _MEASURE, _STREAM = 0x80, 0x08, 0x08, 0x80
 
-# Table 15, page 22: change of output at 2.5 V, and its factor at other supplies (table 14)
+# Page 22 of revision E: change of output at 2.5 V, and its factor at other supplies
 _SELF_TEST_LSB = np.array([[50.0, 540.0], [-540.0, -50.0], [75.0, 875.0]])
 _SUPPLY_V = (2.0, 2.5, 3.3, 3.6)
 _FACTOR_XY, _FACTOR_Z = (0.64, 1.0, 1.77, 2.11), (0.8, 1.0, 1.47, 1.69)

@@ -16,7 +16,7 @@ from vislam.hw.emulator.clock import SteppedClock
 _I2C_FUNC_I2C, _I2C_FUNC_SMBUS = 0x1, 0x0EFF0008
 _RETRIES, _TIMEOUT, _SLAVE, _SLAVE_FORCE, _FUNCS, _RDWR, _SMBUS = 0x701, 0x702, 0x703, 0x706, 0x705, 0x707, 0x720
 _BYTE_DATA, _BLOCK_DATA = 2, 8
-_FIRST_FD = 1_000_000  # no process has so many files
+_FIRST_FD, _FDS = 1_000_000_000, 100_000_000  # no process has so many files; openings of one bus
 
 
 class EmulatedBus:
@@ -151,7 +151,7 @@ class _FileFunctions:
     O_RDWR = os.O_RDWR
 
     def __init__(self, inner: Any, bus: EmulatedBus, first_fd: int) -> None:
-        self._inner, self._bus, self._next_fd = inner, bus, first_fd
+        self._inner, self._bus, self.first_fd, self._next_fd = inner, bus, first_fd, first_fd
         self.open_fds: set[int] = set()
 
     def open(self, path: str, flags: int) -> int:
@@ -177,7 +177,8 @@ def emulated_bus(bus: EmulatedBus) -> Iterator[EmulatedBus]:
     """
     module: Any = importlib.import_module("smbus2.smbus2")
     inner_os, inner_ioctl = module.os, module.ioctl
-    files = _FileFunctions(inner_os, bus, _FIRST_FD + 1000 * (id(bus) % 1000))
+    is_nested = isinstance(inner_os, _FileFunctions)
+    files = _FileFunctions(inner_os, bus, inner_os.first_fd + _FDS if is_nested else _FIRST_FD)
 
     def ioctl(fd: int, request: int, argument: Any) -> Any:
         return bus.ioctl(request, argument) if fd in files.open_fds else inner_ioctl(fd, request, argument)
