@@ -16,6 +16,7 @@ from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
+from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
 from vislam.frontend.uniform_motion import UniformMotion
@@ -241,6 +242,13 @@ class Front:
         if self._has_imu and self.initialisation is None and self.frontend.mode != "mono":
             return self._release(self._T_upright)
         return []
+
+    @property
+    def calibration(self) -> dict[str, float]:
+        """What was learned of the camera, with standard deviations: its clock, and over a floor its mount."""
+        clock = {"camera_offset_s": self.camera_clock.applied_s, "camera_offset_sigma_s": self.camera_clock.sigma_s}
+        mount = self.frontend.calibration if isinstance(self.frontend, PlanarFrontEnd) else {}
+        return {**(clock if self._has_imu else {}), **mount}
 
     @property
     def all_counters(self) -> dict[str, dict[str, int]]:

@@ -366,6 +366,7 @@ class Run:
                 "scale_sigma": None if found is None else found.scale_sigma,
                 "excitation_m_s2": None if found is None else found.excitation_m_s2,
             },
+            "calibration": front.calibration,
             "accuracy": self._accuracy(final, truth),
             "timing_ms": self.slam.clock.summary_ms(),
             "counters": counters,

@@ -104,6 +104,13 @@ def _head(run: RunFiles) -> str:
         when = number(start.get("t_s"), 2, " s")
         reason = f" ({start['reason']})" if start.get("reason") else ""
         parts.append(f"Initialisation: {start.get('status', 'unknown')} at {when}{reason}.")
+    mount = _dict(m, "calibration")
+    if "tilt_deg" in mount:
+        values = [number(mount.get(name), 3) for name in ("height_m", "tilt_deg", "tilt_sigma_deg", "roll_deg")]
+        parts.append(
+            f"Over the floor: camera {values[0]} m high as given, tilted by {values[1]} ± {values[2]} deg and rolled "
+            f"by {values[3]} deg as the floor shows."
+        )
     source = run.manifest.get("source")
     if source:
         parts.append(f"Source: {source}.")

@@ -1,0 +1,152 @@
+"""The front half with planar odometry: start, rest, drive, a floor whose texture ends, a clock that is late."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vislam.clock import StageClock
+from vislam.config import Config, from_data
+from vislam.front import Front, FrontStep
+from vislam.geometry import invert, se3_log
+from vislam.messages import Array, Frame, ImuSample
+from vislam.sim.sensors import GY85_IMU, GY85_TURN_ON, sense_imu
+from vislam.sim.spline import BodySpline
+
+sys.path.insert(0, str(Path(__file__).parent / "frontend"))
+from floor_world import HEIGHT_M, FloorWorld, rig, stamp_ns
+
+CAMERA_HZ = 10.0
+LATE_S = 0.03
+
+
+@dataclass(frozen=True)
+class Cart:
+    """A cart with a GY-85: what its sensors deliver, and where it truly is at each frame."""
+
+    frames: tuple[Frame, ...]
+    samples: tuple[ImuSample, ...]
+    T_world_body: Array
+
+
+def cart(seconds: float, speed_m_s: float, late_s: float = 0.0, blank: tuple[int, int] = (0, 0), seed: int = 1) -> Cart:
+    """Draw a drive that begins with 2 s of rest; frames `blank` show a floor without texture."""
+
+    def design(t: Array) -> tuple[Array, Array]:
+        moving = np.clip((t - 2.0) / 1.0, 0.0, None)
+        way = speed_m_s * np.where(moving < 1.0, 0.5 * moving**2, moving - 0.5)
+        yaw = 0.3 * np.sin(0.9 * np.maximum(t - 2.0, 0.0)) * (speed_m_s > 0.0)
+        x = np.concatenate([[0.0], np.cumsum(np.diff(way) * np.cos(yaw[1:]))])
+        y = np.concatenate([[0.0], np.cumsum(np.diff(way) * np.sin(yaw[1:]))])
+        rocking = np.deg2rad(0.15) * (way > 0.02)
+        tilt = np.column_stack([rocking * np.sin(7.0 * t), rocking * np.sin(9.0 * t), yaw])
+        return np.column_stack([x - 2.0, y - 2.0, np.full(len(t), HEIGHT_M - 0.2)]), tilt
+
+    motion = BodySpline.from_design(design, seconds, 0.1)
+    imu_s = np.arange(round(seconds * GY85_IMU.rate_hz)) / GY85_IMU.rate_hz
+    record = sense_imu(motion.at(imu_s), GY85_IMU, 9.81, np.random.default_rng(seed), True, GY85_TURN_ON)
+    samples = tuple(
+        ImuSample(t, gyro, accel)
+        for t, gyro, accel in zip(stamp_ns(imu_s).tolist(), record.gyro_rad_s, record.accel_m_s2, strict=True)
+    )
+    frame_s = np.arange(1, round((seconds - 0.2) * CAMERA_HZ)) / CAMERA_HZ
+    poses, world = motion.at(frame_s).T_world_body, FloorWorld(rig())
+    rng = np.random.default_rng(seed)
+    still = world.draw(poses[0]).astype(np.float32) if speed_m_s == 0.0 else None
+    frames = []
+    for i, (t, T) in enumerate(zip(stamp_ns(frame_s + late_s).tolist(), poses, strict=True)):
+        if still is not None:
+            image = np.clip(still + rng.normal(0.0, 2.0, still.shape), 0, 255).astype(np.uint8)
+        else:
+            image = world.draw(T)
+        if blank[0] <= i < blank[1]:
+            image = np.clip(rng.normal(110.0, 2.0, image.shape), 0, 255).astype(np.uint8)
+        frames.append(Frame(t, i, (image,)))
+    return Cart(tuple(frames), samples, poses)
+
+
+def config(**ekf: object) -> Config:
+    frontend = {"planar": {"height_m": HEIGHT_M}, "described_features": 50}
+    return from_data({"frontend": frontend, "ekf": dict(ekf)}, "test")
+
+
+def run(made: Cart, chosen: Config) -> tuple[Front, list[FrontStep]]:
+    front = Front(chosen, rig(), GY85_IMU, StageClock())
+    assert front.frontend.mode == "planar"
+    steps, waiting, samples = [], list(made.frames), iter(made.samples)
+    for sample in samples:
+        front.add(sample)
+        while waiting and sample.t_ns > waiting[0].t_ns + 40_000_000:
+            steps.append(front.process(waiting.pop(0)))
+    return front, steps
+
+
+@cache
+def driven(**_: object) -> tuple[Cart, Front, list[FrontStep]]:
+    made = cart(9.0, 0.6)
+    return made, *run(made, config())
+
+
+def test_it_starts_at_rest_and_the_filter_is_metric() -> None:
+    made, front, steps = driven()
+    assert front.initialisation is not None and front.ekf_coupling == "loose"
+    true, seen = made.T_world_body[len(steps) - 1], steps[-1].T_odom_body
+    first = next(i for i, s in enumerate(steps) if s.T_odom_body is not None)
+    way = np.linalg.norm(np.diff(made.T_world_body[:, :3, 3], axis=0), axis=1).sum()
+    assert seen is not None and steps[first].T_odom_body is not None
+    a = invert(made.T_world_body[first]) @ true
+    b = invert(steps[first].T_odom_body) @ seen
+    print(f"off by {np.linalg.norm((a - b)[:2, 3]) / way:.2%} of {way:.1f} m")
+    assert np.linalg.norm((a - b)[:2, 3]) < 0.012 * way
+    assert front.all_counters["ekf"]["vo_gated"] <= 2
+
+
+def test_the_filter_knows_its_error() -> None:
+    made, _, steps = driven()
+    known = [(T, s.state) for T, s in zip(made.T_world_body, steps, strict=False) if s.state is not None]
+    (T0, first), squares = known[0], []
+    for T, state in known[10:]:
+        a, b = invert(T0) @ T, invert(first.T_world_body) @ state.T_world_body
+        off = first.T_world_body[:3, :3] @ (a - b)[:3, 3]
+        P = state.covariance[3:6, 3:6] - first.covariance[3:6, 3:6]
+        squares.append(off @ np.linalg.solve(P + 1e-8 * np.eye(3), off) / 3.0)
+    print(f"NEES of position per degree of freedom {np.mean(squares):.2f}")
+    assert np.mean(squares) < 3.0
+
+
+def test_it_stays_where_it_stands() -> None:
+    made = cart(12.0, 0.0)
+    front, steps = run(made, config())
+    poses = [s.T_odom_body for s in steps if s.T_odom_body is not None]
+    off = np.array([se3_log(invert(poses[0]) @ T) for T in poses])
+    print(f"{np.abs(off[:, 3:]).max() * 1e3:.2f} mm, {np.rad2deg(np.abs(off[:, :3]).max()):.3f} deg")
+    assert np.abs(off[:, 3:]).max() < 0.005 and np.rad2deg(np.abs(off[:, :3]).max()) < 0.2
+    assert front.counters["frames_at_rest"] > 0.5 * len(steps)
+
+
+def test_wheels_carry_it_over_a_floor_without_texture() -> None:
+    made = cart(9.0, 0.6, blank=(45, 65))
+    ends = {}
+    for name, chosen in (("alone", config()), ("wheels", config(nonholonomic=True, floor_sigma_m=0.01))):
+        front, steps = run(made, chosen)
+        assert front.counters["frames_lost"] >= 18
+        lost = steps[60].state
+        assert lost is not None and not steps[60].track.keyframe
+        a = invert(made.T_world_body[44]) @ made.T_world_body[64]
+        assert steps[44].T_odom_body is not None and steps[64].T_odom_body is not None
+        b = invert(steps[44].T_odom_body) @ steps[64].T_odom_body
+        ends[name] = float(np.linalg.norm((a - b)[:3, 3]))
+    print(f"2 s without texture: {ends['alone']:.3f} m alone, {ends['wheels']:.3f} m on wheels")
+    assert ends["wheels"] < max(0.15, ends["alone"])
+
+
+def test_a_late_camera_is_found_out() -> None:
+    made = cart(12.0, 0.6, late_s=LATE_S)
+    front, _ = run(made, config())
+    print(f"found {front.camera_clock.applied_s * 1e3:.1f} ms of {-LATE_S * 1e3:.0f}")
+    assert front.camera_clock.applied_s == pytest.approx(-LATE_S, abs=0.006)
