@@ -592,6 +592,26 @@ class MapConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LiveConfig:
+    """Live sensors: processes, and the pose that they publish for control."""
+
+    name: str = "vislam-pose"  # of the shared memory, /dev/shm/NAME, and of the socket NAME.sock
+    send_to: tuple[str, ...] = ("unix",)  # a datagram per sample to: unix[:PATH], udp:HOST:PORT
+    allow_remote: bool = False  # let send_to name other machines
+    base_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what a controller steers, in body axes
+    vision_timeout_s: float = 0.3  # without a correction for so long it is dead reckoning; a lost frame says so at once
+    drift_sigma_m: float = 0.3  # position sigma gained since vision was lost, above which the pose is invalid
+    velocity_sigma_m_s: float = 0.5  # above which it is invalid
+    imu_timeout_s: float = 0.1  # without a sample for so long the pose is old: invalid
+    heartbeat_s: float = 0.05  # between poses while there are no samples, so that a reader sees why
+    event_s: float = 0.5  # so long a passing sensor event stays in the health word
+    rest_speed_m_s: float = 0.1  # without vision, still inertial data mean rest only below this speed and its sigma
+    keyframe_queue: int = 8  # keyframes that may wait for the back end; when half of that wait, fewer are made
+    crowded_spacing: float = 2.0  # factor on the distances between keyframes then
+    realtime_priority: int = 0  # 1 to 99: SCHED_FIFO for the fast process, where the system permits; 0: as others
+
+
+@dataclass(frozen=True, slots=True)
 class ViewConfig:
     """The Rerun recording of a run."""
 
@@ -776,6 +796,7 @@ class Config:
     batch: BatchConfig = field(default_factory=BatchConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
-from vislam.ekf import CameraCalibration, Ekf, MsckfEkf, make_ekf
+from vislam.ekf import CameraCalibration, Correction, Ekf, Hint, MsckfEkf, make_ekf
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
@@ -54,6 +54,21 @@ class FrontStep:
     keyframe_id: int  # the newest keyframe
     T_keyframe_body: Array | None  # relative to it; None: only known by interpolation between keyframes
     keyframes: list[OdometryKeyframe]  # usually none or one; those that waited for gravity come together
+    corrections: list[Correction]  # what the filter was told with it, usually one; none before it has a state
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrontReport:
+    """What the front half has to say of a whole run."""
+
+    mode: str  # of the front end
+    coupling: str | None  # of the filter; None without an IMU
+    start: StartFacts | None  # how gravity was found; None: it was not, or there is no IMU
+    refusal: str  # why there was no first state, when last tried
+    counters: dict[str, dict[str, int]]
+    nis: dict[str, tuple[int, float, int]]  # innovations that the filter accepted, see `Ekf.nis_statistics`
+    noise_warnings: list[str]
+    uniform_s: float  # longest stretch without motion that shows scale
 
 
 class Front:
@@ -111,6 +126,7 @@ class Front:
             self._make_ekf = partial(make_ekf, ekf_config, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
             self._ekf = self._make_ekf(noise=noise)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
+        self._told: list[Correction] = []  # to the filter, with the frame at hand
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
@@ -188,6 +204,11 @@ class Front:
             if self.envelope.add(value) and self.initialisation is None:
                 self._follow_noise()
 
+    def add_hint(self, hint: Hint) -> None:
+        """Tell the filter what holds a body while the camera sees nothing."""
+        if isinstance(self._ekf, Ekf):
+            hint.apply(self._ekf)
+
     def is_ready(self, frame_t_ns: int, newest_frame_t_ns: int) -> bool:
         """Whether a frame can be processed: an inertial sample newer than it is there, or none will come in time."""
         if not self._has_imu:
@@ -224,7 +245,8 @@ class Front:
             T_keyframe_body = np.eye(4)
         self._last_frame_t_ns = frame.t_ns
         self._follow_clock(track.vo)
-        return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready)
+        told, self._told = self._told, []
+        return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready, told)
 
     def feed_back(self, update: GraphUpdate) -> None:
         """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
@@ -242,6 +264,15 @@ class Front:
         if self._has_imu and self.initialisation is None and self.frontend.mode != "mono":
             return self._release(self._T_upright)
         return []
+
+    def report(self) -> FrontReport:
+        """Return what there is to say of the run so far."""
+        return FrontReport(
+            self.frontend.mode, self.ekf_coupling if self.noise is not None else None, self.start, self.last_refusal,
+            self.all_counters, self.nis_statistics,
+            self.envelope.warnings(self._config.imu.noise_tolerance) if self.noise is not None else [],
+            self.uniform.longest_s,
+        )  # fmt: skip
 
     @property
     def calibration(self) -> dict[str, float]:
@@ -422,13 +453,11 @@ class Front:
 
     def _correct(self, ekf: Ekf | MsckfEkf, t_ns: int, track: TrackResult, at_rest: bool) -> None:
         """Give the filter what was seen in a frame, in time or later."""
-        ekf.update_vision(track.vo, track.observations)
-        if at_rest:
-            ekf.update_zero_velocity(t_ns)
-        elif self._config.ekf.nonholonomic and isinstance(ekf, Ekf):
-            ekf.update_nonholonomic(t_ns)
-        if track.keyframe is not None:
-            ekf.add_keyframe(track.keyframe.id, t_ns)
+        keyframe_id = None if track.keyframe is None else track.keyframe.id
+        on_wheels = self._config.ekf.nonholonomic and not at_rest
+        correction = Correction(t_ns, track.vo, track.observations, at_rest, on_wheels, keyframe_id)
+        correction.apply(ekf)
+        self._told.append(correction)
 
     def _without_filter(self, vo: VoMeasurement) -> Array | None:
         """Return the pose in `odom` where inertial data stopped before the frame: vision carries the last one on."""

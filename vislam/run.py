@@ -9,24 +9,29 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from vislam.clock import StageClock
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
 from vislam.factor_log import rig_data
+from vislam.factors.gate import EdgeReport
+from vislam.front import FrontReport
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.loop_gallery import LoopGallery
 from vislam.mapping.map_pictures import write_pictures
-from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
-from vislam.messages import Frame, ImuSample, Localisation, LoopDecision, MagSample, Tracking
+from vislam.mapping.mapper import Mapper
+from vislam.memory import FrontMemory, FrontNews, GraphNews, KeyframeEntry, SlamMemory, StartFacts
+from vislam.messages import Array, Frame, ImuSample, Localisation, LoopDecision, MagSample, NavState, Tracking
 from vislam.recording import Recording
 from vislam.runfolder import MapChoice, RunLog, storage, write_json, write_setup
 from vislam.session import Session, SessionWriter, has_begun, recall
-from vislam.slam import KeyframeStep, Slam, Step
+from vislam.slam import Finish, KeyframeStep, Slam, Step
 from vislam.trajectory import Trajectory, align, associate, evaluate
 from vislam.viewer import NullViewer, open_viewer
 
@@ -53,17 +58,105 @@ def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
     return ImuNoise(**{**asdict(recorded), **overrides})
 
 
+class FrontHalf(Protocol):
+    """What a run asks of the front half, in this process or another."""
+
+    @property
+    def start(self) -> StartFacts | None:
+        """How gravity was found."""
+        ...
+
+    @property
+    def news(self) -> FrontNews:
+        """What was learned so far."""
+        ...
+
+    def report(self) -> FrontReport:
+        """Return what there is to say of the run."""
+        ...
+
+
+class FinalGraph(Protocol):
+    """What a run asks of the graph when it is finished."""
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """Keyframes [M]."""
+        ...
+
+    def poses(self) -> Array:
+        """Return T_map_body [M, 4, 4]."""
+        ...
+
+    def states(self) -> list[NavState]:
+        """Return the states of the keyframes; empty without an IMU."""
+        ...
+
+    def edge_reports(self) -> list[EdgeReport]:
+        """Return what became of every offered loop."""
+        ...
+
+
+class BackHalf(Protocol):
+    """What a run asks of the back end, in this process or another."""
+
+    @property
+    def graph(self) -> FinalGraph:
+        """The graph."""
+        ...
+
+    @property
+    def mapper(self) -> Mapper | None:
+        """The map; None where it is off."""
+        ...
+
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Counters of the rooms."""
+        ...
+
+
+class Pipeline(Protocol):
+    """What a run asks of the pipeline beside its steps: `Slam`, or processes that do the same."""
+
+    counters: dict[str, int]
+
+    @property
+    def clock(self) -> StageClock:
+        """Durations of the stages of this process."""
+        ...
+
+    @property
+    def front(self) -> FrontHalf:
+        """The half at the rate of the sensors."""
+        ...
+
+    @property
+    def back(self) -> BackHalf | None:
+        """The half at the rate of keyframes; None before the first."""
+        ...
+
+    def finish(self) -> Finish:
+        """Process what still waits and optimise a last time."""
+        ...
+
+
 class Run:
     """Drives the pipeline over one recording and keeps the run folder."""
 
-    def __init__(self, recording: Recording, config: Config, out: Path, session: SessionWriter) -> None:
-        """Open the outputs in an existing folder; `session` is a new one, or that of a run to `resume`."""
+    def __init__(
+        self, recording: Recording, config: Config, out: Path, session: SessionWriter, slam: Pipeline | None = None
+    ) -> None:
+        """Open the outputs in an existing folder; `session` is a new one, or that of a run to `resume`.
+
+        Without `slam` the pipeline is made here.
+        """
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
         self.recording = recording
         self.config = config
         self.out = out
         self.noise = imu_noise(config.imu, recording.imu_noise)
-        self.slam = Slam(config, recording.rig, self.noise)
+        self.slam: Pipeline = Slam(config, recording.rig, self.noise) if slam is None else slam
         self.log = RunLog()
         self.gallery = LoopGallery()
         self.session = session
@@ -90,6 +183,7 @@ class Run:
         memory = recall(stored)
         if memory is None:
             return False
+        assert isinstance(self.slam, Slam)
         update = self.slam.resume(memory)
         self.base = info.get("map")
         self.log.restore(stored, memory)
@@ -109,6 +203,7 @@ class Run:
 
     def begin_in_map(self, memory: SlamMemory) -> None:
         """Begin in the map of another session, before `execute`."""
+        assert isinstance(self.slam, Slam)
         update = self.slam.begin_in_map(memory)
         self.log.begin_in_map(memory)
         self.base = self.session.base()
@@ -148,6 +243,7 @@ class Run:
             self.viewer.go_on(int(self.log.stamps_ns[0]), poses)
 
     def _feed(self, progress: Progress | None) -> None:
+        assert isinstance(self.slam, Slam)
         clock = self.slam.clock
         values = iter(self._values())
         while True:
@@ -249,7 +345,7 @@ class Run:
         with suppress(DataError):  # too many voxels, or too large a grid: said where they are exported
             octree = mapper.occupancy.max_likelihood_octree()
             self.viewer.log_octree(t_ns, octree.occupied_voxels(), octree.resolution_m)
-            if self.slam.front.first_state is not None:  # else the map is not level
+            if self.slam.front.start is not None:  # else the map is not level
                 grid = mapper.grid()
                 self.viewer.log_grid(t_ns, grid.cells, grid.resolution_m, grid.origin_m, grid.floor_m)
 
@@ -274,7 +370,7 @@ class Run:
         self._show_result(final, truth)
         wall_s = time.perf_counter() - start  # everything but pictures and report
         if self.slam.back is not None and self.slam.back.mapper is not None:
-            is_level = self.slam.front.first_state is not None
+            is_level = self.slam.front.start is not None
             write_pictures(self.slam.back.mapper, self.out / "map", final.positions_m, is_level)
         metrics = self._metrics(final, truth, wall_s, loops)
         write_json(self.out / "metrics.json", metrics)
@@ -321,34 +417,32 @@ class Run:
     def _metrics(
         self, final: Trajectory, truth: Trajectory | None, wall_s: float, loops: dict[str, int]
     ) -> dict[str, Any]:
-        front, back = self.slam.front, self.slam.back
+        front, back = self.slam.front.report(), self.slam.back
         stamps = self.log.stamps_ns
         duration_s = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
         part = stamps[self._first_frame :]
         part_s = float(part[-1] - part[0]) * 1e-9 if len(part) else 0.0
-        counters: dict[str, Any] = {**front.all_counters, "localisation": dict(self.slam.counters)}
+        counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
-            rooms = {"loop": back.loops, "map": back.mapper, "mono depth": back.depth}
-            counters |= {name: dict(room.counters) for name, room in rooms.items() if room is not None}
-        found = front.initialisation
+            counters |= back.counters
         if self.noise is not None:
-            self.warnings += front.envelope.warnings(self.config.imu.noise_tolerance)
+            self.warnings += front.noise_warnings
             sigma_m = self.log.worst_position_sigma_m
             if sigma_m > _LOST_SIGMA_M:
                 self.warnings.append(
                     f"the filter's position was uncertain by {sigma_m:.1f} m (1 sigma) at its worst: too long without "
                     "vision, or without motion that shows scale"
                 )
-        self._doubt_filter(counters)
+        self._doubt_filter(front)
         self._compare_filter_and_graph(final)
-        if self.noise is not None and found is None:
-            self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.last_refusal}")
+        if self.noise is not None and front.start is None:
+            self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.refusal}")
         return {
             "name": self.recording.name,
-            "mode": front.frontend.mode,
+            "mode": front.mode,
             "has_imu": self.noise is not None,
             "coupling": {
-                "ekf": None if self.noise is None else front.ekf_coupling,
+                "ekf": front.coupling,
                 "graph": self.config.graph.coupling,
             },
             "frames": len(self.log),
@@ -360,17 +454,17 @@ class Run:
             "resumed": self.resumed,
             "map": self._found_in_map(),
             "initialisation": {
-                "status": "none" if found is None else str(found.status),
-                "reason": front.last_refusal if found is None else found.reason,
-                "t_s": None if found is None or found.last is None else (found.last.t_ns - int(stamps[0])) * 1e-9,
-                "scale_sigma": None if found is None else found.scale_sigma,
-                "excitation_m_s2": None if found is None else found.excitation_m_s2,
+                "status": "none" if front.start is None else str(front.start.status),
+                "reason": front.refusal if front.start is None else front.start.reason,
+                "t_s": None if front.start is None else (front.start.last.t_ns - int(stamps[0])) * 1e-9,
+                "scale_sigma": None if front.start is None else front.start.scale_sigma,
+                "excitation_m_s2": None if front.start is None else front.start.excitation_m_s2,
             },
             "calibration": front.calibration,
             "accuracy": self._accuracy(final, truth),
             "timing_ms": self.slam.clock.summary_ms(),
             "counters": counters,
-            "nis": front.nis_statistics,
+            "nis": front.nis,
             "problems": dict(self.recording.problems),
             "loops": loops,
             "graph_revisions": self.log.revisions,
@@ -378,15 +472,15 @@ class Run:
             "warnings": self.warnings,
         }
 
-    def _doubt_filter(self, counters: dict[str, Any]) -> None:
+    def _doubt_filter(self, front: FrontReport) -> None:
         """Warn where the filter's numbers hold less than they seem to."""
-        uniform_s = self.slam.front.uniform.longest_s
+        uniform_s = front.uniform_s
         if uniform_s > _UNIFORM_S:
             self.warnings.append(
                 f"uniform motion for {uniform_s:.0f} s: the scale of one camera is held by the IMU's biases alone "
                 "there, and may be off by more than its sigma; accelerate now and then, or use a second camera or depth"
             )
-        ekf = counters.get("ekf", {})
+        ekf = front.counters.get("ekf", {})
         resets, gated, opposed, taken = (
             ekf.get(name, 0) for name in ("soft_resets", "vo_gated", "vo_opposed", "vo_accepted")
         )

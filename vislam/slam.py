@@ -111,6 +111,12 @@ class Back:
         self._words_revision = 0
         self._held = 0  # keyframes of a map that is not to change
 
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Counters of the rooms that there are."""
+        rooms = {"loop": self.loops, "map": self.mapper, "mono depth": self.depth}
+        return {name: dict(room.counters) for name, room in rooms.items() if room is not None}
+
     def restore(self, memory: SlamMemory) -> GraphUpdate:
         """Take over an earlier run; return all its poses. Raises UsageError where loops are made up on purpose."""
         if self._false is not None:
@@ -205,6 +211,17 @@ class Back:
                 self.mapper.move(update)
         if self.depth is not None:
             self.depth.move(update.ids, update.T_map_body)
+
+
+def localised(before: Pieces, after: Pieces, tracking: Tracking, counters: dict[str, int]) -> Localisation:
+    """Return whether the place in the map is known after a frame that changed the pieces so, and count it."""
+    is_joined = after.groups[-1] == 0
+    if is_joined and before.groups[-1] != 0:
+        counters["relocalised"] += 1
+        return Localisation.RELOCALISED
+    is_lost = tracking is Tracking.LOST or not is_joined
+    counters["frames_lost"] += is_lost
+    return Localisation.LOST if is_lost else Localisation.TRACKING
 
 
 class Slam:
@@ -306,16 +323,10 @@ class Slam:
 
     def _localisation(self, tracking: Tracking, keyframes: list[KeyframeStep]) -> Localisation:
         """Return whether the place in the map is known after a frame."""
-        was_joined = self._pieces.groups[-1] == 0
+        before = self._pieces
         if keyframes:
             self._pieces = keyframes[-1].update.pieces
-        is_joined = self._pieces.groups[-1] == 0
-        if is_joined and not was_joined:
-            self.counters["relocalised"] += 1
-            return Localisation.RELOCALISED
-        is_lost = tracking is Tracking.LOST or not is_joined
-        self.counters["frames_lost"] += is_lost
-        return Localisation.LOST if is_lost else Localisation.TRACKING
+        return localised(before, self._pieces, tracking, self.counters)
 
     def _remember(self, front: FrontStep) -> None:
         """Keep a frame for depth from one camera, if odometry knows where it was taken."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from vislam.config import EkfConfig
+from vislam.ekf.correction import Correction, Hint
 from vislam.ekf.filter import Ekf, UpdateResult
 from vislam.ekf.msckf import CameraCalibration, MsckfEkf
 from vislam.imu import ImuNoise
@@ -12,7 +13,7 @@ from vislam.imu import ImuNoise
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.camera import Rig
 
-__all__ = ["CameraCalibration", "Ekf", "MsckfEkf", "UpdateResult", "make_ekf"]
+__all__ = ["CameraCalibration", "Correction", "Ekf", "Hint", "MsckfEkf", "UpdateResult", "make_ekf"]
 
 
 def make_ekf(config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> Ekf | MsckfEkf:

@@ -28,16 +28,17 @@ class Departure:
     restarted: bool = False  # whether tracking was lost a few keyframes ago
 
 
-def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
+def keyframe_reason(departure: Departure, config: FrontEndConfig, spacing: float = 1.0) -> str:
     """Return why the frame should become a keyframe, or an empty string.
 
     A keyframe costs a little drift and a node in the graph; a late one costs tracks. So distance decides, and time only
-    makes sure that the graph hears of a camera that hardly moves.
+    makes sure that the graph hears of a camera that hardly moves. `spacing` widens the distances and times: 1 where
+    the back end keeps up.
     """
     least = config.keyframe_min_alive if departure.fit else config.keyframe_min_alive_unfit
     if departure.alive < least:
         return f"only {departure.alive:.0%} of the tracks left"
-    if not departure.fit or departure.dt_s < config.keyframe_min_interval_s:
+    if not departure.fit or departure.dt_s < spacing * config.keyframe_min_interval_s:
         return ""
     if departure.restarted:
         return "one of the first since tracking was lost"
@@ -49,7 +50,7 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig) -> str:
         (turned_deg, config.keyframe_rotation_deg, f"turned by {turned_deg:.0f} deg"),
         (departure.dt_s, config.keyframe_max_interval_s, f"{departure.dt_s:.1f} s since the last keyframe"),
     )
-    return next((reason for value, limit, reason in limits if value >= limit), "")
+    return next((reason for value, limit, reason in limits if value >= spacing * limit), "")
 
 
 def make_keyframe(

@@ -62,6 +62,7 @@ class MetricFrontEnd:
     def __init__(self, mode: str, config: FrontEndConfig, rig: Rig, depth: DepthSensor, seed: int) -> None:
         """Take the sensor that measures depth; `mode` is only the name."""
         self.mode = mode
+        self.keyframe_spacing = 1.0
         self._config = config
         self._camera = rig.cameras[0]
         self._T_body_cam = rig.T_body_cams[0]
@@ -238,7 +239,7 @@ class MetricFrontEnd:
             fit=self._depth.available(frame),
             restarted=self._since_restart < self._config.restart_keyframes,
         )
-        reason = keyframe_reason(departure, self._config)
+        reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
         if reason:
             new, observations = self._continue_from(frame, attempt)
             return TrackResult(vo, observations, new, departure.parallax_px, reason)

@@ -67,6 +67,7 @@ class MonoFrontEnd:
 
     def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
         """Take the rig's first camera."""
+        self.keyframe_spacing = 1.0
         self._config = config
         self._camera = rig.cameras[0]
         self._T_body_cam = rig.T_body_cams[0]
@@ -264,7 +265,7 @@ class MonoFrontEnd:
             fit=True,
             restarted=self._since_restart < self._config.restart_keyframes,
         )
-        reason = keyframe_reason(departure, self._config)
+        reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
         if reason:
             pixels = motion.pixels.copy()
             self._tracker.begin(frame, good, pixels)

@@ -68,6 +68,7 @@ class PlanarFrontEnd:
 
     def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
         """Take the rig's first camera; raises UsageError where its height above the floor is not known."""
+        self.keyframe_spacing = 1.0
         self._config, self._planar = config, config.planar
         self._camera = rig.cameras[0]
         self._T_body_cam = rig.T_body_cams[0]
@@ -312,7 +313,7 @@ class PlanarFrontEnd:
             fit=True,
             restarted=self._since_restart < self._config.restart_keyframes,
         )
-        reason = self._ran_dry(place) if self._is_split else keyframe_reason(departure, self._config)
+        reason = self._ran_dry(place) if self._is_split else keyframe_reason(departure, self._config, self.keyframe_spacing)
         vo = self._measurement(frame, keyframe.id, place)
         if reason:
             new, observations = self._continue_from(frame, place)

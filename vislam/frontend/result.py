@@ -29,6 +29,7 @@ class FrontEnd(Protocol):
     """Visual odometry that is fed frame by frame."""
 
     mode: str
+    keyframe_spacing: float  # widens the distances between keyframes; 1, unless a live back end does not keep up
 
     def track(
         self,

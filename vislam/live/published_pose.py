@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 
 from vislam.errors import DataError
-from vislam.geometry import quaternion_xyzw_from_rotation, rotation_from_quaternion_xyzw, skew, so3_exp, transform
+from vislam.geometry import quaternion_wxyz, rotation_from_quaternion_xyzw, skew, so3_exp, transform
 from vislam.hw.health import Health
 from vislam.messages import Array, NavState
 
@@ -48,6 +49,7 @@ LAYOUT = np.dtype(
     ]
 )
 _UPPER_6 = np.triu_indices(6)
+_XYZW = [1, 2, 3, 0]
 _UPPER_3 = np.triu_indices(3)
 _CHECKED = SIZE - 4
 
@@ -123,13 +125,13 @@ def pack(pose: PublishedPose) -> bytes:
     record["sequence"], record["health"] = pose.sequence & 0xFFFFFFFF, int(pose.health)
     record["stamp_sample_ns"], record["stamp_publish_ns"] = pose.t_ns, pose.published_ns
     record["position_m"] = pose.T_odom_base[:3, 3]
-    record["orientation_xyzw"] = quaternion_xyzw_from_rotation(pose.T_odom_base[:3, :3])
+    record["orientation_xyzw"] = _quaternion_xyzw(pose.T_odom_base)
     record["velocity_m_s"], record["rate_rad_s"] = pose.velocity_m_s, pose.rate_rad_s
     record["pose_covariance"] = pose.pose_covariance[_UPPER_6]
     record["velocity_covariance"] = pose.twist_covariance[:3, :3][_UPPER_3]
     record["rate_variance"] = np.diag(pose.twist_covariance)[3:]
     record["map_odom_position_m"] = pose.T_map_odom[:3, 3]
-    record["map_odom_orientation_xyzw"] = quaternion_xyzw_from_rotation(pose.T_map_odom[:3, :3])
+    record["map_odom_orientation_xyzw"] = _quaternion_xyzw(pose.T_map_odom)
     record["map_revision"], record["reset_counter"] = pose.map_revision & 0xFFFFFFFF, pose.reset_counter & 0xFFFF
     record["vision_age_ms"] = min(pose.vision_age_s * 1e3, NO_VISION_MS)
     record["crc32"] = zlib.crc32(record.tobytes()[:_CHECKED])
@@ -171,6 +173,10 @@ def unpack(data: bytes | memoryview) -> PublishedPose:
     )
 
 
+def _quaternion_xyzw(T: Array) -> Array:
+    return quaternion_wxyz(np.ascontiguousarray(T[:3, :3]))[_XYZW]
+
+
 def _pose(position_m: Array, orientation_xyzw: Array) -> Array:
     R = rotation_from_quaternion_xyzw(orientation_xyzw.astype(np.float64))
     return transform(R, position_m.astype(np.float64))
@@ -187,19 +193,32 @@ def of_base(
         gyro_variance: (rad/s)^2 of one axis of one sample, white part.
         base_offset_m: [3] the base's origin in body axes; both have the same axes.
     """
-    R, o = state.T_world_body[:3, :3], base_offset_m
+    T = state.T_world_body
     rate = gyro_rad_s - state.gyro_bias_rad_s
-    velocity_body = R.T @ state.velocity_world_m_s
+    velocity, pose_covariance, twist_covariance = _of_base(
+        T, state.velocity_world_m_s, rate, state.covariance, gyro_variance, base_offset_m
+    )
+    return transform(T[:3, :3], T[:3, 3] + T[:3, :3] @ base_offset_m), velocity, rate, pose_covariance, twist_covariance
+
+
+@njit(cache=True, nogil=True)
+def _of_base(
+    T: Array, velocity_m_s: Array, rate_rad_s: Array, P: Array, gyro_variance: float, offset_m: Array
+) -> tuple[Array, Array, Array]:
+    """Return velocity and both covariances of the base; see `of_base`."""
+    R = T[:3, :3].copy()
+    R_T = R.T.copy()
+    lever = skew(offset_m)
+    velocity_body = R_T @ velocity_m_s
     J = np.zeros((6, 15))  # x, y, z, then rotation about the axes of odom
-    J[3:, :3] = R
-    J[:3, :3] = -R @ skew(o)
+    J[:3, :3] = -R @ lever
     J[:3, 3:6] = np.eye(3)
+    J[3:, :3] = R
     K = np.zeros((3, 15))
     K[:, :3] = skew(velocity_body)
-    K[:, 6:9] = R.T
-    K[:, 9:12] = skew(o)  # the rate is the gyro less its bias
+    K[:, 6:9] = R_T
+    K[:, 9:12] = lever  # the rate is the gyro less its bias
     twist = np.zeros((6, 6))
-    twist[:3, :3] = K @ state.covariance @ K.T + gyro_variance * (skew(o) @ skew(o).T)
-    twist[3:, 3:] = state.covariance[9:12, 9:12] + gyro_variance * np.eye(3)
-    T = transform(R.copy(), state.T_world_body[:3, 3] + R @ o)
-    return T, velocity_body + np.cross(rate, o), rate, J @ state.covariance @ J.T, twist
+    twist[:3, :3] = K @ P @ K.T + gyro_variance * (lever @ lever.T)
+    twist[3:, 3:] = P[9:12, 9:12] + gyro_variance * np.eye(3)
+    return velocity_body - lever @ rate_rad_s, J @ P @ J.T, twist

@@ -9,6 +9,7 @@ from __future__ import annotations
 import mmap
 import os
 import struct
+import time
 import zlib
 from contextlib import suppress
 from pathlib import Path
@@ -79,6 +80,11 @@ class SlotReader:
             raise DataError(f"there is no shared memory {path}: {error}; is `vislam live` running?") from error
         self._tail = len(self._memory) - _TAIL.size
 
+    @property
+    def sequence(self) -> int:
+        """Number of the newest value, 0 before the first; costs nothing."""
+        return int(_HEAD.unpack_from(self._memory, 0)[0])
+
     def read(self) -> tuple[int, bytes] | None:
         """Return the sequence number, from 1, and the newest value.
 
@@ -99,3 +105,20 @@ class SlotReader:
     def close(self) -> None:
         """Let go of the memory; may be called twice."""
         self._memory.close()
+
+
+def remove(name: str) -> None:
+    """Remove a slot whose writer was killed, if there is one."""
+    (_FOLDER / name).unlink(missing_ok=True)
+
+
+def wait_for(name: str, timeout_s: float = 60.0) -> SlotReader:
+    """Open a slot that another process is about to make. Raises DataError when it does not."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            return SlotReader(name)
+        except DataError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)

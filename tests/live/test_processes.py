@@ -1,0 +1,162 @@
+"""Whole live runs in real processes, on simulated vision played in real time; nothing here asserts how long it took."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from vislam.config import Config, load
+from vislam.errors import HardwareError, TrackingLostError, UsageError, VislamError
+from vislam.hw.health import Health
+from vislam.live.replay import Outages, ReplaySource
+from vislam.live.run_live import LiveRun
+from vislam.runfolder import prepare
+from vislam.session import Session
+
+_WORLD = "points:laps,rig=rgbd,camera_hz=10,duration_s=12"
+_FILES = {
+    "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "session.db",
+    "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum",
+    "trajectory_truth.tum",
+}  # fmt: skip
+
+
+def settings(name: str) -> Config:
+    return load(None, {"view.enabled": False, "live.name": f"vislam-test-{name}-{os.getpid()}", "live.send_to": ()})
+
+
+def start(tmp_path: Path, name: str, outages: Outages | None = None, world: str = _WORLD) -> tuple[LiveRun, Path]:
+    out = tmp_path / name
+    prepare(out, overwrite=False)
+    source = ReplaySource(world, outages=outages)
+    return LiveRun(source, settings(name), out, world, ["vislam", "live"]), out
+
+
+def left_behind(name: str) -> list[str]:
+    """Return processes and shared memory of a run that should have ended."""
+    children = [p.name() for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    return children + [p.name for p in Path("/dev/shm").glob(f"*vislam-test-{name}-*")]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list[dict]]:
+    """A run to its end, and what was told on the way."""
+    live, out = start(tmp_path_factory.mktemp("live"), "whole")
+    told: list[dict] = []
+    metrics = live.execute(lambda run: told.append(dict(run.notes.get("fast", {}))), duration_s=12.0)
+    assert left_behind("whole") == []
+    return out, metrics, told
+
+
+def test_a_live_run_leaves_the_folder_of_a_run(finished) -> None:
+    out, metrics, _ = finished
+    assert {path.name for path in out.iterdir()} >= _FILES
+    assert json.loads((out / "metrics.json").read_text())["frames"] == metrics["frames"] > 10
+    assert metrics["keyframes"] >= 3
+    assert metrics["counters"]["camera"]["captured"] >= metrics["frames"]
+    stored = Session(out / "session.db")
+    try:
+        assert stored.info()["finished"]
+        assert len(stored.frames()) == metrics["frames"]
+    finally:
+        stored.close()
+
+
+def test_it_finds_the_trajectory(finished) -> None:
+    _, metrics, _ = finished
+    assert metrics["initialisation"]["status"] != "none"
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.25
+    assert metrics["accuracy"]["live"]["ate_rmse_m"] < 0.5
+
+
+def test_no_sample_is_lost_on_the_way_to_vision(finished) -> None:
+    """What the fast process read, the front half has; camera frames may be dropped, and are counted."""
+    _, metrics, told = finished
+    sensor = [note["sensor"] for note in told if "sensor" in note][-1]
+    assert metrics["counters"]["imu"]["samples"] == sensor["samples"] > 500
+    assert metrics["counters"]["imu"]["gaps"] == 0
+    health = Health(told[-1]["status"]["health"])
+    assert Health.LEVELLED in health
+
+
+def test_unplugged_sensors_degrade_and_come_back(tmp_path: Path) -> None:
+    live, out = start(
+        tmp_path, "unplugged", Outages(imu=((8.0, 9.0),), camera=((11.0, 13.0),)),
+        "points:laps,rig=rgbd,camera_hz=10,duration_s=16",
+    )  # fmt: skip
+    seen: list[Health] = []
+    live.execute(
+        lambda run: seen.append(Health(run.notes.get("fast", {}).get("status", {}).get("health", 0))), duration_s=16.0
+    )
+    assert any(Health.IMU_MISSING in h and Health.INVALID in h for h in seen)
+    assert any(Health.DEAD_RECKONING in h for h in seen)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["counters"]["imu"]["gaps"] == 1
+    assert left_behind("unplugged") == []
+
+
+def test_an_interrupt_ends_it_cleanly(tmp_path: Path) -> None:
+    live, out = start(tmp_path, "interrupted")
+    begun = time.monotonic()
+    sent = []
+
+    def interrupt(run: LiveRun) -> None:
+        status = run.notes.get("fast", {}).get("status", {})
+        if not sent and status.get("samples", 0) > 800:
+            sent.append(time.monotonic() - begun)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    metrics = live.execute(interrupt)
+    assert sent
+    assert metrics["frames"] > 0
+    assert {path.name for path in out.iterdir()} >= _FILES
+    assert left_behind("interrupted") == []
+
+
+@pytest.mark.parametrize("role", ["fast", "front", "back", "map"])
+def test_a_killed_process_ends_the_run_with_its_name(role: str, tmp_path: Path) -> None:
+    live, out = start(tmp_path, role)
+
+    def kill(run: LiveRun) -> None:
+        process = run.processes()[role]
+        if run.notes.get("fast", {}).get("status", {}).get("samples", 0) > 400 and process.is_alive():
+            process.kill()
+
+    with pytest.raises(HardwareError, match=f"the {role} process was killed by signal 9"):
+        live.execute(kill)
+    assert (out / "session.db").is_file()
+    if role != "map":
+        assert (out / "metrics.json").is_file()
+    assert left_behind(role) == []
+
+
+def test_what_a_process_raises_comes_home_whole(tmp_path: Path) -> None:
+    """One camera without motion never sees scale: the front half gives up, as in a run of a recording."""
+    out = tmp_path / "run"
+    prepare(out, overwrite=False)
+    world = "points:still,rig=mono,camera_hz=10,duration_s=20"
+    live_settings = load(
+        None, {"view.enabled": False, "init.give_up_s": 2.0, "live.name": f"vislam-test-mono-{os.getpid()}"}
+    )
+    live = LiveRun(ReplaySource(world), live_settings, out, world, ["vislam", "live"])
+    with pytest.raises(TrackingLostError, match="no scale after") as caught:
+        live.execute(duration_s=20.0)
+    assert "in the front process" in "".join(caught.value.__notes__)
+    assert left_behind("mono") == []
+
+
+@pytest.mark.parametrize("setting", ["map.mono_depth.enabled", "ekf.graph_feedback"])
+def test_settings_for_recordings_are_refused(setting: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=setting):
+        LiveRun(ReplaySource(_WORLD), load(None, {setting: True}), tmp_path, _WORLD, [])
+
+
+def test_a_source_without_inertial_data_is_refused() -> None:
+    with pytest.raises(VislamError, match="no simulated world"):
+        ReplaySource("sim:nowhere")

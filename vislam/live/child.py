@@ -1,0 +1,123 @@
+"""What every process of a live run does alike: report, notice the end, and carry its failure home whole."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from typing import Any
+
+from vislam.errors import VislamError
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Everything is loaded and compiled."""
+
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something to tell the user while it runs."""
+
+    role: str
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """How a process ended that should not have."""
+
+    role: str
+    error: Exception | None  # as it was raised, if that can travel
+    traceback: str
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """What the parent tells all."""
+
+    go: Event  # every process is ready
+    stop: Event
+    dead: dict[str, Event]  # by role: it died, and others must not wait for its last word
+
+
+class Life:
+    """Tells a child whether to go on, and its parent how it is."""
+
+    def __init__(self, role: str, report: Connection, signals: Signals) -> None:
+        """Keep the parent's id: with another parent, the old one is dead."""
+        self.role = role
+        self._report = report
+        self._signals = signals
+        self._parent = os.getppid()
+        self._asked = 0.0
+        self._is_orphan = False
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the run is to end, because somebody said so or the parent is gone."""
+        return self._signals.stop.is_set() or self.is_orphan
+
+    @property
+    def is_orphan(self) -> bool:
+        """Whether the parent is gone; asked of the system four times a second."""
+        now = time.monotonic()
+        if now - self._asked > 0.25:
+            self._asked, self._is_orphan = now, os.getppid() != self._parent
+        return self._is_orphan
+
+    def is_dead(self, role: str) -> bool:
+        """Whether another process died before its last word."""
+        return self._signals.dead[role].is_set()
+
+    def ready(self) -> bool:
+        """Say that everything is loaded, wait for the others; False when the run ends before."""
+        self.tell(Ready(self.role))
+        while not self._signals.go.wait(0.1):
+            if self.stopped:
+                return False
+        return True
+
+    def note(self, **values: Any) -> None:
+        """Tell the parent something to show."""
+        self.tell(Note(self.role, values))
+
+    def tell(self, message: Ready | Note | Failure) -> None:
+        """Send a message; a parent that is gone needs none."""
+        try:
+            self._report.send(message)
+        except OSError:
+            self._is_orphan = True
+
+
+def guarded(role: str, report: Connection, signals: Signals, body: Callable[[Life], None]) -> None:
+    """Run a child's body; report whatever it raises, and leave with exit code 1 then.
+
+    Ctrl-C reaches every process of a terminal; only the parent acts on it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    life = Life(role, report, signals)
+    try:
+        body(life)
+    except Exception as error:
+        life.tell(Failure(role, _portable(error), traceback.format_exc()))
+        raise SystemExit(1) from None
+
+
+def _portable(error: Exception) -> Exception | None:
+    """Return an error that the parent can load: one of ours, as it is."""
+    if not isinstance(error, VislamError):
+        return None
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 what this very process wrote
+    except Exception:
+        return None
+    return error

@@ -1,0 +1,26 @@
+"""The moment at which something played back, or simulated, begins: one for all processes of a run."""
+
+from __future__ import annotations
+
+import time
+from multiprocessing import get_context
+
+_LEAD_NS = 200_000_000  # so that every process is there when it begins
+
+
+class Epoch:
+    """CLOCK_MONOTONIC ns of the beginning; the first who asks decides."""
+
+    def __init__(self) -> None:
+        self._value = get_context("spawn").Value("q", 0)
+
+    def begin_ns(self) -> int:
+        """Return when it begins, or began."""
+        with self._value.get_lock():
+            if self._value.value == 0:
+                self._value.value = time.monotonic_ns() + _LEAD_NS
+            return int(self._value.value)
+
+    def peek_ns(self) -> int:
+        """Return when it begins, 0 while nobody has asked."""
+        return int(self._value.value)

@@ -1,0 +1,226 @@
+"""The fast path: inertial samples through the filter to the published pose, whatever vision and graph are doing.
+
+The filter here is a twin of the one beside vision. It gets the same samples, the same corrections and the same hints,
+and as the answer of a filter depends on the set of measurements only, not on when they came, both agree at all times:
+`odom` is one frame in all processes, and no state has to be sent around.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vislam.config import Config
+from vislam.ekf.correction import Correction, Hint
+from vislam.ekf.filter import Ekf
+from vislam.hw.health import Health
+from vislam.imu import ImuBuffer, ImuNoise, RestDetector
+from vislam.live.messages import CameraHealth, MapMoved, Rebase, Start, ToFast
+from vislam.live.published_pose import PublishedPose, of_base
+from vislam.messages import Array, ImuSample, MagSample, NavState, Tracking
+
+_NS = 1_000_000_000
+_REST_STEP_NS = 100_000_000  # rest is asked for so often
+_LOOK_NS = 50_000_000  # and the sensors for their health
+_UNKNOWN = np.full((6, 6), np.inf)
+
+
+class FastPath:
+    """Owns the filter that is published. One thread; no clock: whoever calls says what time it is."""
+
+    def __init__(
+        self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None]
+    ) -> None:
+        """Prepare an uninitialised filter.
+
+        Args:
+            config: `live`, `ekf`, `init` and `imu` of it are used.
+            noise: of the IMU, until `Start` says better.
+            T_body_camera: [4, 4] of the first camera.
+            publish: takes each pose.
+        """
+        self.counters = {"samples": 0, "rests_without_vision": 0, "wheels_without_vision": 0, "rebases": 0}
+        self._config = config
+        self._noise = noise
+        self._T_body_camera = T_body_camera
+        self._publish = publish
+        self._ekf = self._new_filter(noise)
+        self._buffer = ImuBuffer(config.imu)
+        self._rest = RestDetector(config.init, noise)
+        self._rest_t_ns: int | None = None  # until when rest was looked for
+        self._gyro = np.zeros(3)
+        self._offset = np.array(config.live.base_offset_m)
+        self._started = 0
+        self._at_rest = False
+        self._sees = False  # the newest frame was tracked
+        self._rejects = False  # ... and contradicted the filter
+        self._settled_variance = 0.0  # of position, when vision last corrected
+        self._map = MapMoved(0, np.eye(4))
+        self._camera = Health(0)
+        self._events: deque[tuple[int, Health]] = deque()
+        self._looked_ns = 0
+        self._sequence = 0
+        self._newest: PublishedPose | None = None
+
+    @property
+    def filter_counters(self) -> dict[str, int]:
+        """What came to the filter and what became of it."""
+        return self._ekf.counters
+
+    @property
+    def heartbeat_s(self) -> float:
+        """How often to publish while there are no samples."""
+        return self._config.live.heartbeat_s
+
+    def status(self) -> dict[str, Any]:
+        """Return what a person wants to see of the newest pose."""
+        pose = self._newest
+        if pose is None:
+            return {}
+        return {
+            "health": int(pose.health),
+            "samples": self.counters["samples"],
+            "position_m": pose.T_odom_base[:3, 3].tolist(),
+            "speed_m_s": float(np.linalg.norm(pose.velocity_m_s)),
+            "sigma_m": float(np.sqrt(np.trace(pose.pose_covariance[:3, :3]))),
+            "map_revision": pose.map_revision,
+            "vision_age_s": pose.vision_age_s,
+        }
+
+    def add(self, value: ImuSample | MagSample) -> Hint | None:
+        """Take a sample; return what vision's filter has to be told of it besides."""
+        if isinstance(value, MagSample):
+            return None
+        self.counters["samples"] += 1
+        if not self._buffer.add(value):
+            return None
+        self._ekf.predict(value)
+        self._gyro = value.gyro_rad_s
+        return self._look_for_rest(value.t_ns)
+
+    def correct(self, message: ToFast) -> None:
+        """Take what vision, camera or graph say, late as it may be."""
+        if isinstance(message, Correction):
+            answer = message.apply(self._ekf)
+            is_seen = message.vo.tracking is not Tracking.LOST
+            self._follow_vision(is_seen, answer.accepted, is_seen and not np.isnan(answer.nis) and not answer.accepted)
+            self._at_rest = message.at_rest
+        elif isinstance(message, Rebase):
+            self.counters["rebases"] += 1
+            self._ekf.initialise(message.state)
+            self._follow_vision(message.is_tracking, message.is_tracking, False)
+            self._at_rest = message.at_rest
+        elif isinstance(message, MapMoved):
+            if message.revision >= self._map.revision:
+                self._map = message
+        elif isinstance(message, CameraHealth):
+            self._camera = message.health
+        else:
+            self._start(message)
+
+    def publish(self, now_ns: int, look: Callable[[], Health]) -> None:
+        """Hand out the pose of the newest sample.
+
+        Args:
+            now_ns: CLOCK_MONOTONIC.
+            look: asks the inertial sensor for its health word; called now and then.
+        """
+        if now_ns - self._looked_ns >= _LOOK_NS:
+            self._looked_ns = now_ns
+            self._events.append((now_ns, look()))
+            while now_ns - self._events[0][0] > self._config.live.event_s * _NS:
+                self._events.popleft()
+        state = self._ekf.state() if self._started else None
+        self._sequence += 1
+        self._newest = self._pose(state, now_ns)
+        self._publish(self._newest)
+
+    def _pose(self, state: NavState | None, now_ns: int) -> PublishedPose:
+        resets = self._started - 1 + self._ekf.counters["soft_resets"]
+        if state is None:
+            base = np.eye(4), np.zeros(3), np.zeros(3), _UNKNOWN, _UNKNOWN
+            resets, newest_ns = 0, self._buffer.newest_t_ns or 0
+        else:
+            variance = self._noise.gyro_noise_density**2 * self._noise.rate_hz
+            base, newest_ns = of_base(state, self._gyro, variance, self._offset), state.t_ns
+        T, velocity, rate, pose_covariance, twist_covariance = base
+        return PublishedPose(
+            newest_ns, now_ns, self._sequence, self._health(state, now_ns - newest_ns), T, velocity, rate,
+            pose_covariance, twist_covariance, self._map.T_map_odom, self._map.revision, resets,
+            self._ekf.dead_reckoning_s,
+        )  # fmt: skip
+
+    def _health(self, state: NavState | None, age_ns: int) -> Health:
+        config = self._config.live
+        health = self._camera
+        for _, event in self._events:
+            health |= event
+        if age_ns > config.imu_timeout_s * _NS:
+            health |= Health.IMU_MISSING | Health.INVALID
+        if state is None:
+            return health | Health.INVALID
+        health |= Health.LEVELLED
+        sees = self._sees and self._ekf.dead_reckoning_s <= config.vision_timeout_s
+        health |= Health.VISION_OK if sees else Health.DEAD_RECKONING
+        if self._at_rest:
+            health |= Health.AT_REST
+        if self._rejects:
+            health |= Health.GATE_REJECT
+        drifted = np.trace(state.covariance[3:6, 3:6]) - self._settled_variance
+        if drifted > config.drift_sigma_m**2 or self._velocity_sigma(state) > config.velocity_sigma_m_s:
+            health |= Health.INVALID
+        return health
+
+    def _start(self, start: Start) -> None:
+        """Begin at the first state, with the noise that the samples showed, and catch up with the newest sample."""
+        newest_t_ns = self._buffer.newest_t_ns
+        self._noise = start.noise
+        self._rest.trust(start.noise)
+        self._ekf = self._new_filter(start.noise)
+        span = None if newest_t_ns is None else self._buffer.span(start.state.t_ns, newest_t_ns)
+        if span is not None:
+            for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
+                self._ekf.predict(ImuSample(t_ns, gyro, accel))
+        self._ekf.initialise(start.state, start.vo)
+        self._started += 1
+        self._follow_vision(True, True, False)
+
+    def _new_filter(self, noise: ImuNoise) -> Ekf:
+        return Ekf(self._config.ekf, noise, self._config.imu.gravity_m_s2, self._T_body_camera)
+
+    def _follow_vision(self, sees: bool, accepted: bool, rejects: bool) -> None:
+        self._sees, self._rejects = sees, rejects
+        if accepted and self._ekf.initialised:
+            self._settled_variance = float(np.trace(self._ekf.state().covariance[3:6, 3:6]))
+
+    def _look_for_rest(self, t_ns: int) -> Hint | None:
+        """Hold the drift while vision is away: by rest, or by wheels where `ekf.nonholonomic` says that there are any.
+
+        Still inertial data mean rest where the filter itself sees no speed: an IMU alone cannot tell rest from uniform
+        motion, so a filter that is not sure of its speed is not told.
+        """
+        if self._rest_t_ns is None:
+            self._rest_t_ns = t_ns
+        if t_ns - self._rest_t_ns < _REST_STEP_NS:
+            return None
+        rests = self._rest.add(self._buffer.span(self._rest_t_ns, t_ns))
+        self._rest_t_ns = t_ns
+        if not self._started or self._ekf.dead_reckoning_s <= self._config.live.vision_timeout_s:
+            return None
+        state = self._ekf.state()
+        limit = self._config.live.rest_speed_m_s
+        is_slow = float(np.linalg.norm(state.velocity_world_m_s)) < limit and self._velocity_sigma(state) < limit
+        hint = Hint(t_ns, at_rest=rests and is_slow)
+        self._at_rest = hint.at_rest
+        if not hint.at_rest and not self._config.ekf.nonholonomic:
+            return None
+        hint.apply(self._ekf)
+        self.counters["rests_without_vision" if hint.at_rest else "wheels_without_vision"] += 1
+        return hint
+
+    @staticmethod
+    def _velocity_sigma(state: NavState) -> float:
+        return float(np.sqrt(np.trace(state.covariance[6:9, 6:9])))

@@ -1,0 +1,146 @@
+"""The process that reads the IMU and publishes the pose. It loads neither gtsam, OpenCV, Open3D nor Rerun."""
+
+from __future__ import annotations
+
+import gc
+import os
+import socket
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from vislam.config import Config, LiveConfig
+from vislam.ekf.correction import Correction
+from vislam.hw.health import Health
+from vislam.hw.source import InertialSource
+from vislam.imu import ImuNoise
+from vislam.live.child import Life
+from vislam.live.fast import FastPath
+from vislam.live.latency import Latency
+from vislam.live.messages import Start
+from vislam.live.published_pose import PublishedPose
+from vislam.live.publisher import PosePublisher
+from vislam.live.stream import SampleSender
+from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
+
+_NS = 1_000_000_000
+_READ_S = 0.005  # most that reading waits: messages of vision are looked for in between
+_NOTE_S = 0.5
+
+
+def run(
+    life: Life,
+    config: Config,
+    noise: ImuNoise,
+    T_body_camera: Array,
+    open_source: Callable[[], InertialSource],
+    samples: socket.socket,
+    inbox: list[Connection],
+) -> None:
+    """Read, predict, publish, until the run ends; then end the stream of samples.
+
+    Args:
+        life: of this process.
+        config: of the run.
+        noise: of the IMU.
+        T_body_camera: [4, 4] of the first camera.
+        open_source: opens the IMU, in this process.
+        samples: to the front process.
+        inbox: from the front and the back process.
+    """
+    warm_up(config, noise, T_body_camera)
+    _take_priority(config.live, life)
+    publisher = PosePublisher(config.live.name, config.live.send_to, config.live.allow_remote)
+    sender = SampleSender(samples)
+    latency = Latency()
+    try:
+        source = open_source()
+        try:
+            if life.ready():
+                _loop(life, FastPath(config, noise, T_body_camera, publisher.publish), source, sender, inbox, latency)
+            counters = source.counters()
+        finally:
+            source.close()
+        life.note(latency_ms=latency.summary_ms(), sensor=counters, publisher=dict(publisher.counters))
+    finally:
+        publisher.close()
+        sender.close()
+
+
+def _loop(
+    life: Life, fast: FastPath, source: InertialSource, sender: SampleSender, inbox: list[Connection], latency: Latency
+) -> None:
+    gc.collect()
+    gc.freeze()
+    gc.disable()  # nothing here makes cycles, and a collection would cost the pose a millisecond
+    heartbeat_ns, published_ns, noted_ns = round(fast.heartbeat_s * _NS), 0, 0
+    while not life.stopped:
+        values = source.read(_READ_S)
+        for value in values:
+            hint = fast.add(value)
+            if isinstance(value, ImuSample):
+                published_ns = time.monotonic_ns()
+                fast.publish(published_ns, source.health)
+                latency.add(time.monotonic_ns() - value.t_ns)
+            sender.send(value)
+            if hint is not None:
+                sender.send(hint)
+        if not values:
+            sender.flush()
+        for connection in list(inbox):
+            _take_messages(connection, fast, inbox)
+        now_ns = time.monotonic_ns()
+        if now_ns - published_ns > heartbeat_ns:
+            published_ns = now_ns
+            fast.publish(now_ns, source.health)
+        if now_ns - noted_ns > _NOTE_S * _NS:
+            noted_ns = now_ns
+            life.note(status=fast.status(), latency_ms=latency.summary_ms())
+
+
+def _take_messages(connection: Connection, fast: FastPath, inbox: list[Connection]) -> None:
+    """Take all that is here; a process that has ended sends no more."""
+    try:
+        while connection.poll():
+            fast.correct(connection.recv())
+    except (EOFError, OSError):
+        inbox.remove(connection)
+
+
+def _take_priority(live: LiveConfig, life: Life) -> None:
+    if live.realtime_priority <= 0:
+        return
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(live.realtime_priority))
+    except OSError as error:
+        life.note(
+            warning=f"no real-time priority for the pose ({error}); see docs/cart.md, or --live.realtime-priority 0"
+        )
+
+
+def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
+    """Run all that is compiled once: the first sample and the first frame must not wait for a compiler."""
+    rest = np.array([0.0, 0.0, config.imu.gravity_m_s2])
+    dt_ns = round(_NS / noise.rate_hz)
+    fast = FastPath(config, noise, T_body_camera, _ignore)
+    keyframe = VoMeasurement(60 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
+    frame = VoMeasurement(100 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
+    nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+    state = NavState(keyframe.t_ns, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15) * 1e-4)
+    for k in range(1, 200):
+        fast.add(ImuSample(k * dt_ns, np.zeros(3), rest))
+        if k == 80:
+            fast.correct(Start(state, keyframe, noise))
+        if k == 120:
+            fast.correct(Correction(frame.t_ns, frame, nothing, True, False, 1))
+        fast.publish(k * dt_ns, _well)
+
+
+def _ignore(pose: PublishedPose) -> None:
+    """Publish nothing."""
+
+
+def _well() -> Health:
+    return Health(0)

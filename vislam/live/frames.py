@@ -1,0 +1,61 @@
+"""A camera as the front process sees it: the newest frame, or none."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import cv2
+
+from vislam.hw.health import Health
+from vislam.hw.source import ImageSource
+from vislam.messages import Frame
+
+
+class FrameSource(Protocol):
+    """Cameras of a rig that keep their newest frame only; the frame's index tells how many were dropped."""
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the newest frame not yet returned, waiting at most `timeout_s`; None if none came."""
+        ...
+
+    def health(self) -> Health:
+        """Return CAMERA_MISSING or nothing."""
+        ...
+
+    def counters(self) -> dict[str, int]:
+        """Return frames captured, dropped as too old, and faults since the start."""
+        ...
+
+    def close(self) -> None:
+        """Give the device back; may be called twice."""
+        ...
+
+
+class OneCamera:
+    """Frames of one camera."""
+
+    def __init__(self, camera: ImageSource) -> None:
+        """Own the camera."""
+        self._camera = camera
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the newest image as a frame; see `FrameSource`."""
+        captured = self._camera.read(timeout_s)
+        if captured is None:
+            return None
+        if captured.image.ndim == 2:
+            return Frame(captured.t_ns, captured.index, (captured.image,))
+        grey = cv2.cvtColor(captured.image, cv2.COLOR_BGR2GRAY)
+        return Frame(captured.t_ns, captured.index, (grey,), captured.image)
+
+    def health(self) -> Health:
+        """Return that of the camera."""
+        return self._camera.health()
+
+    def counters(self) -> dict[str, int]:
+        """Return those of the camera."""
+        return self._camera.counters()
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._camera.close()

@@ -1,0 +1,213 @@
+"""The process that sees: frames and samples through the front half, corrections to the pose, keyframes to the back."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.queues import Queue
+from queue import Full
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vislam.camera import Rig
+from vislam.clock import StageClock
+from vislam.config import Config
+from vislam.ekf.correction import Hint
+from vislam.errors import DataError, HardwareError
+from vislam.front import Front, FrontStep
+from vislam.frontend.result import no_observations
+from vislam.hw.health import Health
+from vislam.imu import ImuNoise
+from vislam.live.child import Life
+from vislam.live.frames import FrameSource
+from vislam.live.handover import FrontEnded, KeyframeOut, Seen
+from vislam.live.messages import CameraHealth, Rebase, Start, ToFast
+from vislam.live.publisher import PoseReader
+from vislam.live.rehearsal import rehearse_front
+from vislam.live.stream import SampleReceiver, Value
+from vislam.messages import Array, Frame, Keyframe, Tracking
+
+_READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
+_PUT_S = 0.1
+
+
+def run(
+    life: Life,
+    config: Config,
+    rig: Rig,
+    noise: ImuNoise,
+    open_camera: Callable[[], FrameSource],
+    samples: socket.socket,
+    to_fast: Connection,
+    to_back: Queue[Any],
+    to_map: Queue[Any],
+) -> None:
+    """Process frames until the samples end; then tell the back and the map process that there are no more.
+
+    Args:
+        life: of this process.
+        config: of the run.
+        rig: the cameras.
+        noise: of the IMU.
+        open_camera: opens them, in this process.
+        samples: from the fast process.
+        to_fast: corrections.
+        to_back: `KeyframeOut`, bounded; None ends it.
+        to_map: `Seen`, then `FrontEnded`.
+    """
+    cv2.setNumThreads(1)
+    rehearse_front(config, rig, noise)
+    camera = open_camera()
+    try:
+        process = FrontProcess(life, config, rig, noise, to_fast, to_back, to_map)
+        if life.ready():
+            process.loop(camera, SampleReceiver(samples))
+            process.end()
+        process.closing(camera.counters())
+    finally:
+        camera.close()
+
+
+class FrontProcess:
+    """Owns the front half of this run and the ends of its wires."""
+
+    def __init__(
+        self, life: Life, config: Config, rig: Rig, noise: ImuNoise, to_fast: Connection, to_back: Queue[Any],
+        to_map: Queue[Any],
+    ) -> None:  # fmt: skip
+        self.clock = StageClock()
+        self.front = Front(config, rig, noise, self.clock)
+        self._life, self._config = life, config
+        self._to_fast, self._to_back, self._to_map = to_fast, to_back, to_map
+        self._frames: deque[Frame] = deque()
+        self._is_started = False
+        self._begins_back = True
+        self._camera_health = Health(0)
+        self._frames_taken = 0
+        self._poses: PoseReader | None = None
+        self._counters = {"crowded_frames": 0, "waits_for_back": 0}
+
+    def loop(self, camera: FrameSource, samples: SampleReceiver) -> None:
+        """Take frames and samples until the samples end."""
+        while not samples.ended and not self._life.is_orphan:
+            samples.receive(self._take)
+            frame = camera.read(_READ_S)
+            if frame is not None:
+                self._frames.append(frame)
+            self._follow_camera(camera.health())
+            while self._frames and self.front.is_ready(self._frames[0].t_ns, self._frames[-1].t_ns):
+                samples.receive(self._take)
+                self._process(self._frames.popleft())
+
+    def end(self) -> None:
+        """Process what still waits."""
+        while self._frames:
+            self._process(self._frames.popleft())
+        for odometry in self.front.give_up_waiting():
+            self._put_keyframe(KeyframeOut(odometry, *self._first()))
+
+    def closing(self, camera_counters: dict[str, int]) -> None:
+        """Say good-bye to the others; what happened goes to the map process, which writes it down."""
+        self._put(self._to_back, None)
+        report = self.front.report()
+        report = replace(report, counters={**report.counters, "camera": camera_counters, "live": self._counters})
+        ended = FrontEnded(report, self.front.start, self.front.news, self.clock.summary_ms())
+        self._put(self._to_map, ended)
+
+    def _take(self, value: Value) -> None:
+        if isinstance(value, Hint):
+            self.front.add_hint(value)
+        else:
+            self.front.add(value)
+
+    def _process(self, frame: Frame) -> None:
+        is_crowded = self._to_back.qsize() >= self._config.live.keyframe_queue // 2
+        self.front.frontend.keyframe_spacing = self._config.live.crowded_spacing if is_crowded else 1.0
+        self._counters["crowded_frames"] += is_crowded
+        step = self.front.process(frame)
+        self._correct(step)
+        for odometry in step.keyframes:
+            self._put_keyframe(KeyframeOut(odometry, *self._first()))
+        shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
+        self._frames_taken += 1
+        seen = Seen(light(step, shows), self._T_map_odom(), self.front.start, self.front.news)
+        try:
+            self._to_map.put_nowait(seen)
+        except Full:
+            raise HardwareError(
+                "the map process does not take frames any more; is the disk of --out stuck, or the machine too slow?"
+            ) from None
+
+    def _correct(self, step: FrontStep) -> None:
+        """Tell the fast process's filter what this one was told."""
+        found = self.front.initialisation
+        if not self._is_started and found is not None and found.last is not None and self.front.noise is not None:
+            self._is_started = True
+            self._send(Start(found.last, step.track.vo, self.front.noise))
+        if self.front.ekf_coupling == "tight":
+            if step.state is not None:
+                is_tracking = step.track.vo.tracking is not Tracking.LOST
+                at_rest = any(correction.at_rest for correction in step.corrections)
+                self._send(Rebase(step.state, is_tracking, at_rest))
+            return
+        for correction in step.corrections:
+            self._send(replace(correction, observations=no_observations()))
+
+    def _follow_camera(self, health: Health) -> None:
+        if health != self._camera_health:
+            self._camera_health = health
+            self._send(CameraHealth(health))
+
+    def _send(self, message: ToFast) -> None:
+        try:
+            self._to_fast.send(message)
+        except OSError:  # the fast process has ended; the end of the samples says so in a moment
+            return
+
+    def _first(self) -> tuple[Any, Any]:
+        """Return what the back end has to know before its first keyframe."""
+        if not self._begins_back:
+            return None, None
+        self._begins_back = False
+        return self.front.noise, self.front.first_state
+
+    def _put_keyframe(self, keyframe: KeyframeOut) -> None:
+        """Hand a keyframe to the back end; where it has too many, vision waits and the pose is dead reckoning."""
+        self._counters["waits_for_back"] += self._to_back.full()
+        self._put(self._to_back, keyframe)
+
+    def _put(self, queue: Queue[Any], value: object) -> None:
+        while not (self._life.is_orphan or self._life.is_dead("back")):
+            try:
+                queue.put(value, timeout=_PUT_S)
+                return
+            except Full:
+                continue
+
+    def _T_map_odom(self) -> Array:
+        """Return where `odom` is in `map` as it is published now."""
+        if self._poses is None:
+            try:
+                self._poses = PoseReader(self._config.live.name)
+            except DataError:
+                return np.eye(4)
+        pose = self._poses.latest()
+        return np.eye(4) if pose is None else pose.T_map_odom
+
+
+def light(step: FrontStep, shows: bool) -> FrontStep:
+    """Return a step without what comes to the map process from the back end; with pictures only if it `shows` them."""
+    frame, track = step.frame, step.track
+    bare = replace(frame, images=(), color=None, depth_m=None, tracks=None)
+    keyframe = track.keyframe
+    if keyframe is not None:
+        keyframe = Keyframe(keyframe.id, keyframe.t_ns, bare, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
+    observations = track.observations if shows else no_observations()
+    track = replace(track, keyframe=keyframe, observations=observations)
+    shown = replace(frame, depth_m=None, tracks=None) if shows else bare
+    return replace(step, frame=shown, track=track, keyframes=[], corrections=[])

@@ -1,0 +1,79 @@
+"""What goes from the front and the back process to the map process, and from the front to the back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.factors.gate import EdgeReport
+from vislam.front import FrontReport, FrontStep
+from vislam.imu import ImuNoise
+from vislam.memory import FrontNews, GraphNews, StartFacts
+from vislam.messages import Array, GraphUpdate, NavState
+from vislam.odometry_keyframe import OdometryKeyframe
+
+Timings = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeOut:
+    """A keyframe for the back end; the first one brings the noise of the IMU and the first state."""
+
+    odometry: OdometryKeyframe
+    noise: ImuNoise | None
+    first_state: NavState | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """One frame after the front half, with what was published then and what was known."""
+
+    step: FrontStep
+    T_map_odom: Array  # [4, 4]
+    start: StartFacts | None
+    news: FrontNews
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrontEnded:
+    """The last word of the front process."""
+
+    report: FrontReport
+    start: StartFacts | None
+    news: FrontNews
+    timings: Timings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EndedGraph:
+    """The graph after it was finished, as plain values; see `vislam.run.FinalGraph`."""
+
+    ids: NDArray[np.int64]
+    T_map_body: Array  # [M, 4, 4]
+    nav_states: list[NavState]
+    reports: list[EdgeReport]
+
+    def poses(self) -> Array:
+        """Return T_map_body [M, 4, 4]."""
+        return self.T_map_body
+
+    def states(self) -> list[NavState]:
+        """Return the states of the keyframes."""
+        return self.nav_states
+
+    def edge_reports(self) -> list[EdgeReport]:
+        """Return what became of every offered loop."""
+        return self.reports
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BackEnded:
+    """The last word of the back process."""
+
+    graph: EndedGraph | None  # None: not one keyframe came
+    update: GraphUpdate | None
+    news: GraphNews | None
+    counters: dict[str, dict[str, int]]
+    timings: Timings

@@ -1,0 +1,139 @@
+"""A recording in real time, as if its sensors were plugged in: for trying out settings, and for tests."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from vislam.errors import DataError
+from vislam.hw.health import Health
+from vislam.live.child import Life
+from vislam.live.epoch import Epoch
+from vislam.live.frames import FrameSource
+from vislam.live.replayed_imu import InertialTable, ReplayedImu
+from vislam.messages import Frame, ImuSample, MagSample
+from vislam.recording import Recording
+from vislam.sources import open_source
+from vislam.trajectory import Trajectory
+
+_NS = 1_000_000_000
+_NO_FRAMES_NS = 1 << 62
+_CAMERA_TIMEOUT_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outages:
+    """When sensors are unplugged, in seconds since the beginning: [begin, end) each."""
+
+    imu: tuple[tuple[float, float], ...] = ()
+    camera: tuple[tuple[float, float], ...] = ()
+
+
+class ReplaySource:
+    """Satisfies `LiveSource`: any source of `vislam run` that has an IMU."""
+
+    def __init__(self, uri: str, seed: int = 0, outages: Outages | None = None) -> None:
+        """Read the inertial data of a recording; images are read as they are played.
+
+        Raises UsageError for an unknown source, DataError when it has no inertial data.
+        """
+        recording = open_source(uri, seed)
+        self.name = f"live {recording.name}"
+        self.rig, self.imu_noise = recording.rig, recording.imu_noise
+        self.frame_count, self.problems = 0, recording.problems
+        samples = [value for value in recording.events(_NO_FRAMES_NS) if isinstance(value, ImuSample)]
+        if len(samples) < 2 or recording.imu_noise is None:
+            raise DataError(f"{uri} has no inertial data to play")
+        self._table = InertialTable(
+            np.array([sample.t_ns for sample in samples], dtype=np.int64),
+            np.array([[*sample.gyro_rad_s, *sample.accel_m_s2] for sample in samples]),
+            recording.imu_noise.rate_hz,
+        )
+        self.duration_s: float | None = float(self._table.t_ns[-1] - self._table.t_ns[0]) / _NS
+        self._zero_ns = int(self._table.t_ns[0])
+        self._uri, self._seed = uri, seed
+        self._outages = outages or Outages()
+        self._epoch = Epoch()
+
+    def inertial(self) -> Callable[[], ReplayedImu]:
+        """Return what plays the samples."""
+        return partial(ReplayedImu, self._table, self._epoch, self._outages.imu)
+
+    def cameras(self) -> Callable[[], FrameSource]:
+        """Return what plays the frames."""
+        return partial(ReplayedFrames, self._uri, self._seed, self._zero_ns, self._epoch, self._outages.camera)
+
+    def helpers(self) -> dict[str, Callable[[Life], None]]:
+        """Return nothing: it needs no other processes."""
+        return {}
+
+    def close(self) -> None:
+        """Do nothing: no memory is shared."""
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        """Raise DataError: live sensors cannot be read twice."""
+        raise DataError(f"{self.name} is live; run {self._uri} to process the recording itself")
+
+    def truth(self) -> Trajectory | None:
+        """Return the truth at the times when it was played."""
+        truth = open_source(self._uri, self._seed).truth()
+        shift_ns = self._epoch.begin_ns() - self._zero_ns
+        return None if truth is None else Trajectory(truth.t_ns + shift_ns, truth.T_world_body)
+
+
+class ReplayedFrames:
+    """Plays the frames of a recording at their times; those that nobody took in time are dropped and counted."""
+
+    def __init__(
+        self, uri: str, seed: int, zero_ns: int, epoch: Epoch, outages: tuple[tuple[float, float], ...] = ()
+    ) -> None:
+        """Open the recording; `zero_ns` of it is the epoch."""
+        recording: Recording = open_source(uri, seed)
+        self._frames = (value for value in recording.events() if isinstance(value, Frame))
+        self._zero_ns, self._epoch, self._outages = zero_ns, epoch, outages
+        self._next: Frame | None = next(self._frames, None)
+        self._counts = {"captured": 0, "dropped": 0}
+        self._newest_ns: int | None = None
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the newest frame whose time has come; see `FrameSource`."""
+        shift_ns = self._epoch.begin_ns() - self._zero_ns
+        deadline_ns = time.monotonic_ns() + round(timeout_s * _NS)
+        newest: Frame | None = None
+        while True:
+            now_ns = time.monotonic_ns()
+            while self._next is not None and self._next.t_ns + shift_ns <= now_ns:
+                since_s = (self._next.t_ns - self._zero_ns) / _NS
+                if not is_out(since_s, self._outages):
+                    self._counts["captured"] += 1
+                    self._counts["dropped"] += newest is not None
+                    newest = self._next
+                self._next = next(self._frames, None)
+            if newest is not None:
+                self._newest_ns = now_ns
+                return replace(newest, t_ns=newest.t_ns + shift_ns)
+            if now_ns >= deadline_ns:
+                return None
+            time.sleep(min((deadline_ns - now_ns) / _NS, 0.002))
+
+    def health(self) -> Health:
+        """Return CAMERA_MISSING after a second without a frame."""
+        since_ns = self._epoch.begin_ns() if self._newest_ns is None else self._newest_ns
+        return Health.CAMERA_MISSING if time.monotonic_ns() - since_ns > _CAMERA_TIMEOUT_NS else Health(0)
+
+    def counters(self) -> dict[str, int]:
+        """Return frames captured, and dropped as too old."""
+        return dict(self._counts)
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._next = None
+
+
+def is_out(since_s: float, outages: tuple[tuple[float, float], ...]) -> bool:
+    """Return whether a sensor is unplugged."""
+    return any(begin <= since_s < end for begin, end in outages)
