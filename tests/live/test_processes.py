@@ -41,7 +41,7 @@ def start(tmp_path: Path, name: str, outages: Outages | None = None, world: str 
 def left_behind(name: str) -> list[str]:
     """Return processes and shared memory of a run that should have ended."""
     children = [p.name() for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
-    return children + [p.name for p in Path("/dev/shm").glob(f"*vislam-test-{name}-*")]
+    return children + [p.name for p in Path("/dev/shm").glob(f"*vislam-test-{name}-{os.getpid()}*")]
 
 
 @pytest.fixture(scope="module")

@@ -132,7 +132,7 @@ class FollowedPipeline:
     @property
     def back(self) -> _Back | None:
         """The back end; None before the first keyframe."""
-        return None if self._newest_id < 0 and not len(self._map.graph.ids) else self._map
+        return self._map if self._newest_id >= 0 else None
 
     def steps(self) -> Iterator[Step]:
         """Yield a step per frame, until the front process ends."""
@@ -157,11 +157,12 @@ class FollowedPipeline:
         self._newest_id = 1 << 62
         keyframes = self._ripe()
         timings = {} if self.front.ended is None else self.front.ended.timings
+        if ended is None or ended.graph is None:
+            self._newest_id = -1  # there is no graph to ask
         if ended is None:
+            self.clock.add(timings)
             return Finish([], keyframes, None, None)
         self.clock.add(timings | ended.timings)
-        if ended.graph is None:
-            self._newest_id = -1
         if ended.update is not None and self._map.mapper is not None:
             with self.clock.measure("map finish"):
                 self._map.mapper.move(ended.update)

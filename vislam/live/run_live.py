@@ -213,8 +213,12 @@ class LiveRun:
                 elif isinstance(message, Note):
                     self.notes[role] = {**self.notes.get(role, {}), **message.values}
                     self.metrics = message.values.get("metrics", self.metrics)
-                elif self._failure is None:
-                    self._failure = _raised(message)
+                else:
+                    raised = _raised(message)
+                    if self._failure is None:
+                        self._failure = raised
+                    else:
+                        self._failure.add_note(f"then: {raised}")
         except (EOFError, OSError):
             child.report.close()
 
