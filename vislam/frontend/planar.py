@@ -313,7 +313,9 @@ class PlanarFrontEnd:
             fit=True,
             restarted=self._since_restart < self._config.restart_keyframes,
         )
-        reason = self._ran_dry(place) if self._is_split else keyframe_reason(departure, self._config, self.keyframe_spacing)
+        reason = (
+            self._ran_dry(place) if self._is_split else keyframe_reason(departure, self._config, self.keyframe_spacing)
+        )
         vo = self._measurement(frame, keyframe.id, place)
         if reason:
             new, observations = self._continue_from(frame, place)
