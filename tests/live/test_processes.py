@@ -78,8 +78,8 @@ def test_it_finds_the_trajectory(finished) -> None:
 def test_no_sample_is_lost_on_the_way_to_vision(finished) -> None:
     """What the fast process read, the front half has; camera frames may be dropped, and are counted."""
     _, metrics, told = finished
-    sensor = [note["sensor"] for note in told if "sensor" in note][-1]
-    assert metrics["counters"]["imu"]["samples"] == sensor["samples"] > 500
+    assert metrics["counters"]["imu"]["samples"] == metrics["live"]["counters"]["sensor_samples"] > 500
+    assert metrics["live"]["latency_ms"]["count"] == metrics["live"]["counters"]["samples"]
     assert metrics["counters"]["imu"]["gaps"] == 0
     health = Health(told[-1]["status"]["health"])
     assert Health.LEVELLED in health

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from multiprocessing.queues import Queue
-from queue import Empty, Full
-from typing import Any
 
 import cv2
 
@@ -16,6 +13,7 @@ from vislam.config import Config
 from vislam.imu import ImuNoise
 from vislam.live.child import Life
 from vislam.live.handover import BackEnded, EndedGraph, KeyframeOut
+from vislam.live.mail import Inbox, Outbox
 from vislam.live.messages import MapMoved
 from vislam.live.rehearsal import rehearse
 from vislam.slam import Back
@@ -24,8 +22,8 @@ _WAIT_S = 0.1
 
 
 def run(
-    life: Life, config: Config, rig: Rig, noise: ImuNoise, keyframes: Queue[Any], to_fast: Connection,
-    to_map: Queue[Any],
+    life: Life, config: Config, rig: Rig, noise: ImuNoise, keyframes: Connection, to_fast: Connection,
+    to_map: Connection,
 ) -> None:  # fmt: skip
     """Take keyframes until the front process ends them; then finish the graph and hand it over.
 
@@ -34,9 +32,9 @@ def run(
         config: of the run; the map belongs to another process.
         rig: the cameras.
         noise: of the IMU, as it is rehearsed with.
-        keyframes: `KeyframeOut` from the front process, None at the end.
+        keyframes: `KeyframeOut` from the front process, until it closes it or is killed.
         to_fast: `MapMoved`, one per revision.
-        to_map: `KeyframeStep`, then `BackEnded`; bounded.
+        to_map: `KeyframeStep`, then `BackEnded`.
     """
     cv2.setNumThreads(1)
     config = replace(config, map=replace(config.map, enabled=False))
@@ -44,28 +42,28 @@ def run(
     life.ready()
     clock = StageClock()
     back: Back | None = None
-    while (keyframe := _next(life, keyframes)) is not None:
+    inbox, outbox = Inbox(keyframes), Outbox(to_map, config.live.keyframe_queue)
+    while (keyframe := _next(life, inbox)) is not None:
         if back is None:
             back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, keyframe.odometry.T_odom_body)
         step = back.add(keyframe.odometry, [])
         _tell(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
-        _put(life, to_map, step)
+        _put(life, outbox, step)
     if back is None:
-        _put(life, to_map, BackEnded(None, None, None, {}, clock.summary_ms()))
-        return
-    update = back.finish()
-    graph = EndedGraph(back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports())
-    _put(life, to_map, BackEnded(graph, update, back.graph.take_news(), back.counters, clock.summary_ms()))
+        ended = BackEnded(None, None, None, {}, clock.summary_ms())
+    else:
+        update = back.finish()
+        graph = EndedGraph(back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports())
+        ended = BackEnded(graph, update, back.graph.take_news(), back.counters, clock.summary_ms())
+    _put(life, outbox, ended)
+    outbox.close()
 
 
-def _next(life: Life, keyframes: Queue[Any]) -> KeyframeOut | None:
-    while not life.is_orphan:
-        try:
-            keyframe: KeyframeOut | None = keyframes.get(timeout=_WAIT_S)
+def _next(life: Life, keyframes: Inbox) -> KeyframeOut | None:
+    while not (keyframes.is_over or life.is_orphan):
+        keyframe: KeyframeOut | None = keyframes.get(_WAIT_S)
+        if keyframe is not None:
             return keyframe
-        except Empty:
-            if life.is_dead("front"):
-                return None
     return None
 
 
@@ -76,10 +74,6 @@ def _tell(to_fast: Connection, message: MapMoved) -> None:
         return
 
 
-def _put(life: Life, queue: Queue[Any], value: object) -> None:
-    while not life.is_orphan:
-        try:
-            queue.put(value, timeout=_WAIT_S)
-            return
-        except Full:
-            continue
+def _put(life: Life, box: Outbox, value: object) -> None:
+    while not (box.put(value, _WAIT_S) or life.is_orphan):
+        continue

@@ -46,7 +46,6 @@ class Signals:
 
     go: Event  # every process is ready
     stop: Event
-    dead: dict[str, Event]  # by role: it died, and others must not wait for its last word
 
 
 class Life:
@@ -73,10 +72,6 @@ class Life:
         if now - self._asked > 0.25:
             self._asked, self._is_orphan = now, os.getppid() != self._parent
         return self._is_orphan
-
-    def is_dead(self, role: str) -> bool:
-        """Whether another process died before its last word."""
-        return self._signals.dead[role].is_set()
 
     def ready(self) -> bool:
         """Say that everything is loaded, wait for the others; False when the run ends before."""

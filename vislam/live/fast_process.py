@@ -58,12 +58,17 @@ def run(
     try:
         source = open_source()
         try:
+            fast = FastPath(config, noise, T_body_camera, publisher.publish)
             if life.ready():
-                _loop(life, FastPath(config, noise, T_body_camera, publisher.publish), source, sender, inbox, latency)
-            counters = source.counters()
+                _loop(life, fast, source, sender, inbox, latency)
+            counters = {
+                **fast.counters,
+                **publisher.counters,
+                **{f"sensor_{k}": n for k, n in source.counters().items()},
+            }
+            life.note(latency_ms=latency.summary_ms(), counters=counters, filter=fast.filter_counters)
         finally:
             source.close()
-        life.note(latency_ms=latency.summary_ms(), sensor=counters, publisher=dict(publisher.counters))
     finally:
         publisher.close()
         sender.close()

@@ -7,8 +7,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from multiprocessing.queues import Queue
-from queue import Full
 from typing import Any
 
 import cv2
@@ -26,6 +24,7 @@ from vislam.imu import ImuNoise
 from vislam.live.child import Life
 from vislam.live.frames import FrameSource
 from vislam.live.handover import FrontEnded, KeyframeOut, Seen
+from vislam.live.mail import Outbox
 from vislam.live.messages import CameraHealth, Rebase, Start, ToFast
 from vislam.live.publisher import PoseReader
 from vislam.live.rehearsal import rehearse_front
@@ -34,6 +33,7 @@ from vislam.messages import Array, Frame, Keyframe, Tracking
 
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
 _PUT_S = 0.1
+_STEPS = 4096  # frames that may wait for the map process: minutes; then it is stuck
 
 
 def run(
@@ -44,8 +44,8 @@ def run(
     open_camera: Callable[[], FrameSource],
     samples: socket.socket,
     to_fast: Connection,
-    to_back: Queue[Any],
-    to_map: Queue[Any],
+    to_back: Connection,
+    to_map: Connection,
 ) -> None:
     """Process frames until the samples end; then tell the back and the map process that there are no more.
 
@@ -57,14 +57,15 @@ def run(
         open_camera: opens them, in this process.
         samples: from the fast process.
         to_fast: corrections.
-        to_back: `KeyframeOut`, bounded; None ends it.
+        to_back: `KeyframeOut`.
         to_map: `Seen`, then `FrontEnded`.
     """
     cv2.setNumThreads(1)
     rehearse_front(config, rig, noise)
     camera = open_camera()
     try:
-        process = FrontProcess(life, config, rig, noise, to_fast, to_back, to_map)
+        back, follower = Outbox(to_back, config.live.keyframe_queue), Outbox(to_map, _STEPS)
+        process = FrontProcess(life, config, rig, noise, to_fast, back, follower)
         if life.ready():
             process.loop(camera, SampleReceiver(samples))
             process.end()
@@ -77,8 +78,8 @@ class FrontProcess:
     """Owns the front half of this run and the ends of its wires."""
 
     def __init__(
-        self, life: Life, config: Config, rig: Rig, noise: ImuNoise, to_fast: Connection, to_back: Queue[Any],
-        to_map: Queue[Any],
+        self, life: Life, config: Config, rig: Rig, noise: ImuNoise, to_fast: Connection, to_back: Outbox,
+        to_map: Outbox,
     ) -> None:  # fmt: skip
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock)
@@ -113,11 +114,12 @@ class FrontProcess:
 
     def closing(self, camera_counters: dict[str, int]) -> None:
         """Say good-bye to the others; what happened goes to the map process, which writes it down."""
-        self._put(self._to_back, None)
+        self._to_back.close()
         report = self.front.report()
         report = replace(report, counters={**report.counters, "camera": camera_counters, "live": self._counters})
         ended = FrontEnded(report, self.front.start, self.front.news, self.clock.summary_ms())
         self._put(self._to_map, ended)
+        self._to_map.close()
 
     def _take(self, value: Value) -> None:
         if isinstance(value, Hint):
@@ -126,7 +128,7 @@ class FrontProcess:
             self.front.add(value)
 
     def _process(self, frame: Frame) -> None:
-        is_crowded = self._to_back.qsize() >= self._config.live.keyframe_queue // 2
+        is_crowded = len(self._to_back) >= self._config.live.keyframe_queue // 2
         self.front.frontend.keyframe_spacing = self._config.live.crowded_spacing if is_crowded else 1.0
         self._counters["crowded_frames"] += is_crowded
         step = self.front.process(frame)
@@ -136,12 +138,10 @@ class FrontProcess:
         shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
         self._frames_taken += 1
         seen = Seen(light(step, shows), self._T_map_odom(), self.front.start, self.front.news)
-        try:
-            self._to_map.put_nowait(seen)
-        except Full:
+        if not self._to_map.put(seen):
             raise HardwareError(
                 "the map process does not take frames any more; is the disk of --out stuck, or the machine too slow?"
-            ) from None
+            )
 
     def _correct(self, step: FrontStep) -> None:
         """Tell the fast process's filter what this one was told."""
@@ -178,16 +178,12 @@ class FrontProcess:
 
     def _put_keyframe(self, keyframe: KeyframeOut) -> None:
         """Hand a keyframe to the back end; where it has too many, vision waits and the pose is dead reckoning."""
-        self._counters["waits_for_back"] += self._to_back.full()
+        self._counters["waits_for_back"] += len(self._to_back) >= self._config.live.keyframe_queue
         self._put(self._to_back, keyframe)
 
-    def _put(self, queue: Queue[Any], value: object) -> None:
-        while not (self._life.is_orphan or self._life.is_dead("back")):
-            try:
-                queue.put(value, timeout=_PUT_S)
-                return
-            except Full:
-                continue
+    def _put(self, box: Outbox, value: object) -> None:
+        while not (box.put(value, _PUT_S) or self._life.is_orphan):
+            continue
 
     def _T_map_odom(self) -> Array:
         """Return where `odom` is in `map` as it is published now."""

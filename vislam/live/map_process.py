@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, replace
-from multiprocessing.queues import Queue
+from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import Empty
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from vislam.errors import HardwareError
 from vislam.front import FrontReport
 from vislam.live.child import Life
 from vislam.live.handover import BackEnded, EndedGraph, FrontEnded, Seen
+from vislam.live.mail import Inbox
 from vislam.mapping.mapper import Mapper
 from vislam.memory import FrontNews, StartFacts
 from vislam.messages import Array, GraphUpdate, Pieces
@@ -31,8 +31,8 @@ _WAIT_S = 0.05
 
 
 def run(
-    life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Queue[Any],
-    keyframes: Queue[Any],
+    life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
+    keyframes: Connection,
 ) -> None:  # fmt: skip
     """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
 
@@ -51,7 +51,7 @@ def run(
     info = {"source": source, "config": asdict(config)}
     session = SessionWriter(out / "session.db", info, recording.rig, noise, config.imu.gravity_m_s2)
     mapper = Mapper(config.map, recording.rig) if config.map.enabled else None
-    pipeline = FollowedPipeline(life, config, mapper, frames, keyframes)
+    pipeline = FollowedPipeline(life, mapper, Inbox(frames), Inbox(keyframes))
     live = _LiveRun(recording, config, out, session, pipeline, pipeline)
     life.ready()
     metrics = live.execute()
@@ -114,9 +114,7 @@ class FollowedPipeline:
     Keyframes come when the graph has them, later than their frames; the frame that is at hand then carries them.
     """
 
-    def __init__(
-        self, life: Life, config: Config, mapper: Mapper | None, frames: Queue[Any], keyframes: Queue[Any]
-    ) -> None:
+    def __init__(self, life: Life, mapper: Mapper | None, frames: Inbox, keyframes: Inbox) -> None:
         """Follow two queues, and feed a map."""
         self.clock = StageClock()
         self.counters = {"frames_lost": 0, "relocalised": 0}
@@ -138,11 +136,10 @@ class FollowedPipeline:
         """Yield a step per frame, until the front process ends."""
         while self.front.ended is None and not self._life.is_orphan:
             self._take_keyframes()
-            try:
-                message = self._frames.get(timeout=_WAIT_S)
-            except Empty:
-                if self._life.is_dead("front"):
-                    raise HardwareError("the front process died; frames after its last word are lost") from None
+            message = self._frames.get(_WAIT_S)
+            if message is None:
+                if self._frames.is_over:
+                    raise HardwareError("the front process died; what it had not told yet is lost")
                 continue
             if isinstance(message, FrontEnded):
                 self.front.ended, self.front.start, self.front.news = message, message.start, message.news
@@ -151,7 +148,7 @@ class FollowedPipeline:
 
     def finish(self) -> Finish:
         """Wait for the back process's last word; return what came after the last frame."""
-        while self._back_ended is None and not (self._life.is_orphan or self._life.is_dead("back")):
+        while self._back_ended is None and not (self._life.is_orphan or self._keyframes.is_over):
             self._take_keyframes(_WAIT_S)
         ended = self._back_ended
         self._newest_id = 1 << 62
@@ -182,11 +179,7 @@ class FollowedPipeline:
         return Step(front, T_map_body, localisation, len(self._pieces.groups) - 1, keyframes)
 
     def _take_keyframes(self, wait_s: float = 0.0) -> None:
-        while self._back_ended is None:
-            try:
-                message = self._keyframes.get(timeout=wait_s) if wait_s > 0.0 else self._keyframes.get_nowait()
-            except Empty:
-                return
+        while self._back_ended is None and (message := self._keyframes.get(wait_s)) is not None:
             if isinstance(message, BackEnded):
                 self._back_ended = message
                 self._map.end(message)

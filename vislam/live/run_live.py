@@ -24,14 +24,16 @@ from vislam.live.frames import FrameSource
 from vislam.live.slot import remove
 from vislam.recording import Recording
 from vislam.run import imu_noise
+from vislam.runfolder import write_json
 
 _WATCH_S = 0.2
 _END_S = 10.0  # that a process may take to end after it was told twice
-_STEPS = 4096  # frames that may wait for the map process: minutes; then it is stuck
 
 
 class LiveSource(Recording, Protocol):
     """Sensors: what a recording says of itself, and how to open them, each in the process that reads it."""
+
+    duration_s: float | None  # after which there is no more; None: endless
 
     def inertial(self) -> Callable[[], InertialSource]:
         """Return what opens the IMU; it travels to the fast process."""
@@ -90,10 +92,9 @@ class LiveRun:
                 raise UsageError(f"--{name} is for recordings: record the drive and run it with that, or leave it off")
         self.notes: dict[str, dict[str, Any]] = {}
         self.metrics: dict[str, Any] | None = None
-        self._source, self._shared_name = source, config.live.name
+        self._source, self._out, self._shared_name = source, out, config.live.name
         self._context = get_context("spawn")
-        dead = {role: self._context.Event() for role in ("fast", "front", "back", "map")}
-        self._signals = Signals(self._context.Event(), self._context.Event(), dead)
+        self._signals = Signals(self._context.Event(), self._context.Event())
         self._children: dict[str, _Child] = {}
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
@@ -106,10 +107,13 @@ class LiveRun:
         samples_in, samples_out = socket.socketpair()
         front_says, fast_hears_front = self._context.Pipe(duplex=False)[::-1]
         back_says, fast_hears_back = self._context.Pipe(duplex=False)[::-1]
-        packets = self._context.Queue(config.live.keyframe_queue)
-        frames = self._context.Queue(_STEPS)
-        keyframes = self._context.Queue(config.live.keyframe_queue)
-        self._ends = [samples_in, samples_out, front_says, fast_hears_front, back_says, fast_hears_back]
+        packets_out, packets = self._context.Pipe(duplex=False)[::-1]
+        frames_out, frames = self._context.Pipe(duplex=False)[::-1]
+        keyframes_out, keyframes = self._context.Pipe(duplex=False)[::-1]
+        self._ends = [
+            samples_in, samples_out, front_says, fast_hears_front, back_says, fast_hears_back, packets_out, packets,
+            frames_out, frames, keyframes_out, keyframes,
+        ]  # fmt: skip
         rig = source.rig
         return {
             **source.helpers(),
@@ -119,17 +123,31 @@ class LiveRun:
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),
-                samples=samples_out, to_fast=front_says, to_back=packets, to_map=frames,
+                samples=samples_out, to_fast=front_says, to_back=packets_out, to_map=frames_out,
             ),
             "back": partial(
                 back_process.run, config=config, rig=rig, noise=noise, keyframes=packets, to_fast=back_says,
-                to_map=keyframes,
+                to_map=keyframes_out,
             ),
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,
                 frames=frames, keyframes=keyframes,
             ),
         }  # fmt: skip
+
+    @property
+    def is_going(self) -> bool:
+        """Whether every process is ready and the sensors are read."""
+        return self._signals.go.is_set()
+
+    @property
+    def waits_for(self) -> list[str]:
+        """Roles of the processes that are not ready yet."""
+        return [role for role, child in self._children.items() if not child.is_ready]
+
+    def stop(self) -> None:
+        """Ask for the end, as Ctrl-C does."""
+        self._signals.stop.set()
 
     def processes(self) -> dict[str, SpawnProcess]:
         """Return the processes that were started, by role."""
@@ -167,6 +185,9 @@ class LiveRun:
             raise self._failure
         if self.metrics is None:
             raise HardwareError("the run ended before its folder was written; see what is said above")
+        told = {name: value for name, value in self.notes.get("fast", {}).items() if name != "status"}
+        self.metrics = {**self.metrics, "live": told}
+        write_json(self._out / "metrics.json", self.metrics)
         return self.metrics
 
     def _start(self) -> None:
@@ -194,8 +215,6 @@ class LiveRun:
         for role, child in self._children.items():
             self._hear(role, child)
             code = child.process.exitcode
-            if code and role in self._signals.dead:
-                self._signals.dead[role].set()
             if code and self._failure is None:
                 how = f"was killed by signal {-code}" if code < 0 else f"left with code {code}"
                 self._failure = HardwareError(f"the {role} process {how}; the other processes were ended cleanly")
@@ -238,7 +257,7 @@ class LiveRun:
             child.report.close()
         for end in self._ends:
             end.close()
-        if self._signals.dead["fast"].is_set():
+        if self._failure is not None:
             remove(self._shared_name)
         self._source.close()
 
