@@ -69,6 +69,7 @@ class FrontReport:
     nis: dict[str, tuple[int, float, int]]  # innovations that the filter accepted, see `Ekf.nis_statistics`
     noise_warnings: list[str]
     uniform_s: float  # longest stretch without motion that shows scale
+    calibration: dict[str, float]  # what was learned of the camera
 
 
 class Front:
@@ -271,7 +272,7 @@ class Front:
             self.frontend.mode, self.ekf_coupling if self.noise is not None else None, self.start, self.last_refusal,
             self.all_counters, self.nis_statistics,
             self.envelope.warnings(self._config.imu.noise_tolerance) if self.noise is not None else [],
-            self.uniform.longest_s,
+            self.uniform.longest_s, self.calibration,
         )  # fmt: skip
 
     @property
