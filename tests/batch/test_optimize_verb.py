@@ -160,7 +160,7 @@ def test_settings_that_this_version_does_not_know_are_left_aside(folder):
 
 
 def test_what_is_no_run_folder_is_refused(tmp_path, capsys):
-    assert run_verb(["optimize", str(tmp_path / "sphere.g2o")]) == 2
+    assert run_verb(["optimize", str(tmp_path / "sphere.g2o")]) == 3
     assert "g2o" in capsys.readouterr().err
     assert run_verb(["optimize", str(tmp_path)]) == 3
     assert "session" in capsys.readouterr().err

@@ -56,6 +56,69 @@ class Factor:
         out[self._node] = y.reshape(rhs.shape)
         return out
 
+    def edge_covariances(self, ends: Ints, jacobians: Array) -> Array:
+        """Return J @ A^-1 @ J^T [M, d, d] of pairs of free poses: J is jacobians [M, 2, d, d], by the ends' columns.
+
+        `ends` [M, 2] are indices of free poses, -1 for one that is known. Only the fronts between the two poses and
+        the root are visited.
+        """
+        s = self._symbolic
+        front_of = np.repeat(np.arange(len(s.first) - 1), np.diff(s.first))
+        places = np.where(ends >= 0, s.place[ends], -1)
+        out = np.zeros((len(ends), self._d, self._d))
+        _edge_covariances(
+            self._d, s.first, s.row_begin, s.rows, s.parent, s.panel_begin, front_of, self._panels, places,
+            np.ascontiguousarray(jacobians.transpose(0, 1, 3, 2)), out,
+        )  # fmt: skip
+        return out
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _edge_covariances(  # type: ignore[no-untyped-def]  # noqa: PLR0912
+    d, first, row_begin, rows, parent, panel_begin, front_of, panels, places, transposed, out
+):
+    """Solve L @ y = J^T along the path to the root and sum y^T @ y up."""
+    y = np.zeros((first[-1] * d, d))
+    for m in range(len(places)):
+        low, high = -1, -1  # fronts still to visit: from the two ends, until the paths meet
+        for end in range(2):
+            place = places[m, end]
+            if place < 0:
+                continue
+            y[place * d : (place + 1) * d] += transposed[m, end]
+            if low == -1:
+                low = front_of[place]
+            else:
+                high = front_of[place]
+        while low != -1 or high != -1:
+            f = high if low == -1 or (high != -1 and high < low) else low
+            if low == f:
+                low = parent[f]
+            if high == f:
+                high = parent[f]
+            width, height = (
+                (first[f + 1] - first[f]) * d,
+                (first[f + 1] - first[f] + row_begin[f + 1] - row_begin[f]) * d,
+            )
+            panel = panels[panel_begin[f] * d * d : panel_begin[f + 1] * d * d]
+            own = y[first[f] * d : first[f + 1] * d]
+            for j in range(width):
+                column = panel[j * height : (j + 1) * height]
+                for c in range(d):
+                    own[j, c] /= column[j]
+                for i in range(j + 1, width):
+                    for c in range(d):
+                        own[i, c] -= column[i] * own[j, c]
+                for a in range(d):
+                    for c in range(d):
+                        out[m, a, c] += own[j, a] * own[j, c]
+                for r in range(row_begin[f], row_begin[f + 1]):
+                    at = width + (r - row_begin[f]) * d
+                    for i in range(d):
+                        for c in range(d):
+                            y[rows[r] * d + i, c] -= column[at + i] * own[j, c]
+            own[:] = 0.0
+
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _factorise(  # type: ignore[no-untyped-def]  # noqa: PLR0912

@@ -1,85 +1,202 @@
-"""Graduated non-convexity on pose graphs: which loops to believe, decided together with the poses."""
+"""Which loops of a pose graph are false: gates that narrow as loops are taken, then graduated non-convexity.
+
+Graduated non-convexity alone, from odometry that drifted far, ends with false loops kept: the true ones pull as weakly
+at first as the false ones. So loops enter first that odometry can tell, in the order of their evidence: each must pass
+a chi-square gate of its innovation, and be far likelier true than a false loop, which may say anything in the space of
+the trajectory. Every loop taken narrows the gates of the others.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from vislam.batch.graph_solver import Descent, Progress, levenberg_marquardt
+from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.batch.graph_solver import Progress, levenberg_marquardt
 from vislam.batch.graph_starts import odometry_start
-from vislam.batch.graph_structure import Structure
+from vislam.batch.graph_structure import NormalEquations, Structure
 from vislam.config import PoseGraphConfig
 from vislam.messages import Array
 
-_GROWTH = 1.4  # of the control parameter per step, as in the paper
-_STEPS_MAX = 100
-_INNER = 3  # iterations of a step: the next one asks something else anyway
+Mask = NDArray[np.bool_]
+
+_EVIDENCE = (16.0, 12.0, 9.0, 6.0, 4.0)  # log-odds of a loop that enters; lower ones once there is nothing above
+_ROUNDS_MAX = 60
+_CLOSEST = 0.1  # of the loops, taken as the closest fifth of true ones when half of all are false
+_LOOPS_FOR_SCALE = 30  # from which on the cost per degree of freedom tells the scale
+_SCALE_MIN = 1e-10
+_INNER_TOLERANCE = 1e-6
+_GROWTH = 1.4  # of the control parameter of graduated non-convexity per step, as in the paper
+_STEPS_MAX = 60
+_INNER = 2  # iterations of a step: the next one asks something else anyway
+_LEAST_INFORMATION = 1e-9  # of the trace: what makes a matrix with unknown directions invertible
+_NEAR = 25.0  # times the limit: rejected loops that graduated non-convexity looks at again
+_TAILS = 4.0  # times the limit at the end: errors of real loops have heavier tails than a Gaussian
 _SETTLED = 1e-3  # weights this close to 0 or 1 are decided
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Robust:
-    """Poses and which edges they rest on."""
-
-    descent: Descent
-    weights: Array  # [E] 1 kept, 0 rejected
-
-
-def doubtful_edges(structure: Structure) -> NDArray[np.bool_]:
+def doubtful_edges(problem: PoseGraphProblem) -> Mask:
     """Return which edges [E] may be false: those that do not join successive ids."""
-    edges = structure.problem.edges
-    return np.abs(edges[:, 1] - edges[:, 0]) != 1
+    return np.abs(problem.edges[:, 1] - problem.edges[:, 0]) != 1
 
 
 def reject_false_edges(structure: Structure, config: PoseGraphConfig, progress: Progress | None = None) -> Array:
-    """Return the weights [E] that graduated non-convexity from odometry gives: 1 kept, 0 rejected."""
-    start = odometry_start(structure.problem)
-    return graduated_non_convexity(
-        structure, start, probability=config.inlier_probability, iterations=config.iterations,
-        tolerance=config.tolerance, progress=progress,
-    ).weights  # fmt: skip
+    """Return the weights [E] of edges: 1 kept, 0 rejected. Edges between successive ids are never doubted.
+
+    Where these leave the graph in parts, as few others as join it are believed too.
+    """
+    problem = structure.problem
+    trusted = ~doubtful_edges(problem)
+    trusted |= _joining(problem, trusted)
+    limit = float(chi2.ppf(config.inlier_probability, problem.tangent))
+    poses, candidates, scale = _gated(problem, trusted, limit, progress)
+    weights = candidates.astype(np.float64)
+    weights[candidates] = graduated_non_convexity(
+        Structure(_subset(problem, candidates)), poses, trusted[candidates], _TAILS * limit * scale, progress
+    )
+    return weights
+
+
+def _joining(problem: PoseGraphProblem, trusted: Mask) -> Mask:
+    """Return edges [E] that join what the trusted ones leave apart, in the order of the file."""
+    labels = _subset(problem, trusted).components()
+    out = np.zeros(len(trusted), dtype=np.bool_)
+    for e in np.flatnonzero(labels[problem.edges[:, 0]] != labels[problem.edges[:, 1]]).tolist():
+        a, b = labels[problem.edges[e]].tolist()
+        if a != b:
+            labels[labels == b] = a
+            out[e] = True
+    return out
+
+
+def _subset(problem: PoseGraphProblem, keep: Mask) -> PoseGraphProblem:
+    return PoseGraphProblem(
+        problem.dimension, problem.ids, problem.poses, problem.fixed, problem.edges[keep], problem.measurements[keep],
+        problem.information[keep],
+    )  # fmt: skip
+
+
+def _gated(
+    problem: PoseGraphProblem, trusted: Mask, limit: float, progress: Progress | None
+) -> tuple[Array, Mask, float]:
+    """Return poses by the edges that passed the gates, these edges with others not far off, and the noise's scale.
+
+    Many files state variances that are far too large, by which nothing could be told from anything. So all variances
+    are multiplied by what the agreement of loops with odometry shows, and later the cost per degree of freedom; never
+    by more than 1.
+    """
+    k = problem.tangent
+    kept = trusted.copy()
+    poses = odometry_start(_subset(problem, trusted))
+    volume = _log_volume(problem, poses)
+    level, scale = 0, 0.0
+    for _ in range(_ROUNDS_MAX):
+        structure = Structure(_subset(problem, kept))
+        ones = np.ones(int(kept.sum()))
+        poses = levenberg_marquardt(structure, poses, ones, iterations=10, tolerance=1e-4).poses
+        cost = structure.problem.chi2(poses)
+        if progress is not None:
+            progress(0, cost)
+        rest = np.flatnonzero(~kept)
+        if not len(rest):
+            break
+        distance, log_density = _tested(structure, problem, poses, rest)
+        loops = len(structure.problem.edges) - len(structure.free)
+        if loops >= _LOOPS_FOR_SCALE:
+            scale = cost / (k * loops)
+        elif scale == 0.0:
+            scale = float(np.quantile(distance, _CLOSEST) / chi2.ppf(2.0 * _CLOSEST, k))
+        scale = min(1.0, max(scale, _SCALE_MIN))
+        evidence = volume + log_density - 0.5 * (k * math.log(scale) + distance / scale)
+        passed = distance <= limit * scale
+        enters = rest[passed & (evidence >= _EVIDENCE[level])]
+        while not len(enters) and level + 1 < len(_EVIDENCE):
+            level += 1
+            enters = rest[passed & (evidence >= _EVIDENCE[level])]
+        if not len(enters):
+            kept[rest[distance <= _NEAR * limit * scale]] = True
+            break
+        kept[enters] = True
+    return poses, kept, scale or 1.0
+
+
+def _log_volume(problem: PoseGraphProblem, poses: Array) -> float:
+    """Return the logarithm of the space in which a false loop may put a pose: angles, and the trajectory's box."""
+    d = problem.dimension
+    extent = np.maximum(np.ptp(poses[:, :d, d], axis=0), 1.0)
+    angles = 2.0 * math.pi if d == 2 else 8.0 * math.pi**2
+    return float(np.sum(np.log(extent))) + math.log(angles)
+
+
+def _tested(
+    structure: Structure, problem: PoseGraphProblem, poses: Array, edges: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Return squared Mahalanobis distances of edges not in the structure, and the log-density at distance zero."""
+    k = problem.tangent
+    equations = NormalEquations(structure)
+    equations.linearise(poses, np.ones(len(structure.problem.edges)))
+    factor = structure.factor(k)
+    if not factor.factorise(equations.damped(1e-9), equations.off):
+        return np.full(len(edges), np.inf), np.full(len(edges), -np.inf)
+    ends = problem.edges[edges]
+    jacobians = np.empty((len(edges), 2, k, k))
+    jacobians[:, 1] = np.eye(k)
+    jacobians[:, 0] = -_adjoints(poses[ends[:, 0]], poses[ends[:, 1]])  # with Jr(r) = I: false loops are far off
+    S = factor.edge_covariances(structure.index[ends], jacobians)
+    information = problem.information[edges]
+    floor = _LEAST_INFORMATION * np.einsum("eii->e", information)
+    innovation = S + np.linalg.inv(information + floor[:, None, None] * np.eye(k))
+    r = problem.residuals(poses)[edges]
+    distance = np.einsum("ea,ea->e", r, np.linalg.solve(innovation, r[:, :, None])[:, :, 0])
+    return distance, -0.5 * (np.linalg.slogdet(innovation)[1] + k * math.log(2.0 * math.pi))
+
+
+def _adjoints(T_from: Array, T_to: Array) -> Array:
+    """Return Ad of T_to^-1 @ T_from [M, k, k]."""
+    d = T_from.shape[1] - 1
+    turn = T_to[:, :d, :d].transpose(0, 2, 1)
+    R = turn @ T_from[:, :d, :d]
+    p = (turn @ (T_from[:, :d, d] - T_to[:, :d, d])[:, :, None])[:, :, 0]
+    if d == 2:
+        out = np.zeros((len(R), 3, 3))
+        out[:, 0, 0] = 1.0
+        out[:, 1, 0], out[:, 2, 0] = p[:, 1], -p[:, 0]
+        out[:, 1:, 1:] = R
+        return out
+    out = np.zeros((len(R), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = R
+    out[:, 3:, :3] = np.cross(p[:, None, :], R.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return out
 
 
 def graduated_non_convexity(
-    structure: Structure,
-    poses: Array,
-    *,
-    probability: float,
-    iterations: int,
-    tolerance: float,
-    progress: Progress | None = None,
-) -> Robust:
-    """Minimise the truncated least squares of the doubtful edges from `poses`, which are best those of odometry.
+    structure: Structure, poses: Array, trusted: Mask, limit: float, progress: Progress | None = None
+) -> Array:
+    """Return the weights [E], 0 or 1, that minimise the least squares, truncated at `limit`, of what is not trusted.
 
-    An edge is rejected when its chi2 is beyond the quantile `probability` of its dimension. Yang, Antonante, Tzoumas,
-    Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, section IV.
+    Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, section IV.
     """
     problem = structure.problem
-    doubtful = doubtful_edges(structure)
-    limit = float(chi2.ppf(probability, problem.tangent))
     weights = np.ones(len(problem.edges))
+    if trusted.all():
+        return weights
     errors = problem.edge_chi2(poses)
-    worst = float(errors[doubtful].max(initial=0.0))
-    control = limit / max(2.0 * worst - limit, 1e-300)
-    if worst > limit:
-        for _ in range(_STEPS_MAX):
-            weights[doubtful] = _weights(errors[doubtful], limit, control)
-            poses = levenberg_marquardt(structure, poses, weights, iterations=_INNER, tolerance=tolerance).poses
-            errors = problem.edge_chi2(poses)
-            if progress is not None:
-                progress(0, float(np.minimum(errors, limit)[doubtful].sum() + errors[~doubtful].sum()))
-            undecided = (weights > _SETTLED) & (weights < 1.0 - _SETTLED)
-            if not undecided.any() and control > 1.0:
-                break
-            control *= _GROWTH
-    weights[doubtful] = errors[doubtful] <= limit
-    descent = levenberg_marquardt(
-        structure, poses, weights, iterations=iterations, tolerance=tolerance, progress=progress
-    )  # fmt: skip
-    return Robust(descent, weights)
+    worst = float(errors[~trusted].max(initial=0.0))
+    control = limit / max(2.0 * worst - limit, limit)
+    for _ in range(_STEPS_MAX):
+        weights[~trusted] = _weights(errors[~trusted], limit, control)
+        descent = levenberg_marquardt(structure, poses, weights, iterations=_INNER, tolerance=_INNER_TOLERANCE)
+        poses, errors = descent.poses, problem.edge_chi2(descent.poses)
+        if progress is not None:
+            progress(0, descent.costs[-1])
+        if control > 1.0 and np.all((weights < _SETTLED) | (weights > 1.0 - _SETTLED)):
+            break
+        control *= _GROWTH
+    weights[~trusted] = errors[~trusted] <= limit
+    return weights
 
 
 def _weights(errors: Array, limit: float, control: float) -> Array:

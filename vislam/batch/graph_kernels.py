@@ -79,6 +79,22 @@ def _log_pose(D: Array, r: Array) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def errors_3d(edges: NDArray[np.int64], poses: Array, measurements: Array, out: Array) -> None:
+    """Write the error r of every edge into out [E, 6]."""
+    between, D = np.empty((3, 4)), np.empty((3, 4))
+    for e in range(len(edges)):
+        _difference(poses[edges[e, 0]], poses[edges[e, 1]], measurements[e], between, D)
+        _log_pose(D, out[e])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def errors_2d(edges: NDArray[np.int64], poses: Array, measurements: Array, out: Array) -> None:
+    """Write the error r of every edge into out [E, 3]."""
+    for e in range(len(edges)):
+        _error_2d(poses[edges[e, 0]], poses[edges[e, 1]], measurements[e], out[e])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def chi2_3d(edges: NDArray[np.int64], poses: Array, measurements: Array, information: Array, out: Array) -> None:
     """Write r^T @ information @ r of every edge into out [E]."""
     between, D, r = np.empty((3, 4)), np.empty((3, 4)), np.empty(6)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vislam.batch.graph_kernels import chi2_2d, chi2_3d
+from vislam.batch.graph_kernels import chi2_2d, chi2_3d, errors_2d, errors_3d
 from vislam.errors import DataError
 from vislam.messages import Array
 
@@ -68,6 +68,13 @@ class PoseGraphProblem:
         out = np.empty(len(self.edges))
         kernel = chi2_2d if self.dimension == 2 else chi2_3d
         kernel(self.edges, np.ascontiguousarray(poses, dtype=np.float64), self.measurements, self.information, out)
+        return out
+
+    def residuals(self, poses: Array) -> Array:
+        """Return the errors r [E, k] of the edges (see the class)."""
+        out = np.empty((len(self.edges), self.tangent))
+        kernel = errors_2d if self.dimension == 2 else errors_3d
+        kernel(self.edges, np.ascontiguousarray(poses, dtype=np.float64), self.measurements, out)
         return out
 
     def components(self) -> Ids:
