@@ -31,29 +31,36 @@ class Factor:
 
     def __init__(self, symbolic: Symbolic, d: int) -> None:
         """Allocate the factor; nothing is allocated later but what a solution returns."""
-        self._symbolic, self._d = symbolic, d
+        self.symbolic, self.d = symbolic, d
         self._panels = np.empty(symbolic.blocks * d * d)
         self._stack = np.empty(symbolic.stack_size * d * d)
-        self._node = np.empty(symbolic.count, dtype=np.int64)
-        self._node[symbolic.place] = np.arange(symbolic.count)
+        self.node = np.empty(symbolic.count, dtype=np.int64)  # the pose at each place
+        self.node[symbolic.place] = np.arange(symbolic.count)
         self._blas = blas_addresses()
 
     def factorise(self, diagonal: Array, off: Array) -> bool:
         """Replace the factor by that of another matrix; False where that is not positive definite."""
-        s = self._symbolic
+        s = self.symbolic
         good: bool = _factorise(
-            self._d, s.first, s.row_begin, s.target, s.parent, s.panel_begin, s.edge_begin, s.edge_of, s.edge_row,
-            s.edge_column, self._node, diagonal, off, self._panels, self._stack, self._blas,
+            self.d, s.first, s.row_begin, s.target, s.parent, s.panel_begin, s.edge_begin, s.edge_of, s.edge_row,
+            s.edge_column, self.node, diagonal, off, self._panels, self._stack, self._blas,
         )  # fmt: skip
         return good
 
+    def panel(self, front: int) -> tuple[Array, Array]:
+        """Return the triangle [w, w] of a front's pivots in the factor, and the rows [b, w] beneath it."""
+        s, d = self.symbolic, self.d
+        width = int(s.first[front + 1] - s.first[front]) * d
+        columns = self._panels[s.panel_begin[front] * d * d : s.panel_begin[front + 1] * d * d].reshape(width, -1)
+        return np.tril(columns[:, :width].T), columns[:, width:].T
+
     def solve(self, rhs: Array) -> Array:
         """Return x [n, d] with A @ x = rhs [n, d]."""
-        s = self._symbolic
-        y = rhs[self._node].ravel()
-        _solve(self._d, s.first, s.row_begin, s.rows, s.panel_begin, self._panels, y)
+        s = self.symbolic
+        y = rhs[self.node].ravel()
+        _solve(self.d, s.first, s.row_begin, s.rows, s.panel_begin, self._panels, y)
         out = np.empty_like(rhs)
-        out[self._node] = y.reshape(rhs.shape)
+        out[self.node] = y.reshape(rhs.shape)
         return out
 
     def edge_covariances(self, ends: Ints, jacobians: Array) -> Array:
