@@ -513,7 +513,7 @@ def _optimize_graph(arguments: list[str]) -> int:
         show = None if bar is None else (lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}"))
         result = optimize_graph_file(options.file, out, options.settings, show)
     if options.report:
-        write_graph_report(result.problem, result.solution, options.file.stem, out / "report.html")
+        write_graph_report(result.problem, result.solution, options.file.stem, out / "report.html", result.certificate)
     summary = result.summary
     if options.json:
         print(json.dumps(summary))
@@ -523,6 +523,8 @@ def _optimize_graph(arguments: list[str]) -> int:
             f"{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
             f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
         )
+        if result.certificate is not None:
+            print(result.certificate.text)
         for warning in summary["warnings"]:
             print(f"warning: {warning}")
         print(f"results: {out}")

@@ -422,6 +422,8 @@ class PoseGraphConfig:
     iterations: int = 100  # most of them; 3 to 8 as a rule
     tolerance: float = 1e-9  # of the cost: the decrease still to come at which to end
     inlier_probability: float = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
+    certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
+    covariances: bool = False  # write those of all poses: in space 300 bytes each
 
 
 @dataclass(frozen=True, slots=True)

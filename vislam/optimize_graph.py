@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vislam.batch.graph_certificate import Certificate, certify
 from vislam.batch.graph_files import read_pose_graph
 from vislam.batch.graph_g2o import write_g2o
 from vislam.batch.graph_optimize import PoseGraphSolution, optimize_pose_graph
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_solver import Progress
+from vislam.batch.graph_uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
 from vislam.errors import StorageError
 from vislam.geometry import quaternion_xyzw_from_rotation
@@ -31,6 +33,7 @@ class OptimizedGraph:
     problem: PoseGraphProblem
     solution: PoseGraphSolution
     summary: dict[str, Any]
+    certificate: Certificate | None
 
 
 def optimize_graph_file(
@@ -43,14 +46,39 @@ def optimize_graph_file(
     begun = time.perf_counter()
     problem = read_pose_graph(path)
     solution = optimize_pose_graph(problem, config, progress)
+    certificate = None
+    if config.certify:
+        solution, certificate = _certified(problem, solution)
+    covariances = Uncertainty(problem, solution.poses, solution.weights).of_all() if config.covariances else None
     make_folder(out)
     write_g2o(problem, out / "optimized.g2o", solution.poses)
     _write_trajectories(problem, solution.poses, out)
     _write_edges(problem, solution, out / "edges.csv")
+    if covariances is not None:
+        _write_covariances(problem, covariances, out / "covariances.csv")
     summary = summarise(problem, solution) | {"source": str(path), "config": asdict(config)}
+    summary["certificate"] = None if certificate is None else certificate_entry(certificate)
     summary["wall_s"] = time.perf_counter() - begun
     write_json(out / "summary.json", summary)
-    return OptimizedGraph(problem, solution, summary)
+    return OptimizedGraph(problem, solution, summary, certificate)
+
+
+def _certified(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[PoseGraphSolution, Certificate]:
+    """Return the certificate, and with it the better solution where the search for it came across one."""
+    certificate = certify(problem, solution.poses, solution.weights)
+    if certificate.better is None:
+        return solution, certificate
+    certificate, left = certify(problem, certificate.better, solution.weights), certificate
+    note = f"a minimum of chi2 {left.chi2:.9g} was left for a lower one that the certificate's check came across"
+    costs = (*solution.costs, certificate.chi2)
+    poses = left.better if left.better is not None else solution.poses
+    return replace(solution, poses=poses, costs=costs, notes=(*solution.notes, note)), certificate
+
+
+def certificate_entry(certificate: Certificate) -> dict[str, Any]:
+    """Return a certificate for summary.json; what could not be computed is None."""
+    entry = {f.name: getattr(certificate, f.name) for f in fields(certificate) if f.name != "better"}
+    return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in entry.items()}
 
 
 def make_folder(out: Path) -> None:
@@ -101,6 +129,16 @@ def _write_trajectories(problem: PoseGraphProblem, poses: Array, out: Path) -> N
     trajectory = Trajectory(stamps, T)
     write_tum(trajectory, out / "trajectory.tum")
     write_kitti(trajectory, out / "trajectory_kitti.txt")
+
+
+def _write_covariances(problem: PoseGraphProblem, covariances: Array, path: Path) -> None:
+    """Write the upper triangle, in rows, of each pose's covariance: rotation, then translation, on the body side."""
+    axes = ("yaw", "x", "y") if problem.dimension == 2 else ("rx", "ry", "rz", "x", "y", "z")
+    a, b = np.triu_indices(len(axes))
+    header = ",".join(["id", *(f"{axes[i]}_{axes[j]}" for i, j in zip(a, b, strict=True))])
+    row = "%d," + ",".join(["%.9g"] * len(a))
+    lines = [row % (i, *u) for i, u in zip(problem.ids.tolist(), covariances[:, a, b].tolist(), strict=True)]
+    write_text(path, "\n".join([header, *lines]) + "\n")
 
 
 def _write_edges(problem: PoseGraphProblem, solution: PoseGraphSolution, path: Path) -> None:

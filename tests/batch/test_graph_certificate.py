@@ -1,5 +1,6 @@
 """What is proven of pose-graph solutions: published optima, wrong minima, and bounds that nothing is below."""
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -10,12 +11,15 @@ from needs import missing
 
 from vislam.batch.graph_certificate import bounding_weights, certify, isotropic_weights
 from vislam.batch.graph_files import read_pose_graph
+from vislam.batch.graph_g2o import write_g2o
 from vislam.batch.graph_isotropic import IsotropicGraph
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_solver import levenberg_marquardt
 from vislam.batch.graph_starts import chordal_start, odometry_start
 from vislam.batch.graph_structure import Structure
+from vislam.batch.graph_uncertainty import Uncertainty
 from vislam.batch.graph_worlds import Shape, SimulatedGraph, simulate_graph
+from vislam.cli import run_verb
 from vislam.config import GraphWorldConfig
 
 Array = np.ndarray
@@ -223,3 +227,22 @@ def test_what_cannot_be_proven_says_why() -> None:
     loose = certify(replace(made.problem, information=free), solution)
     assert not loose.certified
     assert "translations" in loose.reason
+
+
+def test_the_verb_tells_and_keeps_the_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = _made("torus")
+    path, out = tmp_path / "torus.g2o", tmp_path / "out"
+    write_g2o(made.problem, path)
+    assert run_verb(["optimize", str(path), "--out", str(out), "--covariances"]) == 0
+    assert "\ncertified: " in capsys.readouterr().out
+    entry = json.loads((out / "summary.json").read_text())["certificate"]
+    assert entry["certified"]
+    assert 0.98 * entry["chi2"] < entry["chi2_bound"] <= entry["chi2"]
+    assert "certified" in (out / "report.html").read_text()
+    rows = np.loadtxt(out / "covariances.csv", delimiter=",", skiprows=1)
+    problem = read_pose_graph(out / "optimized.g2o")
+    expected = Uncertainty(problem, problem.poses).of(np.array([50]))[0]
+    assert np.allclose(rows[50, 1:], expected[np.triu_indices(6)], rtol=1e-5)
+    assert run_verb(["optimize", str(path), "--out", str(out), "--no-certify", "--no-report"]) == 0
+    assert "certified" not in capsys.readouterr().out
+    assert json.loads((out / "summary.json").read_text())["certificate"] is None

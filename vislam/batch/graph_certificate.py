@@ -52,6 +52,13 @@ class Certificate:
         """Return "certified" or "not certified"."""
         return "certified" if self.certified else "not certified"
 
+    @property
+    def text(self) -> str:
+        """Return the verdict with its numbers, in one line."""
+        least = "" if np.isnan(self.least_eigenvalue) else f"; least eigenvalue {self.least_eigenvalue:.2g}"
+        allowed = "" if np.isnan(self.tolerance) else f" (down to -{self.tolerance:.2g} is zero)"
+        return f"{self.word}: {self.reason}{least}{allowed}; chi2 of any solution is at least {self.chi2_bound:.9g}"
+
 
 def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = None) -> Certificate:
     """Return what can be proven about poses [N, d + 1, d + 1], which should be at a minimum of chi2.
@@ -75,9 +82,7 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
     if better is not None and problem.chi2(better) >= chi2 * (1.0 - _SAME) - _NOTHING:
         better = None
     if not least:
-        reason = (
-            f"the isotropic cost may be lower elsewhere: its certificate matrix has the eigenvalue {spectrum.least:.3g}"
-        )
+        reason = "the isotropic cost may be lower elsewhere: its certificate matrix has a negative eigenvalue"
     elif better is not None:
         reason = f"from the global minimum of the isotropic cost chi2 goes down to {problem.chi2(better):.8g}"
     else:

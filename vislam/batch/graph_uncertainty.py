@@ -48,7 +48,7 @@ class Uncertainty:
     def of_all(self) -> Array:
         """Return the covariances [N, k, k] of all poses, zero for anchors."""
         out = np.zeros((len(self._poses), self._problem.tangent, self._problem.tangent))
-        out[self._structure.free] = inverse_diagonal(self._factor)
+        out[self._structure.free] = _symmetric(inverse_diagonal(self._factor))
         return out
 
     def relative(self, pairs: Ids) -> Array:

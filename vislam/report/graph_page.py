@@ -11,18 +11,28 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from vislam.batch.graph_certificate import Certificate
 from vislam.batch.graph_optimize import PoseGraphSolution
 from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.batch.graph_uncertainty import Uncertainty, ellipses
+from vislam.errors import DataError
 from vislam.messages import Array
 from vislam.report.html import bullets, card, escape, folded, grid, note, number, section, table, tile
 from vislam.report.style import CODE, RC, stylesheet, svg
 from vislam.trajectory import write_text
 
 _MAX_LINES = 3000  # edges drawn of a picture: more cannot be seen and only makes the file heavy
+_REGIONS = 40  # poses whose uncertainty is drawn
 _MAX_ROWS = 300  # rejected edges in the table; edges.csv has them all
 
 
-def write_graph_report(problem: PoseGraphProblem, solution: PoseGraphSolution, name: str, path: Path) -> None:
+def write_graph_report(
+    problem: PoseGraphProblem,
+    solution: PoseGraphSolution,
+    name: str,
+    path: Path,
+    certificate: Certificate | None = None,
+) -> None:
     """Write report.html of an optimised pose graph. Raises StorageError."""
     unit = "ms" if solution.solve_s < 1.0 else "s"
     took = solution.solve_s * (1000.0 if unit == "ms" else 1.0)
@@ -32,10 +42,15 @@ def write_graph_report(problem: PoseGraphProblem, solution: PoseGraphSolution, n
         tile(f"{solution.costs[-1]:.6g}", "", f"chi², from {solution.costs[0]:.6g}"),
         tile(number(took, 1), unit, f"to solve, {len(solution.costs) - 1} iterations"),
         tile(number(len(solution.rejected), 0), "", "edges found false"),
+        *([tile(certificate.word, "", "global optimum")] if certificate is not None else []),
     )
+    regions, enlarged = _regions(problem, solution)
+    after = _picture(problem, solution, solution.poses, "after", regions)
+    times = "" if enlarged == 1.0 else f", {enlarged:g} times as large"
+    title = f"After, with 95 % regions of some poses{times}" if len(regions) else "After"
     pictures = grid(
         card(_picture(problem, solution, solution.start, "before"), title=f"Before: start '{solution.start_name}'"),
-        card(_picture(problem, solution, solution.poses, "after"), title="After"),
+        card(after, title=title),
     )
     starts = table(("start", "chi²"), [(k, f"{v:.6g}") for k, v in solution.start_costs.items()])
     body = "".join(
@@ -46,6 +61,7 @@ def write_graph_report(problem: PoseGraphProblem, solution: PoseGraphSolution, n
             section(
                 "Cost", grid(card(_cost_curve(solution), title="chi² over iterations"), card(starts, title="Starts"))
             ),
+            section("Certificate", note(escape(certificate.text))) if certificate is not None else "",
             _rejected(problem, solution),
             section("Notes", bullets(solution.notes)) if solution.notes else "",
         )
@@ -59,11 +75,37 @@ def write_graph_report(problem: PoseGraphProblem, solution: PoseGraphSolution, n
     write_text(path, page)
 
 
-def _picture(problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Array, name: str) -> str:
-    """Draw the poses in the plane in which they spread most, with their edges."""
+def _plane(poses: Array) -> tuple[int, int]:
+    """Return the two axes along which poses spread most."""
+    d = poses.shape[1] - 1
+    first, second = np.sort(np.argsort(-np.ptp(poses[:, :d, d], axis=0), kind="stable")[:2]).tolist()
+    return first, second
+
+
+def _regions(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[Array, float]:
+    """Return outlines [M, P, 2] of some poses' regions, none where they are undetermined, and how much enlarged."""
+    step = max(1, len(problem.ids) // _REGIONS)
+    chosen = np.arange(step // 2, len(problem.ids), step)
+    try:
+        covariances = Uncertainty(problem, solution.poses, solution.weights).of(problem.ids[chosen])
+    except DataError:
+        return np.empty((0, 1, 2)), 1.0
+    axes = _plane(solution.poses)
+    outlines = ellipses(solution.poses[chosen], covariances, axes=axes)
+    extent = float(np.ptp(solution.poses[:, axes, problem.dimension], axis=0).max())
+    widest = float(np.ptp(outlines, axis=1).max(initial=0.0))
+    # by a power of ten, to between a thirtieth and a third of the picture; files often state a nominal information
+    fits = widest > 0.0 and extent > 0.0
+    enlarged = 10.0 ** float(np.floor(np.log10(0.3 * extent / widest))) if fits else 1.0
+    return ellipses(solution.poses[chosen], covariances, axes=axes, enlarged=enlarged), enlarged
+
+
+def _picture(
+    problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Array, name: str, regions: Array | None = None
+) -> str:
+    """Draw the poses in the plane in which they spread most, with their edges and the outlines of `regions`."""
     d = problem.dimension
-    spread = np.ptp(solution.poses[:, :d, d], axis=0)
-    first, second = np.sort(np.argsort(-spread, kind="stable")[:2]).tolist()
+    first, second = _plane(solution.poses)
     points = poses[:, [first, second], d]
     successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
     with mpl.rc_context(RC):
@@ -73,6 +115,8 @@ def _picture(problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Arra
         _lines(axes, points, problem.edges[rejected], CODE["bad"], 0.4, 0.5)
         _lines(axes, points, problem.edges[~successive & ~rejected], CODE["muted"], 0.4, 0.5)
         _lines(axes, points, problem.edges[successive], CODE["graph"], 1.2, 1.0)
+        if regions is not None:
+            axes.add_collection(LineCollection(list(regions), colors=CODE["ekf"], linewidths=0.8))
         axes.autoscale_view()
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]")
