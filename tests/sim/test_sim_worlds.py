@@ -6,6 +6,7 @@ from vislam.sim import WORLD_DESCRIPTIONS, WORLD_NAMES
 
 LIMITS = {  # speed m/s, acceleration m/s2, rate rad/s, length m, seconds, rest at the start s
     "workshop-cart": (1.2, 2.0, 1.4, (50.0, 60.0), (60.0, 80.0), 2.0),
+    "cart-drive": (1.0, 2.0, 1.5, (100.0, 115.0), (150.0, 180.0), 3.0),
     "handheld-room": (1.0, 4.0, 1.5, (8.0, 16.0), (30.0, 40.0), 1.5),
     "corridor-loop": (1.6, 4.0, 2.0, (65.0, 85.0), (50.0, 75.0), 2.0),
     "aliased-halls": (1.6, 4.0, 2.0, (62.0, 72.0), (58.0, 66.0), 2.0),
