@@ -157,10 +157,12 @@ class Gy85:
         for _ in range(_START_ATTEMPTS):
             self._clock.sleep_until(link.retry_ns if not link.is_up else 0)
             self._connect(self._clock.now_ns())
+            if not link.is_up:
+                continue
             try:
-                if link is self._accel_link and link.is_up and self._accel is not None:
+                if link is self._accel_link and self._accel is not None:
                     link.self_test = self._accel.self_test(self._clock, self._config.supply_v)
-                elif link.is_up and self._mag is not None:
+                elif self._mag is not None:
                     link.self_test = self._mag.self_test(self._clock)
             except BusError as error:
                 self._failed(link, error)
@@ -321,15 +323,15 @@ class Gy85:
                 self._drop(link, now)
             return None
         link.newest_ns, link.silent = now, 0
+        if reading.overflow:
+            self._counts["mag_overflow"] += 1
+            self._events |= Health.MAG_FAULT
+            return None
         link.repeats = link.repeats + 1 if (reading.field_ut == self._last_field_ut).all() else 0
         self._last_field_ut = reading.field_ut
         if link.repeats >= self._config.stuck_samples:
             self._counts["mag_stuck"] += 1
             self._drop(link, now)
-            return None
-        if reading.overflow:
-            self._counts["mag_overflow"] += 1
-            self._events |= Health.MAG_FAULT
             return None
         # the measurement ended up to a period ago, and took most of one
         t_ns = now - round(0.5 * _NS / self._mag.rate_hz)
