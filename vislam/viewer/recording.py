@@ -32,6 +32,7 @@ from vislam.messages import (
     Observations,
     Tracking,
 )
+from vislam.viewer.layout import layout
 from vislam.viewer.map_view import grid_cells, octree_voxels
 
 _PAPER_GREY = 60
@@ -322,47 +323,7 @@ class RunViewer:
             self._stream.log(f"world/loops/{decision.value}", lines)
 
     def _blueprint(self) -> Any:
-        """Return the layout: the world beside the camera, the tracking state and one plot per group of numbers."""
-        plots = [rrb.TimeSeriesView(origin=f"plots/{group}", name=group) for group in self._groups]
-        side: list[Any] = [
-            rrb.Spatial2DView(origin=_CAMERA, name="camera"),
-            rrb.StateTimelineView(origin="status", name="tracking"),
-        ]
-        if plots:
-            side.append(rrb.Tabs(*plots))
-        if self._has_loop_pictures:
-            pair = rrb.Spatial2DView(origin="loop/pair", name="loop candidate")
-            side.append(rrb.Horizontal(pair, rrb.TextDocumentView(origin="loop/why", name="why")))
-        side.append(rrb.TextLogView(origin="notes", name="notes"))
-        world = rrb.Spatial3DView(
-            origin="world",
-            name="world",
-            contents=[
-                "$origin/**",
-                "- world/loops/rejected",
-                f"- {_CAMERA}/image/**",
-                "- world/octree",
-                "- world/grid",
-            ],
-            background=[20, 22, 26],
-            eye_controls=self._eye(),
-        )
-        solid = rrb.Spatial3DView(
-            origin="world",
-            name="octree and grid",
-            contents=["world/octree", "world/grid", "world/paths/**", "world/live"],
-            background=[20, 22, 26],
-            eye_controls=self._eye(),
-        )
-        return rrb.Blueprint(
-            rrb.Horizontal(
-                rrb.Tabs(world, solid),
-                rrb.Vertical(*side, row_shares=[4, 1.2, *[2.5] * (len(side) - 3), 1.5]),
-                column_shares=[2.2, 1],
-            ),
-            rrb.TimePanel(state="collapsed"),
-            collapse_panels=True,
-        )
+        return layout(_CAMERA, list(self._groups), self._has_loop_pictures, self._eye())
 
     def _eye(self) -> Any:
         """Return a point of view from which everything travelled so far is seen."""
