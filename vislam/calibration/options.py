@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
+from vislam.config import CalibrationConfig
+
 
 @dataclass(frozen=True)
 class BoardOptions:
@@ -122,6 +124,41 @@ class ImuOptions:
     """A pose counts when it was held so long"""
     gravity_m_s2: float = 9.81
     """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as imu.gravity_m_s2 of the config"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class CameraImuOptions:
+    """Options of `vislam calibrate camera-imu`."""
+
+    source: Positional[str]
+    """Recording as for `vislam run`: camera and IMU turn briskly to and fro about all axes before a textured scene"""
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    max_s: float = 120.0
+    """Only the first so many seconds"""
+    out: Path = Path("calibration")
+    """Folder for camera-imu.yaml (Kalibr's camchain), camera-imu.png and camera-imu.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class MagOptions:
+    """Options of `vislam calibrate mag`."""
+
+    source: Positional[Path]
+    """Raw recording with mag0 and imu0 in which the cart turns once on the spot, slowly, or is turned by hand"""
+    mode: Literal["auto", "2d", "3d"] = "auto"
+    """2d: on the floor, level part only; 3d: by hand, to all sides; auto: by how far it was tilted"""
+    imu: Path | None = None
+    """imu.yaml of `vislam calibrate imu`, for the direction of gravity and the turns"""
+    out: Path = Path("calibration")
+    """Folder for mag.yaml, mag.png and mag.json"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
     json: bool = False
