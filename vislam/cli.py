@@ -701,6 +701,37 @@ def _stopped_by_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+def _live(arguments: list[str]) -> int:
+    from vislam.config import load, load_sensors
+    from vislam.live.run_live import LiveRun
+    from vislam.live.sensors import open_live
+    from vislam.live.status import status_line
+    from vislam.options import LiveOptions, live_options
+    from vislam.runfolder import prepare
+
+    command = ["vislam", "live", *arguments]
+    config_path, sensors_path = (_take_option(arguments, name) for name in ("--config", "--sensors"))
+    base = load(Path(config_path) if config_path else None)
+    sensors = load_sensors(Path(sensors_path) if sensors_path else None)
+    options = _parse(LiveOptions, arguments, "live", live_options(base, sensors))
+    source, settings = open_live(options.source, options.settings, options.sensors)
+    prepare(options.out, options.overwrite)
+
+    def show(run: LiveRun) -> None:
+        if sys.stderr.isatty():
+            print(f"\r{status_line(run)}\033[K", end="", file=sys.stderr)
+
+    with _written_up(options.out):
+        live = LiveRun(source, settings, options.out, options.source, command)
+        try:
+            metrics = live.execute(show, source.duration_s if options.seconds is None else options.seconds)
+        finally:
+            if sys.stderr.isatty():
+                print(file=sys.stderr)
+    _show(metrics, options.out, options.json)
+    return 0
+
+
 def _report(arguments: list[str]) -> int:
     from vislam.options import ReportOptions
     from vislam.report import write_report
@@ -748,6 +779,11 @@ _VERBS = {
         _record,
         "record the cart's IMU and camera",
         "vislam record --out recordings/ride --imu serial:/dev/ttyUSB0 --camera 0",
+    ),
+    "live": _Verb(
+        _live,
+        "run the pipeline on live sensors and publish the pose",
+        "vislam live --source virtual-cart --out runs/cart",
     ),
     "report": _Verb(_report, "write report.html of a run again", "vislam report runs/desk"),
 }

@@ -293,6 +293,29 @@ def record_options(base: SensorsConfig) -> RecordOptions:
 
 
 @dataclass(frozen=True)
+class LiveOptions:
+    """Options of `vislam live`."""
+
+    out: Path
+    """Folder to make for everything that the run leaves"""
+    source: str = "virtual-cart"
+    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, serial:PORT+webcam"""
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    seconds: float | None = None
+    """How long; None: until Ctrl-C, or the end of a replay"""
+    overwrite: bool = False
+    """Replace the run that the folder holds"""
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+def live_options(base: Config, sensors: SensorsConfig) -> LiveOptions:
+    """Return the options of `vislam live` to parse into, with given values for every setting that is not given."""
+    return LiveOptions(out=tyro.MISSING, settings=base, sensors=sensors)
+
+
+@dataclass(frozen=True)
 class ReportOptions:
     """Options of `vislam report`."""
 

@@ -278,6 +278,7 @@ def predict_run(
         store(x, track[k])
 
 
+@njit(cache=True, nogil=True)
 def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Array) -> None:
     """Apply a gain K [21, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain.
 
@@ -287,10 +288,30 @@ def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Arra
     vision and gravity cannot tell, heading and position, then stays untold however often the state is corrected.
     """
     G = np.eye(ERRORS)  # from the error about the old state to that about the new
-    _move_all(x, K @ residual, G)
-    A, K = G @ (np.eye(ERRORS) - K @ H), G @ K
-    P[:, :] = A @ P @ A.T + K @ noise @ K.T
+    _move_all(x, _product(K, residual.reshape(-1, 1))[:, 0].copy(), G)
+    GK = _product(G, K)
+    A = _product(GK, H)
+    for i in range(ERRORS):
+        for j in range(ERRORS):
+            A[i, j] = G[i, j] - A[i, j]
+    prior = _product(_product(A, P), A.T.copy())
+    told = _product(_product(GK, noise), GK.T.copy())
+    for i in range(ERRORS):
+        for j in range(ERRORS):
+            P[i, j] = prior[i, j] + told[i, j]
     symmetrise(P)
+
+
+@njit(cache=True, nogil=True)
+def _product(A: Array, B: Array) -> Array:
+    """Return A @ B; for matrices this small, calling BLAS costs more than multiplying."""
+    out = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            a = A[i, k]
+            for j in range(B.shape[1]):
+                out[i, j] += a * B[k, j]
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -341,13 +362,40 @@ def _move(x: Array, d: Array, G: Array, at: int, error: int, row: int, R: Array,
         G[error + 2, row + j] = my * R[0, j] - mx * R[1, j]
 
 
+@njit(cache=True, nogil=True)
 def innovation(P: Array, H: Array, noise: Array, residual: Array) -> tuple[float, Array]:
     """Return the normalised innovation squared and the optimal gain [21, m]."""
-    PHt = P @ H.T
-    S = H @ PHt + noise
-    S_inverse = np.linalg.inv(0.5 * (S + S.T))
-    nis = float(residual @ S_inverse @ residual)
-    return nis, PHt @ S_inverse
+    m = len(residual)
+    PHt = _product(P, H.T.copy())
+    S = _product(H, PHt)
+    for i in range(m):
+        for j in range(m):
+            S[i, j] += noise[i, j]
+    symmetrise(S)
+    for i in range(m):  # S = L L^T, L in the lower half
+        for j in range(i + 1):
+            for k in range(j):
+                S[i, j] -= S[i, k] * S[j, k]
+            S[i, j] = math.sqrt(S[i, j]) if i == j else S[i, j] / S[j, j]
+    nis = 0.0
+    whitened = np.empty(m)
+    for i in range(m):
+        whitened[i] = residual[i]
+        for k in range(i):
+            whitened[i] -= S[i, k] * whitened[k]
+        whitened[i] /= S[i, i]
+        nis += whitened[i] * whitened[i]
+    K = PHt
+    for i in range(ERRORS):  # K L L^T = P H^T
+        for j in range(m):
+            for k in range(j):
+                K[i, j] -= K[i, k] * S[j, k]
+            K[i, j] /= S[j, j]
+        for j in range(m - 1, -1, -1):
+            for k in range(j + 1, m):
+                K[i, j] -= K[i, k] * S[k, j]
+            K[i, j] /= S[j, j]
+    return nis, K
 
 
 def clone(x: Array, P: Array) -> None:

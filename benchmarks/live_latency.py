@@ -1,0 +1,238 @@
+"""How late is the published pose while the back end closes a loop over 1,000 keyframes? Real processes, real time.
+
+    .venv/bin/python benchmarks/live_latency.py processes --seconds 60
+    .venv/bin/python benchmarks/live_latency.py filter
+    NUMBA_DISABLE_JIT=1 .venv/bin/python benchmarks/live_latency.py filter     # what it costs without a compiler
+
+`processes` runs the fast process of `vislam live` on samples at 400 Hz, with 20 corrections a second that come 50 ms
+late from a second process, beside a third one that builds pose graphs of 1,000 keyframes and closes a loop over each,
+again and again. A fourth one listens to the datagrams: from a sample's stamp to when a reader has it. Nothing may be
+lost. Quantiles hold for the machine as it is: close everything else. `filter` times the filter's arithmetic: CPU time,
+least of several rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from multiprocessing import get_context
+from pathlib import Path
+
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "live")]
+
+import numpy as np  # noqa: E402
+
+RATE_HZ = 400.0
+FRAME_EVERY = 20  # samples
+LATE_S = 0.05
+KEYFRAMES = 1000
+
+
+def correct(connection, seconds: float, begin_ns: int) -> None:
+    """Send the corrections of a body at rest, each 50 ms late."""
+    from vislam.ekf import Correction
+    from vislam.imu import ImuNoise
+    from vislam.live.messages import Start
+    from vislam.messages import NavState, Observations, Tracking, VoMeasurement
+
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
+    nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+    for k in range(int(seconds * RATE_HZ / FRAME_EVERY)):
+        t_ns = begin_ns + int((0.5 + k * FRAME_EVERY / RATE_HZ) * 1e9)
+        time.sleep(max(0.0, (t_ns - time.monotonic_ns()) * 1e-9 + LATE_S))
+        vo = VoMeasurement(t_ns, max(k - 1, 0) // 10, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
+        if k == 0:
+            state = NavState(t_ns, np.eye(4), *(np.zeros(3) for _ in range(3)), np.eye(15) * 1e-4)
+            connection.send(Start(state, vo, noise))
+        connection.send(Correction(t_ns, vo, nothing, False, False, k // 10 if k % 10 == 0 else None))
+
+
+def close_loops(connection, stop, closed) -> None:
+    """Build graphs of 1,000 keyframes and close a loop over each."""
+    from graph_world import GRAVITY_M_S2, RIG, World
+
+    from vislam.config import GraphConfig
+    from vislam.graph import PoseGraph
+    from vislam.live.messages import MapMoved
+
+    world = World(duration_s=KEYFRAMES / 5.0 + 2.0)
+    revision = 0
+    while not stop.is_set():
+        graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, GRAVITY_M_S2, RIG)
+        graph.initialise(world.initial_state(), np.eye(4))
+        for k in range(KEYFRAMES):
+            if stop.is_set():
+                return
+            began = time.monotonic()
+            edges = [world.loop(0, 0, k)] if k == KEYFRAMES - 1 else []
+            update = graph.add(world.packet(k), edges, world.T_world_body[k])
+            revision += 1
+            connection.send(MapMoved(revision, update.T_map_odom))
+        closed.append(time.monotonic() - began)
+
+
+def listen(address: str, results, ready) -> None:
+    """Note for each datagram how old its sample is when it is here."""
+    from vislam.live.publisher import PoseListener
+
+    listener = PoseListener(address)
+    ready.set()
+    ages, sequences, quiet = [], [], 0
+    while quiet < 5 or not ages:
+        pose = listener.next(1.0)
+        quiet = 0 if pose is not None else quiet + 1
+        if pose is not None:
+            ages.append(time.monotonic_ns() - pose.t_ns)
+            sequences.append((pose.sequence, pose.t_ns, pose.published_ns))
+    listener.close()
+    results.put((np.array(ages), np.array(sequences)))
+
+
+def fast(signals, samples, inbox, name: str, address: str, epoch, table, report) -> None:
+    """Run the fast process as `vislam live` does."""
+    from functools import partial
+
+    from vislam.config import load
+    from vislam.imu import ImuNoise
+    from vislam.live import fast_process
+    from vislam.live.child import guarded
+    from vislam.live.replayed_imu import ReplayedImu
+
+    config = load(None, {"live.name": name, "live.send_to": [address]})
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
+    body = partial(
+        fast_process.run, config=config, noise=noise, T_body_camera=np.eye(4),
+        open_source=partial(ReplayedImu, table, epoch), samples=samples, inbox=inbox,
+    )  # fmt: skip
+    guarded("fast", report, signals, body)
+
+
+def processes(seconds: float) -> None:  # noqa: PLR0915
+    """Measure."""
+    import socket
+
+    from vislam.live.child import Ready, Signals
+    from vislam.live.epoch import Epoch
+    from vislam.live.replayed_imu import InertialTable
+
+    context = get_context("spawn")
+    stop, go, ready = context.Event(), context.Event(), context.Event()
+    signals, epoch, results = Signals(go, stop), Epoch(), context.Queue()
+    count = int(seconds * RATE_HZ)
+    rng = np.random.default_rng(0)
+    values = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) + rng.normal(size=(count, 6)) * np.repeat([0.02, 0.2], 3)
+    table = InertialTable((np.arange(count) * (1e9 / RATE_HZ)).astype(np.int64), values, RATE_HZ)
+    to_front, at_front = socket.socketpair()
+    hears_front, front_says = context.Pipe(duplex=False)
+    hears_back, back_says = context.Pipe(duplex=False)
+    hears, says = context.Pipe(duplex=False)
+    with context.Manager() as manager, tempfile.TemporaryDirectory() as folder:
+        closed, address = manager.list(), f"unix:{folder}/pose.sock"
+        listener = context.Process(target=listen, args=(address, results, ready))
+        publisher = context.Process(
+            target=fast,
+            args=(signals, to_front, [hears_front, hears_back], f"bench-{os.getpid()}", address, epoch, table, says),
+        )
+        back = context.Process(target=close_loops, args=(back_says, stop, closed))
+        for process in (listener, publisher, back):
+            process.start()
+        ready.wait()
+        while not isinstance(hears.recv(), Ready):
+            continue
+        time.sleep(5.0)  # the graph is growing
+        front = context.Process(target=correct, args=(front_says, seconds - 1.0, epoch.begin_ns()))
+        front.start()
+        go.set()
+        taken, last = 0, {}
+        at_front.settimeout(2.0)
+        while True:
+            try:
+                taken += len(at_front.recv(1 << 16))
+            except TimeoutError:
+                break
+            while hears.poll():
+                last = {**last, **getattr(hears.recv(), "values", {})}
+        stop.set()
+        ages, poses = results.get()
+        publisher.join()
+        while hears.poll():
+            last = {**last, **getattr(hears.recv(), "values", {})}
+        front.join()
+        back.join()
+        listener.join()
+        loops = list(closed)
+    fresh = np.concatenate([[True], np.diff(poses[:, 1]) > 0])  # the others are heartbeats
+    print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, {count} samples in {seconds:g} s")
+    print(f"loops closed over {KEYFRAMES} keyframes: {len(loops)}, {np.round(loops, 2).tolist()} s each")
+    inside = (poses[fresh, 2] - poses[fresh, 1]) / 1e6
+    for title, values_ms in (("sample to publication", inside), ("sample to reader", ages[fresh] / 1e6)):
+        p50, p99, p999 = np.percentile(values_ms, [50, 99, 99.9])
+        print(f"{title:22} p50 {p50:.3f}  p99 {p99:.3f}  p99.9 {p999:.3f}  max {values_ms.max():.2f} ms")
+    print(f"samples: {count} made, {int(fresh.sum())} published to the reader, {taken // 64} to vision")
+    print(f"filter: {last.get('filter')}")
+
+
+def least_us(work: Callable[[], None], calls: int, rounds: int = 7) -> float:
+    """Return the CPU time of one call in microseconds, least of several rounds."""
+    work()
+    best = np.inf
+    for _ in range(rounds):
+        began = time.process_time()
+        for _ in range(calls):
+            work()
+        best = min(best, time.process_time() - began)
+    return best / calls * 1e6
+
+
+def filter_cost() -> None:
+    """Print what predicting, correcting and replaying cost."""
+    from numba import config
+
+    from vislam.ekf import kernels
+
+    x, P, work = np.zeros(23), np.eye(21) * 1e-4, np.zeros((21, 21))
+    x[6] = x[19] = 1.0
+    sigmas = np.array([1e-3, 1e-2, 1e-5, 1e-4, 0.5, 2.0])
+    sample = np.array([0.01, 0.02, 0.3, 0.1, 0.2, 9.8])
+    H = np.zeros((6, 21))
+    H[:, :6], H[:, 15:] = np.eye(6), -np.eye(6)
+    noise, residual = np.eye(6) * 1e-4, np.full(6, 1e-4)
+
+    def update() -> None:
+        _, K = kernels.innovation(P, H, noise, residual)
+        kernels.correct(x, P, K, H, noise, residual)
+
+    t_ns = np.arange(41) * 2_500_000
+    samples, gaps, track = np.tile(sample, (41, 1)), np.zeros(41), np.empty((41, 10))
+    calls = 3 if config.DISABLE_JIT else 2000
+    print(f"compiled: {not config.DISABLE_JIT}; microseconds of CPU time")
+    for title, call in {
+        "predict": lambda: kernels.predict(x, P, sample, sample, 0.0025, 0.0, sigmas, 9.81, work),
+        "update, 6 rows": update,
+        "replay of 100 ms at 400 Hz": lambda: kernels.predict_run(x, P, t_ns, samples, gaps, track, sigmas, 9.81, work),
+    }.items():
+        print(f"  {title:28} {least_us(call, calls):10.2f}")
+
+
+def main() -> None:
+    """Parse and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["processes", "filter"])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    arguments = parser.parse_args()
+    if arguments.what == "filter":
+        filter_cost()
+    else:
+        processes(arguments.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""The virtual cart: exact motion in every process, who steers it, what can be asked of it, and a whole run."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vislam.config import Config, SensorsConfig, load
+from vislam.errors import DataError, UsageError, VislamError
+from vislam.live.epoch import Epoch
+from vislam.live.run_live import LiveRun
+from vislam.live.sensors import open_live
+from vislam.live.virtual.cart import VirtualCart
+from vislam.live.virtual.imu import _truth
+from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
+from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
+from vislam.live.virtual.place import course
+from vislam.runfolder import prepare
+
+
+def test_a_segment_is_the_exact_integral_of_its_accelerations() -> None:
+    start = Segment(1.0, 0.3, -0.2, 0.7, 0.6, 0.9, 0.5, -1.5)
+    x, y, steps = start.x_m, start.y_m, 20_000
+    dt = SEGMENT_S / steps
+    for k in range(steps):
+        t = (k + 0.5) * dt
+        yaw = start.yaw_rad + start.rate_rad_s * t + 0.5 * start.angular_accel_rad_s2 * t * t
+        speed = start.speed_m_s + start.accel_m_s2 * t
+        x, y = x + speed * np.cos(yaw) * dt, y + speed * np.sin(yaw) * dt
+    end = start.at(1.0 + SEGMENT_S)
+    np.testing.assert_allclose([end.x_m, end.y_m], [x, y], atol=1e-10)
+    assert end.speed_m_s == pytest.approx(0.625)
+
+
+def test_other_processes_see_the_same_motion_and_chips_its_derivatives() -> None:
+    name, epoch = f"vislam-test-{uuid.uuid4().hex}", Epoch()
+    drive = Drive(name, 1.0, 2.0, 0.5)
+    try:
+        follower = Follower.waiting(name)
+        for k in range(60):
+            drive.advance(0.05 * k, 0.6, 0.8 if k > 20 else 0.0)
+        assert follower.at(2.5) == drive.at(2.5)
+        truth, begin_ns, h = _truth(follower, epoch, 9.81), epoch.begin_ns(), 1e-4
+        for t_s in (0.312, 1.21, 2.03):
+            before, here, after = (drive.at(t_s + d) for d in (-h, 0.0, h))
+            rate, force, _, _ = truth(begin_ns + round(t_s * 1e9))
+            assert rate[2] == pytest.approx((after.yaw_rad - before.yaw_rad) / (2 * h), abs=1e-6)
+            acceleration = (
+                np.array([after.x_m - 2 * here.x_m + before.x_m, after.y_m - 2 * here.y_m + before.y_m]) / h**2
+            )
+            forward = np.array([np.cos(here.yaw_rad), np.sin(here.yaw_rad)])
+            assert force[0] == pytest.approx(acceleration @ forward, abs=1e-3)
+            assert force[1] == pytest.approx(acceleration @ np.array([-forward[1], forward[0]]), abs=1e-3)
+            assert force[2] == 9.81
+    finally:
+        drive.close()
+
+
+def test_the_pilot_drives_the_course_to_its_end() -> None:
+    way = course(1)
+    follower, drive, errors = PathFollower(way), Drive(f"vislam-test-{uuid.uuid4().hex}", *way[0].tolist(), 0.0), []
+    try:
+        for k in range(4000):
+            here = drive.at(0.02 * k)
+            speed, rate, is_done = follower.command(here.x_m, here.y_m, here.yaw_rad)
+            if is_done:
+                break
+            drive.advance(0.02 * k, speed, rate)
+            errors.append(follower.error_m(here.x_m, here.y_m))
+    finally:
+        drive.close()
+    assert is_done
+    assert follower.length_m > 20.0
+    assert max(errors) < 0.25
+
+
+def test_commands_that_nobody_renews_are_not_obeyed() -> None:
+    name = f"vislam-test-{uuid.uuid4().hex}"
+    reader = CommandReader(name, timeout_s=0.5)
+    assert reader.newest(0.0) == (0.0, 0.0)
+    writer = CommandWriter(name)
+    try:
+        writer.command(0.4, -0.2)
+        assert reader.newest(1.0) == (0.4, -0.2)
+        assert reader.newest(1.4) == (0.4, -0.2)
+        assert reader.newest(1.6) == (0.0, 0.0)
+        writer.command(0.4, -0.2)
+        assert reader.newest(2.0) == (0.4, -0.2)
+    finally:
+        writer.close()
+
+
+def test_the_virtual_cart_tells_its_wheels_and_its_camera() -> None:
+    source, settings = open_live("virtual-cart,imu_out=2:3/4:5,camera_hz=5", Config(), SensorsConfig())
+    assert isinstance(source, VirtualCart)
+    assert source.options.imu_out == ((2.0, 3.0), (4.0, 5.0))
+    assert settings.ekf.nonholonomic
+    assert settings.frontend.planar.height_m == pytest.approx(0.6)
+    with pytest.raises(DataError, match="live"):
+        next(iter(source.events()))
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ("nothing", "no live source 'nothing'"),
+        ("gy85", "no live source"),
+        ("virtual-cart,colour=red", "no option 'colour'"),
+        ("virtual-cart,camera_hz", "write virtual-cart,option=value"),
+        ("virtual-cart,imu_out=5", "no list of outages"),
+        ("gy85+webcam", "needs its calibration"),
+        ("replay:sim:nowhere", "no simulated world"),
+    ],
+)
+def test_wrong_sources_are_told(asked: str, message: str) -> None:
+    with pytest.raises(VislamError, match=message):
+        open_live(asked, Config(), SensorsConfig())
+
+
+def test_a_second_calibration_of_the_imu_is_refused(tmp_path: Path) -> None:
+    config = load(None, {"calibration.camera": str(tmp_path / "cam.yaml"), "calibration.imu": "imu.yaml"})
+    with pytest.raises(UsageError, match="sensors file"):
+        open_live("gy85+webcam", config, SensorsConfig())
+
+
+@pytest.mark.slow
+def test_a_whole_run_of_the_virtual_cart(tmp_path: Path) -> None:
+    """Real drivers, emulated chips, rendered camera, every process; the IMU is unplugged for a second."""
+    out = tmp_path / "run"
+    prepare(out, overwrite=False)
+    name = f"vislam-test-cart-{os.getpid()}"
+    base = load(None, {"view.enabled": False, "live.name": name, "live.send_to": ()})
+    asked = "virtual-cart,camera_hz=4,image_width_px=320,imu_out=9:10"
+    source, config = open_live(asked, base, SensorsConfig())
+    metrics = LiveRun(source, config, out, asked, ["vislam", "live"]).execute(duration_s=14.0)
+    assert metrics["mode"] == "planar"
+    assert metrics["frames"] > 5
+    assert metrics["counters"]["imu"]["gaps"] >= 1
+    assert metrics["live"]["counters"]["samples"] > 200
+    assert (out / "trajectory_truth.tum").is_file()
+    assert not list(Path("/dev/shm").glob(f"*vislam-virtual-{os.getpid()}*"))
+    assert not list(Path("/dev/shm").glob(f"*{name}*"))

@@ -1,0 +1,25 @@
+"""One line that tells how a live run is going."""
+
+from __future__ import annotations
+
+from vislam.hw.health import Health
+from vislam.live.run_live import LiveRun
+
+
+def status_line(run: LiveRun) -> str:
+    """Return where the cart is, how sure that is, what ails the sensors, and how late poses are."""
+    if not run.is_going:
+        waiting = ", ".join(run.waits_for) or "nothing"
+        return f"getting ready: waiting for {waiting}"
+    told = run.notes.get("fast", {})
+    status, latency = told.get("status"), told.get("latency_ms", {})
+    if not status:
+        return "no pose yet"
+    x, y, z = status["position_m"]
+    health = Health(status["health"])
+    names = " ".join((flag.name or "").lower() for flag in health) or "not levelled"
+    late = f"{latency['p50']:.2f}/{latency['p99']:.2f} ms" if "p50" in latency else "-"
+    return (
+        f"x {x:7.2f} y {y:7.2f} z {z:5.2f} m +-{status['sigma_m']:.2f}  {status['speed_m_s']:.2f} m/s  "
+        f"map {status['map_revision']}  sample to pose {late} (p50/p99)  {names}"
+    )

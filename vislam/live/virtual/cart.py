@@ -1,0 +1,156 @@
+"""The virtual cart as a source of a live run: `vislam live --source virtual-cart`."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from vislam.config import Config, Gy85Config
+from vislam.errors import DataError
+from vislam.imu import ImuNoise
+from vislam.live.child import Life
+from vislam.live.epoch import Epoch
+from vislam.live.frames import FrameSource
+from vislam.live.slot import remove
+from vislam.live.virtual.camera import VirtualCamera, run_camera
+from vislam.live.virtual.imu import VirtualGy85
+from vislam.live.virtual.motion import Drive, Segment, locate
+from vislam.live.virtual.pilot import CommandReader, PathFollower
+from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, course, virtual_rig
+from vislam.messages import Frame, ImuSample, MagSample
+from vislam.trajectory import Trajectory
+
+_NS = 1_000_000_000
+_REST_S = 4.0  # before it drives: gravity and gyro bias are found
+_STEP_S = 0.01
+_TRUTH_STEP_S = 0.01
+_COLUMNS = 8
+# the data sheets' noise, with what quantisation to 3.9 mg and 0.07 deg/s adds
+NOISE = ImuNoise(5.4e-4, 7.0e-3, 3.0e-5, 4.0e-4, 200.0)
+
+
+class VirtualCart:
+    """Satisfies `LiveSource`."""
+
+    def __init__(self, options: PlaceOptions, gravity_m_s2: float = 9.81) -> None:
+        """Choose names for what its processes share; nothing starts yet."""
+        self.name = "virtual cart"
+        self.rig = virtual_rig(options)
+        self.imu_noise: ImuNoise | None = NOISE
+        self.frame_count = 0
+        self.problems: dict[str, int] = {}
+        self.duration_s: float | None = None
+        self.options = options
+        self._gravity_m_s2 = gravity_m_s2
+        self._epoch = Epoch()
+        self._shared = f"vislam-virtual-{os.getpid()}-{id(self):x}"
+        self._truth = Path(tempfile.gettempdir()) / f"{self._shared}.truth"
+
+    def settings(self, config: Config) -> Config:
+        """Return the settings with what this cart knows of itself: wheels, and how high its one camera is."""
+        config = replace(config, ekf=replace(config.ekf, nonholonomic=True))
+        front = config.frontend
+        if self.rig.has_depth or front.mode not in ("auto", "planar") or front.planar.height_m is not None:
+            return config
+        height_m = BODY_HEIGHT_M + float(self.rig.T_body_cams[0][2, 3])
+        return replace(config, frontend=replace(front, planar=replace(front.planar, height_m=height_m)))
+
+    @property
+    def command_name(self) -> str:
+        """Name of the shared memory in which commands are looked for."""
+        return f"{self._shared}-command"
+
+    def inertial(self) -> Callable[[], VirtualGy85]:
+        """Return what opens its GY-85."""
+        config = replace(Gy85Config(), bus="/dev/i2c-virtual", rate_hz=NOISE.rate_hz)
+        return partial(
+            VirtualGy85, f"{self._shared}-cart", self._epoch, config, self.options.seed, self._gravity_m_s2,
+            self.options.imu_out,
+        )  # fmt: skip
+
+    def cameras(self) -> Callable[[], FrameSource]:
+        """Return what opens its camera."""
+        return partial(VirtualCamera, f"{self._shared}-camera")
+
+    def helpers(self) -> dict[str, Callable[[Life], None]]:
+        """Return the processes that move it and that render."""
+        names = f"{self._shared}-cart", self._epoch, self.options
+        return {
+            "cart": partial(_run_cart, shared=names, command_name=self.command_name, truth=self._truth),
+            "camera": partial(
+                run_camera, name=f"{self._shared}-camera", cart=names[0], epoch=self._epoch, options=self.options
+            ),
+        }
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        """Raise DataError: live sensors cannot be read twice."""
+        raise DataError("the virtual cart is live; `vislam simulate` makes recordings")
+
+    def truth(self) -> Trajectory | None:
+        """Return where it was, a hundred times a second, as far as it has driven."""
+        segments = true_segments(self._truth)
+        if not segments:
+            return None
+        t_s = np.arange(0.0, segments[-1].t_s, _TRUTH_STEP_S)
+        poses = np.array([locate(segments, float(t)).T_world_body(BODY_HEIGHT_M) for t in t_s]).reshape(-1, 4, 4)
+        return Trajectory(self._epoch.begin_ns() + np.round(t_s * _NS).astype(np.int64), poses)
+
+    def true_path(self) -> list[Segment]:
+        """Return the true motion so far."""
+        return true_segments(self._truth)
+
+    def close(self) -> None:
+        """Remove what its processes wrote and shared; may be called twice."""
+        self._truth.unlink(missing_ok=True)
+        for part in ("cart", "camera"):
+            remove(f"{self._shared}-{part}")
+
+
+def true_segments(path: Path) -> list[Segment]:
+    """Read the segments that the cart's process wrote, whole ones only."""
+    if not path.exists():
+        return []
+    data = path.read_bytes()
+    rows = np.frombuffer(data[: len(data) - len(data) % (8 * _COLUMNS)]).reshape(-1, _COLUMNS)
+    return [Segment(*row) for row in rows.tolist()]
+
+
+def _run_cart(life: Life, shared: tuple[str, Epoch, PlaceOptions], command_name: str, truth: Path) -> None:
+    """Move the cart until the run ends, and write down how."""
+    name, epoch, options = shared
+    way = course(options.laps)
+    follower = PathFollower(way)
+    commands = CommandReader(command_name)
+    drive = Drive(name, float(way[0, 0]), float(way[0, 1]), 0.0)
+    try:
+        with truth.open("wb") as out:
+            out.write(_bytes(drive.at(0.0)))
+            if not life.ready():
+                return
+            begin_ns = epoch.begin_ns()
+            while not life.stopped:
+                now_s = (time.monotonic_ns() - begin_ns) / _NS
+                speed, rate = 0.0, 0.0
+                if options.steered:
+                    speed, rate = commands.newest(now_s)
+                elif now_s > _REST_S and options.laps > 0:
+                    here = drive.at(now_s)
+                    speed, rate, _ = follower.command(here.x_m, here.y_m, here.yaw_rad)
+                for segment in drive.advance(max(now_s, 0.0), speed, rate):
+                    out.write(_bytes(segment))
+                out.flush()
+                time.sleep(_STEP_S)
+    finally:
+        drive.close()
+
+
+def _bytes(s: Segment) -> bytes:
+    values = s.t_s, s.x_m, s.y_m, s.yaw_rad, s.speed_m_s, s.rate_rad_s, s.accel_m_s2, s.angular_accel_rad_s2
+    return np.array(values).tobytes()

@@ -1,0 +1,78 @@
+"""The virtual cart's GY-85: the real driver, through the real smbus2, against emulated chips. Loads no OpenCV."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import ExitStack
+
+from vislam.config import Gy85Config
+from vislam.hw.emulator import Truth, emulated_bus, emulated_gy85
+from vislam.hw.gy85 import Gy85
+from vislam.hw.health import Health
+from vislam.live.epoch import Epoch
+from vislam.live.virtual.motion import Follower
+from vislam.messages import ImuSample, MagSample
+
+_NS = 1_000_000_000
+_FIELD_UT = (18.2, -10.5, -43.0)  # central Europe, z up
+_WARM_C = 25.0
+
+
+class VirtualGy85:
+    """Satisfies `InertialSource`; unplugged in each of `outages`."""
+
+    def __init__(
+        self, cart: str, epoch: Epoch, config: Gy85Config, seed: int, gravity_m_s2: float,
+        outages: tuple[tuple[float, float], ...] = (),
+    ) -> None:  # fmt: skip
+        """Put a board on the cart whose segments are published under a name, and open it with the driver."""
+        self._epoch, self._outages = epoch, outages
+        self._stack = ExitStack()
+        truth = _truth(Follower.waiting(cart), epoch, gravity_m_s2)
+        self._board = emulated_gy85(truth, time.monotonic_ns, seed, path=config.bus)
+        self._is_plugged = True
+        self._stack.enter_context(emulated_bus(self._board))
+        self._driver = Gy85(config)
+        self._stack.callback(self._driver.close)
+        self.rate_hz = self._driver.rate_hz
+
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what the driver reads."""
+        since_s = (time.monotonic_ns() - self._epoch.begin_ns()) / _NS
+        plugged = not any(begin <= since_s < end for begin, end in self._outages)
+        if plugged != self._is_plugged:
+            self._is_plugged = plugged
+            (self._board.replug if plugged else self._board.unplug)()
+        return self._driver.read(timeout_s)
+
+    def health(self) -> Health:
+        """Return that of the driver."""
+        return self._driver.health()
+
+    def counters(self) -> dict[str, int]:
+        """Return those of the driver."""
+        return self._driver.counters()
+
+    def close(self) -> None:
+        """Give the board back."""
+        self._stack.close()
+
+
+def _truth(cart: Follower, epoch: Epoch, gravity_m_s2: float) -> Truth:
+    """Return what chips on the cart sense at a time: a body above the middle of the axle, level."""
+    begin_ns = epoch.peek_ns  # the cart stands until the epoch is known
+
+    def at(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:
+        zero_ns = begin_ns()
+        since_s = -1.0 if zero_ns == 0 else (t_ns - zero_ns) * 1e-9
+        s = cart.segment(since_s)
+        dt = max(since_s - s.t_s, 0.0)
+        speed, rate = s.speed_m_s + s.accel_m_s2 * dt, s.rate_rad_s + s.angular_accel_rad_s2 * dt
+        yaw = s.yaw_rad + dt * (s.rate_rad_s + 0.5 * s.angular_accel_rad_s2 * dt)
+        c, n = math.cos(yaw), math.sin(yaw)
+        accel = s.accel_m_s2 if since_s > 0.0 else 0.0
+        field = (c * _FIELD_UT[0] + n * _FIELD_UT[1], c * _FIELD_UT[1] - n * _FIELD_UT[0], _FIELD_UT[2])
+        return (0.0, 0.0, rate), (accel, speed * rate, gravity_m_s2), field, _WARM_C
+
+    return at

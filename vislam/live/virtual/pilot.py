@@ -1,0 +1,109 @@
+"""Who steers the virtual cart: a controller that writes commands, or else a driver who knows the way."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.errors import DataError
+from vislam.live.slot import SlotReader, SlotWriter
+from vislam.messages import Array
+
+_COMMAND = struct.Struct("<2d")
+
+
+class CommandWriter:
+    """Owns the place where a controller's newest command is."""
+
+    def __init__(self, name: str) -> None:
+        """Make the shared memory."""
+        self._slot = SlotWriter(name, _COMMAND.size)
+
+    def command(self, speed_m_s: float, rate_rad_s: float) -> None:
+        """Ask the wheels for a twist."""
+        self._slot.write(_COMMAND.pack(speed_m_s, rate_rad_s))
+
+    def close(self) -> None:
+        """Remove the shared memory; the cart then stops."""
+        self._slot.close()
+
+
+class CommandReader:
+    """Reads commands; one that does not change for too long means that nobody steers."""
+
+    def __init__(self, name: str, timeout_s: float = 0.5) -> None:
+        self._name, self._timeout_s = name, timeout_s
+        self._slot: SlotReader | None = None
+        self._sequence = 0
+        self._since_s = 0.0
+
+    def newest(self, now_s: float) -> tuple[float, float]:
+        """Return speed and rate to drive with at a time; zero when nobody steers."""
+        if self._slot is None:
+            try:
+                self._slot = SlotReader(self._name)
+            except DataError:
+                return 0.0, 0.0
+        read = self._slot.read()
+        if read is None:
+            return 0.0, 0.0
+        if read[0] != self._sequence:
+            self._sequence, self._since_s = read[0], now_s
+        if now_s - self._since_s > self._timeout_s:
+            return 0.0, 0.0
+        speed, rate = _COMMAND.unpack(read[1])
+        return speed, rate
+
+
+class PathFollower:
+    """Pure pursuit of a polyline, with a speed that bends and the end allow (Coulter, CMU-RI-TR-92-01)."""
+
+    def __init__(self, xy_m: Array, speed_m_s: float = 0.6, ahead_m: float = 0.45, is_loop: bool = False) -> None:
+        """Take a dense path [N, 2]; a loop is driven for ever."""
+        self.xy_m = xy_m
+        self._speed, self._ahead, self._is_loop = speed_m_s, ahead_m, is_loop
+        ends = np.vstack([xy_m, xy_m[:1]]) if is_loop else xy_m
+        self._arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
+        self._at = 0
+
+    @property
+    def length_m(self) -> float:
+        """Of the path."""
+        return float(self._arc[-1])
+
+    def error_m(self, x_m: float, y_m: float) -> float:
+        """Return the distance of a place from the path around where the follower is."""
+        return float(np.linalg.norm(self._near(x_m, y_m)[1], axis=1).min())
+
+    def command(self, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float, bool]:
+        """Return speed, rate and whether the end is reached, at a pose."""
+        window, offsets = self._near(x_m, y_m)
+        self._at = int(window[int(np.argmin(np.linalg.norm(offsets, axis=1)))])
+        left_m = np.inf if self._is_loop else self._arc[len(self.xy_m) - 1] - self._arc[self._at]
+        if left_m < 0.05:
+            return 0.0, 0.0, True
+        goal = self._goal()
+        dx, dy = goal[0] - x_m, goal[1] - y_m
+        bearing = (np.arctan2(dy, dx) - yaw_rad + np.pi) % (2.0 * np.pi) - np.pi
+        curvature = 2.0 * np.sin(bearing) / max(float(np.hypot(dx, dy)), 1e-3)
+        speed = min(self._speed, float(np.sqrt(2.0 * 0.4 * left_m)), 0.5 / max(abs(curvature), 1e-6))
+        if abs(bearing) > 1.0:  # turn on the spot first
+            return 0.0, float(np.clip(1.5 * bearing, -0.8, 0.8)), False
+        return speed, speed * curvature, False
+
+    def _near(self, x_m: float, y_m: float) -> tuple[NDArray[np.int64], Array]:
+        count = len(self.xy_m)
+        window = np.arange(self._at - 20, self._at + 80)
+        window = window % count if self._is_loop else np.clip(window, 0, count - 1)
+        return window, self.xy_m[window] - np.array([x_m, y_m])
+
+    def _goal(self) -> Array:
+        wanted = self._arc[self._at] + self._ahead
+        if self._is_loop:
+            wanted %= self._arc[-1]
+        place = int(np.searchsorted(self._arc, wanted)) % len(self.xy_m) if self._is_loop else None
+        if place is None:
+            place = min(int(np.searchsorted(self._arc, wanted)), len(self.xy_m) - 1)
+        return np.asarray(self.xy_m[place])
