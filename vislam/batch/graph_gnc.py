@@ -90,7 +90,8 @@ def _gated(
     """
     k = problem.tangent
     kept = trusted.copy()
-    poses = odometry_start(_subset(problem, trusted))
+    chain = _subset(problem, trusted)
+    poses = odometry_start(chain, chain.anchors())
     volume = _log_volume(problem, poses)
     level, scale = 0, 0.0
     for _ in range(_ROUNDS_MAX):

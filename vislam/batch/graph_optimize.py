@@ -57,10 +57,9 @@ def optimize_pose_graph(
 
         weights = reject_false_edges(structure, config, progress)
         structure = Structure(without_edges(problem, weights == 0.0))
-    kept = structure.problem
     start_name, start, start_costs = _start(structure, config)
     descent = _descend(structure, start, config, progress)
-    parts = int(kept.components().max()) + 1
+    parts = structure.parts
     notes = list(problem.notes)
     if parts > 1:
         notes.append(f"{parts} parts that no edge joins, each with a pose of its own that keeps its value")
@@ -89,8 +88,8 @@ def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, d
     ones = np.ones(len(problem.edges))
     makers: dict[str, Callable[[], Array]] = {
         "chordal": lambda: chordal_start(structure, ones),
-        "tree": lambda: tree_start(problem),
-        "odometry": lambda: odometry_start(problem),
+        "tree": lambda: tree_start(problem, structure.anchors),
+        "odometry": lambda: odometry_start(problem, structure.anchors),
         "file": lambda: file_start(problem),
     }
     if config.start != "auto":

@@ -89,7 +89,10 @@ class PoseGraphProblem:
 
     def anchors(self) -> Ids:
         """Return the poses (indices) that hold the graph: the fixed ones, and the first of each part that has none."""
-        labels = self.components()
+        return self.anchors_of(self.components())
+
+    def anchors_of(self, labels: Ids) -> Ids:
+        """Return the anchors, given the parts [N] as `components` numbers them."""
         held = np.unique(labels[self.fixed])
         first = np.unique(labels, return_index=True)[1]
         return np.sort(np.concatenate([np.flatnonzero(self.fixed), np.delete(first, held)]))

@@ -12,7 +12,7 @@ from vislam.messages import Array
 
 Progress = Callable[[int, float], None]  # iteration, cost
 
-_DAMPING_FIRST = 1e-4
+_DAMPING_FIRST = 1e-9
 _DAMPING_MAX = 1e8
 _RADIUS_MIN = 1e-12  # of the trust region: no step lowers the cost any more
 

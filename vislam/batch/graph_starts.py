@@ -18,18 +18,24 @@ Mask = NDArray[np.bool_]
 
 def file_start(problem: PoseGraphProblem) -> Array:
     """Return the poses [N, d + 1, d + 1] that the problem has, with those missing chained to them by edges."""
-    return _chained(problem, problem.has_pose, np.zeros(len(problem.edges), dtype=np.bool_))
+    known = problem.has_pose
+    if known.all():
+        return problem.poses.copy()
+    labels = problem.components()
+    without = np.setdiff1d(np.arange(labels.max() + 1), labels[known])
+    known[np.unique(labels, return_index=True)[1][without]] = True
+    return _chained(problem, known, np.zeros(len(problem.edges), dtype=np.bool_))
 
 
-def odometry_start(problem: PoseGraphProblem) -> Array:
+def odometry_start(problem: PoseGraphProblem, anchors: Ints) -> Array:
     """Return poses chained from the anchors by edges between successive ids, other edges only where these end."""
     successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
-    return _chained(problem, _anchored(problem), successive)
+    return _chained(problem, _mask(problem, anchors), successive)
 
 
-def tree_start(problem: PoseGraphProblem) -> Array:
+def tree_start(problem: PoseGraphProblem, anchors: Ints) -> Array:
     """Return poses chained from the anchors by as few edges as possible."""
-    return _chained(problem, _anchored(problem), np.zeros(len(problem.edges), dtype=np.bool_))
+    return _chained(problem, _mask(problem, anchors), np.zeros(len(problem.edges), dtype=np.bool_))
 
 
 def chordal_start(structure: Structure, weights: Array) -> Array:
@@ -135,10 +141,10 @@ def _harmonic(information: Array) -> Array:
     return np.maximum(harmonic, 1e-6 * mean)
 
 
-def _anchored(problem: PoseGraphProblem) -> Mask:
-    known = np.zeros(len(problem.ids), dtype=np.bool_)
-    known[problem.anchors()] = True
-    return known
+def _mask(problem: PoseGraphProblem, chosen: Ints) -> Mask:
+    out = np.zeros(len(problem.ids), dtype=np.bool_)
+    out[chosen] = True
+    return out
 
 
 def _placed_anchors(problem: PoseGraphProblem) -> Array:
@@ -149,9 +155,6 @@ def _placed_anchors(problem: PoseGraphProblem) -> Array:
 def _chained(problem: PoseGraphProblem, known: Mask, free_of_charge: Mask) -> Array:
     poses = _placed_anchors(problem)
     reached = known.copy()
-    labels = problem.components()
-    without = np.setdiff1d(np.arange(labels.max() + 1), labels[reached])
-    reached[np.unique(labels, return_index=True)[1][without]] = True
     _chain(problem.edges, problem.measurements, free_of_charge, reached, poses)
     return poses
 

@@ -17,7 +17,9 @@ class Structure:
     def __init__(self, problem: PoseGraphProblem) -> None:
         """Analyse the graph; the values of its measurements do not matter here."""
         self.problem = problem
-        self.anchors = problem.anchors()
+        labels = problem.components()
+        self.parts = int(labels.max(initial=-1)) + 1
+        self.anchors = problem.anchors_of(labels)
         held = np.zeros(len(problem.ids), dtype=np.bool_)
         held[self.anchors] = True
         self.free: Ids = np.flatnonzero(~held)
