@@ -128,6 +128,9 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         return refusal(capsys, "mag", written(tmp_path / name, recording), "--out", tmp_path / "out", *more)
 
     assert "never faced" in said("half", cart(1, np.pi))
+    t_s, inertial, field = cart(4, np.pi)
+    inertial[:, 2] += 0.3  # a gyroscope that was never calibrated seems to turn by itself
+    assert "never faced" in said("biased", (t_s, inertial, field))
     assert "all directions" in said("tilted", by_hand(1, 0.2), "--mode", "3d")
     assert "turn the cart on the floor" in said("hand", by_hand(1), "--mode", "2d")
     assert "all directions" in said("flat", cart(1), "--mode", "3d")

@@ -106,7 +106,7 @@ def _doubts(solved: HandEye) -> list[str]:
         axis = ", ".join(f"{x:+.2f}" for x in vectors[:, -1])
         doubts.append(
             f"the rotation about the IMU's axis ({axis}) would be known to {np.rad2deg(np.sqrt(values[-1])):.1f} deg "
-            f"only (turned along the principal axes, in degrees: {turned}); turn about two axes at least"
+            f"only (turned along the principal axes, in degrees: {turned}); turn more, and about two axes at least"
         )
     if not solved.sigmas[3] < _MAX_OFFSET_SIGMA_S:
         doubts.append(

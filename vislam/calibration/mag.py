@@ -13,6 +13,7 @@ from vislam.calibration.field import IronFit, fit_iron
 from vislam.calibration.options import MagOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.calibration.tables import Table, read_field, read_inertial
+from vislam.datasets import survey
 from vislam.datasets.imu_files import mag_calibration_text, read_imu_calibration
 from vislam.errors import DataError
 from vislam.geometry import level_rotation
@@ -108,10 +109,7 @@ def _solve_2d(what: str, field: Table, inertial: Table, up: Array, usual: Array,
     R_level = level_rotation(usual)
     level = np.einsum("nij,nj->ni", _levelled(up, R_level, usual), field.values)[:, :2]
     yaw = _yaw_at(field, inertial, up)
-    heading = np.sort(np.mod(yaw, 2.0 * np.pi))
-    gap = float(np.rad2deg(np.max(np.diff(heading, append=heading[0] + 2.0 * np.pi))))
-    refuse(what, [f"a sector of {gap:.0f} deg was never faced; turn the cart once around, slowly"]
-           if gap > _MAX_GAP_DEG else [])  # fmt: skip
+    _refuse_gap(what, yaw)
     fit = fit_iron(level)
     if fit is None:
         raise DataError(
@@ -120,12 +118,22 @@ def _solve_2d(what: str, field: Table, inertial: Table, up: Array, usual: Array,
     refuse(what, _doubts(fit))
     seen = (level - fit.centre) @ fit.shape
     magnetic = np.unwrap(-np.arctan2(seen[:, 1], seen[:, 0]))
+    gap = _refuse_gap(what, magnetic)  # a gyroscope with its bias turns while the cart does not
     line = np.polyfit(field.t_s, magnetic - yaw, 1)  # offset, and the drift of the gyroscope
     rms = float(np.rad2deg(np.std(magnetic - yaw - np.polyval(line, field.t_s))))
     refuse(what, [f"its heading and the gyroscope's differ by {rms:.0f} deg rms: the field changes on the way (iron, "
                   "motors), or an axis is swapped; turn on the spot, elsewhere"]
            if rms > _MAX_HEADING_DEG else [])  # fmt: skip
     return MagResult("2d", fit, R_level, level, gap, 0.0, rms, tilt_deg)
+
+
+def _refuse_gap(what: str, heading_rad: Array) -> float:
+    """Return the largest gap between neighbouring headings in degrees; raises DataError when a sector is missing."""
+    heading = np.sort(np.mod(heading_rad, 2.0 * np.pi))
+    gap = float(np.rad2deg(np.max(np.diff(heading, append=heading[0] + 2.0 * np.pi))))
+    reason = f"a sector of {gap:.0f} deg was never faced; turn the cart once around, slowly"
+    refuse(what, [reason] if gap > _MAX_GAP_DEG else [])
+    return gap
 
 
 def _doubts(fit: IronFit) -> list[str]:
@@ -139,10 +147,13 @@ def _doubts(fit: IronFit) -> list[str]:
 
 
 def _inertial(options: MagOptions) -> Table:
+    """Return inertial samples, calibrated by the file that is named or by what the recording itself says."""
     table = read_inertial(options.source)
-    if options.imu is None:
+    own = None if options.source.is_file() else survey(str(options.source)).imu_calibration
+    calibration = own if options.imu is None else read_imu_calibration(options.imu)
+    if calibration is None:
         return table
-    values = read_imu_calibration(options.imu).apply_to(table.values)
+    values = calibration.apply_to(table.values)
     return Table(table.path, table.t_ns, values, table.problems)
 
 
@@ -237,7 +248,7 @@ def draw(figure: Figure, colors: Mapping[str, str], result: MagResult) -> None:
     around = np.linspace(0.0, 2.0 * np.pi, 200)
     r = result.fit.radius
     left.plot(r * np.cos(around), r * np.sin(around), color=colors["ekf"], linewidth=0.8)
-    left.set(title=f"field, x over y [µT] ({result.mode})", aspect="equal", xlabel="x", ylabel="y")
+    left.set(title=f"field, y over x [µT] ({result.mode})", aspect="equal", xlabel="x", ylabel="y")
     left.legend(loc="upper right")
     right.plot(result.fit.residual_ut, ".", markersize=2, color=colors["graph"])
     right.set(xlabel="sample", title="strength minus the mean [µT]")

@@ -156,7 +156,7 @@ class MagOptions:
     mode: Literal["auto", "2d", "3d"] = "auto"
     """2d: on the floor, level part only; 3d: by hand, to all sides; auto: by how far it was tilted"""
     imu: Path | None = None
-    """imu.yaml of `vislam calibrate imu`, for the direction of gravity and the turns"""
+    """imu.yaml of `vislam calibrate imu`, for gravity and turns; None: what the recording itself says"""
     out: Path = Path("calibration")
     """Folder for mag.yaml, mag.png and mag.json"""
     overwrite: bool = False
