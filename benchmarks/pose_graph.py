@@ -82,9 +82,9 @@ def judge(problem: PoseGraphProblem, result: Path) -> tuple[str, str]:
     return f"{certificate.chi2:.7g}", certificate.word
 
 
-def compare(files: list[Path], limit_s: float, folder: Path) -> None:
+def compare(files: list[Path], limit_s: float, folder: Path, g2o: str) -> None:
     """Print the table of all peers on files."""
-    python, reason = g2o_python(folder / "g2o")
+    python, reason = (g2o, "") if g2o else g2o_python(folder / "g2o")
     print("| file | poses, edges | peer | load s | solve s | total s | wall s | chi2 | certified |")
     print("|---|---|---|---:|---:|---:|---:|---:|---|")
     for source in files:
@@ -167,6 +167,7 @@ def main() -> None:
     parser.add_argument("--shapes", nargs="+", default=["manhattan", "torus", "sphere", "grid3d"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[1000, 3000, 10000, 30000, 100000])
     parser.add_argument("--loops-per-pose", type=float, default=1.0, help="4 makes 500,000 edges of 100,000 poses")
+    parser.add_argument("--g2o-python", default="", help="a python that has g2opy, instead of making one")
     parser.add_argument("--picture", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -174,7 +175,7 @@ def main() -> None:
         if args.files == ["growth"]:
             growth(args.shapes, args.sizes, args.loops_per_pose, args.limit_s, folder, args.picture)
         else:
-            compare([Path(file) for file in args.files], args.limit_s, folder)
+            compare([Path(file) for file in args.files], args.limit_s, folder, args.g2o_python)
 
 
 if __name__ == "__main__":
