@@ -107,10 +107,11 @@ def test_a_wrong_tilt_corrects_itself() -> None:
     told = replace(CONFIG, planar=replace(PLANAR, tilt_deg=17.4, roll_deg=-0.4))
     driven = run(drive, frames, told)
     found = driven.frontend.calibration
-    assert abs(found["tilt_deg"] - 18.0) < 0.15 and abs(found["roll_deg"]) < 0.15
-    assert found["tilt_sigma_deg"] < 0.12 and found["height_m"] == HEIGHT_M
+    assert abs(found["tilt_deg"] - 18.0) < min(0.25, 3.0 * found["tilt_sigma_deg"]) and abs(found["roll_deg"]) < 0.2
+    assert found["tilt_sigma_deg"] < 0.15 and found["height_m"] == HEIGHT_M
     assert end_error(drive, driven)[0] < 0.01
-    trusted = replace(told, planar=replace(told.planar, tilt_sigma_deg=1e-4, tilt_walk_deg=0.0))
+    stiff = {"tilt_sigma_deg": 1e-4, "tilt_walk_deg": 0.0, "vibration_deg": 1e-4, "vibration_known_deg": 1e-4}
+    trusted = replace(told, planar=replace(told.planar, heave_m=1e-6, **stiff))
     assert end_error(drive, run(drive, frames, trusted))[0] > 0.02  # 0.7 deg are 3.5 % of scale
 
 

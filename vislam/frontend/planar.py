@@ -237,7 +237,7 @@ class PlanarFrontEnd:
         failure = fit.failure or self._failure(fit, candidates)
         good = fit.inliers.copy()
         if not failure:
-            covariance = covariance + self._lasting(fit, T)
+            covariance = covariance + self._lasting(fit, T) + self._jitter(pair.R_now)
             off_px = from_epipolar_segment(T, pair.rays, xy, 1.0 / self._config.min_depth_m) / self._px
             with np.errstate(invalid="ignore"):
                 good |= off_px < _EPIPOLAR_PX
@@ -262,6 +262,12 @@ class PlanarFrontEnd:
         out = np.zeros((6, 6))
         out[3:, 3:] = relative**2 * max(length, planar.correlation_m) / length * np.outer(way, way)
         return out
+
+    def _jitter(self, R_now: Array) -> Array:
+        """Return the covariance [6, 6] of a motion whose ends were stamped a little early or late, at this speed."""
+        turning, moving = R_now[2] * self._rate[0], self._rate[1:] @ R_now[:2]
+        step = np.concatenate([turning, moving]) * self._planar.stamp_jitter_s
+        return 2.0 * np.outer(step, step)
 
     def _failure(self, fit: Fit, candidates: int) -> str:
         agree = int(np.count_nonzero(fit.inliers))
