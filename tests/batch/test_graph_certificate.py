@@ -65,7 +65,7 @@ def test_the_published_optimum_is_found_and_proven(name: str) -> None:
 @pytest.mark.data
 def test_a_wrong_minimum_of_a_real_graph_is_not_certified() -> None:
     problem = _file("MIT")
-    certificate = certify(problem, _solved(problem, odometry_start(problem)))
+    certificate = certify(problem, _solved(problem, odometry_start(problem, Structure(problem).anchors)))
     assert certificate.chi2 > 100.0, "chi2 has a local minimum there"
     assert not certificate.certified
     assert certificate.least_eigenvalue < -1.0
