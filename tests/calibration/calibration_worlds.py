@@ -72,8 +72,8 @@ def hand_held(
     R_world_body = Rotation.align_vectors([[0.0, 0.0, 1.0]], [ups[0]])[0]
     steps = round(move_s * RATE_HZ)
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(steps) + 0.5) / steps)  # its mean is one
-    rates, attitudes = [np.zeros((round(rest_s * RATE_HZ), 3))], [np.tile(R_world_body.as_matrix(), (300, 1, 1))]
-    attitudes[0] = np.tile(R_world_body.as_matrix(), (len(rates[0]), 1, 1))
+    rates = [np.zeros((round(rest_s * RATE_HZ), 3))]
+    attitudes = [np.tile(R_world_body.as_matrix(), (len(rates[0]), 1, 1))]
     for up in ups[1:]:
         target = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
         target = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-2.0, 2.0)]) * target
