@@ -69,12 +69,12 @@ class Factor:
         `ends` [M, 2] are indices of free poses, -1 for one that is known. Only the fronts between the two poses and
         the root are visited.
         """
-        s = self._symbolic
+        s = self.symbolic
         front_of = np.repeat(np.arange(len(s.first) - 1), np.diff(s.first))
         places = np.where(ends >= 0, s.place[ends], -1)
-        out = np.zeros((len(ends), self._d, self._d))
+        out = np.zeros((len(ends), self.d, self.d))
         _edge_covariances(
-            self._d, s.first, s.row_begin, s.rows, s.parent, s.panel_begin, front_of, self._panels, places,
+            self.d, s.first, s.row_begin, s.rows, s.parent, s.panel_begin, front_of, self._panels, places,
             np.ascontiguousarray(jacobians.transpose(0, 1, 3, 2)), out,
         )  # fmt: skip
         return out
