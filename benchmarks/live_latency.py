@@ -59,21 +59,24 @@ def close_loops(connection, stop, closed) -> None:
     """Build graphs of 1,000 keyframes and close a loop over each."""
     from graph_world import GRAVITY_M_S2, RIG, World
 
-    from vislam.config import GraphConfig
+    from vislam.config import GraphConfig, WindowConfig
     from vislam.graph import PoseGraph
     from vislam.live.messages import MapMoved
 
     world = World(duration_s=KEYFRAMES / 5.0 + 2.0)
     revision = 0
     while not stop.is_set():
-        graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, GRAVITY_M_S2, RIG)
-        graph.initialise(world.initial_state(), np.eye(4))
+        graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+        graph.initialise(world.initial_state(), world.truth[0])
+        T_odom_body = world.truth[0]
         for k in range(KEYFRAMES):
             if stop.is_set():
                 return
             began = time.monotonic()
             edges = [world.loop(0, 0, k)] if k == KEYFRAMES - 1 else []
-            update = graph.add(world.packet(k), edges, world.T_world_body[k])
+            packet = world.packet(k)
+            T_odom_body = T_odom_body @ packet.vo.T_keyframe_body
+            update = graph.add(packet, edges, T_odom_body)
             revision += 1
             connection.send(MapMoved(revision, update.T_map_odom))
         closed.append(time.monotonic() - began)

@@ -32,6 +32,7 @@ _REST_S = 4.0  # before it drives: gravity and gyro bias are found
 _STEP_S = 0.01
 _TRUTH_STEP_S = 0.01
 _COLUMNS = 8
+_FRAMES_MISSED = 4  # in a row: then vision counts as lost, however slow the camera is
 # the data sheets' noise, with what quantisation to 3.9 mg and 0.07 deg/s adds
 NOISE = ImuNoise(5.4e-4, 7.0e-3, 3.0e-5, 4.0e-4, 200.0)
 
@@ -55,7 +56,9 @@ class VirtualCart:
 
     def settings(self, config: Config) -> Config:
         """Return the settings with what this cart knows of itself: wheels, and how high its one camera is."""
-        config = replace(config, ekf=replace(config.ekf, nonholonomic=True))
+        timeout_s = max(config.live.vision_timeout_s, _FRAMES_MISSED / self.options.camera_hz)
+        live = replace(config.live, vision_timeout_s=timeout_s)
+        config = replace(config, ekf=replace(config.ekf, nonholonomic=True), live=live)
         front = config.frontend
         if self.rig.has_depth or front.mode not in ("auto", "planar") or front.planar.height_m is not None:
             return config
