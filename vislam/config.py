@@ -600,7 +600,10 @@ class LiveConfig:
 
     name: str = "vislam-pose"  # of the shared memory, /dev/shm/NAME, and of the socket NAME.sock
     send_to: tuple[str, ...] = ("unix",)  # a datagram per sample to: unix[:PATH], udp:HOST:PORT
-    allow_remote: bool = False  # let send_to name other machines
+    allow_remote: bool = False  # let send_to, mavlink and ROS 2 reach other machines
+    ros2_domain: int | None = None  # /odom and /tf over DDS, in this domain; needs cyclonedds
+    mavlink: str | None = None  # udp:HOST:PORT that gets ODOMETRY; needs pymavlink
+    bridge_rate_hz: float = 50.0  # of both at most: what autopilots want; control near by takes the datagrams
     base_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what a controller steers, in body axes
     vision_timeout_s: float = 0.3  # without a correction for so long it is dead reckoning; a lost frame says so at once
     drift_sigma_m: float = 0.3  # position sigma gained since vision was lost, above which the pose is invalid

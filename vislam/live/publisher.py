@@ -19,7 +19,11 @@ def socket_path(name: str) -> Path:
     return Path(os.environ.get("XDG_RUNTIME_DIR", "/tmp")) / f"{name}.sock"
 
 
-def _address(to: str, name: str, allow_remote: bool) -> tuple[socket.AddressFamily, str | tuple[str, int]]:
+def send_address(to: str, name: str, allow_remote: bool) -> tuple[socket.AddressFamily, str | tuple[str, int]]:
+    """Return family and address of "unix", "unix:PATH" or "udp:HOST:PORT".
+
+    Raises UsageError for what is none of these, or beyond this machine without `allow_remote`.
+    """
     kind, _, rest = to.partition(":")
     if kind == "unix":
         return socket.AF_UNIX, rest or str(socket_path(name))
@@ -58,7 +62,7 @@ class PosePublisher:
             StorageError: the shared memory cannot be made.
         """
         self.counters = {"published": 0, "datagrams_refused": 0}
-        addresses = [_address(to, name, allow_remote) for to in send_to]
+        addresses = [send_address(to, name, allow_remote) for to in send_to]
         self._targets = [(socket.socket(family, socket.SOCK_DGRAM), address) for family, address in addresses]
         for target, _ in self._targets:
             target.setblocking(False)
@@ -109,7 +113,7 @@ class PoseListener:
 
         Raises UsageError when that cannot be bound.
         """
-        family, address = _address(at, "vislam", allow_remote=True)
+        family, address = send_address(at, "vislam", allow_remote=True)
         self._path = Path(address) if isinstance(address, str) else None
         if self._path is not None:
             with suppress(OSError):  # left by a listener that was killed

@@ -7,7 +7,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import connection, get_context
 from multiprocessing.connection import Connection
@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from vislam.config import Config
 from vislam.errors import HardwareError, UsageError, VislamError
 from vislam.hw.source import InertialSource
-from vislam.live import back_process, fast_process, front_process, map_process
+from vislam.live import back_process, bridge, fast_process, front_process, map_process
 from vislam.live.child import Failure, Life, Note, Ready, Signals, guarded
 from vislam.live.frames import FrameSource
 from vislam.live.slot import remove
@@ -78,7 +78,7 @@ class LiveRun:
             command: as it was typed.
 
         Raises:
-            UsageError: settings that only make sense with a recording.
+            UsageError: settings that only make sense with a recording, or a bridge that cannot be.
         """
         noise = imu_noise(config.imu, source.imu_noise)
         if noise is None:
@@ -104,6 +104,8 @@ class LiveRun:
         self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str], noise: Any
     ) -> dict[str, Callable[[Life], None]]:
         """Return what each process does, with its ends of the wires."""
+        bridges = bridge.asked(config.live)
+        send_to = (*config.live.send_to, *(at for at, _ in bridges.values()))
         samples_in, samples_out = socket.socketpair()
         front_says, fast_hears_front = self._context.Pipe(duplex=False)[::-1]
         back_says, fast_hears_back = self._context.Pipe(duplex=False)[::-1]
@@ -117,9 +119,11 @@ class LiveRun:
         rig = source.rig
         return {
             **source.helpers(),
+            **{role: body for role, (_, body) in bridges.items()},
             "fast": partial(
-                fast_process.run, config=config, noise=noise, T_body_camera=rig.T_body_cams[0],
-                open_source=source.inertial(), samples=samples_in, inbox=[fast_hears_front, fast_hears_back],
+                fast_process.run, config=replace(config, live=replace(config.live, send_to=send_to)), noise=noise,
+                T_body_camera=rig.T_body_cams[0], open_source=source.inertial(), samples=samples_in,
+                inbox=[fast_hears_front, fast_hears_back],
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),

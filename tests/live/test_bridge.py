@@ -1,0 +1,356 @@
+"""The pose on the wires of others: ROS 2 over DDS, MAVLink; checked against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from tests.live.test_published_pose import random_pose
+from tests.needs import missing
+from vislam.config import LiveConfig
+from vislam.errors import UsageError
+from vislam.geometry import roll_pitch_yaw_rad, rotation_from_quaternion_xyzw, transform
+from vislam.hw.health import Health
+from vislam.live import bridge
+from vislam.live.child import Signals, guarded
+from vislam.live.publisher import PosePublisher
+
+_DOMAIN = 100 + os.getpid() % 100  # not the domain of whatever else runs here
+_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # 90 degrees to the left
+_HALF = math.sqrt(0.5)
+_NO_STATE = {"pose_covariance": np.full((6, 6), np.inf), "twist_covariance": np.full((6, 6), np.inf)}
+
+needs_dds = pytest.mark.usefixtures("dds")
+needs_mavlink = pytest.mark.usefixtures("mavlink")
+
+
+@pytest.fixture
+def dds() -> None:
+    if importlib.util.find_spec("cyclonedds") is None:
+        missing("cyclonedds is not installed: pip install 'vislam[ros2]'")
+
+
+@pytest.fixture
+def mavlink() -> None:
+    if importlib.util.find_spec("pymavlink") is None:
+        missing("pymavlink is not installed: pip install 'vislam[mavlink]'")
+
+
+def known_pose(**changes: object):
+    """A base 3 m ahead, 2 m to the left and 1 m up, turned left by 90 degrees, in a map that is turned as well."""
+    covariance = np.diag([1.0, 4.0, 9.0, 0.01, 0.04, 0.09])
+    covariance[0, 1] = covariance[1, 0] = 0.5  # x with y
+    covariance[1, 5] = covariance[5, 1] = 0.25  # y with the heading
+    covariance[1, 2] = covariance[2, 1] = 0.125  # y with z
+    twist = np.diag([0.1, 0.2, 0.3, 0.001, 0.002, 0.003])
+    twist[0, 2] = twist[2, 0] = 0.05
+    values = {
+        "t_ns": 12_345_678_901, "T_odom_base": transform(_TURN, np.array([3.0, 2.0, 1.0])),
+        "velocity_m_s": np.array([0.5, 0.1, -0.2]), "rate_rad_s": np.array([0.01, 0.02, 0.3]),
+        "pose_covariance": covariance, "twist_covariance": twist, "reset_counter": 258,
+        "T_map_odom": transform(_TURN, np.array([10.0, 20.0, 0.0])),
+    }  # fmt: skip
+    return random_pose(**(values | changes))
+
+
+@needs_dds
+def test_odometry_is_in_ros_frames_units_and_order() -> None:
+    from vislam.live.ros2 import odometry
+
+    pose = known_pose()
+    message = odometry(pose, 1_700_000_000_250_000_000)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 250_000_000)
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
+    where, q = message.pose.pose.position, message.pose.pose.orientation
+    assert (where.x, where.y, where.z) == (3.0, 2.0, 1.0)
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.0, 0.0, _HALF, _HALF], atol=1e-15)
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    assert (linear.x, linear.y, linear.z) == (0.5, 0.1, -0.2)
+    assert (angular.x, angular.y, angular.z) == (0.01, 0.02, 0.3)
+    assert [message.pose.covariance[k] for k in (0, 1, 7, 8, 11, 14, 21, 28, 31, 35)] == [
+        1.0, 0.5, 4.0, 0.125, 0.25, 9.0, 0.01, 0.04, 0.25, 0.09,
+    ]  # fmt: skip
+    assert [message.twist.covariance[k] for k in (0, 2, 7, 12, 14, 21, 28, 35)] == [
+        0.1, 0.05, 0.2, 0.05, 0.3, 0.001, 0.002, 0.003,
+    ]  # fmt: skip
+
+
+@needs_dds
+def test_tf_says_where_odom_is_in_map_and_base_in_odom() -> None:
+    from vislam.live.ros2 import transforms
+
+    pose = known_pose()
+    links = transforms(pose, 1).transforms
+    assert [(link.header.frame_id, link.child_frame_id) for link in links] == [("map", "odom"), ("odom", "base_link")]
+    T_map_base = np.eye(4)
+    for link in links:
+        q, t = link.transform.rotation, link.transform.translation
+        T_map_base = T_map_base @ transform(
+            rotation_from_quaternion_xyzw(np.array([q.x, q.y, q.z, q.w])), np.array([t.x, t.y, t.z])
+        )
+    # 3 ahead and 2 left of a frame that is turned left: 2 back, 3 left; two quarter turns are a half.
+    np.testing.assert_allclose(T_map_base[:3, 3], [8.0, 23.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(T_map_base[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
+
+
+def publish_until(name: str, at: str, pose, enough) -> None:
+    """Publish a pose again and again, new every time, until enough has come of it."""
+    publisher = PosePublisher(name, (at,))
+    try:
+        for k in range(1, 2000):
+            now_ns = time.monotonic_ns()
+            publisher.publish(known_pose(t_ns=now_ns, published_ns=now_ns, sequence=k) if pose is None else pose)
+            if enough():
+                return
+            time.sleep(0.01)
+    finally:
+        publisher.close()
+    pytest.fail("nothing came over the wire")
+
+
+class Bridge:
+    """A translator's process, run as a live run does."""
+
+    def __init__(self, live: LiveConfig, role: str) -> None:
+        context = get_context("spawn")
+        self.at, body = bridge.asked(live)[role]
+        self._signals = Signals(context.Event(), context.Event())
+        self.report, says = context.Pipe(duplex=False)
+        self._process = context.Process(target=guarded, args=(role, says, self._signals, body))
+        self._process.start()
+        says.close()
+        self._signals.go.set()
+
+    def end(self) -> int | None:
+        self._signals.stop.set()
+        self._process.join(20.0)
+        return self._process.exitcode
+
+
+@needs_dds
+def test_a_ros_reader_gets_the_pose_from_the_process_beside() -> None:
+    from cyclonedds.domain import Domain, DomainParticipant
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from vislam.live import ros2
+
+    name = f"vislam-test-{uuid.uuid4().hex[:8]}"
+    translator = Bridge(LiveConfig(name=name, ros2_domain=_DOMAIN, bridge_rate_hz=1000.0), "ros2")
+    domain = Domain(_DOMAIN, ros2.LOOPBACK)
+    participant = DomainParticipant(_DOMAIN)
+    readers = {
+        topic: DataReader(participant, Topic(participant, f"rt/{topic}", kind, qos=ros2.QOS), qos=ros2.QOS)
+        for topic, kind in (("odom", ros2.Odometry), ("tf", ros2.TFMessage))
+    }
+    got: dict[str, list] = {"odom": [], "tf": []}
+
+    def enough() -> bool:
+        for topic, reader in readers.items():
+            got[topic] += reader.take(N=100)
+        return all(len(messages) >= 3 for messages in got.values())
+
+    try:
+        publish_until(name, translator.at, None, enough)
+    finally:
+        assert translator.end() == 0
+        readers.clear()
+        del participant, domain
+    message = got["odom"][-1]
+    expected = ros2.odometry(known_pose(), message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+    assert abs(time.time() - message.header.stamp.sec) < 60.0
+    assert message.header == expected.header
+    assert message.pose.pose.position == expected.pose.pose.position
+    np.testing.assert_allclose(message.pose.covariance, expected.pose.covariance, rtol=1e-6)
+    assert [link.child_frame_id for link in got["tf"][-1].transforms] == ["odom", "base_link"]
+
+
+@needs_dds
+@pytest.mark.parametrize("changes", [{"health": Health.LEVELLED | Health.INVALID}, _NO_STATE])
+def test_ros_hears_nothing_of_a_pose_not_to_steer_by(changes: dict) -> None:
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from vislam.live import ros2
+
+    wire = ros2.Ros2(_DOMAIN + 30)
+    try:
+        topic = Topic(wire._participant, "rt/odom", ros2.Odometry, qos=ros2.QOS)
+        reader = DataReader(wire._participant, topic, qos=ros2.QOS)
+        wire.send(known_pose(**changes))
+        wire.send(known_pose(T_odom_base=np.eye(4)))
+        assert [message.pose.pose.position.x for message in reader.take(N=10)] == [0.0]
+    finally:
+        wire.close()
+
+
+@needs_mavlink
+def test_mavlink_odometry_is_in_forward_right_down() -> None:
+    from pymavlink.dialects.v20 import common
+
+    from vislam.live.mavlink import odometry
+
+    link = common.MAVLink(None, 1, 197)
+    message = common.MAVLink(None).parse_char(odometry(known_pose()).pack(link))
+    assert message.get_msgId() == 331
+    assert message.time_usec == 12_345_678
+    assert (message.frame_id, message.child_frame_id) == (common.MAV_FRAME_LOCAL_FRD, common.MAV_FRAME_BODY_FRD)
+    np.testing.assert_allclose([message.x, message.y, message.z], [3.0, -2.0, -1.0])
+    np.testing.assert_allclose(message.q, [_HALF, 0.0, 0.0, -_HALF], atol=1e-7)  # a turn to the left is negative
+    np.testing.assert_allclose([message.vx, message.vy, message.vz], [0.5, -0.1, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(
+        [message.rollspeed, message.pitchspeed, message.yawspeed], [0.01, -0.02, -0.3], rtol=1e-6
+    )
+    pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+    pose[np.triu_indices(6)], twist[np.triu_indices(6)] = message.pose_covariance, message.velocity_covariance
+    expected = np.diag([1.0, 4.0, 9.0, 0.01, 0.04, 0.09])
+    expected[0, 1], expected[1, 5], expected[1, 2] = -0.5, 0.25, 0.125  # y and z, y and heading both turn over
+    np.testing.assert_allclose(pose, expected, rtol=1e-6)
+    expected = np.diag([0.1, 0.2, 0.3, 0.001, 0.002, 0.003])
+    expected[0, 2] = -0.05
+    np.testing.assert_allclose(twist, expected, rtol=1e-6)
+    assert message.reset_counter == 2  # of 258: it is a byte there
+    assert message.estimator_type == common.MAV_ESTIMATOR_TYPE_VIO
+
+
+@needs_mavlink
+def test_roll_keeps_its_sign_and_pitch_turns_over() -> None:
+    from vislam.live.mavlink import odometry
+
+    rolled = transform(rotation_from_quaternion_xyzw(np.array([math.sin(0.1), 0.0, 0.0, math.cos(0.1)])), np.zeros(3))
+    pitched = transform(rotation_from_quaternion_xyzw(np.array([0.0, math.sin(0.1), 0.0, math.cos(0.1)])), np.zeros(3))
+    for T, expected in ((rolled, [0.2, 0.0, 0.0]), (pitched, [0.0, -0.2, 0.0])):
+        w, x, y, z = odometry(known_pose(T_odom_base=T)).q
+        R = rotation_from_quaternion_xyzw(np.array([x, y, z, w]))
+        np.testing.assert_allclose(roll_pitch_yaw_rad(R), expected, atol=1e-12)
+
+
+@needs_mavlink
+def test_what_is_unknown_is_nan_and_quality_follows_the_health() -> None:
+    from vislam.live.mavlink import odometry, quality
+
+    message = odometry(known_pose(health=Health.INVALID, **_NO_STATE))
+    assert np.isnan(message.pose_covariance[0])
+    assert np.isnan(message.velocity_covariance[0])
+    assert message.quality == quality(Health(0)) == quality(Health.LEVELLED | Health.VISION_OK | Health.INVALID) == -1
+    assert quality(Health.LEVELLED | Health.VISION_OK) == 100
+    assert quality(Health.LEVELLED | Health.DEAD_RECKONING) == 25
+    assert quality(Health.LEVELLED | Health.VISION_OK | Health.GATE_REJECT) == 25
+
+
+@needs_mavlink
+def test_an_autopilot_gets_the_pose_from_the_process_beside() -> None:
+    from pymavlink.dialects.v20 import common
+
+    name = f"vislam-test-{uuid.uuid4().hex[:8]}"
+    autopilot = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    autopilot.bind(("127.0.0.1", 0))
+    autopilot.setblocking(False)
+    live = LiveConfig(name=name, mavlink=f"udp:127.0.0.1:{autopilot.getsockname()[1]}", bridge_rate_hz=1000.0)
+    translator = Bridge(live, "mavlink")
+    parser, got = common.MAVLink(None), []
+
+    def enough() -> bool:
+        try:
+            while True:
+                got.extend(parser.parse_buffer(autopilot.recv(1024)) or [])
+        except BlockingIOError:
+            return len(got) >= 4
+
+    try:
+        publish_until(name, translator.at, None, enough)
+    finally:
+        assert translator.end() == 0
+        autopilot.close()
+    assert [message.get_type() for message in got[:3]] == ["HEARTBEAT", "ODOMETRY", "ODOMETRY"]
+    sequence = [message.get_seq() for message in got]
+    assert sequence == list(range(len(got)))
+    assert (got[1].x, got[1].y, got[1].z) == (3.0, -2.0, -1.0)
+
+
+def test_poses_beyond_the_rate_are_left_out() -> None:
+    from vislam.live.child import Life
+
+    sent: list[int] = []
+
+    class Kept:
+        def send(self, pose) -> None:
+            sent.append(pose.sequence)
+
+        def close(self) -> None:
+            sent.append(-1)
+
+    class Poses:
+        """Hands out a second of poses at 400 Hz, then ends the run."""
+
+        def __init__(self, at: str) -> None:
+            self.left = iter([known_pose(published_ns=10**9 + k * 2_500_000, sequence=k) for k in range(1, 401)])
+
+        def next(self, timeout_s: float):
+            pose = next(self.left, None)
+            if pose is None:
+                signals.stop.set()
+            return pose
+
+        def close(self) -> None:
+            sent.append(-2)
+
+    context = get_context("spawn")
+    signals = Signals(context.Event(), context.Event())
+    signals.go.set()
+    _, says = context.Pipe(duplex=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bridge, "PoseListener", Poses)
+        bridge.run(Life("kept", says, signals), "unix:never", 50.0, Kept)
+    assert sent == [*range(1, 401, 8), -1, -2]
+
+
+def test_nothing_is_started_unasked() -> None:
+    assert bridge.asked(LiveConfig()) == {}
+
+
+@needs_dds
+@needs_mavlink
+@pytest.mark.parametrize(
+    ("live", "says"),
+    [
+        (LiveConfig(ros2_domain=233), "domains 0 to 232"),
+        (LiveConfig(mavlink="udp:192.0.2.1:14550"), "beyond this machine"),
+        (LiveConfig(mavlink="udpout:127.0.0.1:14550"), "write unix, unix:PATH or udp"),
+        (LiveConfig(ros2_domain=0, bridge_rate_hz=0.0), "must be more than 0"),
+        (LiveConfig(ros2_domain=0, bridge_rate_hz=float("nan")), "must be more than 0"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_starts(live: LiveConfig, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        bridge.asked(live)
+
+
+@pytest.mark.parametrize(
+    ("live", "extra"), [(LiveConfig(ros2_domain=0), "ros2"), (LiveConfig(mavlink="udp:127.0.0.1:1"), "mavlink")]
+)
+def test_a_missing_package_is_named_with_what_installs_it(
+    live: LiveConfig, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bridge, "find_spec", lambda package: None)
+    with pytest.raises(UsageError, match=rf"pip install 'vislam\[{extra}\]'"):
+        bridge.asked(live)
+
+
+def test_neither_package_is_loaded_beside_the_pose() -> None:
+    code = (
+        "import sys, vislam.cli, vislam.live.run_live, vislam.live.fast_process; "
+        "print(sorted({name.partition('.')[0] for name in sys.modules} & {'cyclonedds', 'pymavlink'}))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]", found.stdout
