@@ -474,6 +474,9 @@ def _compare(arguments: list[str]) -> int:
 
 
 def _optimize(arguments: list[str]) -> int:
+    sessions = [a for a in arguments if (Path(a) / "session.db").is_file() or Path(a).name == "session.db"]
+    if len(sessions) > 1 or (sessions and any(a.partition("=")[0] == "--out" for a in arguments)):
+        return _join_sessions(arguments)
     if any(Path(argument).is_file() or argument.endswith(".g2o") for argument in arguments):
         return _optimize_graph(arguments)
     from vislam.optimize import optimize
@@ -499,6 +502,31 @@ def _optimize(arguments: list[str]) -> int:
         _print_evaluation({f"{options.out_name} ({mode})": entry["accuracy"][mode] for mode in entry["accuracy"]})
     print(f"trajectory: {options.run / f'trajectory_{options.out_name}.tum'}")
     return 0
+
+
+def _join_sessions(arguments: list[str]) -> int:
+    from vislam.join_sessions import join_sessions, write_joined
+    from vislam.options import JoinOptions
+    from vislam.report.graph_page import write_graph_report
+
+    options = _parse(JoinOptions, arguments, "optimize")
+    with _progress("loops between sessions", "keyframes") as bar:
+        joined = join_sessions(options.sessions, progress=bar)
+    write_joined(joined, options.out)
+    if options.report:
+        write_graph_report(joined.problem, joined.solution, " + ".join(joined.names), options.out / "report.html")
+    summary = joined.summary
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(
+            f"{len(joined.names)} sessions, {summary['poses']} keyframes; {summary['loops_kept']} of "
+            f"{summary['loops_between']} loops between them kept; chi2 {summary['chi2_after']:.6g}"
+        )
+        for warning in summary["warnings"]:
+            print(f"warning: {warning}")
+        print(f"results: {options.out}")
+    return 0 if summary["converged"] else TrackingLostError.exit_code
 
 
 def _optimize_graph(arguments: list[str]) -> int:
@@ -758,7 +786,11 @@ _VERBS = {
         "say what is wrong with a recording, or with the sensors of this machine",
         "vislam doctor euroc:PATH; vislam doctor --i2c /dev/i2c-1 --camera 0",
     ),
-    "optimize": _Verb(_optimize, "estimate a run again in batch, from its factor log", "vislam optimize runs/desk"),
+    "optimize": _Verb(
+        _optimize,
+        "estimate a run again in batch, optimise a pose-graph file, or join sessions",
+        "vislam optimize runs/desk",
+    ),
     "map": _Verb(
         _map,
         "make the maps of a run again, or say what an OctoMap file holds",

@@ -179,10 +179,11 @@ class DoctorOptions:
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """Options of `vislam optimize`."""
+    """Options of `vislam optimize RUN`; a pose-graph FILE and several RUNs have their own."""
 
     run: Positional[Path]
-    """Run folder, whether its run came to the end or not"""
+    """Run folder, whether its run came to the end or not; give several, or a pose-graph file, before --help for their
+    options"""
     settings: Annotated[BatchConfig, tyro.conf.arg(name="")] = field(default_factory=BatchConfig)
     out_name: str = "batch"
     """Names the files: trajectory_NAME.tum, states_NAME.csv"""
@@ -200,6 +201,20 @@ class OptimizeGraphOptions:
     out: Path | None = None
     """Folder for optimized.g2o, trajectory.tum, trajectory_kitti.txt, poses.csv, edges.csv, summary.json and
     report.html; None: NAME_optimized in the working folder"""
+    report: bool = True
+    """Write report.html, with pictures of before and after"""
+    json: bool = False
+    """Print summary.json instead of the summary"""
+
+
+@dataclass(frozen=True)
+class JoinOptions:
+    """Options of `vislam optimize RUN RUN [...]`: sessions joined into one pose graph by loops between them."""
+
+    out: Path
+    """Folder for trajectory_NAME.tum of each session, joined.g2o, loops.csv, summary.json and report.html"""
+    sessions: Positional[tuple[Path, ...]] = ()
+    """Run folders or session.db files, two or more, which are only read; the map is that of the first"""
     report: bool = True
     """Write report.html, with pictures of before and after"""
     json: bool = False

@@ -60,6 +60,15 @@ def reject_false_edges(structure: Structure, config: PoseGraphConfig, progress: 
     return weights
 
 
+def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraphConfig) -> Array:
+    """Return the weights [E] of edges, 1 kept, 0 rejected, of which only `suspects` [E] are doubted.
+
+    For a problem whose poses are good already, as those of sessions that several loops agreed to bring together.
+    """
+    limit = _TAILS * float(chi2.ppf(config.inlier_probability, problem.tangent))
+    return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)
+
+
 def _joining(problem: PoseGraphProblem, trusted: Mask) -> Mask:
     """Return edges [E] that join what the trusted ones leave apart, in the order of the file."""
     labels = _subset(problem, trusted).components()

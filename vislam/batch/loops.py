@@ -98,21 +98,30 @@ class Loops:
         self.verdicts[record.id] = LoopVerdict(record.id, record.from_id, record.to_id, in_run, kept, reason)
 
     def _factor(self, record: LoopRecord, poses: Array, robust: bool) -> gtsam.NonlinearFactor:
-        config = self._config
-        T, floor_rad = record.T_from_to, np.deg2rad(config.loop_floor_deg)
-        if record.has_scale:
-            covariance = inflated(record.covariance, 1.0, floor_rad, config.loop_floor_m)
-        else:
-            moved, lever = invert(poses[record.from_id]) @ poses[record.to_id], self._lever_m
-            step_m = float(np.linalg.norm(moved[:3, 3] + moved[:3, :3] @ lever - lever))
-            T, covariance = direction_as_pose(
-                T, inflated(record.covariance, 1.0, floor_rad, 0.0), lever, max(step_m, config.direction_soft_m),
-                floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=_UNSCALED_SIGMA,
-            )  # fmt: skip
-        model: gtsam.noiseModel.Base = gaussian(covariance, config.covariance_ratio_max)
-        if robust:
-            model = cauchy(model, config.loop_cauchy_k)
-        return pose_factor(X(record.from_id), X(record.to_id), T, model)
+        return loop_factor(record, poses, self._config, self._lever_m, robust)
+
+
+def loop_factor(
+    record: LoopRecord, poses: Array, config: GraphConfig, lever_m: Array, robust: bool
+) -> gtsam.BetweenFactorPose3:
+    """Return a loop as a metric relative pose; `poses` [K, 4, 4] lend length to one without scale.
+
+    `lever_m` [3] is cam0 in the body; `robust`: under a Cauchy kernel.
+    """
+    T, floor_rad = record.T_from_to, np.deg2rad(config.loop_floor_deg)
+    if record.has_scale:
+        covariance = inflated(record.covariance, 1.0, floor_rad, config.loop_floor_m)
+    else:
+        moved = invert(poses[record.from_id]) @ poses[record.to_id]
+        step_m = float(np.linalg.norm(moved[:3, 3] + moved[:3, :3] @ lever_m - lever_m))
+        T, covariance = direction_as_pose(
+            T, inflated(record.covariance, 1.0, floor_rad, 0.0), lever_m, max(step_m, config.direction_soft_m),
+            floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=_UNSCALED_SIGMA,
+        )  # fmt: skip
+    model: gtsam.noiseModel.Base = gaussian(covariance, config.covariance_ratio_max)
+    if robust:
+        model = cauchy(model, config.loop_cauchy_k)
+    return pose_factor(X(record.from_id), X(record.to_id), T, model)
 
 
 def _pair(record: LoopRecord, poses: Array) -> gtsam.Values:

@@ -149,3 +149,10 @@ def direction_factor(
 def pose_factor(key_a: int, key_b: int, T_a_b: Array, model: gtsam.noiseModel.Base) -> gtsam.BetweenFactorPose3:
     """Return the metric relative pose factor."""
     return gtsam.BetweenFactorPose3(key_a, key_b, gtsam.Pose3(T_a_b), model)
+
+
+def measurement_of(factor: gtsam.BetweenFactorPose3) -> tuple[Array, Array]:
+    """Return the motion [4, 4] that a relative pose factor without a kernel says, and its information [6, 6]."""
+    model = factor.noiseModel()
+    assert isinstance(model, gtsam.noiseModel.Gaussian)
+    return factor.measured().matrix(), model.information()

@@ -65,9 +65,9 @@ class WindowOdometry:
         if old is None or edge.settled:
             return float("inf")
         moved = se3_log(np.linalg.inv(old.T_previous_body) @ edge.T_previous_body)
-        covariance = self._covariance(old, 1.0)
+        covariance = self.covariance(old, 1.0)
         sigmas = float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
-        ratio = np.trace(self._covariance(edge, 1.0)) / np.trace(covariance)
+        ratio = np.trace(self.covariance(edge, 1.0)) / np.trace(covariance)
         if sigmas > self._config.window_refresh_sigma or not 1.0 / _SPREAD < ratio < _SPREAD:
             return sigmas
         return 0.0
@@ -128,20 +128,21 @@ class WindowOdometry:
         assert edge is not None
         self._edges[k] = replace(edge, T_previous_body=nearest_rigid(T_previous_body))
 
-    def _variances(self, edge: EdgeRecord, vo_scale: float) -> tuple[float, float]:
-        covariance = self._covariance(edge, vo_scale)
-        return float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0
-
-    def _covariance(self, edge: EdgeRecord, vo_scale: float) -> Array:
+    def covariance(self, edge: EdgeRecord, vo_scale: float) -> Array:
+        """Return the covariance [6, 6] that the graph gives an edge."""
         config = self._config
         if edge.begins_piece:
             return edge.covariance
         floor_rad = np.deg2rad(config.window_floor_deg)
         return inflated(edge.covariance, vo_scale * config.window_inflation, floor_rad, config.window_floor_m)
 
+    def _variances(self, edge: EdgeRecord, vo_scale: float) -> tuple[float, float]:
+        covariance = self.covariance(edge, vo_scale)
+        return float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0
+
     def _edge_factor(self, edge: EdgeRecord, vo_scale: float) -> gtsam.NonlinearFactor:
         config = self._config
-        model = huber(gaussian(self._covariance(edge, vo_scale), config.covariance_ratio_max), config.huber_k)
+        model = huber(gaussian(self.covariance(edge, vo_scale), config.covariance_ratio_max), config.huber_k)
         return pose_factor(X(edge.to_id - 1), X(edge.to_id), edge.T_previous_body, model)
 
     def _tilt_factor(self, tilt: TiltRecord) -> gtsam.NonlinearFactor:

@@ -103,7 +103,11 @@ class LoopDetector:
         self._next_edge_id = memory.next_edge_id
 
     def detect(
-        self, keyframe: Keyframe, T_map_body: Array, begins_piece: bool = False
+        self,
+        keyframe: Keyframe,
+        T_map_body: Array,
+        begins_piece: bool = False,
+        tags: tuple[TagSighting, ...] | None = None,
     ) -> tuple[list[LoopEdge], list[LoopCandidate]]:
         """Look for loops that a new keyframe closes.
 
@@ -111,6 +115,7 @@ class LoopDetector:
             keyframe: the newest keyframe; ids ascend.
             T_map_body: its current estimate [4, 4].
             begins_piece: no odometry ties it to the one before.
+            tags: that it saw; None: they are looked for in its image.
 
         Returns:
             Verified edges, some perhaps to an earlier keyframe whose parked edge was confirmed now, and every candidate
@@ -122,7 +127,9 @@ class LoopDetector:
         if begins_piece and len(self._poses):
             self._pieces = self._pieces.begun(view.id)
         self._poses.add(view.id, T_map_body)
-        self._tags.add(view.id, sight_tags(keyframe.frame, self._rig.cameras[0], self._config))
+        if tags is None:
+            tags = sight_tags(keyframe.frame, self._rig.cameras[0], self._config)
+        self._tags.add(view.id, tags)
         trials = self._try(view)
         self._views[view.id] = view
         self._witnesses += [trial.measured for trial in trials if trial.measured is not None]
