@@ -142,7 +142,13 @@ def test_what_a_process_raises_comes_home_whole(tmp_path: Path) -> None:
     prepare(out, overwrite=False)
     world = "points:still,rig=mono,camera_hz=10,duration_s=20"
     live_settings = load(
-        None, {"view.enabled": False, "init.give_up_s": 2.0, "live.name": f"vislam-test-mono-{os.getpid()}"}
+        None,
+        {
+            "view.enabled": False,
+            "init.give_up_s": 2.0,
+            "init.rest_s": 100.0,
+            "live.name": f"vislam-test-mono-{os.getpid()}",
+        },
     )
     live = LiveRun(ReplaySource(world), live_settings, out, world, ["vislam", "live"])
     with pytest.raises(TrackingLostError, match="no scale after") as caught:

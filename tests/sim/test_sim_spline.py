@@ -104,7 +104,7 @@ def test_rounded_path_has_arcs_of_the_radius_and_the_right_length():
 
 
 def test_travel_rests_pauses_and_arrives():
-    travel = Travel(10.0, 1.0, 1.0, 2.0, 1.5, stop_at_m=4.0, pause_s=3.0)
+    travel = Travel(10.0, 1.0, 1.0, 2.0, 1.5, stops_m=(4.0,), pause_s=3.0)
     t = np.linspace(0.0, travel.duration_s, 5000)
     arc = travel.arc_m(t)
     speed = np.gradient(arc, t)
