@@ -52,9 +52,10 @@ class SlotWriter:
             raise ValueError(f"{len(value)} bytes do not fit into a slot of {self._capacity}")
         self._sequence += 1
         memory = self._memory
-        _TAIL.pack_into(memory, _HEAD.size + self._capacity, self._sequence)
+        # not pack_into, which clears first: a reader would meet length 0 and CRC 0, a sound value of no bytes
+        memory[_HEAD.size + self._capacity :] = _TAIL.pack(self._sequence)
         memory[_HEAD.size : _HEAD.size + len(value)] = bytes(value)
-        _HEAD.pack_into(memory, 0, self._sequence, len(value), zlib.crc32(value))
+        memory[: _HEAD.size] = _HEAD.pack(self._sequence, len(value), zlib.crc32(value))
 
     def close(self) -> None:
         """Remove the memory, unless another writer has taken its name; may be called twice."""
