@@ -16,9 +16,7 @@ from vislam.messages import Array
 
 _SIGMA_S = 0.02  # before anything is known: cameras take 0 to 33 ms
 _MAX_S = 0.05
-_GLOBAL_S = (
-    0.005  # a shorter readout counts as a global shutter: 5 s of MH_01 alone say 3 ms, rolling ones take 10 to 33
-)
+_GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter: half a pixel at 60 deg/s
 _TRUST = 0.1  # of a frame's information: successive frames share landmarks and their errors
 _FRAME_SIGMA_S = 0.01  # no single frame may claim to know it better: its velocity may be wrong
 _MIN_Z = 0.05  # relative to its old z-depth: a point nearer than this is beside or behind the camera
