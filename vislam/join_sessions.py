@@ -127,7 +127,7 @@ class _Search:
         self._joining: list[tuple[int, int]] = []  # a pair of keyframes for each two pieces that are joined
         self._take_pieces()
         self._graph = parts[0].config.graph
-        self.lever_m = parts[0].rig.T_body_cams[0][:3, 3]
+        self.lever_m = np.ascontiguousarray(parts[0].rig.T_body_cams[0][:3, 3])
         self._waiting = Waiting(self._graph)
         self._known = self._knowledge([])
         self._placing: list[LoopModel] = []
