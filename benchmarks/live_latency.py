@@ -77,7 +77,8 @@ def close_loops(connection, stop, grown, closed) -> None:
         T_odom_body = T_odom_body @ packet.vo.T_keyframe_body
         began = time.monotonic()
         update = graph.add(packet, edges, T_odom_body)
-        connection.send(MapMoved(update.revision, update.T_map_odom))
+        if k >= KEYFRAMES:  # before, nobody reads yet, and the pipe would fill
+            connection.send(MapMoved(update.revision, update.T_map_odom))
         if is_closed:
             closed.append(time.monotonic() - began)
 
@@ -172,7 +173,7 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
         back.join()
         listener.join()
         loops = list(closed)
-    fresh = np.concatenate([[True], np.diff(poses[:, 1]) > 0])  # the others are heartbeats
+    fresh = np.diff(poses[:, 1], prepend=poses[0, 1]) > 0  # the others are heartbeats, as is the first
     print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, {count} samples in {seconds:g} s")
     print(f"loops closed over {KEYFRAMES} keyframes: {len(loops)}, at most {max(loops, default=0.0):.2f} s each")
     inside = (poses[fresh, 2] - poses[fresh, 1]) / 1e6
