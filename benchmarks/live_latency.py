@@ -123,12 +123,12 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
     """Measure."""
     import socket
 
-    from vislam.live.child import Ready, Signals
+    from vislam.live.child import Flag, Ready, Signals
     from vislam.live.epoch import Epoch
     from vislam.live.replayed_imu import InertialTable
 
     context = get_context("spawn")
-    stop, go, ready, grown = (context.Event() for _ in range(4))
+    ready, grown, stop, go = context.Event(), context.Event(), Flag(), Flag()
     signals, epoch, results = Signals(go, stop), Epoch(), context.Queue()
     count = int(seconds * RATE_HZ)
     rng = np.random.default_rng(0)

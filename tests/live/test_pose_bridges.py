@@ -22,7 +22,7 @@ from vislam.errors import UsageError
 from vislam.geometry import roll_pitch_yaw_rad, rotation_from_quaternion_xyzw, transform
 from vislam.hw.health import Health
 from vislam.live import bridge
-from vislam.live.child import Signals, guarded
+from vislam.live.child import Flag, Signals, guarded
 from vislam.live.publisher import PosePublisher
 
 _DOMAIN = 100 + os.getpid() % 100  # not the domain of whatever else runs here
@@ -124,7 +124,7 @@ class Bridge:
     def __init__(self, live: LiveConfig, role: str) -> None:
         context = get_context("spawn")
         self.at, body = bridge.asked(live)[role]
-        self._signals = Signals(context.Event(), context.Event())
+        self._signals = Signals(Flag(), Flag())
         self.report, says = context.Pipe(duplex=False)
         self._process = context.Process(target=guarded, args=(role, says, self._signals, body))
         self._process.start()
@@ -306,7 +306,7 @@ def test_poses_beyond_the_rate_are_left_out() -> None:
             sent.append(-2)
 
     context = get_context("spawn")
-    signals = Signals(context.Event(), context.Event())
+    signals = Signals(Flag(), Flag())
     signals.go.set()
     _, says = context.Pipe(duplex=False)
     with pytest.MonkeyPatch.context() as patch:

@@ -10,10 +10,12 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Event
+from multiprocessing.sharedctypes import RawValue
 from typing import Any
 
 from vislam.errors import VislamError
+
+_POLL_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +42,35 @@ class Failure:
     traceback: str
 
 
+class Flag:
+    """A byte in shared memory that only ever rises: unlike an Event it has no lock that a killed process could keep."""
+
+    def __init__(self) -> None:
+        """Begin low; travels to a process that is spawned with it."""
+        self._byte = RawValue("b", 0)
+
+    def set(self) -> None:
+        """Raise it."""
+        self._byte.value = 1
+
+    def is_set(self) -> bool:
+        """Return whether it was raised."""
+        return bool(self._byte.value)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Return whether it was raised, waiting at most so long for that."""
+        deadline = time.monotonic() + timeout_s
+        while not self.is_set() and time.monotonic() < deadline:
+            time.sleep(_POLL_S)
+        return self.is_set()
+
+
 @dataclass(frozen=True, slots=True)
 class Signals:
     """What the parent tells all."""
 
-    go: Event  # every process is ready
-    stop: Event
+    go: Flag  # every process is ready
+    stop: Flag
 
 
 class Life:

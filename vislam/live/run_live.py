@@ -19,7 +19,7 @@ from vislam.config import Config
 from vislam.errors import HardwareError, UsageError, VislamError
 from vislam.hw.source import InertialSource
 from vislam.live import back_process, bridge, fast_process, front_process, map_process
-from vislam.live.child import Failure, Life, Note, Ready, Signals, guarded
+from vislam.live.child import Failure, Flag, Life, Note, Ready, Signals, guarded
 from vislam.live.frames import FrameSource
 from vislam.live.slot import remove
 from vislam.recording import Recording
@@ -27,6 +27,7 @@ from vislam.run import imu_noise
 from vislam.runfolder import write_json
 
 _WATCH_S = 0.2
+_AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
 _END_S = 10.0  # that a process may take to end after it was told twice
 
 
@@ -94,7 +95,7 @@ class LiveRun:
         self.metrics: dict[str, Any] | None = None
         self._source, self._out, self._shared_name = source, out, config.live.name
         self._context = get_context("spawn")
-        self._signals = Signals(self._context.Event(), self._context.Event())
+        self._signals = Signals(Flag(), Flag())
         self._children: dict[str, _Child] = {}
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
@@ -178,10 +179,15 @@ class LiveRun:
                         deadline = time.monotonic() + duration_s
                     if asked() or time.monotonic() > deadline or self._failure is not None:
                         self._signals.stop.set()
+                patience = float("inf")
                 while any(child.process.is_alive() for child in self._children.values()):
                     self._watch(show)
                     if asked() > 1:
                         raise KeyboardInterrupt
+                    if self._failure is not None and patience == float("inf"):
+                        patience = time.monotonic() + _AFTER_FAILURE_S
+                    if time.monotonic() > patience:
+                        break  # a killed process may have held what the others wait for
                 self._watch(show)
         finally:
             self._end()
