@@ -8,16 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera
-from vislam.datasets.images import UnreadableImageError, probe, read_grey_or_color
-from vislam.errors import DataError, UsageError
+from vislam.datasets.images import read_any_size
+from vislam.errors import UsageError
 from vislam.features import describe
 from vislam.loop.vocabulary import Vocabulary, depth_for, train
 from vislam.messages import Frame, ImageU8
 from vislam.sources import open_source
 
 _SUFFIXES = (".png", ".jpg", ".jpeg")
-_MAX_PIXELS = 100_000_000  # of an image; more is no camera's
 
 
 def train_vocabulary(
@@ -56,19 +54,9 @@ def _images(source: str, every: int, seed: int) -> Iterator[ImageU8 | None]:
     folder = Path(source)
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
     for path in files[::every]:
-        yield _read(path)
+        yield read_any_size(path)
     if not files:
         frames = (event for event in open_source(source, seed).events() if isinstance(event, Frame))
         for number, frame in enumerate(frames):
             if number % every == 0:
                 yield frame.images[0]
-
-
-def _read(path: Path) -> ImageU8 | None:
-    try:
-        width, height = probe(path)
-        if width * height > _MAX_PIXELS:
-            return None
-        return read_grey_or_color(path, Camera(width, height, 1.0, 1.0, 0.0, 0.0))[0]
-    except (UnreadableImageError, DataError):
-        return None

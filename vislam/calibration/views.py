@@ -11,16 +11,14 @@ import cv2
 import numpy as np
 
 from vislam.calibration.board import Board, View
-from vislam.camera import Camera
 from vislam.datasets import survey
-from vislam.datasets.images import UnreadableImageError, probe, read_grey_or_color
+from vislam.datasets.images import read_any_size
 from vislam.datasets.video import SUFFIXES as VIDEO_SUFFIXES
 from vislam.errors import DataError
 from vislam.hw.source import ImageSource
 from vislam.messages import Array, ImageU8
 
 _SUFFIXES = (".png", ".jpg", ".jpeg")
-_MAX_PIXELS = 100_000_000  # of an image; more is no camera's
 _LIVE_WAIT_S = 1.0
 _LIVE_EVERY_S = 0.4  # between two searches in a live image
 _SAME_PX = 3.0  # a board that moved less in between is the same view
@@ -73,7 +71,7 @@ def images_of(source: str, at_most: int) -> Images:
         if not cameras:
             raise DataError(f"{source} holds neither PNG nor JPEG images nor a recording with a camera")
         files = [cameras[0].path(i) for i in range(len(cameras[0].files))]
-    return ((file.name, _read(file)) for file in _evenly(files, at_most))
+    return ((file.name, read_any_size(file)) for file in _evenly(files, at_most))
 
 
 def live_images(source: ImageSource, seconds: float, clock: Callable[[], float] = time.monotonic) -> Images:
@@ -118,16 +116,6 @@ def _evenly(files: list[Path], at_most: int) -> list[Path]:
     if len(files) <= at_most:
         return files
     return [files[i] for i in np.linspace(0, len(files) - 1, at_most).round().astype(int)]
-
-
-def _read(path: Path) -> ImageU8 | None:
-    try:
-        width, height = probe(path)
-        if width * height > _MAX_PIXELS:
-            return None
-        return read_grey_or_color(path, Camera(width, height, 1.0, 1.0, 0.0, 0.0))[0]
-    except (UnreadableImageError, DataError):
-        return None
 
 
 def _video(path: Path, at_most: int) -> Images:

@@ -22,6 +22,7 @@ Stamps = NDArray[np.int64]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+_MAX_PIXELS = 100_000_000  # of an image whose size nobody told; more is no camera's
 MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
 _SHORT_HEAD_BYTES = 2**12  # holds the size of most images
 _HEAD_BYTES = 2**18  # enough to reach the size in a JPEG with an embedded preview and profile
@@ -163,6 +164,17 @@ def read_grey_or_color(path: Path, camera: Camera) -> tuple[ImageU8, ImageU8 | N
     if image.ndim == 2:
         return image, None
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8), image
+
+
+def read_any_size(path: Path) -> ImageU8 | None:
+    """Return a grey image of whatever size its file says; None if it cannot be read, or is larger than any camera's."""
+    try:
+        width, height = probe(path)
+        if width * height > _MAX_PIXELS:
+            return None
+        return read_grey_or_color(path, Camera(width, height, 1.0, 1.0, 0.0, 0.0))[0]
+    except (UnreadableImageError, DataError):
+        return None
 
 
 def read_depth(path: Path, camera: Camera, units_per_m: float) -> ImageF32:

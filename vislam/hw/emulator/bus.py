@@ -28,7 +28,6 @@ class EmulatedBus:
         is_stuck: a line is held low: every transfer times out.
         busy: addresses that a kernel driver owns (only SMBus transfers ask for that).
         transfers: so many were asked for.
-        bytes_read: so many bytes went to the host.
     """
 
     def __init__(
@@ -50,7 +49,6 @@ class EmulatedBus:
         self.is_stuck = False
         self.busy: set[int] = set()
         self.transfers = 0
-        self.bytes_read = 0
         self._smbus_only, self._one_read, self._clock, self._bit_ns = smbus_only, one_read, clock, 1e9 / bus_hz
         self._is_plugged = True
         self._address = -1
@@ -122,7 +120,6 @@ class EmulatedBus:
             chip = self._chip(message.addr, message.len)
             if message.flags & 1:
                 ctypes.memmove(message.buf, chip.read(message.len), message.len)
-                self.bytes_read += message.len
             else:
                 chip.write(ctypes.string_at(message.buf, message.len))
 
@@ -138,7 +135,6 @@ class EmulatedBus:
         chip = self._chip(self._address, 2 + length)
         chip.write(bytes([transfer.command]))
         answer = chip.read(length)
-        self.bytes_read += length
         if transfer.size == _BYTE_DATA:
             data.byte = answer[0]
         else:
