@@ -1,13 +1,11 @@
 """What is proven of pose-graph solutions: published optima, wrong minima, and bounds that nothing is below."""
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from needs import missing
 
 from vislam.batch.graph_certificate import bounding_weights, certify, isotropic_weights
 from vislam.batch.graph_files import read_pose_graph
@@ -41,18 +39,10 @@ def _made(shape: Shape, poses: int = 120, **settings: float) -> SimulatedGraph:
     return simulate_graph(shape, GraphWorldConfig(poses=poses, **settings))
 
 
-def _file(name: str) -> PoseGraphProblem:
-    folder = os.environ.get("VISLAM_DATA")
-    path = Path(folder or "nowhere") / "g2o" / f"{name}.g2o"
-    if not path.is_file():
-        missing(f"set VISLAM_DATA to a folder that holds g2o/{name}.g2o")
-    return read_pose_graph(path)
-
-
 @pytest.mark.data
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_the_published_optimum_is_found_and_proven(name: str) -> None:
-    problem = _file(name)
+def test_the_published_optimum_is_found_and_proven(name: str, data_root: Path) -> None:
+    problem = read_pose_graph(data_root / "g2o" / f"{name}.g2o")
     solution = _solved(problem, chordal_start(Structure(problem), np.ones(len(problem.edges))))
     certificate = certify(problem, solution)
     assert certificate.certified, certificate.reason
@@ -63,8 +53,8 @@ def test_the_published_optimum_is_found_and_proven(name: str) -> None:
 
 
 @pytest.mark.data
-def test_a_wrong_minimum_of_a_real_graph_is_not_certified() -> None:
-    problem = _file("MIT")
+def test_a_wrong_minimum_of_a_real_graph_is_not_certified(data_root: Path) -> None:
+    problem = read_pose_graph(data_root / "g2o" / "MIT.g2o")
     certificate = certify(problem, _solved(problem, odometry_start(problem, Structure(problem).anchors)))
     assert certificate.chi2 > 100.0, "chi2 has a local minimum there"
     assert not certificate.certified

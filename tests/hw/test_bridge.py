@@ -179,7 +179,7 @@ def test_what_keeps_samples_from_coming_is_said(
     config: SerialConfig, board: BridgeEmulator, faults: LineFaults, problem: str, counter: str
 ) -> None:
     board.faults = faults
-    short = replace(config, start_s=1.0, missing_s=0.05)
+    short = replace(config, start_s=3.0, missing_s=0.05)
     with pytest.raises(HardwareError, match=problem):
         SerialBridge(short)
     patient = SerialBridge(short, must_be_there=False)
@@ -203,7 +203,7 @@ def test_a_sketch_of_another_version_is_refused(
     monkeypatch.setattr(emulator, "encode", encode_as_2)
     board.restart()
     with pytest.raises(HardwareError, match="version 2 of the protocol, this vislam speaks 1"):
-        SerialBridge(replace(config, start_s=1.0))
+        SerialBridge(config)
 
 
 def test_a_chip_that_goes_away_and_comes_back(config: SerialConfig, board: BridgeEmulator) -> None:

@@ -172,7 +172,8 @@ class SerialBridge:
         while not self._newest_ns:
             left_ns = end_ns - time.monotonic_ns()
             found += self.read(min(max(left_ns / _NS, 0.0), _GLANCE_S))
-            if left_ns <= 0 or (self._port is None and self._counts["opened"] == 0):
+            hopeless = self._other_version is not None or (self._port is None and self._counts["opened"] == 0)
+            if left_ns <= 0 or hopeless:
                 problem = self.problem if self._port is None else self._diagnosis()[1]
                 self.close()
                 raise HardwareError(problem)
