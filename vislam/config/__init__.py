@@ -1,0 +1,160 @@
+"""Every default of vislam in one typed tree, with its unit and its reason.
+
+`load` reads a TOML file and applies `{"section.field": value}` overrides; `dump` gives the resolved tree as plain data,
+which every run writes down as `config.json`.
+"""
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from vislam.config.batch import BatchConfig, GraphWorldConfig, PoseGraphConfig
+from vislam.config.estimators import EkfConfig, GraphConfig, WindowConfig
+from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig, PlanarConfig
+from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig
+from vislam.config.live import LiveConfig, ViewConfig
+from vislam.config.loop import LoopConfig, LoopTruthConfig
+from vislam.config.mapping import DriveConfig, MapConfig, MapProduct, MonoDepthConfig
+from vislam.config.sensors import (
+    Axes,
+    BridgeClockConfig,
+    Gy85Config,
+    Matrix3,
+    RecordConfig,
+    SensorCalibration,
+    SensorsConfig,
+    SerialConfig,
+    Vector3,
+    WebcamConfig,
+)
+from vislam.errors import UsageError
+
+__all__ = [
+    "AttitudeConfig",
+    "Axes",
+    "BatchConfig",
+    "BridgeClockConfig",
+    "CalibrationConfig",
+    "Config",
+    "DriveConfig",
+    "EkfConfig",
+    "FrontEndConfig",
+    "GraphConfig",
+    "GraphWorldConfig",
+    "Gy85Config",
+    "ImuConfig",
+    "InitConfig",
+    "LiveConfig",
+    "LoopConfig",
+    "LoopTruthConfig",
+    "MapConfig",
+    "MapProduct",
+    "Matrix3",
+    "MonoDepthConfig",
+    "PlanarConfig",
+    "PoseGraphConfig",
+    "PowerUpConfig",
+    "RecordConfig",
+    "SensorCalibration",
+    "SensorsConfig",
+    "SerialConfig",
+    "Vector3",
+    "ViewConfig",
+    "WebcamConfig",
+    "WindowConfig",
+    "dump",
+    "from_data",
+    "load",
+    "load_sensors",
+    "validated",
+]
+
+Options = TypeVar("Options")
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """The whole configuration of a run."""
+
+    seed: int = 0  # of every random choice in the pipeline
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
+    frontend: FrontEndConfig = field(default_factory=FrontEndConfig)
+    init: InitConfig = field(default_factory=InitConfig)
+    ekf: EkfConfig = field(default_factory=EkfConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    batch: BatchConfig = field(default_factory=BatchConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
+    view: ViewConfig = field(default_factory=ViewConfig)
+
+
+def dump(config: Config) -> dict[str, Any]:
+    """Return the configuration as plain nested data, ready for JSON."""
+    return dataclasses.asdict(config)
+
+
+def load(path: Path | None = None, overrides: dict[str, Any] | None = None) -> Config:
+    """Build a configuration from defaults, a TOML file and dotted overrides such as `{"graph.coupling": "tight"}`.
+
+    Raises UsageError naming the field, what was asked and what is allowed.
+    """
+    data = {} if path is None else _read_toml(path)
+    for dotted, value in (overrides or {}).items():
+        *sections, name = dotted.split(".")
+        node = data
+        for section in sections:
+            node = node.setdefault(section, {})
+        node[name] = value
+    return from_data(data, source=str(path) if path else "overrides")
+
+
+def load_sensors(path: Path | None = None) -> SensorsConfig:
+    """Return the sensors of a cart as a TOML file describes them; raises UsageError as `load` does."""
+    data = {} if path is None else _read_toml(path)
+    _refuse_unknown(data, SensorsConfig, str(path))
+    return validated(SensorsConfig, data, str(path))
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"config {path} cannot be read: {error}; see docs/config.md for an example") from error
+
+
+def from_data(data: dict[str, Any], source: str) -> Config:
+    """Build a configuration from plain nested data; unknown and ill-typed fields raise UsageError with `source`."""
+    _refuse_unknown(data, Config, source)
+    return validated(Config, data, source)
+
+
+def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Options:
+    """Build a dataclass from plain data; unknown and ill-typed fields raise UsageError that begins with `where`."""
+    known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    for name in data:
+        if name not in known:
+            raise UsageError(f"{where}: no option '{name}'; there are: {', '.join(known)}")
+    try:
+        return TypeAdapter(cls).validate_python(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field_path = ".".join(str(part) for part in first["loc"])
+        raise UsageError(f"{where}: option {field_path}: {first['msg']}, got {first['input']!r}") from error
+
+
+def _refuse_unknown(data: dict[str, Any], cls: type, source: str, prefix: str = "") -> None:
+    known = {f.name: f for f in dataclasses.fields(cls)}
+    for name, value in data.items():
+        if name not in known:
+            raise UsageError(f"{source}: no setting '{prefix}{name}'; this section has: {', '.join(known)}")
+        factory = known[name].default_factory
+        if isinstance(value, dict) and isinstance(factory, type) and dataclasses.is_dataclass(factory):
+            _refuse_unknown(value, factory, source, f"{prefix}{name}.")

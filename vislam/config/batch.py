@@ -1,0 +1,54 @@
+"""Defaults of batch optimisation, of runs and of pose-graph files."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class BatchConfig:
+    """Batch optimisation of a finished run: visual-inertial bundle adjustment over all keyframes."""
+
+    rounds: int = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
+    iterations: int = 20  # most Levenberg-Marquardt steps of a round; converged earlier as a rule
+    start_gate_px: float = 20.0  # first round: poses of the run may be off, only gross outliers leave
+    start_cauchy: float = 3.0  # standard deviations, scale of the kernel in that round
+    huber_k: float = 2.0  # standard deviations, in later rounds
+    gate_probability: float = 0.999  # chi-square of a pixel or depth that stays, in later rounds
+    max_relative_sigma: float = 0.25  # of a landmark's distance by its own rays; farther ones lack parallax or depth
+    max_observations: int = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
+    min_seen: int = 12  # landmarks; a keyframe that sees fewer also gets the odometry of the run
+    imu_inflation: float = 6.0  # on white-noise sigmas, as in the window, for vibration: V2_01 0.040 m, 0.071 m at 2
+    vision_inflation: float = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
+    pixel_sigma_min_px: float = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
+    pixel_sigma_max_px: float = 3.0
+    loop_probability: float = 0.9999  # a loop beyond this chi-square is refused by graduated non-convexity
+    unscaled_odometry_sigma: float = 0.1  # one camera: relative, on the steps of the run's own odometry among the loops
+    covariances: bool = True  # of all states; costs about as much as a round
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphConfig:
+    """Optimisation of a pose graph from a file."""
+
+    start: Literal["auto", "file", "odometry", "tree", "chordal"] = "auto"  # auto: the one of lowest cost
+    method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
+    robust: Literal["none", "gnc"] = "none"  # gnc: edges that do not join successive ids may be rejected
+    iterations: int = 100  # most of them; 3 to 8 as a rule
+    tolerance: float = 1e-9  # of the cost: the decrease still to come at which to end
+    inlier_probability: float = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
+    certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
+    covariances: bool = False  # write those of all poses: in space 300 bytes each
+
+
+@dataclass(frozen=True, slots=True)
+class GraphWorldConfig:
+    """A made pose graph, as `vislam simulate --graph` writes it. Noise is white, of odometry and loops alike."""
+
+    poses: int = 1000
+    loops_per_pose: float = 1.0  # true ones; only between poses that are at most 5 m apart
+    rotation_sigma_deg: float = 1.0  # per axis; the drift of a thousand steps then needs its loops
+    translation_sigma_m: float = 0.05  # per axis; 5 % of a step, poor odometry
+    anisotropy: float = 1.0  # forward, and about z, the sigmas are this many times as large
+    outlier_fraction: float = 0.0  # of all loops
+    alias_group: int = 1  # so many false loops in a row agree, as a corridor that looks like another one gives them
+    seed: int = 0  # same seed, same graph

@@ -1,0 +1,46 @@
+"""Defaults of the inertial unit: its noise, power-up and attitude."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ImuConfig:
+    """Inertial noise; None keeps what the recording's own sensor file says."""
+
+    enabled: bool = True  # off: vision alone, as if the recording had no IMU
+    gyro_noise_density: float | None = None  # rad/s/sqrt(Hz)
+    accel_noise_density: float | None = None  # m/s^2/sqrt(Hz)
+    gyro_bias_walk: float | None = None  # rad/s^2/sqrt(Hz)
+    accel_bias_walk: float | None = None  # m/s^3/sqrt(Hz)
+    gravity_m_s2: float = 9.81
+    buffer_s: float = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
+    noise_tolerance: float = 3.0  # a model of white noise that the quietest half second exceeds by more is raised
+    max_gap_s: float = 0.1  # a longer hole between samples is an outage, not something to interpolate across
+    max_wait_s: float = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
+
+
+@dataclass(frozen=True, slots=True)
+class PowerUpConfig:
+    """Taking the current attitude as horizontal and the current rate as zero, when the power comes on."""
+
+    window_s: float = 2.0  # of standing still; a gyro of 0.03 deg/s/sqrt(Hz) gives its bias to 0.02 deg/s
+    max_gyro_std_rad_s: float = 0.02  # per axis; an ITG3205 at 98 Hz has 0.0065, a hand on the cart gives 0.03
+    max_accel_std_m_s2: float = 0.25  # per axis; an ADXL345 at 400 Hz has 0.08
+    max_rate_rad_s: float = 0.7  # mean; the ITG3205 may start with 40 deg/s, more is motion
+    max_turn_rad_s: float = 0.005  # between the means of the window's halves: a bias stays, white noise leaves 0.0003
+    max_bias_change_rad_s: float = 0.05  # from what was remembered for this temperature: an even turn looks like a bias
+    gravity_tolerance_m_s2: float = 0.5  # of the measured norm: an accelerometer after calibration
+    max_tilt_deg: float = 20.0  # of the body to gravity; more is a wrong axis, or no cart that stands on a floor
+    remembered: int = 64  # biases kept, one per degree of temperature
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeConfig:
+    """Complementary filter: attitude from gyro and accelerometer alone, the baseline without vision."""
+
+    proportional_gain: float = 0.1  # 1/s: leans on the accelerometer over 10 s; half of it and ten times it are worse
+    integral_gain: float = 0.001  # 1/s^2: learns what bias is left after power-up within minutes
+    gate_m_s2: float = 0.15  # |force| further from gravity is motion, not tilt
+    level_cutoff_hz: float = 5.0  # low-pass on the force that levels, so that vibration does not close the gate
+    mag_gain: float = 0.05  # 1/s, of the yaw by the magnetometer
+    mag_gate: float = 0.1  # relative change of the field's norm, and of its vertical part: iron or a motor is near
