@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vislam.messages import NavState
+from vislam.runfolder import TRACKING_COLUMNS
 from vislam.trajectory import Trajectory, evaluate, write_states_csv, write_tum
 
 START_NS = 1_700_000_000_000_000_000
@@ -97,14 +98,14 @@ def _states(trajectory: Trajectory, keyframes, sigma: float, rng) -> list[NavSta
 def _write_tracking(folder: Path, truth: Trajectory, rng) -> None:
     with (folder / "tracking.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["t_ns", "tracking", "inliers", "keyframe_id", "reason"])
+        writer.writerow(TRACKING_COLUMNS)
         for k, t_ns in enumerate(truth.t_ns.tolist()):
             state, reason, inliers = "ok", "", int(240 + 60 * np.sin(k / 70) + rng.normal(0, 12))
             if k in LOST:
                 state, reason, inliers = "lost", "7 inliers of 30, image too dark", 7
             elif k in DEGRADED:
                 state, reason, inliers = "degraded", f"{60 - k % 20} inliers", 60 - k % 20
-            writer.writerow([t_ns, state, inliers, k // 10, reason])
+            writer.writerow([t_ns, state, inliers, k // 10, "", 0, reason])
 
 
 def _write_loops(folder: Path, truth: Trajectory, rng, total: int) -> dict[str, int]:

@@ -15,6 +15,7 @@ from vislam.cli import run_verb
 from vislam.config import load
 from vislam.datasets.recorder import record
 from vislam.messages import Frame, ImuSample
+from vislam.report.run_files import read_run
 from vislam.run import execute
 from vislam.runfolder import prepare
 from vislam.sim import open_world
@@ -87,6 +88,7 @@ def test_a_run_leaves_the_documented_folder(small_room, tmp_path):
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.01
     assert metrics["accuracy"]["ekf"]["ate_rmse_m"] < 0.02
     assert json.loads((tmp_path / "run" / "config.json").read_text())["view"]["enabled"] is True
+    assert read_run(tmp_path / "run").unread == {}
 
 
 def test_replay_in_fresh_processes_gives_identical_bytes(recorded, tmp_path):

@@ -19,7 +19,6 @@ from vislam.trajectory import (
     ate,
     coverage,
     evaluate,
-    nees,
     read_euroc,
     read_kitti,
     read_states_csv,
@@ -220,28 +219,6 @@ def test_single_pose_trajectory_answers_at_its_own_time_only():
     np.testing.assert_array_equal(one.at(7), np.eye(4))
     with pytest.raises(DataError):
         one.at(8)
-
-
-def test_nees_of_states_drawn_from_their_covariance_matches_the_degrees_of_freedom():
-    truth = smooth(2000)
-    rng = np.random.default_rng(11)
-    A = rng.normal(0, 0.01, (6, 6))
-    P = A @ A.T + 1e-5 * np.eye(6)
-    covariance = np.eye(15)
-    covariance[:6, :6] = P
-    errors = rng.multivariate_normal(np.zeros(6), P, len(truth))
-    world = transform(Rotation.from_rotvec([0, 0, 1.2]).as_matrix(), np.array([5.0, 2.0, 1.0]))
-    states = []
-    for t_ns, T, e in zip(truth.t_ns, world @ truth.T_world_body, errors, strict=True):
-        wrong = T.copy()
-        wrong[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-e[:3]).as_matrix()
-        wrong[:3, 3] -= e[3:]
-        states.append(NavState(int(t_ns), wrong, np.zeros(3), np.zeros(3), np.zeros(3), covariance))
-    result = nees(states, truth)
-    # 2000 draws: the mean of chi2(k) has a standard deviation of sqrt(2k / 2000)
-    assert np.mean(result["rotation"]) == pytest.approx(3, abs=0.25)
-    assert np.mean(result["position"]) == pytest.approx(3, abs=0.25)
-    assert np.mean(result["pose"]) == pytest.approx(6, abs=0.35)
 
 
 # files

@@ -40,7 +40,7 @@ _RUN_FILES = (
     "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml", "map/drive.yaml",
     "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
-_TRACKING_HEADER = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "piece", "reason")
+TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "piece", "reason")
 
 
 def prepare(out: Path, overwrite: bool) -> None:
@@ -389,7 +389,7 @@ class RunLog:
             (f.t_ns, str(f.tracking), f.inliers, f.vo_keyframe_id, str(f.localisation), f.piece, f.reason)
             for f in self._frames
         ]
-        write_text(out / "tracking.csv", csv_text(_TRACKING_HEADER, tracking))
+        write_text(out / "tracking.csv", csv_text(TRACKING_COLUMNS, tracking))
         write_text(out / "retrieved.csv", retrieved_text(self._retrieved))
         write_text(out / "loops.csv", loops_text(loops))
         decisions = Counter(row.decision for row in loops)

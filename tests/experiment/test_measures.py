@@ -14,7 +14,7 @@ from vislam.experiment.recordings import TimedRecording
 from vislam.geometry import transform
 from vislam.messages import Frame, ImuSample, NavState
 from vislam.trajectory import Trajectory, write_tum
-from vislam.trajectory.consistency import anees, chi_square_mean
+from vislam.trajectory.consistency import anees, chi_square_mean, nees
 
 RUN = {"has_imu": True, "mode": "stereo"}
 
@@ -124,6 +124,9 @@ def test_consistency_of_errors_drawn_from_their_covariance():
     for name in ("rotation", "position", "velocity"):
         assert found[name].count >= 1490
         assert found[name].low < found[name].mean < found[name].high, name
+    tilted = transform(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix(), np.array([3.0, -2.0, 1.0]))
+    values = nees(states_of(truth, covariance, 9, tilted), truth, gravity=False)
+    assert all(np.nanmean(values[name]) == pytest.approx(3.0, abs=0.3) for name in ("rotation", "position"))
     optimistic = covariance / 4.0
     states = [
         NavState(s.t_ns, s.T_world_body, s.velocity_world_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, optimistic)

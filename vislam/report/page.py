@@ -192,7 +192,7 @@ def _accuracy(run: RunFiles, scene: Scene) -> str:
 def _consistency(scene: Scene) -> str:
     rows: list[list[str | Cell]] = []
     for name, values in scene.nees.items():
-        row: list[str | Cell] = [Cell(scene.labels[name], mark=name), number(len(values["t_ns"]), 0)]
+        row: list[str | Cell] = [Cell(scene.labels[name], mark=name), number(len(values["position"]), 0)]
         for part in ("rotation", "position"):
             finite = values[part][np.isfinite(values[part])]
             row += [
@@ -204,8 +204,8 @@ def _consistency(scene: Scene) -> str:
         return ""
     head = ["", "keyframes", "rotation mean", "median", "position mean", "median"]
     text = (
-        f"Normalised estimation error squared of the keyframes after {'yaw' if scene.has_gravity else 'SE(3)'} "
-        "alignment. A filter that knows its own "
+        f"Normalised estimation error squared of the keyframes, the first of which stands at its true position and "
+        f"{'heading' if scene.has_gravity else 'attitude'}. An estimator that knows its own "
         "uncertainty has a mean of 3; a larger number means that it is too sure of itself."
     )
     return card(table(head, rows), title="Consistency (NEES, expected 3)") + note(text)
@@ -258,7 +258,7 @@ def _loops(run: RunFiles, scene: Scene) -> str:
         "score",
         "inliers",
         "σ [m]",
-        "agree",
+        "in a row",
         "χ²",
         "weight",
         "moved [m]",

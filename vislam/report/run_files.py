@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from vislam.errors import DataError
 from vislam.loop.table import LoopRow, read_loops, read_rows
 from vislam.messages import NavState, Tracking
+from vislam.runfolder import TRACKING_COLUMNS
 from vislam.trajectory import Trajectory, read_states_csv, read_tum
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
 ESTIMATES = ("ekf", "live", "graph", "batch")
-_TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "reason")
 _MAX_LOOP_PICTURES = 24
 _MAX_JSON_BYTES = 64 * 2**20
 
@@ -107,7 +107,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _read_tracking(path: Path) -> TrackingRows:
-    rows = read_rows(path, _TRACKING_COLUMNS)
+    rows = read_rows(path, TRACKING_COLUMNS)
     try:
         t_ns = np.array([int(row["t_ns"]) for _, row in rows], dtype=np.int64)
         inliers = np.array([float(row["inliers"] or "nan") for _, row in rows])

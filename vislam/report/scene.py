@@ -113,6 +113,6 @@ def _add_nees(run: RunFiles, scene: Scene) -> None:
         return
     for name, states in run.states.items():
         try:
-            scene.nees[name] = nees(states, run.truth, "yaw" if scene.has_gravity else "se3")
+            scene.nees[name] = nees(states, run.truth, scene.has_gravity)
         except VislamError as error:
             scene.notes.append(f"no consistency of {name}: {error}")

@@ -1,5 +1,6 @@
 """Trajectories: the value, its files, and how one is judged against another."""
 
+from vislam.trajectory.consistency import Consistency, anees, nees
 from vislam.trajectory.evaluation import (
     Alignment,
     Pairs,
@@ -9,7 +10,6 @@ from vislam.trajectory.evaluation import (
     ate,
     coverage,
     evaluate,
-    nees,
     rpe,
     scale_error,
 )
@@ -28,10 +28,12 @@ from vislam.trajectory.states import read_states_csv, write_states_csv
 
 __all__ = [
     "Alignment",
+    "Consistency",
     "Pairs",
     "RelativeErrors",
     "Trajectory",
     "align",
+    "anees",
     "associate",
     "ate",
     "coverage",

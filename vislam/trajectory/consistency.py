@@ -45,14 +45,15 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
     return Consistency(total / freedom, low, high, count)
 
 
-def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistency]:
-    """Return the average NEES per degree of freedom of "rotation", "position" and "velocity" (3 each).
+def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) -> dict[str, Array]:
+    """Return the normalised estimation error squared of states: "rotation", "position" and "velocity", [M], 3 dof each.
 
-    Yaw and position of the first state are a free choice that its covariance does not hold, so the truth is brought
-    into the states' world by them: the error there is zero and grows with drift, as the covariance does. A fit over
-    all states would hide drift. The true velocity is that of a fit to the true positions,
-    and its variance joins the state's; errors of the true poses themselves count as the state's.
-    What was not estimated (NaN) is left out; so is the first state. Raises DataError with fewer than 2 matching states.
+    Position and yaw of the first state (its attitude, without `gravity`) are a free choice that its covariance does
+    not hold, so the truth is brought into the states' world by them: the error there is zero and grows with drift, as
+    the covariance does. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
+    The true velocity is that of a fit to the true positions, and its variance joins the state's; errors of the true
+    poses themselves count as the state's. NaN is what was not estimated, and the first state.
+    Raises DataError with fewer than 2 matching states.
     """
     estimate = Trajectory(
         np.array([s.t_ns for s in states], dtype=np.int64),
@@ -62,8 +63,9 @@ def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistenc
     if len(pairs) < 2:
         raise DataError(f"consistency needs 2 states within the truth, got {len(pairs)} of {len(states)}")
     matched = [s for s, inside in zip(states, np.isin(estimate.t_ns, pairs.t_ns), strict=True) if inside]
-    yaw = _heading_rad(pairs.estimate[0, :3, :3] @ pairs.reference[0, :3, :3].T)
-    R = Rotation.from_rotvec([0.0, 0.0, yaw]).as_matrix()
+    R = pairs.estimate[0, :3, :3] @ pairs.reference[0, :3, :3].T
+    if gravity:
+        R = Rotation.from_rotvec([0.0, 0.0, _heading_rad(R)]).as_matrix()
     true_R = R @ pairs.reference[:, :3, :3]
     true_p = (pairs.reference[:, :3, 3] - pairs.reference[0, :3, 3]) @ R.T + pairs.estimate[0, :3, 3]
     velocity, velocity_variance = _velocities(truth, pairs.t_ns)
@@ -78,12 +80,15 @@ def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistenc
         P = covariance[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         if name == "velocity":
             P = P + velocity_variance[:, None, None] * np.eye(3)
-        values = _squared_mahalanobis(error, P)
-        usable = np.isfinite(values)
-        usable[0] = False
-        if usable.any():
-            results[name] = chi_square_mean(float(values[usable].sum()), int(usable.sum()), 3)
+        results[name] = _squared_mahalanobis(error, P)
+        results[name][0] = np.nan
     return results
+
+
+def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistency]:
+    """Return the average per degree of freedom of each `nees` that has a value; raises DataError as that does."""
+    finite = {name: values[np.isfinite(values)] for name, values in nees(states, truth).items()}
+    return {name: chi_square_mean(float(v.sum()), len(v), 3) for name, v in finite.items() if len(v)}
 
 
 def _heading_rad(R: Array) -> float:

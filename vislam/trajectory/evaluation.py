@@ -6,7 +6,6 @@ systems) and Bar-Shalom et al. 2001 (NEES); with equal association the numbers a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -15,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vislam.errors import DataError, UsageError
-from vislam.geometry import align_points, invert, invert_many, sim3, sim3_parts, transform
-from vislam.messages import NavState
+from vislam.geometry import align_points, invert, invert_many, sim3, sim3_parts
 from vislam.trajectory.poses import Trajectory
 
 Array = NDArray[np.float64]
@@ -189,34 +187,6 @@ def coverage(
     return float(steps[held].sum() / (last - first))
 
 
-def nees(states: Sequence[NavState], truth: Trajectory, mode: Alignment = "yaw") -> dict[str, Array]:
-    """Return the normalised estimation error squared of keyframe states, against a truth in its own world.
-
-    The truth is brought into the states' world, so covariances stay as they are. Keys: "t_ns" [M], "rotation" [M]
-    (3 degrees of freedom), "position" [M] (3), "pose" [M] (6). Singular covariances give NaN. Raises DataError when
-    fewer states match than the alignment needs.
-    """
-    estimate = Trajectory(np.array([s.t_ns for s in states]), np.array([s.T_world_body for s in states]))
-    pairs = associate(estimate, truth)
-    scale, R, t = sim3_parts(align(pairs, mode))
-    if abs(scale - 1.0) > 1e-9:
-        raise UsageError("NEES of a rescaled trajectory means nothing; use alignment yaw, se3, first or none")
-    T_world_truth = invert(transform(R, t))
-    true_poses = T_world_truth @ pairs.reference
-    covariance = np.array([s.covariance for s in states])[np.isin(estimate.t_ns, pairs.t_ns)]
-    error = np.empty((len(pairs), 6))
-    error[:, :3] = Rotation.from_matrix(
-        pairs.estimate[:, :3, :3].transpose(0, 2, 1) @ true_poses[:, :3, :3]
-    ).as_rotvec()
-    error[:, 3:] = true_poses[:, :3, 3] - pairs.estimate[:, :3, 3]
-    return {
-        "t_ns": pairs.t_ns.astype(np.float64),
-        "rotation": _squared_mahalanobis(error[:, :3], covariance[:, :3, :3]),
-        "position": _squared_mahalanobis(error[:, 3:], covariance[:, 3:6, 3:6]),
-        "pose": _squared_mahalanobis(error, covariance[:, :6, :6]),
-    }
-
-
 def evaluate(
     estimate: Trajectory,
     truth: Trajectory,
@@ -312,14 +282,3 @@ def _angles_rad(R: Array) -> Array:
 
 def _rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
-
-
-def _squared_mahalanobis(error: Array, covariance: Array) -> Array:
-    out = np.full(len(error), np.nan)
-    for i, (e, P) in enumerate(zip(error, covariance, strict=True)):
-        try:
-            root = np.linalg.cholesky(P)
-        except np.linalg.LinAlgError:
-            continue
-        out[i] = float(np.sum(np.linalg.solve(root, e) ** 2))
-    return out
