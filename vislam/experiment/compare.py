@@ -14,6 +14,7 @@ from vislam.errors import TrackingLostError, UsageError
 from vislam.experiment import engines
 from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, expand, source_identities, unique
+from vislam.experiment.options import CompareOptions
 from vislam.experiment.page import comparison_page
 from vislam.experiment.plan import Plan, load_plan
 from vislam.experiment.statistics import compare, groups
@@ -21,7 +22,6 @@ from vislam.experiment.store import ResultStore
 from vislam.experiment.tables import latex, runs_csv, summary_csv, tests_csv
 from vislam.experiment.trials import Trial, trials
 from vislam.experiment.verify import read_manifest, verify
-from vislam.options import CompareOptions
 from vislam.runfolder import code_revision, storage, write_json
 from vislam.trajectory import write_text
 

@@ -1,0 +1,41 @@
+"""The options of `vislam compare`; their comments are its --help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Options of `vislam compare`."""
+
+    plan: Positional[Path]
+    """TOML file that says what to compare on what; docs/experiments.md"""
+    out: Path | None = None
+    """Folder for report, tables and manifest; None: results/NAME of the plan"""
+    workers: int = 2
+    """Jobs at the same time on this machine; 1 for undisturbed timings"""
+    engine: Literal["local", "dask"] = "local"
+    """Processes of this machine, or the workers of a Dask cluster"""
+    scheduler: str | None = None
+    """Address of the Dask scheduler"""
+    store: Path = Path("results/results.db")
+    """Keeps every result by the hash of all it depends on; nothing in it runs again"""
+    cache: Path = Path("results/recordings")
+    """Keeps the recordings of simulated worlds"""
+    keep_runs: Path | None = None
+    """Keep the run folder of every job in here"""
+    retry_failed: bool = False
+    """Run the jobs again that failed before"""
+    verify: Path | None = None
+    """Run jobs of this comparison (folder or manifest) again: do the numbers come out? Exit code 4 if not"""
+    sample: int = 3
+    """How many jobs --verify runs; 0: all"""
+    dry_run: bool = False
+    """Only list the jobs and which of them are done"""
+    json: bool = False
+    """Print JSON instead of lines"""

@@ -1,0 +1,146 @@
+"""`vislam optimize`: the best estimate of a run, of a pose-graph file, or of several runs joined."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from vislam.config import BatchConfig, PoseGraphConfig
+from vislam.errors import TrackingLostError
+from vislam.verbs.arguments import parse
+from vislam.verbs.results import print_evaluation
+from vislam.verbs.terminal import progress_bar
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """Options of `vislam optimize RUN`; a pose-graph FILE and several RUNs have their own."""
+
+    run: Positional[Path]
+    """Run folder, whether its run came to the end or not; give several, or a pose-graph file, before --help for their
+    options"""
+    settings: Annotated[BatchConfig, tyro.conf.arg(name="")] = field(default_factory=BatchConfig)
+    out_name: str = "batch"
+    """Names the files: trajectory_NAME.tum, states_NAME.csv"""
+    json: bool = False
+    """Print the entry of metrics.json instead of the summary"""
+
+
+@dataclass(frozen=True)
+class OptimizeGraphOptions:
+    """Options of `vislam optimize FILE`: a pose graph in g2o, TORO or iSAM format."""
+
+    file: Positional[Path]
+    """Pose graph; what is no format's ending .g2o, .toro or .isam is told by its contents"""
+    settings: Annotated[PoseGraphConfig, tyro.conf.arg(name="")] = field(default_factory=PoseGraphConfig)
+    out: Path | None = None
+    """Folder for optimized.g2o, trajectory.tum, trajectory_kitti.txt, poses.csv, edges.csv, summary.json and
+    report.html; None: NAME_optimized in the working folder"""
+    report: bool = True
+    """Write report.html, with pictures of before and after"""
+    json: bool = False
+    """Print summary.json instead of the summary"""
+
+
+@dataclass(frozen=True)
+class JoinOptions:
+    """Options of `vislam optimize RUN RUN [...]`: sessions joined into one pose graph by loops between them."""
+
+    out: Path
+    """Folder for trajectory_NAME.tum of each session, joined.g2o, loops.csv, summary.json and report.html"""
+    sessions: Positional[tuple[Path, ...]] = ()
+    """Run folders or session.db files, two or more, which are only read; the map is that of the first"""
+    report: bool = True
+    """Write report.html, with pictures of before and after"""
+    json: bool = False
+    """Print summary.json instead of the summary"""
+
+
+def main(arguments: list[str]) -> int:
+    """Optimise what the arguments name: a run, a pose-graph file, or several sessions."""
+    sessions = [a for a in arguments if (Path(a) / "session.db").is_file() or Path(a).name == "session.db"]
+    if len(sessions) > 1 or (sessions and any(a.partition("=")[0] == "--out" for a in arguments)):
+        return _join_sessions(parse(JoinOptions, arguments, "optimize"))
+    if any(Path(argument).is_file() or argument.endswith(".g2o") for argument in arguments):
+        return _optimize_graph(parse(OptimizeGraphOptions, arguments, "optimize"))
+    return _optimize_run(parse(OptimizeOptions, arguments, "optimize"))
+
+
+def _optimize_run(options: OptimizeOptions) -> int:
+    from vislam.optimize import optimize
+    from vislam.report import write_report
+
+    entry = optimize(options.run, options.settings, options.out_name)
+    write_report(options.run)
+    if options.json:
+        print(json.dumps(entry))
+        return 0
+    loops = entry["loops"]
+    print(
+        f"{entry['keyframes']} keyframes, {entry['landmarks']} landmarks, {entry['observations']} observations "
+        f"({entry['rejected_observations']} refused), {loops['kept']} of {loops['offered']} loops; "
+        f"cost {entry['cost_before']:.6g} -> {entry['cost_after']:.6g} in {entry['iterations']} steps, "
+        f"{entry['wall_s']:.1f} s"
+    )
+    for warning in entry["warnings"]:
+        print(f"warning: {warning}")
+    if entry["accuracy"]:
+        print_evaluation({f"{options.out_name} ({mode})": entry["accuracy"][mode] for mode in entry["accuracy"]})
+    print(f"trajectory: {options.run / f'trajectory_{options.out_name}.tum'}")
+    return 0
+
+
+def _optimize_graph(options: OptimizeGraphOptions) -> int:
+    from vislam.optimize_graph import optimize_graph_file
+    from vislam.report.graph_page import write_graph_report
+
+    out = options.out or Path(f"{options.file.stem}_optimized")
+    limit = options.settings.iterations
+    with progress_bar(options.file.stem, "iterations") as bar:
+        show = None if bar is None else (lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}"))
+        result = optimize_graph_file(options.file, out, options.settings, show)
+    if options.report:
+        write_graph_report(result.problem, result.solution, options.file.stem, out / "report.html", result.certificate)
+    summary = result.summary
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(
+            f"{summary['poses']} poses, {summary['edges']} edges ({len(summary['rejected'])} found false); chi2 "
+            f"{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
+            f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
+        )
+        if result.certificate is not None:
+            print(result.certificate.text)
+        for warning in summary["warnings"]:
+            print(f"warning: {warning}")
+        print(f"results: {out}")
+    return 0 if summary["converged"] else TrackingLostError.exit_code
+
+
+def _join_sessions(options: JoinOptions) -> int:
+    from vislam.join_sessions import join_sessions, write_joined
+    from vislam.report.graph_page import write_graph_report
+
+    with progress_bar("loops between sessions", "keyframes") as bar:
+        joined = join_sessions(options.sessions, progress=bar)
+    write_joined(joined, options.out)
+    if options.report:
+        write_graph_report(joined.problem, joined.solution, " + ".join(joined.names), options.out / "report.html")
+    summary = joined.summary
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(
+            f"{len(joined.names)} sessions, {summary['poses']} keyframes; {summary['loops_kept']} of "
+            f"{summary['loops_between']} loops between them kept; chi2 {summary['chi2_after']:.6g}"
+        )
+        for warning in summary["warnings"]:
+            print(f"warning: {warning}")
+        print(f"results: {options.out}")
+    return 0 if summary["converged"] else TrackingLostError.exit_code

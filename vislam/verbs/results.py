@@ -1,0 +1,78 @@
+"""What a run leaves, shown: its report in the folder, its metrics on the terminal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from vislam.errors import VislamError
+from vislam.verbs.terminal import number, print_table
+
+
+@contextmanager
+def written_up(out: Path) -> Iterator[None]:
+    """Write the report of a run afterwards, whatever happened on the way."""
+    from vislam.report import write_report
+
+    try:
+        yield
+    except BaseException:
+        with suppress(VislamError):  # what went wrong first is what is told
+            if (out / "metrics.json").is_file():
+                write_report(out)
+        raise
+    write_report(out)
+
+
+def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
+    """Print what a run in `out` measured: as JSON, or as a table with its warnings and where its files are."""
+    from vislam.runfolder import plain
+
+    if as_json:
+        print(json.dumps(plain(metrics)))
+        return
+    if metrics["accuracy"]:
+        _print_accuracy(metrics)
+    console, loops = Console(), metrics["loops"]
+    console.print(
+        f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {loops['accepted']} loops of "
+        f"{loops['candidates']} candidates, {number(metrics['realtime_factor'], 1)} x real time"
+    )
+    for warning in metrics["warnings"]:
+        console.print(f"warning: {warning}", style="yellow")
+    for name, title in (("report.html", "report"), ("run.rrd", "Rerun recording"), ("map", "map")):
+        if (out / name).exists():
+            console.print(f"{title}: {out / name}", soft_wrap=True)
+
+
+def print_evaluation(results: dict[str, dict[str, Any]]) -> None:
+    """Print the errors of trajectories, as `evaluate` returns them, by name."""
+    columns = {
+        "ATE rmse [m]": "ate_rmse_m", "median": "ate_median_m", "max": "ate_max_m", "RPE 1 s [m]": "rpe_1s_m",
+        "RPE 1 s [deg]": "rpe_1s_deg", "scale": "scale",
+    }  # fmt: skip
+    rows = []
+    for name, entry in results.items():
+        numbers = [number(entry[key], 4) for key in columns.values()]
+        rows.append((name, *numbers, f"{entry['matched']}/{entry['total']}", f"{entry['coverage']:.0%}"))
+    print_table(("trajectory", *columns, "matched", "covered"), rows)
+
+
+def _print_accuracy(metrics: dict[str, Any]) -> None:
+    odometry = "EKF alone, causal" if metrics["has_imu"] else "odometry, causal"
+    titles = {"ekf": odometry, "live": "graph, causal", "graph": "graph, final"}
+    columns = {
+        "ATE rmse [m]": "ate_rmse_m", "ATE max [m]": "ate_max_m", "RPE 1 s [m]": "rpe_1s_m",
+        "RPE 1 s [deg]": "rpe_1s_deg",
+    }  # fmt: skip
+    rows = [
+        (titles.get(name, name), *(number(entry[key], 3) for key in columns.values()), f"{entry['coverage']:.0%}")
+        for name, entry in metrics["accuracy"].items()
+    ]
+    title = f"{metrics['name']} ({metrics['mode']}{', inertial' if metrics['has_imu'] else ''})"
+    print_table(("trajectory", *columns, "covered"), rows, title)

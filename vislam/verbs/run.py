@@ -1,0 +1,94 @@
+"""`vislam run`: the pipeline over a recording, from its start or from where a run of it ended."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import Positional
+
+from vislam.config import Config, dump, load
+from vislam.errors import UsageError
+from vislam.verbs.arguments import parse, take_option, take_path
+from vislam.verbs.results import print_metrics, written_up
+from vislam.verbs.terminal import progress_bar
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of `vislam run`."""
+
+    source: Positional[str]
+    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD[,option=value], points:WORLD or
+    points:PATH[,option=value], or a path, recognised by its contents"""
+    out: Path
+    """Folder to make for everything that the run leaves"""
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    overwrite: bool = False
+    """Replace the run that the folder holds"""
+    map: Path | None = None
+    """Session (RUN/session.db or RUN) of an earlier run in whose map this one begins; it is not written"""
+    localize_only: bool = False
+    """With --map: find the way in it, and leave its keyframes and clouds as they are"""
+    dry_run: bool = False
+    """Only print the resolved configuration as JSON"""
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Options of `vislam run --resume RUN`; source and settings are those that the run began with."""
+
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+def main(arguments: list[str]) -> int:
+    """Run a recording, or with --resume go on with a run."""
+    command = ["vislam", "run", *arguments]
+    resumed = take_option(arguments, "--resume")
+    if resumed is not None:
+        return _resume(Path(resumed), arguments, command)
+    base = RunOptions(source=tyro.MISSING, out=tyro.MISSING, settings=load(take_path(arguments, "--config")))
+    options = parse(RunOptions, arguments, "run", base)
+    if options.dry_run:
+        print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
+        return 0
+    if options.localize_only and options.map is None:
+        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    print_metrics(run_source(options, command), options.out, options.json)
+    return 0
+
+
+def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
+    """Go on with the run in a folder, whatever ended it."""
+    from vislam.run import resume
+    from vislam.runfolder import read_setup
+    from vislam.sources import open_source
+
+    options = parse(ResumeOptions, arguments, "run")
+    source, config, base = read_setup(out)
+    recording = open_source(source, config.seed, config.calibration)
+    with written_up(out), progress_bar(recording.name) as progress:
+        metrics = resume(recording, config, out, source, command, progress, base)
+    print_metrics(metrics, out, options.json)
+    return 0
+
+
+def run_source(options: RunOptions, command: list[str]) -> dict[str, Any]:
+    """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
+    from vislam.datasets.calibrated import with_clock
+    from vislam.run import execute
+    from vislam.runfolder import MapChoice, prepare
+    from vislam.sources import open_source
+
+    settings = with_clock(options.settings)
+    recording = open_source(options.source, settings.seed, settings.calibration)
+    base = None if options.map is None else MapChoice(options.map, options.localize_only)
+    prepare(options.out, options.overwrite)
+    with written_up(options.out), progress_bar(recording.name) as progress:
+        return execute(recording, settings, options.out, options.source, command, progress, base)
