@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from vislam.experiment.measures import SEGMENTS_M
 from vislam.experiment.plan import Axis
@@ -200,10 +200,11 @@ def _panels(
 
 
 def _label_plainly(axis: Any) -> None:
-    """Label a logarithmic axis at 1, 2, 5 of each decade."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    """Label a logarithmic axis at 1, 2, 5 of each decade, or at a few round numbers where it holds less than one."""
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if high >= 10.0 * low else MaxNLocator(4))
+    axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(_PLAIN)
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _color(output: str) -> str:

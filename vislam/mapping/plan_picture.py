@@ -23,7 +23,9 @@ _NAMES = {
     Drive.STEEP: "too steep", Drive.UNKNOWN: "no ground seen",
 }  # fmt: skip
 _MARGIN_CELLS = 4
-_LEGEND_PX = 34
+_LEGEND_PX = 34  # height of a line of a picture that is so wide:
+_LEGEND_WIDTH_PX = 560
+_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 _INK = (60, 66, 78)
 
 
@@ -77,29 +79,41 @@ def _draw(image: ImageU8, pixels: NDArray[np.float64], line: Line) -> None:
 
 
 def _with_legend(image: ImageU8, grid: DriveGrid, scale: int) -> ImageU8:
-    """Return the picture with the meaning of its colours and the length of a metre below it."""
+    """Return the picture with the meaning of its colours and the length of a metre below it.
+
+    The words grow with the picture, so that they can be read where it is shown half a page wide.
+    """
     used = [(_COLORS[s], _NAMES[s]) for s in (*_NAMES,) if (grid.states == s).any()]
     used.insert(1, (_CLOSE, f"less than {grid.turning_radius_m:.2f} m to what is in the way"))
-    width = max(image.shape[1], 560)
-    lines = [[]]  # type: list[list[tuple[int, tuple[int, int, int], str]]]
-    x = 10
+    width = max(image.shape[1], _LEGEND_WIDTH_PX)
+    zoom = width / _LEGEND_WIDTH_PX
+
+    def px(length: float) -> int:
+        return round(length * zoom)
+
+    def write(text: str, x: int, y: int) -> None:
+        cv2.putText(out, text, (x, y), _FONT, _FONT_SCALE * zoom, _INK, max(1, px(1)), cv2.LINE_AA)
+
+    lines: list[list[tuple[int, tuple[int, int, int], str]]] = [[]]
+    x = px(10)
     for color, name in used:
-        needs = 26 + cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)[0][0] + 18
+        needs = px(44) + cv2.getTextSize(name, _FONT, _FONT_SCALE * zoom, max(1, px(1)))[0][0]
         if x + needs > width and lines[-1]:
             lines.append([])
-            x = 10
+            x = px(10)
         lines[-1].append((x, color, name))
         x += needs
-    lines.append([])  # of the metre
-    out = np.full((image.shape[0] + _LEGEND_PX * len(lines), width, 3), 255, np.uint8)
+    height = px(_LEGEND_PX)
+    out = np.full((image.shape[0] + height * (len(lines) + 1), width, 3), 255, np.uint8)
     out[: image.shape[0], : image.shape[1]] = image
     for k, entries in enumerate(lines):
-        y = image.shape[0] + k * _LEGEND_PX + 9
+        y = image.shape[0] + k * height + px(9)
         for x, color, name in entries:
-            cv2.rectangle(out, (x, y), (x + 16, y + 16), color, -1)
-            cv2.rectangle(out, (x, y), (x + 16, y + 16), _INK, 1)
-            cv2.putText(out, name, (x + 24, y + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA)
-    y, metre = out.shape[0] - _LEGEND_PX // 2, round(scale / grid.resolution_m)
-    cv2.line(out, (10, y), (10 + metre, y), _INK, 3)
-    cv2.putText(out, "1 m", (18 + metre, y + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA)
+            corner = (x + px(16), y + px(16))
+            cv2.rectangle(out, (x, y), corner, color, -1)
+            cv2.rectangle(out, (x, y), corner, _INK, max(1, px(1)))
+            write(name, x + px(24), y + px(13))
+    y, metre = out.shape[0] - height // 2, round(scale / grid.resolution_m)
+    cv2.line(out, (px(10), y), (px(10) + metre, y), _INK, px(3))
+    write("1 m", px(18) + metre, y + px(5))
     return out
