@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from vislam.clock import StageClock
 from vislam.config import Config, ImuConfig
-from vislam.errors import DataError, TrackingLostError, UsageError, VislamError
+from vislam.errors import DataError, UsageError, VislamError
 from vislam.factor_log import rig_data
 from vislam.factors.gate import EdgeReport
 from vislam.front import FrontReport
@@ -27,12 +26,14 @@ from vislam.loop_gallery import LoopGallery
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
 from vislam.memory import FrontMemory, FrontNews, GraphNews, KeyframeEntry, SlamMemory, StartFacts
-from vislam.messages import Array, Frame, ImuSample, Localisation, LoopDecision, MagSample, NavState, Tracking
+from vislam.messages import Array, Frame, ImuSample, LoopDecision, MagSample, NavState
 from vislam.recording import Recording
+from vislam.run.metrics import accuracy, doubts, initialisation, judge
+from vislam.run.view import show_map, show_paths, show_step
 from vislam.runfolder import MapChoice, RunLog, storage, write_json, write_setup
 from vislam.session import Session, SessionWriter, has_begun, recall
 from vislam.slam import Finish, KeyframeStep, Slam, Step
-from vislam.trajectory import Trajectory, align, associate, evaluate
+from vislam.trajectory import Trajectory
 from vislam.viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:
@@ -40,14 +41,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
-_LOST_SIGMA_M = 1.0  # of the filter's position: no controller can use it, and a user must be told
-_UNIFORM_S = 20.0  # after which the biases that hold the scale of one camera may have walked away
-_GATED_SHARE = 0.1  # of the visual motions that the filter refused: more than outliers explain
-_APART_M = 0.5  # rms between filter and graph that is no drift ...
-_APART_SHARE = 0.05  # ... and the share of the way that is none either
-_MIN_COMPARED = 10  # poses
 _INERTIAL_BEFORE_NS = 1_000_000_000  # given again before the keyframe at which a run is resumed
-_MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
 def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
@@ -230,8 +224,12 @@ class Run:
             raise failure or error from error
         if failure is not None:
             raise failure
-        self._judge(metrics)
+        judge(metrics, self.out)
         return metrics
+
+    @property
+    def _mapper(self) -> Mapper | None:
+        return None if self.slam.back is None else self.slam.back.mapper
 
     def _open_viewer(self) -> None:
         """Open the Rerun recording; that of a run that is resumed goes on in another file."""
@@ -283,7 +281,7 @@ class Run:
         for keyframe in step.keyframes:
             self._store(keyframe)
         with self.slam.clock.measure("view"):
-            self._show(step)
+            show_step(self.viewer, step, self._mapper, self.slam.front.start is not None)
 
     def _store(self, step: KeyframeStep) -> None:
         with self.slam.clock.measure("store"):
@@ -297,57 +295,6 @@ class Run:
             self.gallery.add(step)
         if self.base is not None and self.joined_t_ns is None and step.update.pieces.group(packet.keyframe.id) == 0:
             self.joined_t_ns = packet.keyframe.t_ns
-
-    def _show(self, step: Step) -> None:
-        """Log a step for the viewer: the image with its tracks, the poses, what the back end did."""
-        frame, track = step.front.frame, step.front.track
-        self.viewer.log_frame(frame, track.observations, track.vo.tracking)
-        if step.T_map_body is not None:
-            self.viewer.log_pose("live", frame.t_ns, step.T_map_body)
-        if step.front.T_odom_body is not None:
-            self.viewer.log_pose("ekf", frame.t_ns, step.front.T_odom_body)
-        self.viewer.log_scalars(frame.t_ns, _plotted(step))
-        if step.localisation is Localisation.RELOCALISED:
-            self.viewer.log_note(
-                frame.t_ns, f"relocalised: piece {step.piece} of the trajectory is joined with the map"
-            )
-        if track.vo.tracking != Tracking.OK:
-            self.viewer.log_note(frame.t_ns, f"{track.vo.tracking}: {track.reason}")
-        for keyframe in step.keyframes:
-            T_map_body = keyframe.update.T_map_odom @ keyframe.odometry.T_odom_body
-            self.viewer.log_keyframe(keyframe.odometry.packet.keyframe, T_map_body)
-            self.viewer.move(keyframe.update)
-            for candidate in keyframe.candidates:
-                self.viewer.log_loop(candidate)
-            self._show_depth(keyframe)
-        if step.keyframes:
-            self._show_map(frame.t_ns)
-
-    def _show_depth(self, step: KeyframeStep) -> None:
-        """Show the points of keyframes whose depth did not come with the image: from two images, or from one, late."""
-        mapper = None if self.slam.back is None else self.slam.back.mapper
-        if (
-            mapper is None
-            or isinstance(self.viewer, NullViewer)
-            or step.odometry.packet.keyframe.frame.depth_m is not None
-        ):
-            return
-        for keyframe_id, scan in step.scans.items():
-            if scan.depth_png:
-                cloud = mapper.keyframe_cloud(keyframe_id)
-                self.viewer.log_cloud(keyframe_id, cloud.points_m, cloud.colors)
-
-    def _show_map(self, t_ns: int, is_last: bool = False) -> None:
-        """Show octree and grid as they are now, if it is time for that."""
-        mapper = None if self.slam.back is None else self.slam.back.mapper
-        if mapper is None or not self.viewer.wants_map(t_ns, is_last):
-            return
-        with suppress(DataError):  # too many voxels, or too large a grid: said where they are exported
-            octree = mapper.occupancy.max_likelihood_octree()
-            self.viewer.log_octree(t_ns, octree.occupied_voxels(), octree.resolution_m)
-            if self.slam.front.start is not None:  # else the map is not level
-                grid = mapper.grid()
-                self.viewer.log_grid(t_ns, grid.cells, grid.resolution_m, grid.origin_m, grid.floor_m)
 
     def _finish(self, start: float) -> dict[str, Any]:
         finish = self.slam.finish()
@@ -363,15 +310,18 @@ class Run:
         self._explain(rows)
         truth = self._truth()
         self.log.write_trajectories(self.out, final, truth)
-        if self.slam.back is not None and self.slam.back.mapper is not None:
+        if self._mapper is not None:
             with self.slam.clock.measure("map export"):
-                self.slam.back.mapper.export(self.out / "map")
-            self.warnings += [f"no {name}: {reason}" for name, reason in self.slam.back.mapper.notes.items()]
-        self._show_result(final, truth)
+                self._mapper.export(self.out / "map")
+            self.warnings += [f"no {name}: {reason}" for name, reason in self._mapper.notes.items()]
+        show_paths(self.viewer, final, truth)
+        is_level = self.slam.front.start is not None
+        if self._mapper is not None and len(self.log):
+            show_map(self.viewer, int(self.log.stamps_ns[-1]), self._mapper, is_level, is_last=True)
+        self.viewer.close()
         wall_s = time.perf_counter() - start  # everything but pictures and report
-        if self.slam.back is not None and self.slam.back.mapper is not None:
-            is_level = self.slam.front.start is not None
-            write_pictures(self.slam.back.mapper, self.out / "map", final.positions_m, is_level)
+        if self._mapper is not None:
+            write_pictures(self._mapper, self.out / "map", final.positions_m, is_level)
         metrics = self._metrics(final, truth, wall_s, loops)
         write_json(self.out / "metrics.json", metrics)
         return metrics
@@ -397,16 +347,6 @@ class Run:
         if decided:
             self.viewer.settle_loops(int(self.log.stamps_ns[-1]), decided)
 
-    def _show_result(self, final: Trajectory, truth: Trajectory | None) -> None:
-        self.viewer.log_path("graph", final.positions_m)
-        if len(self.log):
-            self._show_map(int(self.log.stamps_ns[-1]), is_last=True)
-        if truth is not None and len(final):
-            with suppress(VislamError):  # too little in common: metrics say so
-                pairs = associate(truth, final)
-                self.viewer.log_path("truth", pairs.aligned(align(pairs, "se3")).estimate[:, :3, 3])
-        self.viewer.close()
-
     def _truth(self) -> Trajectory | None:
         try:
             return self.recording.truth()
@@ -419,49 +359,32 @@ class Run:
     ) -> dict[str, Any]:
         front, back = self.slam.front.report(), self.slam.back
         stamps = self.log.stamps_ns
-        duration_s = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
         part = stamps[self._first_frame :]
-        part_s = float(part[-1] - part[0]) * 1e-9 if len(part) else 0.0
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             counters |= back.counters
-        if self.noise is not None:
-            self.warnings += front.noise_warnings
-            sigma_m = self.log.worst_position_sigma_m
-            if sigma_m > _LOST_SIGMA_M:
-                self.warnings.append(
-                    f"the filter's position was uncertain by {sigma_m:.1f} m (1 sigma) at its worst: too long without "
-                    "vision, or without motion that shows scale"
-                )
-        self._doubt_filter(front)
-        self._compare_filter_and_graph(final)
-        if self.noise is not None and front.start is None:
-            self.warnings.append(f"gravity was never found, vision alone gave the motion: {front.refusal}")
+        self.warnings += doubts(front, self.log, final, self.noise is not None)
+        errors: dict[str, Any] = {}
+        found = self._found_in_map()
+        if truth is not None:
+            errors, not_compared = accuracy(self.log, final, truth)
+            self.warnings += not_compared
         return {
             "name": self.recording.name,
             "mode": front.mode,
             "has_imu": self.noise is not None,
-            "coupling": {
-                "ekf": front.coupling,
-                "graph": self.config.graph.coupling,
-            },
+            "coupling": {"ekf": front.coupling, "graph": self.config.graph.coupling},
             "frames": len(self.log),
             "frames_expected": self.recording.frame_count,
             "keyframes": self.log.keyframes,
-            "duration_s": duration_s,
+            "duration_s": _length_s(stamps),
             "wall_s": wall_s,
-            "realtime_factor": part_s / wall_s if wall_s > 0.0 else None,
+            "realtime_factor": _length_s(part) / wall_s if wall_s > 0.0 else None,
             "resumed": self.resumed,
-            "map": self._found_in_map(),
-            "initialisation": {
-                "status": "none" if front.start is None else str(front.start.status),
-                "reason": front.refusal if front.start is None else front.start.reason,
-                "t_s": None if front.start is None else (front.start.last.t_ns - int(stamps[0])) * 1e-9,
-                "scale_sigma": None if front.start is None else front.start.scale_sigma,
-                "excitation_m_s2": None if front.start is None else front.start.excitation_m_s2,
-            },
+            "map": found,
+            "initialisation": initialisation(front, int(stamps[0]) if len(stamps) else None),
             "calibration": front.calibration,
-            "accuracy": self._accuracy(final, truth),
+            "accuracy": errors,
             "timing_ms": self.slam.clock.summary_ms(),
             "counters": counters,
             "nis": front.nis,
@@ -472,29 +395,6 @@ class Run:
             "warnings": self.warnings,
         }
 
-    def _doubt_filter(self, front: FrontReport) -> None:
-        """Warn where the filter's numbers hold less than they seem to."""
-        uniform_s = front.uniform_s
-        if uniform_s > _UNIFORM_S:
-            self.warnings.append(
-                f"uniform motion for {uniform_s:.0f} s: the scale of one camera is held by the IMU's biases alone "
-                "there, and may be off by more than its sigma; accelerate now and then, or use a second camera or depth"
-            )
-        ekf = front.counters.get("ekf", {})
-        resets, gated, opposed, taken = (
-            ekf.get(name, 0) for name in ("soft_resets", "vo_gated", "vo_opposed", "vo_accepted")
-        )
-        if resets:
-            self.warnings.append(
-                f"vision contradicted the filter for so long that its uncertainty was widened {resets} times: look at "
-                "tracking.csv for something that moves through the image, and check calibration and time offset"
-            )
-        if (refused := gated + opposed) > _GATED_SHARE * (refused + taken):
-            self.warnings.append(
-                f"the filter refused {refused} of {refused + taken} visual motions as impossible: its pose is mostly "
-                "inertial there; with one camera use --ekf.coupling tight"
-            )
-
     def _found_in_map(self) -> dict[str, Any] | None:
         """Return in which map the run began, and when it was found there."""
         if self.base is None:
@@ -504,52 +404,9 @@ class Run:
             return {**self.base, "found_t_s": None}
         return {**self.base, "found_t_s": (self.joined_t_ns - int(self.log.stamps_ns[0])) * 1e-9}
 
-    def _compare_filter_and_graph(self, final: Trajectory) -> None:
-        """Warn when filter and graph went different ways by more than drift explains: one of them is wrong."""
-        odometry = self.log.odometry_trajectory()
-        if self.noise is None or len(odometry) < _MIN_COMPARED or len(final) < _MIN_COMPARED:
-            return
-        path_m = float(np.linalg.norm(np.diff(final.positions_m, axis=0), axis=1).sum())
-        with suppress(VislamError):  # nothing in common to compare
-            apart_m = evaluate(odometry, final, "yaw")["ate_rmse_m"]
-            if apart_m > max(_APART_M, _APART_SHARE * path_m):
-                self.warnings.append(
-                    f"filter and graph are {apart_m:.1f} m apart over {path_m:.0f} m of way: one of them is wrong; "
-                    "look at tracking.csv for lost or degraded frames, and for something that moves through the image"
-                )
 
-    def _accuracy(self, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
-        if truth is None:
-            return {}
-        stamps = self.log.stamps_ns
-        accuracy = {}
-        estimates = {"ekf": self.log.odometry_trajectory(), "live": self.log.live_trajectory(), "graph": final}
-        for name, estimate in estimates.items():
-            try:
-                span = (int(stamps[0]), int(stamps[-1]))
-                accuracy[name] = evaluate(estimate, truth, "se3", span_ns=span)
-            except VislamError as error:
-                self.warnings.append(f"{name}: {error}")
-        return accuracy
-
-    def _judge(self, metrics: dict[str, Any]) -> None:
-        if metrics["frames"] == 0:
-            raise DataError(f"{self.recording.name}: not one usable frame; run `vislam doctor` on it")
-        if metrics["coverage_frames"] < _MIN_COVERAGE:
-            raise TrackingLostError(
-                f"{self.recording.name}: only {metrics['coverage_frames']:.0%} of the frames have a pose "
-                f"({metrics['initialisation']['reason']}); see tracking.csv and report.html in {self.out}"
-            )
-
-
-def _plotted(step: Step) -> dict[str, float]:
-    """Return the numbers of a step that the viewer draws over time."""
-    track, state = step.front.track, step.front.state
-    values = {"tracking/inliers": float(track.vo.inliers), "tracking/parallax_px": track.median_parallax_px}
-    if state is not None:
-        for name, bias in (("gyro_bias_rad_s", state.gyro_bias_rad_s), ("accel_bias_m_s2", state.accel_bias_m_s2)):
-            values |= {f"{name}/{axis}": float(value) for axis, value in zip("xyz", bias, strict=True)}
-    return values
+def _length_s(stamps_ns: NDArray[np.int64]) -> float:
+    return float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
 
 
 def execute(
