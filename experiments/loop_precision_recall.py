@@ -20,7 +20,7 @@ from typing import Any
 
 from vislam.config import LoopTruthConfig
 from vislam.errors import VislamError
-from vislam.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
+from vislam.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
 from vislam.report import write_loop_plot
 from vislam.runfolder import write_json
 from vislam.trajectory import write_text

@@ -17,10 +17,10 @@ from vislam.batch.graph_gnc import reject_suspects
 from vislam.cli import run_verb
 from vislam.config import PoseGraphConfig, load
 from vislam.geometry import invert, se3_exp, transform
-from vislam.join_sessions import join_sessions
+from vislam.offline.join_sessions import join_sessions
+from vislam.offline.session_graph import Edges, problem_of
 from vislam.run import execute
 from vislam.runfolder import prepare
-from vislam.session_graph import Edges, problem_of
 from vislam.sources import open_source
 from vislam.trajectory import Trajectory, read_tum
 

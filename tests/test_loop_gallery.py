@@ -10,8 +10,8 @@ import pytest
 
 from vislam import loop_gallery
 from vislam.loop.table import LoopRow, caption
-from vislam.loop_gallery import LoopGallery, chosen
 from vislam.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
+from vislam.run.loop_gallery import LoopGallery, chosen
 from vislam.runfolder import RunLog
 
 

@@ -14,9 +14,9 @@ from vislam.cli import run_verb
 from vislam.config import Config, GraphConfig, WindowConfig
 from vislam.errors import DataError, UsageError
 from vislam.graph import PoseGraph
-from vislam.loop_undo import change_loops, list_loops
 from vislam.memory import FrameEntry, KeyframeEntry, LoopPlace
 from vislam.messages import LoopDecision
+from vislam.offline.loop_undo import change_loops, list_loops
 from vislam.session import Session, SessionWriter, recall
 from vislam.trajectory import read_tum
 

@@ -18,7 +18,7 @@ from session_world import simulate, store
 from vislam.cli import run_verb
 from vislam.config import BatchConfig, Config, load
 from vislam.errors import DataError, UsageError
-from vislam.optimize import optimize
+from vislam.offline.optimize import optimize
 from vislam.run import execute
 from vislam.runfolder import prepare
 from vislam.sources import open_source

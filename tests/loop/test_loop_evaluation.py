@@ -27,7 +27,6 @@ from vislam.loop.evaluation import (
     true_places,
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
-from vislam.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
 from vislam.memory import GraphNews, KeyframeEntry
 from vislam.messages import (
     GraphUpdate,
@@ -38,6 +37,7 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
+from vislam.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
 from vislam.session import SessionWriter
 from vislam.trajectory import Trajectory, read_tum, write_tum
 

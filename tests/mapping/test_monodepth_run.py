@@ -14,7 +14,7 @@ from vislam.config import load
 from vislam.datasets.recorder import record
 from vislam.mapping.octomap_io import read_octree
 from vislam.mapping.ply import read_ply
-from vislam.rebuild import map_settings, rebuild
+from vislam.offline.rebuild import map_settings, rebuild
 from vislam.run import execute
 from vislam.runfolder import prepare
 from vislam.session import Session

@@ -12,7 +12,7 @@ from vislam.errors import DataError, UsageError
 from vislam.mapping.octomap_io import read_octree
 from vislam.mapping.pcd import read_pcd
 from vislam.mapping.ply import read_ply
-from vislam.rebuild import map_settings, rebuild
+from vislam.offline.rebuild import map_settings, rebuild
 from vislam.run import execute
 from vislam.runfolder import prepare
 from vislam.sim import open_world

@@ -68,7 +68,7 @@ def _batch(spec: dict[str, Any], config: Config, out: Path, result: dict[str, An
     """Estimate the run again in batch, if that was asked for; time and memory of the run are those without it."""
     if not spec["batch"]:
         return []
-    from vislam.optimize import optimize
+    from vislam.offline.optimize import optimize
 
     try:
         optimize(out, config.batch)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vislam.camera import Camera
 from vislam.config import InitConfig
+from vislam.frontend.inertial_alignment import Alignment, VisualMotion, Window, excitation, refine, solve_linear
 from vislam.frontend.initialisation_bundle import (
     Bundle,
     InertialPath,
@@ -29,7 +30,6 @@ from vislam.frontend.initialisation_rest import rest_accel_bias, rest_covariance
 from vislam.frontend.initialisation_window import Entry, FrameWindow, gather_tracks, metric_motions
 from vislam.geometry import level_rotation, transform
 from vislam.imu import ImuNoise, RestDetector, join
-from vislam.inertial_alignment import Alignment, VisualMotion, Window, excitation, refine, solve_linear
 from vislam.messages import Array, ImuSpan, NavState, Observations, Tracking, VoMeasurement
 
 _NS = 1_000_000_000

@@ -17,9 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import so3_exp
-from vislam.imu import Preintegrated, preintegrate
-from vislam.inertial_alignment import (
+from vislam.frontend.inertial_alignment import (
     Alignment,
     NormalEquations,
     Window,
@@ -29,6 +27,8 @@ from vislam.inertial_alignment import (
     solve_gyro_bias,
     up_to_z,
 )
+from vislam.geometry import so3_exp
+from vislam.imu import Preintegrated, preintegrate
 from vislam.messages import Array
 
 _DEPTH_ROUNDS = 5  # a bearing's weight needs the point's distance, which the round before has found

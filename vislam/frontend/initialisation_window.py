@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 
 from vislam.camera import Camera
+from vislam.frontend.inertial_alignment import VisualMotion
 from vislam.frontend.initialisation_bundle import Tracks
 from vislam.frontend.result import scaled_motion
 from vislam.geometry import invert, se3_adjoint
 from vislam.imu import join
-from vislam.inertial_alignment import VisualMotion
 from vislam.messages import Array, ImuSpan, Observations, VoMeasurement
 
 _NS = 1_000_000_000

@@ -22,12 +22,12 @@ from vislam.factors.gate import EdgeReport
 from vislam.front import FrontReport
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
-from vislam.loop_gallery import LoopGallery
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
 from vislam.memory import FrontMemory, FrontNews, GraphNews, KeyframeEntry, SlamMemory, StartFacts
 from vislam.messages import Array, Frame, ImuSample, LoopDecision, MagSample, NavState
 from vislam.recording import Recording
+from vislam.run.loop_gallery import LoopGallery
 from vislam.run.metrics import accuracy, doubts, initialisation, judge
 from vislam.run.view import show_map, show_paths, show_step
 from vislam.runfolder import MapChoice, RunLog, storage, write_json, write_setup

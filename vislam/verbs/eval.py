@@ -79,7 +79,7 @@ def _evaluate(options: EvalOptions) -> dict[str, dict[str, Any]]:
 
 
 def _eval_loops(options: EvalOptions) -> int:
-    from vislam.loop_evaluation import evaluate_loops
+    from vislam.offline.loop_evaluation import evaluate_loops
     from vislam.report import write_loop_plot, write_report
 
     answer = evaluate_loops(options.estimate, options.truth, options.reference)

@@ -35,7 +35,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _list(options: LoopsOptions) -> int:
-    from vislam.loop_undo import list_loops
+    from vislam.offline.loop_undo import list_loops
 
     loops = list_loops(options.run)
     if options.json:
@@ -54,7 +54,7 @@ def _print_edges(loops: list[dict[str, Any]]) -> None:
 
 
 def _change(options: LoopsOptions) -> int:
-    from vislam.loop_undo import change_loops
+    from vislam.offline.loop_undo import change_loops
     from vislam.report import write_report
 
     answer = change_loops(options.run, options.undo, options.redo)

@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _settings_of(run: Path) -> MapConfig:
-    from vislam.rebuild import map_settings
+    from vislam.offline.rebuild import map_settings
 
     return map_settings(run).map
 
@@ -67,7 +67,7 @@ def _describe(options: MapOptions) -> int:
 
 
 def _rebuild(options: MapOptions) -> int:
-    from vislam.rebuild import rebuild
+    from vislam.offline.rebuild import rebuild
     from vislam.report import write_report
 
     with progress_bar(options.source.name, "steps") as progress:

@@ -72,7 +72,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _optimize_run(options: OptimizeOptions) -> int:
-    from vislam.optimize import optimize
+    from vislam.offline.optimize import optimize
     from vislam.report import write_report
 
     entry = optimize(options.run, options.settings, options.out_name)
@@ -96,7 +96,7 @@ def _optimize_run(options: OptimizeOptions) -> int:
 
 
 def _optimize_graph(options: OptimizeGraphOptions) -> int:
-    from vislam.optimize_graph import optimize_graph_file
+    from vislam.offline.optimize_graph import optimize_graph_file
     from vislam.report.graph_page import write_graph_report
 
     out = options.out or Path(f"{options.file.stem}_optimized")
@@ -124,7 +124,7 @@ def _optimize_graph(options: OptimizeGraphOptions) -> int:
 
 
 def _join_sessions(options: JoinOptions) -> int:
-    from vislam.join_sessions import join_sessions, write_joined
+    from vislam.offline.join_sessions import join_sessions, write_joined
     from vislam.report.graph_page import write_graph_report
 
     with progress_bar("loops between sessions", "keyframes") as bar:

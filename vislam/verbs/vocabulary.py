@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
     """Train a vocabulary on images, or convert ORB-SLAM's."""
     options = parse(VocabularyOptions, arguments, "vocabulary")
     from vislam.loop.orbslam import read_orbslam
-    from vislam.train_vocabulary import train_vocabulary
+    from vislam.offline.train_vocabulary import train_vocabulary
 
     if (options.from_orbslam is None) != bool(options.sources):
         raise UsageError("give either SOURCE... to train on, or --from-orbslam FILE to convert")

@@ -23,8 +23,8 @@ from vislam.geometry import invert
 from vislam.graph.joining import RelativeCovariance, Waiting
 from vislam.loop.detector import LoopDetector
 from vislam.messages import Array, GraphUpdate, Pieces
+from vislam.offline.session_graph import Edges, SessionPart, loop_edges, problem_of, read_part, together, weak_links
 from vislam.runfolder import storage, write_json
-from vislam.session_graph import Edges, SessionPart, loop_edges, problem_of, read_part, together, weak_links
 from vislam.trajectory import Trajectory, write_text, write_tum
 
 Progress = Callable[[int, int, str], None]
