@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from vislam import loop_gallery
 from vislam.loop.table import LoopRow, caption
 from vislam.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
+from vislam.run import loop_gallery
 from vislam.run.loop_gallery import LoopGallery, chosen
 from vislam.runfolder import RunLog
 

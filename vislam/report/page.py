@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.loop.table import LoopRow, caption
-from vislam.report import loop_plots, plots
+from vislam.report import plots
 from vislam.report.html import (
     Cell,
     bullets,
@@ -28,14 +27,11 @@ from vislam.report.html import (
     table,
     tile,
 )
-from vislam.report.run_files import ESTIMATES, RunFiles, read_run
+from vislam.report.loop_section import loops_section
+from vislam.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_run
 from vislam.report.scene import Scene, build_scene
 from vislam.report.style import stylesheet
 from vislam.trajectory import write_text
-
-_SHOWN_LOOPS = 10  # rows that are always seen
-_MAX_LOOPS = 300  # rows that can be unfolded; the rest is in loops.csv
-_DECISIONS = ("accepted", "parked", "rejected")
 
 
 def write_report(run: Path) -> Path:
@@ -55,7 +51,7 @@ def write_report(run: Path) -> Path:
             _trajectories(files, scene),
             _over_time(files, scene),
             _map(files),
-            _loops(files, scene),
+            loops_section(files, scene),
             _timing(files),
             _biases(files, scene),
             _lost(files),
@@ -74,17 +70,6 @@ def write_report(run: Path) -> Path:
     return path
 
 
-def _dict(value: Any, *keys: str) -> dict[str, Any]:
-    """Return a nested dictionary of damaged or partial data, or an empty one."""
-    for key in keys:
-        value = value.get(key) if isinstance(value, dict) else None
-    return value if isinstance(value, dict) else {}
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
-
-
 def _name(run: RunFiles) -> str:
     return str(run.metrics.get("name") or run.folder.resolve().name)
 
@@ -99,12 +84,12 @@ def _head(run: RunFiles) -> str:
         )
     if m.get("mode"):
         parts.append(f"Mode: {m['mode']}{', inertial' if m.get('has_imu') else ''}.")
-    start = _dict(m, "initialisation")
+    start = as_dict(m, "initialisation")
     if start and m.get("has_imu") is not False:
         when = number(start.get("t_s"), 2, " s")
         reason = f" ({start['reason']})" if start.get("reason") else ""
         parts.append(f"Initialisation: {start.get('status', 'unknown')} at {when}{reason}.")
-    mount = _dict(m, "calibration")
+    mount = as_dict(m, "calibration")
     if "tilt_deg" in mount:
         values = [number(mount.get(name), 3) for name in ("height_m", "tilt_deg", "tilt_sigma_deg", "roll_deg")]
         parts.append(
@@ -121,7 +106,7 @@ def _tiles(run: RunFiles, scene: Scene) -> str:
     m = run.metrics
     if not m:
         return ""
-    graph, ekf, loops = _dict(m, "accuracy", "graph"), _dict(m, "accuracy", "ekf"), _dict(m, "loops")
+    graph, ekf, loops = as_dict(m, "accuracy", "graph"), as_dict(m, "accuracy", "ekf"), as_dict(m, "loops")
     tiles = []
     if graph:
         tiles.append(tile(number(graph.get("ate_rmse_m")), "m", "ATE of the final trajectory", "graph"))
@@ -153,17 +138,17 @@ def _lost_frames(run: RunFiles) -> tuple[int, int]:
 
 
 def _problems(run: RunFiles, scene: Scene) -> str:
-    lines = [str(warning) for warning in _list(run.metrics.get("warnings"))]
+    lines = [str(warning) for warning in as_list(run.metrics.get("warnings"))]
     lines += scene.notes
     lines += [f"{name} left out: {reason}" for name, reason in run.unread.items()]
     return card(bullets(lines), kind="warnings", title="Worth knowing") if lines else ""
 
 
 def _accuracy(run: RunFiles, scene: Scene) -> str:
-    accuracy = _dict(run.metrics, "accuracy")
+    accuracy = as_dict(run.metrics, "accuracy")
     rows: list[list[str | Cell]] = []
     for name in ESTIMATES:
-        entry = _dict(accuracy, name)
+        entry = as_dict(accuracy, name)
         if entry:
             keys = ("ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_max_m", "rpe_1s_m")
             rows.append(
@@ -179,7 +164,7 @@ def _accuracy(run: RunFiles, scene: Scene) -> str:
         reason = "This run has no true trajectory to compare with." if run.truth is None else ""
         return section("Accuracy", note(reason)) if reason and run.metrics else ""
     head = ["", "ATE RMSE [m]", "mean", "median", "max", "RPE 1 s [m]", "[°]", "scale", "coverage"]
-    graph = _dict(accuracy, "graph") or _dict(accuracy, "ekf")
+    graph = as_dict(accuracy, "graph") or as_dict(accuracy, "ekf")
     causal = f"{scene.labels['ekf']} and live"
     text = (
         f"Alignment {graph.get('alignment', 'unknown')} over a path of {number(graph.get('path_m'), 1)} m. "
@@ -241,125 +226,10 @@ def _map(run: RunFiles) -> str:
     return section("Map", *cards) if len(cards) == 1 else section("Map", grid(*cards))
 
 
-def _loops(run: RunFiles, scene: Scene) -> str:
-    counts = _dict(run.metrics, "loops")
-    if not run.loops:
-        return section("Loops", note("No candidates.")) if counts else ""
-    by_decision = Counter(loop.decision for loop in run.loops)
-    summary = ", ".join(f"{by_decision[d]} {d}" for d in _DECISIONS if by_decision[d])
-    order = sorted(run.loops, key=lambda loop: (_rank(loop.decision), loop.to_id, loop.from_id))
-    head = [
-        "from",
-        "to",
-        "at [s]",
-        "decision",
-        "reason",
-        "source",
-        "score",
-        "inliers",
-        "σ [m]",
-        "in a row",
-        "χ²",
-        "weight",
-        "moved [m]",
-    ]
-    rows = [_loop_row(loop, scene.zero_ns) for loop in order[:_MAX_LOOPS]]
-    text = f"{len(run.loops)} candidates: {summary}."
-    shown = card(table(head, rows[:_SHOWN_LOOPS], text_columns=(3, 4, 5)))
-    rest = rows[_SHOWN_LOOPS:]
-    hidden = len(order) - len(rows)
-    title = f"{len(rest)} more candidates" + (f"; another {hidden} are in loops.csv" if hidden else "")
-    more = folded(title, table(head, rest, text_columns=(3, 4, 5))) if rest else ""
-    return section("Loops", note(text), _loop_quality(run), _loop_pictures(run), _reasons(run.loops), shown, more)
-
-
-def _loop_quality(run: RunFiles) -> str:
-    """Return how good the loops are, where `vislam eval RUN --loops` has compared them with the truth."""
-    answer, edges, rule = run.loops_eval, _dict(run.loops_eval, "edges"), _dict(run.loops_eval, "rule")
-    try:
-        figure = loop_plots.loop_quality(answer) if answer else ""
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        return card(note(f"loops_eval.json cannot be drawn: {type(error).__name__} {error}"))
-    if not figure:
-        return ""
-    rows: list[list[str | Cell]] = []
-    for name, stage in _dict(answer, "stages").items():
-        low, high = stage["interval"]
-        interval = f"{number(low, 2)} to {number(high, 2)}"
-        shares = [number(stage[key]) for key in ("precision", "recall", "recall_at_full_precision")]
-        rows.append([name, number(stage["answers"], 0), number(stage["wrong"], 0), *shares, interval])
-    head = ["stage", "answers", "wrong", "precision", "recall", "recall at 100 %", "bootstrap"]
-    text = (
-        f"{number(answer.get('revisits'), 0)} of {number(answer.get('keyframes'), 0)} keyframes see again, "
-        f"{number(rule.get('min_apart_s'), 0)} s or {number(rule.get('min_apart_keyframes'), 0)} keyframes later, what "
-        f"an earlier one saw (overlap of the views above {number(rule.get('min_overlap'), 2)} by the true poses). "
-        "Retrieved images are judged by that overlap, verified poses by their own error. "
-        f"{number(edges.get('gross'), 0)} of {number(edges.get('accepted'), 0)} edges in the graph are off by more "
-        f"than {number(rule.get('gross_m'), 1)} m or {number(rule.get('gross_deg'), 0)}°."
-    )
-    return card(f'<div class="scroll wide">{figure}</div>', table(head, rows), title="Against the truth") + note(text)
-
-
-def _loop_pictures(run: RunFiles) -> str:
-    """Return the pictures of telling candidates, each with its line, folded but for the first of each kind."""
-    told = {(loop.from_id, loop.to_id, loop.decision): loop for loop in run.loops}
-    cards: dict[str, list[str]] = {"accepted": [], "others": []}
-    for path in run.loop_pictures:
-        match = re.fullmatch(r"\d+_(\d+)_(\d+)_(accepted|parked|rejected)", path.stem)
-        loop = told.get((int(match[1]), int(match[2]), match[3])) if match else None
-        if loop is None:
-            continue
-        try:
-            shown = picture(path, "")
-        except OSError as error:
-            shown = card(note(f"{path.name} cannot be read: {error.strerror or error}"))
-        cards["accepted" if loop.decision == "accepted" else "others"].append(shown + note(caption(loop)))
-    parts = []
-    for kind, title in (("accepted", "Accepted ones that moved the map most"), ("others", "Others that came close")):
-        if cards[kind]:
-            pairs = [f"<div>{shown}</div>" for shown in cards[kind]]
-            parts.append(f"<h3>{escape(title)}</h3>" + grid(*pairs[:2]))
-            parts.append(folded(f"{len(pairs) - 2} more", grid(*pairs[2:])) if len(pairs) > 2 else "")
-    return "".join(parts)
-
-
-def _rank(decision: str) -> int:
-    return _DECISIONS.index(decision) if decision in _DECISIONS else len(_DECISIONS)
-
-
-def _loop_row(loop: LoopRow, zero_ns: int) -> list[str | Cell]:
-    return [
-        str(loop.from_id),
-        str(loop.to_id),
-        number((loop.to_t_ns - zero_ns) * 1e-9, 1) if loop.to_t_ns >= 0 else "–",
-        Cell(loop.decision, mark=loop.decision),
-        Cell(loop.reason, kind="text long"),
-        loop.source,
-        number(loop.score),
-        number(loop.inliers, 0),
-        number(loop.sigma_m),
-        number(loop.consistency, 0),
-        number(loop.chi2, 1),
-        number(loop.weight, 2),
-        number(loop.moved_max_m),
-    ]
-
-
-def _reasons(loops: list[LoopRow]) -> str:
-    """Return how often each reason occurred; reasons that differ only in their numbers are one."""
-    refused = Counter(re.sub(r"\d+(\.\d+)?", "…", loop.reason) for loop in loops if loop.decision != "accepted")
-    if len(refused) < 2:
-        return ""
-    rows: list[list[str | Cell]] = [
-        [Cell(reason, kind="text long"), str(count)] for reason, count in refused.most_common(8)
-    ]
-    return card(table(["why not accepted", "candidates"], rows))
-
-
 def _timing(run: RunFiles) -> str:
     stages = {
         name: {key: float(value) for key, value in stage.items() if isinstance(value, int | float)}
-        for name, stage in _dict(run.metrics, "timing_ms").items()
+        for name, stage in as_dict(run.metrics, "timing_ms").items()
         if isinstance(stage, dict)
     }
     if not stages:
@@ -390,8 +260,8 @@ def _biases(run: RunFiles, scene: Scene) -> str:
 def _lost(run: RunFiles) -> str:
     """Return everything that was skipped, lost or refused, room by room; zeros are left out."""
     rows: list[list[str | Cell]] = []
-    for room, counters in [*_dict(run.metrics, "counters").items(), ("recording", _dict(run.metrics, "problems"))]:
-        for name, count in _dict(counters).items():
+    for room, counters in [*as_dict(run.metrics, "counters").items(), ("recording", as_dict(run.metrics, "problems"))]:
+        for name, count in as_dict(counters).items():
             if isinstance(count, int | float) and count:
                 rows.append([str(room), Cell(str(name).replace("_", " "), kind="text"), number(count, 0)])
     reasons: Counter[str] = Counter()

@@ -115,3 +115,15 @@ def _read_tracking(path: Path) -> TrackingRows:
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: {error}") from error
     return TrackingRows(t_ns, tracking, inliers, [row["reason"] for _, row in rows])
+
+
+def as_dict(value: Any, *keys: str) -> dict[str, Any]:
+    """Return a nested dictionary of damaged or partial data, or an empty one."""
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, dict) else {}
+
+
+def as_list(value: Any) -> list[Any]:
+    """Return a list of damaged or partial data, or an empty one."""
+    return value if isinstance(value, list) else []
