@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from vislam.camera import Camera
 from vislam.config import InitConfig
 from vislam.frontend.inertial_alignment import Alignment, VisualMotion, Window, excitation, refine, solve_linear
-from vislam.frontend.initialisation_bundle import (
-    Bundle,
+from vislam.frontend.initialisation_bundle import Bundle, refine_tracks
+from vislam.frontend.initialisation_linear import (
     InertialPath,
     Start,
     Tracks,
     inertial_path,
     median_parallax,
-    refine_tracks,
     solve_start,
 )
 from vislam.frontend.initialisation_rest import rest_accel_bias, rest_covariance

@@ -10,7 +10,7 @@ import numpy as np
 
 from vislam.camera import Camera
 from vislam.frontend.inertial_alignment import VisualMotion
-from vislam.frontend.initialisation_bundle import Tracks
+from vislam.frontend.initialisation_linear import Tracks
 from vislam.frontend.result import scaled_motion
 from vislam.geometry import invert, se3_adjoint
 from vislam.imu import join

@@ -1,0 +1,237 @@
+"""Structure and motion with inertial data from nothing, in closed form: where the least squares of the bundle begins.
+
+One camera sees no scale; the accelerometer does, once the camera accelerates. Velocity, gravity of known norm,
+accelerometer bias and points are solved from all bearings at once, with points eliminated one by one. After Dong-Si and
+Mourikis, "Estimator initialization in vision-aided inertial navigation with unknown camera-IMU calibration", IROS 2012,
+and Martinelli, "Closed-form solution of visual-inertial structure from motion", IJCV 2014.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vislam.frontend.inertial_alignment import Window, solve_gyro_bias
+from vislam.imu import preintegrate
+from vislam.messages import Array
+
+_DEPTH_ROUNDS = 5  # a bearing's weight needs the point's distance, which the round before has found
+_CAUCHY = 3.0  # scale of the kernel in the linear rounds, in medians
+_PLACED = 5.0  # information on a point's distance against what noise alone would show of it
+_NEAR = 0.02  # of the median distance; nearer points are weighted as if there
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Bearings of points in the nodes of a window, sorted by point and then by node."""
+
+    point: Ints  # [M], 0 .. P-1, every one at least three times
+    node: Ints  # [M]
+    xy: Array  # [M, 2] on the plane z = 1
+    sigma_xy: float
+    R_body_cam: Array  # [3, 3]
+
+    @property
+    def points(self) -> int:
+        """How many points there are."""
+        return int(self.point[-1]) + 1 if len(self.point) else 0
+
+    @property
+    def begin(self) -> Ints:
+        """Index [P + 1] of the first observation of each point, and the end."""
+        return np.searchsorted(self.point, np.arange(self.points + 1)).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InertialPath:
+    """The nodes as inertial data alone tells them, in body axes of the first node, but for what is unknown.
+
+    Position of node i: `known[i] + unknown[i] @ (first velocity, gravity, accelerometer bias)`.
+    """
+
+    rotations: Array  # [N, 3, 3]
+    known_m: Array  # [N, 3]
+    unknown: Array  # [N, 3, 9]
+    known_m_s: Array  # [N, 3], the same for velocity
+    unknown_m_s: Array  # [N, 3, 9]
+    gyro_bias_rad_s: Array  # [3]
+    excitation_m_s2: float  # rms change of specific force in fixed axes: what scale is seen by
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The linear solution, in body axes of the first node."""
+
+    gravity_m_s2: Array  # [3], of the known norm
+    free_norm_m_s2: float  # the norm that the bearings ask for when it is left free
+    free_norm_sigma_m_s2: float
+    velocity_m_s: Array  # [3] of the first node
+    accel_bias_m_s2: Array  # [3]
+    points_m: Array  # [P, 3]
+    behind: float  # share of the points that came out behind a camera
+
+
+def inertial_path(window: Window) -> InertialPath:
+    """Integrate the window's spans with the gyro bias that visual rotations ask for."""
+    bias = solve_gyro_bias(window)
+    nodes = len(window.spans) + 1
+    R, c, d = np.tile(np.eye(3), (nodes, 1, 1)), np.zeros((nodes, 3)), np.zeros((nodes, 3))
+    P, Q = np.zeros((nodes, 3, 9)), np.zeros((nodes, 3, 9))
+    Q[0, :, :3] = np.eye(3)
+    force, weight = np.zeros((nodes - 1, 3)), np.zeros(nodes - 1)
+    for i, span in enumerate(window.spans):
+        piece = preintegrate(span, bias)
+        dt = piece.dt_s
+        c[i + 1] = c[i] + d[i] * dt + R[i] @ piece.dp_m
+        d[i + 1] = d[i] + R[i] @ piece.dv_m_s
+        P[i + 1] = P[i] + Q[i] * dt
+        P[i + 1, :, 3:6] += 0.5 * dt * dt * np.eye(3)
+        P[i + 1, :, 6:] += R[i] @ piece.dp_daccel
+        Q[i + 1] = Q[i]
+        Q[i + 1, :, 3:6] += dt * np.eye(3)
+        Q[i + 1, :, 6:] += R[i] @ piece.dv_daccel
+        R[i + 1] = R[i] @ piece.dR
+        force[i], weight[i] = R[i] @ piece.dv_m_s / dt, dt
+    mean = weight @ force / weight.sum()
+    excitation = np.sqrt(weight @ np.sum((force - mean) ** 2, axis=1) / weight.sum())
+    return InertialPath(R, c, P, d, Q, bias, float(excitation))
+
+
+def median_parallax(tracks: Tracks, rotations: Array) -> float:
+    """Return the median over points of the largest displacement on z = 1 that rotation does not explain."""
+    return float(_parallax(tracks.begin, tracks.node, tracks.xy, rotations @ tracks.R_body_cam))
+
+
+@njit(cache=True, nogil=True)
+def _parallax(begin: Ints, node: Ints, xy: Array, R_cams: Array) -> float:
+    largest = np.zeros(len(begin) - 1)
+    ray = np.ones(3)
+    for p in range(len(largest)):
+        first = begin[p]
+        for m in range(first + 1, begin[p + 1]):
+            ray[:2] = xy[m]
+            turned = R_cams[node[first]].T @ (R_cams[node[m]] @ ray)
+            if turned[2] > 0.1:
+                dx, dy = turned[0] / turned[2] - xy[first, 0], turned[1] / turned[2] - xy[first, 1]
+                largest[p] = max(largest[p], np.sqrt(dx * dx + dy * dy))
+    return np.median(largest) if len(largest) else 0.0
+
+
+def solve_start(window: Window, path: InertialPath, tracks: Tracks) -> Start:
+    """Return gravity, first velocity, accelerometer bias and points by linear least squares.
+
+    Raises:
+        numpy.linalg.LinAlgError: the motion does not determine them.
+    """
+    R_cams = path.rotations @ tracks.R_body_cam
+    centres = path.known_m + path.rotations @ window.lever_m
+    rays = np.column_stack([tracks.xy, np.ones(len(tracks.xy))])
+    bearings = np.einsum("mij,mj->mi", R_cams[tracks.node], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    distance, robust = np.ones(len(rays)), np.ones(len(rays))
+    prior = np.zeros((9, 9))
+    prior[6:, 6:] = np.eye(3) / window.accel_bias_sigma_m_s2**2
+    x, A, b = np.zeros(9), np.eye(3), np.zeros(3)
+    points = np.zeros((len(tracks.begin) - 1, 3))
+    along = distance
+    for _ in range(_DEPTH_ROUNDS):
+        weight = robust / (tracks.sigma_xy * distance) ** 2
+        H, g, blocks, heads, links = _eliminated(
+            tracks.begin, tracks.node, bearings, weight, centres, path.unknown, tracks.sigma_xy
+        )
+        x, A, b = _with_known_norm(H + prior, g, window.gravity_m_s2)
+        points = np.linalg.solve(blocks, (heads + links @ x)[..., None])[..., 0]
+        seen = points[tracks.point] - centres[tracks.node] - path.unknown[tracks.node] @ x
+        along = np.einsum("mi,mi->m", seen, bearings)
+        distance = np.maximum(np.abs(along), _NEAR * float(np.median(np.abs(along))) + 1e-6)
+        across = np.sqrt(np.maximum(np.einsum("mi,mi->m", seen, seen) - along**2, 0.0)) / distance
+        robust = 1.0 / (1.0 + (across / (_CAUCHY * max(float(np.median(across)), 1e-9))) ** 2)
+    free = np.linalg.solve(A, b)
+    norm = float(np.linalg.norm(free))
+    down = free / max(norm, 1e-9)
+    behind = np.zeros(len(points), dtype=np.bool_)
+    behind[tracks.point[along <= 0.0]] = True
+    return Start(
+        gravity_m_s2=x[3:6].copy(),
+        free_norm_m_s2=norm,
+        free_norm_sigma_m_s2=float(np.sqrt(down @ np.linalg.solve(A, down))),
+        velocity_m_s=x[:3].copy(),
+        accel_bias_m_s2=x[6:].copy(),
+        points_m=points,
+        behind=float(behind.mean()),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _eliminated(
+    begin: Ints, node: Ints, bearings: Array, weight: Array, centres: Array, unknown: Array, sigma: float
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the normal equations over the nine unknowns, and what gives the points: blocks @ p = heads + links @ x.
+
+    A noisy bearing b makes `I - b b^T` see a little of the distance itself, 2 sigma^2 of its square, and least squares
+    would shrink the world to make that small; it is taken off. Points too far to be placed are left out.
+    """
+    count = len(begin) - 1
+    H, g = np.zeros((9, 9)), np.zeros(9)
+    blocks, heads, links = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 3, 9))
+    for p in range(count):
+        own, own_g = np.zeros((9, 9)), np.zeros(9)
+        for m in range(begin[p], begin[p + 1]):
+            b, U = bearings[m], unknown[node[m]]
+            across = weight[m] * (np.eye(3) - (1.0 + 2.0 * sigma * sigma) * np.outer(b, b))
+            acrossU = across @ U
+            head = across @ centres[node[m]]
+            blocks[p] += across
+            heads[p] += head
+            links[p] += acrossU
+            own += U.T @ acrossU
+            own_g -= U.T @ head
+        lowest = np.linalg.eigvalsh(blocks[p])[0]
+        total = np.sum(weight[begin[p] : begin[p + 1]])
+        if lowest < _PLACED * 2.0 * sigma * sigma * total:
+            blocks[p] += (total * 1e-6 - min(lowest, 0.0)) * np.eye(3)
+            continue
+        inverse = np.linalg.inv(blocks[p])
+        H += own - links[p].T @ inverse @ links[p]
+        g += own_g + links[p].T @ inverse @ heads[p]
+    return H, g, blocks, heads, links
+
+
+def _with_known_norm(H: Array, g: Array, norm: float) -> tuple[Array, Array, Array]:
+    """Minimise `x H x / 2 - g x` with |x[3:6]| = norm; also return the system [3, 3], [3] of x[3:6] alone."""
+    others = [0, 1, 2, 6, 7, 8]
+    H_oo, H_og = H[np.ix_(others, others)], H[np.ix_(others, [3, 4, 5])]
+    scale = np.sqrt(np.diag(H_oo))
+    if not np.all(scale > 0.0):
+        raise np.linalg.LinAlgError("no observation of the velocity")
+    factor = np.linalg.cholesky(H_oo / np.outer(scale, scale) + 1e-12 * np.eye(6))
+
+    def solved(value: Array) -> Array:
+        shaped = value.reshape(6, -1) / scale[:, None]
+        return np.asarray(np.linalg.solve(factor.T, np.linalg.solve(factor, shaped)) / scale[:, None])
+
+    A = H[3:6, 3:6] - H_og.T @ solved(H_og)
+    A = 0.5 * (A + A.T)
+    b = g[3:6] - H_og.T @ solved(g[others])[:, 0]
+    values, axes = np.linalg.eigh(A)
+    if not values[0] > 0.0:
+        raise np.linalg.LinAlgError("gravity is not determined")
+    head = axes.T @ b
+    # the norm falls with the multiplier; the minimum on the sphere is the root above the lowest pole
+    low, high = -values[0], max(values[2], float(np.linalg.norm(b)) / norm)
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if np.sum((head / (values + middle)) ** 2) > norm * norm:
+            low = middle
+        else:
+            high = middle
+    gravity = axes @ (head / (values + high))
+    gravity *= norm / max(float(np.linalg.norm(gravity)), 1e-12)
+    x = np.zeros(9)
+    x[3:6] = gravity
+    x[others] = solved(g[others] - H_og @ gravity)[:, 0]
+    return x, A, b
