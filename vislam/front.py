@@ -37,6 +37,7 @@ from vislam.messages import (
     VoMeasurement,
 )
 from vislam.odometry_keyframe import OdometryKeyframe, first_keyframe_state, pose_before, restamped
+from vislam.trajectory import Alignment, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
@@ -70,6 +71,11 @@ class FrontReport:
     noise_warnings: list[str]
     uniform_s: float  # longest stretch without motion that shows scale
     calibration: dict[str, float]  # what was learned of the camera
+
+    @property
+    def alignment(self) -> Alignment:
+        """How the run may be moved onto a truth."""
+        return gauge_alignment(self.start is not None, self.mode)
 
 
 class Front:

@@ -1,5 +1,8 @@
 """What jobs are judged by, against evo and against errors drawn from known covariances."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from vislam.errors import DataError
-from vislam.experiment.measures import alignment_of, nis_measures, output_measures, peak_memory_mb
+from vislam.experiment.measures import nis_measures, output_measures
 from vislam.experiment.recordings import TimedRecording
 from vislam.geometry import transform
 from vislam.messages import Frame, ImuSample, NavState
@@ -80,7 +83,6 @@ def test_alignment_takes_away_only_what_nobody_can_know(tmp_path):
     free = measured(tmp_path, drifting(truth, 1, scale=1.1), truth, {"has_imu": False, "mode": "mono"})
     assert free["alignment"] == "sim3"
     assert free["ate_m"] < 0.1
-    assert alignment_of({"has_imu": True, "mode": "mono"}) == "yaw"
 
 
 def test_what_cannot_be_judged_says_why(tmp_path):
@@ -227,7 +229,9 @@ def test_time_per_frame_belongs_to_the_value_that_finished_it():
 
 
 def test_memory_is_that_of_this_process():
-    before = peak_memory_mb()
-    block = np.ones(2**25)  # 256 MB
-    assert peak_memory_mb() - before > 150.0
-    assert block.sum() == 2**25
+    code = (
+        "import numpy as np; from vislam.experiment.measures import peak_memory_mb; before = peak_memory_mb(); "
+        "block = np.ones(2**25); print(peak_memory_mb() - before)"  # 256 MB, in a process that never had more
+    )
+    grown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert 150.0 < float(grown) < 400.0

@@ -19,6 +19,7 @@ from vislam.trajectory import (
     align,
     associate,
     evaluate,
+    gauge_alignment,
     read_states_csv,
     read_tum,
 )
@@ -66,7 +67,7 @@ def output_measures(
         try:
             if truth is None:
                 raise DataError("the recording has no truth to compare with")
-            measures[name] = _output(path, truth, alignment_of(metrics), span_ns)
+            measures[name] = _output(path, truth, gauge_alignment(metrics["has_imu"], metrics["mode"]), span_ns)
         except VislamError as error:
             measures[name] = {"failure": str(error).replace(f"{run}/", "")}
             continue
@@ -74,17 +75,6 @@ def output_measures(
         if metrics["has_imu"] and states.is_file():
             measures[name]["anees"] = _consistency(states, truth)
     return measures
-
-
-def alignment_of(metrics: dict[str, Any]) -> Alignment:
-    """Return how a run's trajectories may be moved onto the truth: by what no sensor of it can know.
-
-    With an IMU that is yaw and position. One camera alone knows no scale either (Sim3). Cameras with depth but no IMU
-    do not know which way is up (SE3).
-    """
-    if metrics["has_imu"]:
-        return "yaw"
-    return "sim3" if metrics["mode"] == "mono" else "se3"
 
 
 def _output(path: Path, truth: Trajectory, alignment: Alignment, span_ns: tuple[int, int] | None) -> dict[str, Any]:

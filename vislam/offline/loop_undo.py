@@ -161,8 +161,10 @@ def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any]) -> l
         if truth.is_file():
             stamps = log.stamps_ns
             with suppress(VislamError):  # nothing in common to compare: the run's own metrics say so
-                errors = evaluate(final, read_tum(truth), "se3", span_ns=(int(stamps[0]), int(stamps[-1])))
-                metrics.setdefault("accuracy", {})["graph"] = errors
+                accuracy = metrics.setdefault("accuracy", {})
+                alignment = accuracy.get("graph", {}).get("alignment", "se3")
+                span = (int(stamps[0]), int(stamps[-1]))
+                accuracy["graph"] = evaluate(final, read_tum(truth), alignment, span_ns=span)
         write_json(run / "metrics.json", metrics)
         written.append("metrics.json")
     return written

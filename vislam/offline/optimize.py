@@ -18,7 +18,7 @@ from vislam.factor_log import FactorLog
 from vislam.messages import NavState
 from vislam.runfolder import read_metrics, write_json
 from vislam.session import Session
-from vislam.trajectory import Trajectory, evaluate, read_tum, write_states_csv, write_tum
+from vislam.trajectory import Alignment, Trajectory, evaluate, read_tum, write_states_csv, write_tum
 
 _TAKEN = ("ekf", "live", "graph", "truth")  # names of trajectories that the run itself wrote
 _SECTIONS = ("frontend", "graph", "imu")  # of the run's settings that batch goes by
@@ -37,10 +37,10 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     trajectory = _placed(log, result.states, settings.imu.max_gap_s)
     metrics = read_metrics(run)
     entry = _entry(result, log, trajectory)
-    accuracy = _accuracy(run, trajectory, log, entry["warnings"])
+    accuracy = _accuracy(run, trajectory, log, _alignment(metrics), entry["warnings"])
     entry |= {"accuracy": accuracy, "wall_s": time.perf_counter() - start, "config": asdict(config)}
     if accuracy:
-        metrics.setdefault("accuracy", {})[name] = accuracy["se3"]
+        metrics.setdefault("accuracy", {})[name] = accuracy[_alignment(metrics)]
     metrics.setdefault("batch", {})[name] = entry
     write_tum(trajectory, run / f"trajectory_{name}.tum")
     write_states_csv(run / f"states_{name}.csv", range(len(result.states)), result.states)
@@ -115,15 +115,24 @@ def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory) -> dict[
     }
 
 
-def _accuracy(run: Path, trajectory: Trajectory, log: FactorLog, warnings: list[str]) -> dict[str, Any]:
-    """Return the errors against the run's truth under both alignments; empty without truth."""
+def _alignment(metrics: dict[str, Any]) -> Alignment:
+    """Return how the run's own trajectories were aligned, so that those of the batch stand beside them."""
+    entry = metrics.get("accuracy", {}).get("graph", {})
+    return entry.get("alignment", "se3")  # type: ignore[no-any-return]  # a run killed early has no metrics
+
+
+def _accuracy(
+    run: Path, trajectory: Trajectory, log: FactorLog, alignment: Alignment, warnings: list[str]
+) -> dict[str, Any]:
+    """Return the errors against the run's truth under the run's alignment and the usual ones; empty without truth."""
     path = run / "trajectory_truth.tum"
     if not path.is_file():
         return {}
     truth, stamps = read_tum(path), log.frames.t_ns
     span = (int(np.min(stamps)), int(np.max(stamps))) if len(stamps) else None
+    modes: tuple[Alignment, ...] = ("se3", "yaw", "sim3") if alignment == "sim3" else ("se3", "yaw")
     try:
-        return {mode: evaluate(trajectory, truth, mode, span_ns=span) for mode in ("se3", "yaw")}
+        return {mode: evaluate(trajectory, truth, mode, span_ns=span) for mode in modes}
     except VislamError as error:
         warnings.append(f"accuracy: {error}")
         return {}

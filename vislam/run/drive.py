@@ -314,7 +314,7 @@ class Run:
             with self.slam.clock.measure("map export"):
                 self._mapper.export(self.out / "map")
             self.warnings += [f"no {name}: {reason}" for name, reason in self._mapper.notes.items()]
-        show_paths(self.viewer, final, truth)
+        show_paths(self.viewer, final, truth, self.slam.front.report().alignment)
         is_level = self.slam.front.start is not None
         if self._mapper is not None and len(self.log):
             show_map(self.viewer, int(self.log.stamps_ns[-1]), self._mapper, is_level, is_last=True)
@@ -367,7 +367,7 @@ class Run:
         errors: dict[str, Any] = {}
         found = self._found_in_map()
         if truth is not None:
-            errors, not_compared = accuracy(self.log, final, truth)
+            errors, not_compared = accuracy(self.log, final, truth, front.alignment)
             self.warnings += not_compared
         return {
             "name": self.recording.name,

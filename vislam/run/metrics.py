@@ -11,7 +11,7 @@ import numpy as np
 from vislam.errors import DataError, TrackingLostError, VislamError
 from vislam.front import FrontReport
 from vislam.runfolder import RunLog
-from vislam.trajectory import Trajectory, evaluate
+from vislam.trajectory import Alignment, Trajectory, evaluate
 
 _LOST_SIGMA_M = 1.0  # of the filter's position: no controller can use it, and a user must be told
 _UNIFORM_S = 20.0  # after which the biases that hold the scale of one camera may have walked away
@@ -22,7 +22,9 @@ _MIN_COMPARED = 10  # poses
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
-def accuracy(log: RunLog, final: Trajectory, truth: Trajectory) -> tuple[dict[str, Any], list[str]]:
+def accuracy(
+    log: RunLog, final: Trajectory, truth: Trajectory, alignment: Alignment
+) -> tuple[dict[str, Any], list[str]]:
     """Return the errors of each trajectory by its name, and why some could not be compared with the truth."""
     errors, warnings = {}, []
     if len(log):
@@ -30,7 +32,7 @@ def accuracy(log: RunLog, final: Trajectory, truth: Trajectory) -> tuple[dict[st
         estimates = {"ekf": log.odometry_trajectory(), "live": log.live_trajectory(), "graph": final}
         for name, estimate in estimates.items():
             try:
-                errors[name] = evaluate(estimate, truth, "se3", span_ns=span)
+                errors[name] = evaluate(estimate, truth, alignment, span_ns=span)
             except VislamError as error:
                 warnings.append(f"{name}: {error}")
     return errors, warnings

@@ -9,7 +9,7 @@ from vislam.errors import DataError, VislamError
 from vislam.mapping.mapper import Mapper
 from vislam.messages import Localisation, Tracking
 from vislam.slam import KeyframeStep, Step
-from vislam.trajectory import Trajectory, align, associate
+from vislam.trajectory import Alignment, Trajectory, align, associate
 from vislam.viewer import NullViewer
 
 if TYPE_CHECKING:
@@ -55,13 +55,13 @@ def show_map(viewer: Viewer, t_ns: int, mapper: Mapper, is_level: bool, is_last:
             viewer.log_grid(t_ns, grid.cells, grid.resolution_m, grid.origin_m, grid.floor_m)
 
 
-def show_paths(viewer: Viewer, final: Trajectory, truth: Trajectory | None) -> None:
+def show_paths(viewer: Viewer, final: Trajectory, truth: Trajectory | None, alignment: Alignment) -> None:
     """Log where the run went in the end, and the truth moved onto it."""
     viewer.log_path("graph", final.positions_m)
     if truth is not None and len(final):
         with suppress(VislamError):  # too little in common: metrics say so
             pairs = associate(truth, final)
-            viewer.log_path("truth", pairs.aligned(align(pairs, "se3")).estimate[:, :3, 3])
+            viewer.log_path("truth", pairs.aligned(align(pairs, alignment)).estimate[:, :3, 3])
 
 
 def _show_depth(viewer: Viewer, step: KeyframeStep, mapper: Mapper) -> None:

@@ -10,6 +10,7 @@ from vislam.trajectory.evaluation import (
     ate,
     coverage,
     evaluate,
+    gauge_alignment,
     rpe,
     scale_error,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "ate",
     "coverage",
     "evaluate",
+    "gauge_alignment",
     "nees",
     "read_euroc",
     "read_kitti",
