@@ -34,17 +34,22 @@ _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: has
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
 _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
 _RUN_FILES = (
-    "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "loops_eval.json",
-    "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal", "session.db-shm", "run.rrd", "report.html",
-    "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum",
-    "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml", "map/drive.yaml",
-    "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
+    "manifest.json", "config.json", "sensors.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv",
+    "loops_eval.json", "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal", "session.db-shm", "run.rrd",
+    "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
+    "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml",
+    "map/drive.yaml", "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
 TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "piece", "reason")
 
 
-def prepare(out: Path, overwrite: bool) -> None:
-    """Make the folder of a new run; raises UsageError when it holds something else, StorageError when it cannot be."""
+def prepare(out: Path, overwrite: bool, base: MapChoice | None = None) -> None:
+    """Make the folder of a new run; raises UsageError when it holds something else, StorageError when it cannot be.
+
+    `base` is the map in which the run begins: it must not lie there.
+    """
+    if base is not None and base.session.resolve().parent == out.resolve():
+        raise UsageError(f"--map {base.path} is in --out {out}, where it would be replaced; choose a new folder")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         if not (out / "manifest.json").is_file():
             raise UsageError(f"--out {out} exists and is not a run; choose a new folder")
@@ -195,6 +200,11 @@ class MapChoice:
 
     path: Path
     localize_only: bool  # the map stays as it is
+
+    @property
+    def session(self) -> Path:
+        """Its file."""
+        return self.path / "session.db" if self.path.is_dir() else self.path
 
 
 class RunLog:

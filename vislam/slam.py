@@ -24,7 +24,8 @@ from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
 from vislam.loop.injection import FalseLoops, as_candidate
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.monodepth import MonoDepth, SeenFrame
+from vislam.mapping.monodepth import SeenFrame
+from vislam.mapping.stage import MapStage
 from vislam.memory import GraphNews, PackedScan, SlamMemory, TagSighting, WordsMemory
 from vislam.messages import (
     Array,
@@ -42,7 +43,7 @@ from vislam.messages import (
 )
 from vislam.odometry_keyframe import OdometryKeyframe
 
-_MAX_SEEN = 120  # frames kept between two keyframes: 2 s at 60 Hz, 40 MB
+MAX_SEEN = 120  # frames kept between two keyframes: 2 s at 60 Hz, 40 MB
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,19 +104,21 @@ class Back:
         self._false = None
         if config.loop.inject_share > 0.0:
             self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
-        one_camera = config.map.mono_depth.enabled and mode_for(config.frontend, rig) == "mono"
-        self.mapper = Mapper(config.map, rig, one_camera) if config.map.enabled else None
-        self.depth = MonoDepth(config.map.mono_depth, rig) if one_camera and config.map.enabled else None
+        self.map = map_stage(config, rig, clock)
         self.clock = clock
         self.T_map_odom = np.eye(4)
         self._words_revision = 0
-        self._held = 0  # keyframes of a map that is not to change
+
+    @property
+    def mapper(self) -> Mapper | None:
+        """The map; None where it is off."""
+        return None if self.map is None else self.map.mapper
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
         """Counters of the rooms that there are."""
-        rooms = {"loop": self.loops, "map": self.mapper, "mono depth": self.depth}
-        return {name: dict(room.counters) for name, room in rooms.items() if room is not None}
+        loops = {} if self.loops is None else {"loop": dict(self.loops.counters)}
+        return {**loops, **({} if self.map is None else self.map.counters)}
 
     def restore(self, memory: SlamMemory) -> GraphUpdate:
         """Take over an earlier run; return all its poses. Raises UsageError where loops are made up on purpose."""
@@ -126,11 +129,9 @@ class Back:
         if self.loops is not None:
             self.loops.restore(memory.places)
             self._words_revision = self.loops.words_revision
-        if self.mapper is not None:
-            ids = [packet.keyframe.id for packet in graph.packets]
-            self.mapper.restore(memory.scans, dict(zip(ids, graph.T_map_body, strict=True)))
+        if self.map is not None:
+            self.map.restore(memory.scans, graph.T_map_body, memory.held > 0)
         self._follow(update)
-        self._held = memory.held
         if memory.held:
             self.graph.hold(memory.held)
         return update
@@ -156,10 +157,7 @@ class Back:
         with self.clock.measure("graph"):
             update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
         self._follow(update)
-        if self.mapper is not None and not self._held:
-            with self.clock.measure("map"):
-                self.mapper.add(keyframe, self.T_map_odom @ odometry.T_odom_body)
-        scans = self._scans(keyframe.id, self._late_depth(odometry, seen))
+        scans = {} if self.map is None else self.map.add(odometry, self.T_map_odom @ odometry.T_odom_body, seen)
         retrieved, tags = ([], ()) if self.loops is None else (self.loops.retrieved, self.loops.tags(keyframe.id))
         news, words = self.graph.take_news(), self._new_words()
         return KeyframeStep(odometry, update, edges, candidates, retrieved, news, scans, words, tags)
@@ -171,29 +169,9 @@ class Back:
         with self.clock.measure("graph finish"):
             update = self.graph.finish()
         self._follow(update)
-        if self.mapper is not None:
-            with self.clock.measure("map finish"):
-                self.mapper.finish()
+        if self.map is not None:
+            self.map.finish()
         return update
-
-    def _late_depth(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> int | None:
-        """Let depth from one camera follow, and the map take what is done; return the keyframe that it belongs to."""
-        if self.depth is None or self.mapper is None or self._held:
-            return None
-        with self.clock.measure("depth"):
-            late = self.depth.add(odometry, self.T_map_odom @ odometry.T_odom_body, seen)
-        if late is None:
-            return None
-        with self.clock.measure("map"):
-            self.mapper.add_depth(late)
-        return late.keyframe_id
-
-    def _scans(self, *keyframe_ids: int | None) -> dict[int, PackedScan]:
-        """Return what the map keeps of those keyframes that have a scan."""
-        if self.mapper is None:
-            return {}
-        packed = {i: self.mapper.packed(i) for i in keyframe_ids if i is not None}
-        return {i: scan for i, scan in packed.items() if scan is not None}
 
     def _new_words(self) -> WordsMemory | None:
         """Return the vocabulary if it is new since the last call."""
@@ -206,11 +184,28 @@ class Back:
         self.T_map_odom = update.T_map_odom
         if self.loops is not None:
             self.loops.move(update)
-        if self.mapper is not None:
-            with self.clock.measure("map move"):
-                self.mapper.move(update)
-        if self.depth is not None:
-            self.depth.move(update.ids, update.T_map_body)
+        if self.map is not None:
+            self.map.move(update)
+
+
+def map_stage(config: Config, rig: Rig, clock: StageClock) -> MapStage | None:
+    """Return the map of a pipeline; None where it is off."""
+    return MapStage(config.map, rig, makes_depth(config, rig), clock) if config.map.enabled else None
+
+
+def makes_depth(config: Config, rig: Rig) -> bool:
+    """Whether the map takes depth from one moving camera."""
+    return config.map.enabled and config.map.mono_depth.enabled and mode_for(config.frontend, rig) == "mono"
+
+
+def seen_between(front: FrontStep) -> list[SeenFrame]:
+    """Return what depth from one camera can use of a step: a frame between keyframes of which odometry knows where."""
+    frame, T = front.frame, front.T_keyframe_body
+    is_known = T is not None and front.track.vo.tracking is not Tracking.LOST
+    if front.track.keyframe is not None or not is_known or not frame.images:
+        return []
+    assert T is not None
+    return [SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T)]
 
 
 def localised(before: Pieces, after: Pieces, tracking: Tracking, counters: dict[str, int]) -> Localisation:
@@ -236,7 +231,7 @@ class Slam:
         self._frames: deque[Frame] = deque()
         self._pieces = Pieces()
         self.counters = {"frames_lost": 0, "relocalised": 0}
-        self._seen: deque[SeenFrame] = deque(maxlen=_MAX_SEEN)  # since the newest keyframe
+        self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # since the newest keyframe
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
         self._begins_recording = False  # in a map, with the next keyframe
 
@@ -313,8 +308,8 @@ class Slam:
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)
         keyframes = self._add(front.keyframes)
-        if self.back is not None and self.back.depth is not None and front.track.keyframe is None:
-            self._remember(front)
+        if self.back is not None and self.back.map is not None and self.back.map.wants_frames:
+            self._seen += seen_between(front)
         T_map_body = None
         if self.back is not None and front.T_odom_body is not None:
             T_map_body = self.back.T_map_odom @ front.T_odom_body
@@ -327,9 +322,3 @@ class Slam:
         if keyframes:
             self._pieces = keyframes[-1].update.pieces
         return localised(before, self._pieces, tracking, self.counters)
-
-    def _remember(self, front: FrontStep) -> None:
-        """Keep a frame for depth from one camera, if odometry knows where it was taken."""
-        frame, T = front.frame, front.T_keyframe_body
-        if T is not None and front.track.vo.tracking is not Tracking.LOST and frame.images:
-            self._seen.append(SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T))

@@ -4,14 +4,22 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
+from multiprocessing import Pipe
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from vislam.cli import run_verb
+from vislam.clock import StageClock
 from vislam.config import load
 from vislam.datasets.recorder import record
+from vislam.live.child import Flag, Life, Signals
+from vislam.live.front_process import light
+from vislam.live.handover import BackEnded, FrontEnded, Seen
+from vislam.live.mail import Inbox, Outbox
+from vislam.live.map_process import FollowedPipeline
 from vislam.mapping.octomap_io import read_octree
 from vislam.mapping.ply import read_ply
 from vislam.offline.rebuild import map_settings, rebuild
@@ -19,6 +27,7 @@ from vislam.run import execute
 from vislam.runfolder import prepare
 from vislam.session import Session
 from vislam.sim import open_world
+from vislam.slam import Slam, map_stage
 from vislam.sources import open_source
 
 PRODUCTS = ("cloud", "octomap", "grid", "drive", "mesh")
@@ -126,3 +135,30 @@ def test_a_killed_run_is_resumed_with_its_depth_and_ends_with_the_map_of_its_ses
     assert len(after) > len(before)
     rebuild(killed, map_settings(killed).map, tmp_path, "graph", None)
     assert all((tmp_path / name).read_bytes() == data for name, data in maps_of(killed).items())
+
+
+def test_the_map_process_of_a_live_run_makes_the_same_depth(recording, finished):
+    """Front and back of one pipeline tell it over pipes what those of a live run tell; keyframes come as they will."""
+    config, source = load(None, SETTINGS), open_source(str(recording), 0)
+    slam = Slam(replace(config, map=replace(config.map, enabled=False)), source.rig, source.imu_noise)
+    (frames, frames_out), (keyframes, keyframes_out) = Pipe(duplex=False), Pipe(duplex=False)
+    seen, late = Outbox(frames_out, 10_000), Outbox(keyframes_out, 10_000)
+    for value in source.events():
+        for step in slam.feed(value):
+            for keyframe in step.keyframes:
+                late.put(keyframe)
+            front = slam.front
+            seen.put(Seen(light(step.front, shows=False, feeds_depth=True), np.eye(4), front.start, front.news))
+    seen.put(FrontEnded(slam.front.report(), slam.front.start, slam.front.news, {}))
+    late.put(BackEnded(None, None, None, {}, {}))
+    life, clock = Life("map", Pipe()[1], Signals(Flag(), Flag())), StageClock()
+    stage = map_stage(config, source.rig, clock)
+    followed = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes))
+    steps = [keyframe for step in followed.steps() for keyframe in step.keyframes] + followed.finish().keyframes
+    scans = {i: scan for step in steps for i, scan in step.scans.items() if scan.depth_png}
+    out, metrics = finished
+    assert sorted(scans) == depth_images(out)
+    there, whole = (counters["mono depth"]["depth_pixels"] for counters in (stage.counters, metrics["counters"]))
+    assert abs(there - whole) < 0.05 * whole
+    seen.close()
+    late.close()

@@ -93,6 +93,8 @@ class Config:
     loop: LoopConfig = field(default_factory=LoopConfig)
     map: MapConfig = field(default_factory=MapConfig)
     live: LiveConfig = field(default_factory=LiveConfig)
+    power_up: PowerUpConfig = field(default_factory=PowerUpConfig)
+    attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
 
 

@@ -31,7 +31,8 @@ class PowerUpConfig:
     max_bias_change_rad_s: float = 0.05  # from what was remembered for this temperature: an even turn looks like a bias
     gravity_tolerance_m_s2: float = 0.5  # of the measured norm: an accelerometer after calibration
     max_tilt_deg: float = 20.0  # of the body to gravity; more is a wrong axis, or no cart that stands on a floor
-    remembered: int = 64  # biases kept, one per degree of temperature
+    memory: str | None = None  # file of the biases found, by temperature; one for each board. None: forget them
+    remembered: int = 64  # biases kept there, one per degree of temperature
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,3 +45,4 @@ class AttitudeConfig:
     level_cutoff_hz: float = 5.0  # low-pass on the force that levels, so that vibration does not close the gate
     mag_gain: float = 0.05  # 1/s, of the yaw by the magnetometer
     mag_gate: float = 0.1  # relative change of the field's norm, and of its vertical part: iron or a motor is near
+    tilt_sigma_deg: float = 1.0  # that is published; twice the error on synthetic carts, whose springs are ideal

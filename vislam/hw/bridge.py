@@ -25,8 +25,9 @@ from vislam.hw.bridge_protocol import (
     RawSample,
     Status,
 )
+from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.messages import ImuSample, MagSample
+from vislam.messages import Array, ImuSample, MagSample
 
 if TYPE_CHECKING:
     import serial
@@ -82,6 +83,7 @@ class SerialBridge:
         self._newest_ns = 0  # when the last inertial sample came
         self._accel_watch, self._gyro_watch = _Watch(), _Watch()
         self._temperature_c: float | None = None
+        self._zero = GyroZero(config.calibrated_at_c)
         self._first: list[ImuSample | MagSample] = []
         if must_be_there:
             self._wait_for_sample()
@@ -90,6 +92,10 @@ class SerialBridge:
     def temperature_c(self) -> float | None:
         """Temperature of the gyro, smoothed over a second; None before the first sample."""
         return self._temperature_c
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        self._zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
 
     @property
     def hello(self) -> Hello | None:
@@ -125,10 +131,8 @@ class SerialBridge:
             word |= Health.CLOCK_STEP
         if time.monotonic_ns() - self._newest_ns > self._config.missing_s * _NS:
             word |= Health.IMU_MISSING
-        config, now_c = self._config, self._temperature_c
-        if config.calibrated_at_c is not None and now_c is not None:
-            drifted = abs(now_c - config.calibrated_at_c) > config.max_temperature_change_c
-            word |= Health.TEMPERATURE_DRIFT if drifted else Health(0)
+        if self._zero.is_far(self._temperature_c, self._config.max_temperature_change_c):
+            word |= Health.TEMPERATURE_DRIFT
         return word
 
     def counters(self) -> dict[str, int]:
@@ -287,6 +291,7 @@ class SerialBridge:
             self._events |= Health.IMU_GAP | Health.BUS_FAULT
             return samples
         rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
+        rate -= self._zero.drift_rad_s(self._temperature_c)
         force = accel_map.matrix @ np.array(raw.accel, dtype=np.float64) + accel_map.offset
         samples.append(ImuSample(stamp_ns - self._delay_ns, rate, force))
         self._newest_ns = arrival_ns

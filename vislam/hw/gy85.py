@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from vislam.hw.adxl345 import Adxl345
 from vislam.hw.affine import Affine
 from vislam.hw.bus import BusError, I2cBus, SettingsLostError, kernel_driver, unbind_command
 from vislam.hw.field import Magnetometer
+from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 from vislam.hw.hmc5883l import Hmc5883l
 from vislam.hw.itg3205 import Itg3205
@@ -44,14 +45,6 @@ class _Link:
     silent: int = 0  # reads in a row that found nothing new
     is_up: bool = False
     self_test: SelfTest | None = None
-
-
-@dataclass(slots=True)
-class _Zero:
-    """What is known of the biases at a temperature."""
-
-    temperature_c: float | None = None
-    gyro_per_c: Array = field(default_factory=lambda: np.zeros(3))
 
 
 class Gy85:
@@ -93,7 +86,7 @@ class Gy85:
         self._mag: Magnetometer | None = None
         self._gyro_link, self._accel_link, self._mag_link = _Link(), _Link(), _Link()
         self._events = Health(0)
-        self._zero = _Zero()
+        self._zero = GyroZero()
         self._temperature_c: float | None = None
         self._track = SampleTrack(config.accel_rate_hz)
         self._last_accel: Array = np.full(3, np.nan)
@@ -129,12 +122,9 @@ class Gy85:
         """Which of the chips that are sold as HMC5883L it is; None if there is none."""
         return None if self._mag is None else self._mag.name
 
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array | None = None) -> None:
-        """Tell at which temperature the biases were taken, and by how much [3] the gyro's changes per deg C (rad/s).
-
-        From then on that drift is taken off, and TEMPERATURE_DRIFT tells when the temperature is too far from it.
-        """
-        self._zero = _Zero(temperature_c, np.zeros(3) if gyro_per_c is None else np.asarray(gyro_per_c))
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        self._zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
 
     def run_self_tests(self) -> tuple[SelfTest, ...]:
         """Test accelerometer and magnetometer by their own means; about 2 s, standing still, no samples meanwhile."""
@@ -198,8 +188,7 @@ class Gy85:
             word |= Health.MAG_FAULT if is_bad else Health(0)
         if self._bus is None:
             word |= Health.BUS_FAULT
-        zero_c, now_c = self._zero.temperature_c, self._temperature_c
-        if zero_c is not None and now_c is not None and abs(now_c - zero_c) > self._config.max_temperature_change_c:
+        if self._zero.is_far(self._temperature_c, self._config.max_temperature_change_c):
             word |= Health.TEMPERATURE_DRIFT
         return word
 
@@ -261,8 +250,7 @@ class Gy85:
             self._counts["gyro_saturated"] += 1
             self._events |= Health.GYRO_SATURATED
         rate = self._gyro_map.matrix @ np.array(counts, dtype=np.float64) + self._gyro_map.offset
-        if self._zero.temperature_c is not None and self._temperature_c is not None:
-            rate -= self._zero.gyro_per_c * (self._temperature_c - self._zero.temperature_c)
+        rate -= self._zero.drift_rad_s(self._temperature_c)
         # a process that was put aside within the call must not move the stamp by more than the call usually takes
         delay_s = self._gyro.delay_s if self._config.gyro_delay_s is None else self._config.gyro_delay_s
         t_ns = asked + min(answered - asked, self._period_ns) // 2 - round(delay_s * _NS)

@@ -6,13 +6,25 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from vislam.hw.health import Health
-from vislam.messages import ImageU8, ImuSample, MagSample
+from vislam.messages import Array, ImageU8, ImuSample, MagSample
 
 
 class InertialSource(Protocol):
     """An IMU, and its magnetometer if any, that yields calibrated body-frame samples stamped at capture."""
 
     rate_hz: float
+
+    @property
+    def temperature_c(self) -> float | None:
+        """Temperature of the gyro; None where it does not tell."""
+        ...
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Tell at which temperature biases were taken, and by how much [3] the gyro's change per deg C (rad/s).
+
+        From then on samples come without that drift, so that an estimator's bias stays what it was there.
+        """
+        ...
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured since the last call, in time order (CLOCK_MONOTONIC ns).

@@ -11,8 +11,9 @@ from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
 from vislam.imu import ImuNoise
+from vislam.live.beginning import Beginning, recalled
 from vislam.live.child import Life
-from vislam.live.handover import BackEnded, EndedGraph, KeyframeOut
+from vislam.live.handover import BackBegun, BackEnded, EndedGraph, KeyframeOut
 from vislam.live.mail import Inbox, Outbox
 from vislam.live.messages import MapMoved
 from vislam.live.rehearsal import rehearse
@@ -23,7 +24,7 @@ _WAIT_S = 0.1
 
 def run(
     life: Life, config: Config, rig: Rig, noise: ImuNoise, keyframes: Connection, to_fast: Connection,
-    to_map: Connection,
+    to_map: Connection, beginning: Beginning | None,
 ) -> None:  # fmt: skip
     """Take keyframes until the front process ends them; then finish the graph and hand it over.
 
@@ -34,18 +35,28 @@ def run(
         noise: of the IMU, as it is rehearsed with.
         keyframes: `KeyframeOut` from the front process, until it closes it or is killed.
         to_fast: `MapMoved`, one per revision.
-        to_map: `KeyframeStep`, then `BackEnded`.
+        to_map: `BackBegun` if there is a `beginning`, `KeyframeStep`, then `BackEnded`.
+        beginning: the session that the run goes on from.
     """
     cv2.setNumThreads(1)
     config = replace(config, map=replace(config.map, enabled=False))
     rehearse(config, rig, noise)
-    life.ready()
     clock = StageClock()
     back: Back | None = None
     inbox, outbox = Inbox(keyframes), Outbox(to_map, config.live.keyframe_queue)
+    begins_recording = beginning is not None
+    if beginning is not None:
+        memory = recalled(beginning)
+        back = Back(config, rig, noise, clock, memory.first_state, memory.T_start)
+        _put(life, outbox, BackBegun(back.restore(memory)))
+        del memory
+    life.ready()
     while (keyframe := _next(life, inbox)) is not None:
         if back is None:
             back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, keyframe.odometry.T_odom_body)
+        if begins_recording:
+            back.begin_recording(keyframe.first_state, keyframe.odometry.T_odom_body)
+            begins_recording = False
         step = back.add(keyframe.odometry, [])
         _tell(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
         _put(life, outbox, step)

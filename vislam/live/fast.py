@@ -17,7 +17,8 @@ from vislam.config import Config
 from vislam.ekf.correction import Correction, Hint
 from vislam.ekf.filter import Ekf
 from vislam.hw.health import Health
-from vislam.imu import ImuBuffer, ImuNoise, RestDetector
+from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
+from vislam.live.inertial_only import InertialOnly
 from vislam.live.messages import CameraHealth, MapMoved, Rebase, Start, ToFast
 from vislam.live.published_pose import PublishedPose, of_base
 from vislam.messages import Array, ImuSample, MagSample, NavState, Tracking
@@ -32,15 +33,17 @@ class FastPath:
     """Owns the filter that is published. One thread; no clock: whoever calls says what time it is."""
 
     def __init__(
-        self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None]
-    ) -> None:
+        self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None],
+        memory: BiasMemory | None = None,
+    ) -> None:  # fmt: skip
         """Prepare an uninitialised filter.
 
         Args:
-            config: `live`, `ekf`, `init` and `imu` of it are used.
+            config: `live`, `ekf`, `init`, `imu`, `power_up` and `attitude` of it are used.
             noise: of the IMU, until `Start` says better.
             T_body_camera: [4, 4] of the first camera.
             publish: takes each pose.
+            memory: gyro biases that earlier power-ups found; None: none.
         """
         self.counters = {"samples": 0, "rests_without_vision": 0, "wheels_without_vision": 0, "rebases": 0}
         self._config = config
@@ -49,11 +52,13 @@ class FastPath:
         self._publish = publish
         self._ekf = self._new_filter(noise)
         self._buffer = ImuBuffer(config.imu)
+        self._alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
         self._rest = RestDetector(config.init, noise)
         self._rest_t_ns: int | None = None  # until when rest was looked for
         self._gyro = np.zeros(3)
         self._offset = np.array(config.live.base_offset_m)
         self._started = 0
+        self._resets = 0  # states that took the place of another one, that of the IMU alone included
         self._at_rest = False
         self._sees = False  # the newest frame was tracked
         self._rejects = False  # ... and contradicted the filter
@@ -93,13 +98,32 @@ class FastPath:
     def add(self, value: ImuSample | MagSample) -> Hint | None:
         """Take a sample; return what vision's filter has to be told of it besides."""
         if isinstance(value, MagSample):
+            self._alone.add_field(value)
             return None
         self.counters["samples"] += 1
         if not self._buffer.add(value):
             return None
         self._ekf.predict(value)
         self._gyro = value.gyro_rad_s
+        if not self._started:
+            self._alone.add(value)
         return self._look_for_rest(value.t_ns)
+
+    def power_up(self, temperature_c: float | None) -> PowerUp | None:
+        """Look whether the cart stands as it has to at power-up; return what that told, once.
+
+        With vision already there only while the body rests. Called twice a second: it takes a third of a millisecond.
+        """
+        return self._alone.look(self._buffer, temperature_c) if not self._started or self._at_rest else None
+
+    @property
+    def bias_per_c(self) -> Array:
+        """What is remembered of the gyro's drift [3], rad/s per deg C."""
+        return self._alone.bias_per_c
+
+    def told_of_power_up(self) -> dict[str, Any]:
+        """Return the zero that was found, or why none was."""
+        return self._alone.told()
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
@@ -139,29 +163,34 @@ class FastPath:
         self._publish(self._newest)
 
     def _pose(self, state: NavState | None, now_ns: int) -> PublishedPose:
-        resets = self._started - 1 + self._ekf.counters["soft_resets"]
+        resets = self._resets + self._ekf.counters["soft_resets"]
         if state is None:
             base = np.eye(4), np.zeros(3), np.zeros(3), _UNKNOWN, _UNKNOWN
+            if self._alone.has_attitude:
+                base = self._alone.base(self._gyro)
             resets, newest_ns = 0, self._buffer.newest_t_ns or 0
         else:
             variance = self._noise.gyro_noise_density**2 * self._noise.rate_hz
             base, newest_ns = of_base(state, self._gyro, variance, self._offset), state.t_ns
         T, velocity, rate, pose_covariance, twist_covariance = base
         return PublishedPose(
-            newest_ns, now_ns, self._sequence, self._health(state, now_ns - newest_ns), T, velocity, rate,
+            newest_ns, now_ns, self._sequence, self._health(state, now_ns, now_ns - newest_ns), T, velocity, rate,
             pose_covariance, twist_covariance, self._map.T_map_odom, self._map.revision, resets,
             self._ekf.dead_reckoning_s,
         )  # fmt: skip
 
-    def _health(self, state: NavState | None, age_ns: int) -> Health:
+    def _health(self, state: NavState | None, now_ns: int, age_ns: int) -> Health:
         config = self._config.live
         health = self._camera
         for _, event in self._events:
             health |= event
         if age_ns > config.imu_timeout_s * _NS:
             health |= Health.IMU_MISSING | Health.INVALID
+        if self._alone.is_field_good(now_ns):
+            health |= Health.MAG_OK
         if state is None:
-            return health | Health.INVALID
+            knows_up = Health.LEVELLED | Health.DEAD_RECKONING if self._alone.has_attitude else Health(0)
+            return health | knows_up | Health.INVALID
         health |= Health.LEVELLED
         sees = self._sees and self._ekf.dead_reckoning_s <= config.vision_timeout_s
         health |= Health.VISION_OK if sees else Health.DEAD_RECKONING
@@ -185,7 +214,9 @@ class FastPath:
             for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
                 self._ekf.predict(ImuSample(t_ns, gyro, accel))
         self._ekf.initialise(start.state, start.vo)
+        self._resets += self._started > 0 or self._alone.has_attitude
         self._started += 1
+        self._alone.end()
         self._follow_vision(True, True, False)
 
     def _new_filter(self, noise: ImuNoise) -> Ekf:

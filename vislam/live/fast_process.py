@@ -15,7 +15,7 @@ from vislam.config import Config, LiveConfig
 from vislam.ekf.correction import Correction
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
-from vislam.imu import ImuNoise
+from vislam.imu import AttitudeFilter, BiasMemory, ImuNoise
 from vislam.live.child import Life
 from vislam.live.fast import FastPath
 from vislam.live.latency import Latency
@@ -38,6 +38,7 @@ def run(
     open_source: Callable[[], InertialSource],
     samples: socket.socket,
     inbox: list[Connection],
+    memory: BiasMemory,
 ) -> None:
     """Read, predict, publish, until the run ends; then end the stream of samples.
 
@@ -49,6 +50,7 @@ def run(
         open_source: opens the IMU, in this process.
         samples: to the front process.
         inbox: from the front and the back process.
+        memory: gyro biases that earlier power-ups found.
     """
     warm_up(config, noise, T_body_camera)
     _take_priority(config.live, life)
@@ -58,7 +60,7 @@ def run(
     try:
         source = open_source()
         try:
-            fast = FastPath(config, noise, T_body_camera, publisher.publish)
+            fast = FastPath(config, noise, T_body_camera, publisher.publish, memory)
             if life.ready():
                 _loop(life, fast, source, sender, inbox, latency)
             counters = {
@@ -102,7 +104,15 @@ def _loop(
             fast.publish(now_ns, source.health)
         if now_ns - noted_ns > _NOTE_S * _NS:
             noted_ns = now_ns
-            life.note(status=fast.status(), latency_ms=latency.summary_ms())
+            power_up(fast, source)
+            life.note(status=fast.status(), latency_ms=latency.summary_ms(), power_up=fast.told_of_power_up())
+
+
+def power_up(fast: FastPath, source: InertialSource) -> None:
+    """Look for the zero of a cart that stands; once it is there, the source takes the gyro's drift from it off."""
+    zero = fast.power_up(source.temperature_c)
+    if zero is not None and zero.temperature_c is not None:
+        source.zeroed_at(zero.temperature_c, fast.bias_per_c)
 
 
 def _take_messages(connection: Connection, fast: FastPath, inbox: list[Connection]) -> None:
@@ -134,6 +144,9 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
     frame = VoMeasurement(100 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
     nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
     state = NavState(keyframe.t_ns, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15) * 1e-4)
+    AttitudeFilter(config.attitude, config.imu.gravity_m_s2, np.eye(3), np.zeros(3)).add(
+        ImuSample(dt_ns, np.zeros(3), rest)
+    )
     for k in range(1, 200):
         fast.add(ImuSample(k * dt_ns, np.zeros(3), rest))
         if k == 80:

@@ -21,6 +21,7 @@ from vislam.front import Front, FrontStep
 from vislam.frontend.result import no_observations
 from vislam.hw.health import Health
 from vislam.imu import ImuNoise
+from vislam.live.beginning import Beginning
 from vislam.live.child import Life
 from vislam.live.frames import FrameSource
 from vislam.live.handover import FrontEnded, KeyframeOut, Seen
@@ -30,6 +31,7 @@ from vislam.live.publisher import PoseReader
 from vislam.live.rehearsal import rehearse_front
 from vislam.live.stream import SampleReceiver, Value
 from vislam.messages import Array, Frame, Keyframe, Tracking
+from vislam.slam import makes_depth, seen_between
 
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
 _PUT_S = 0.1
@@ -46,6 +48,7 @@ def run(
     to_fast: Connection,
     to_back: Connection,
     to_map: Connection,
+    beginning: Beginning | None,
 ) -> None:
     """Process frames until the samples end; then tell the back and the map process that there are no more.
 
@@ -59,6 +62,7 @@ def run(
         to_fast: corrections.
         to_back: `KeyframeOut`.
         to_map: `Seen`, then `FrontEnded`.
+        beginning: the session that the run goes on from.
     """
     cv2.setNumThreads(1)
     rehearse_front(config, rig, noise)
@@ -66,6 +70,8 @@ def run(
     try:
         back, follower = Outbox(to_back, config.live.keyframe_queue), Outbox(to_map, _STEPS)
         process = FrontProcess(life, config, rig, noise, to_fast, back, follower)
+        if beginning is not None:
+            process.front.begin_in_map(beginning.first_id, beginning.next_track_id)
         if life.ready():
             process.loop(camera, SampleReceiver(samples))
             process.end()
@@ -90,6 +96,7 @@ class FrontProcess:
         self._begins_back = True
         self._camera_health = Health(0)
         self._frames_taken = 0
+        self._feeds_depth = makes_depth(config, rig)
         self._poses: PoseReader | None = None
         self._counters = {"crowded_frames": 0, "waits_for_back": 0}
 
@@ -137,7 +144,7 @@ class FrontProcess:
             self._put_keyframe(KeyframeOut(odometry, *self._first()))
         shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
         self._frames_taken += 1
-        seen = Seen(light(step, shows), self._T_map_odom(), self.front.start, self.front.news)
+        seen = Seen(light(step, shows, self._feeds_depth), self._T_map_odom(), self.front.start, self.front.news)
         if not self._to_map.put(seen):
             raise HardwareError(
                 "the map process does not take frames any more; is the disk of --out stuck, or the machine too slow?"
@@ -196,10 +203,15 @@ class FrontProcess:
         return np.eye(4) if pose is None else pose.T_map_odom
 
 
-def light(step: FrontStep, shows: bool) -> FrontStep:
-    """Return a step without what comes to the map process from the back end; with pictures only if it `shows` them."""
+def light(step: FrontStep, shows: bool, feeds_depth: bool = False) -> FrontStep:
+    """Return a step without what comes to the map process from the back end.
+
+    With pictures only if it `shows` them, or `feeds_depth` from one camera.
+    """
     frame, track = step.frame, step.track
     bare = replace(frame, images=(), color=None, depth_m=None, tracks=None)
+    if feeds_depth and seen_between(step):
+        bare = replace(bare, images=frame.images[:1])
     keyframe = track.keyframe
     if keyframe is not None:
         keyframe = Keyframe(keyframe.id, keyframe.t_ns, bare, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)

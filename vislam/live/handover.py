@@ -27,6 +27,13 @@ class KeyframeOut:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BackBegun:
+    """The back process has taken over an earlier session and reads it no more; the first thing that it tells then."""
+
+    update: GraphUpdate  # all poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Seen:
     """One frame after the front half, with what was published then and what was known."""
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,24 +15,27 @@ from vislam.clock import StageClock
 from vislam.config import Config
 from vislam.errors import HardwareError
 from vislam.front import FrontReport
+from vislam.live.beginning import Beginning
 from vislam.live.child import Life
-from vislam.live.handover import BackEnded, EndedGraph, FrontEnded, Seen
+from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
 from vislam.live.mail import Inbox
 from vislam.mapping.mapper import Mapper
-from vislam.memory import FrontNews, StartFacts
+from vislam.mapping.monodepth import SeenFrame
+from vislam.mapping.stage import MapStage
+from vislam.memory import FrontNews, SlamMemory, StartFacts
 from vislam.messages import Array, GraphUpdate, Pieces
 from vislam.recording import Recording
-from vislam.run import Progress, Run, imu_noise
-from vislam.runfolder import write_setup
-from vislam.session import SessionWriter
-from vislam.slam import Finish, KeyframeStep, Step, localised
+from vislam.run import Progress, Run, begun
+from vislam.runfolder import MapChoice
+from vislam.session import Session, SessionWriter
+from vislam.slam import MAX_SEEN, Finish, KeyframeStep, Step, localised, map_stage, seen_between
 
 _WAIT_S = 0.05
 
 
 def run(
     life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
-    keyframes: Connection,
+    keyframes: Connection, beginning: Beginning | None, base: MapChoice | None,
 ) -> None:  # fmt: skip
     """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
 
@@ -40,19 +43,26 @@ def run(
         life: of this process.
         config: of the run.
         recording: names the sensors; its truth, if any, is asked for at the end.
-        out: an existing folder.
+        out: an existing folder; that of the run itself where it is resumed.
         source: what was asked for.
         command: as it was typed.
         frames: `Seen` from the front process, then `FrontEnded`.
-        keyframes: `KeyframeStep` from the back process, then `BackEnded`.
+        keyframes: `BackBegun` if there is a `beginning`, `KeyframeStep` from the back process, then `BackEnded`.
+        beginning: the session that the run goes on from.
+        base: the map among them, if it is that of another run.
     """
-    noise = imu_noise(config.imu, recording.imu_noise)
-    write_setup(out, config, source, command)
-    info = {"source": source, "config": asdict(config)}
-    session = SessionWriter(out / "session.db", info, recording.rig, noise, config.imu.gravity_m_s2)
-    mapper = Mapper(config.map, recording.rig) if config.map.enabled else None
-    pipeline = FollowedPipeline(life, mapper, Inbox(frames), Inbox(keyframes))
-    live = _LiveRun(recording, config, out, session, pipeline, pipeline)
+    clock = StageClock()
+    stage = map_stage(config, recording.rig, clock)
+    pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes))
+    if beginning is not None:
+        pipeline.wait_for_back()
+    make = partial(_LiveRun, recording, config, out, pipeline)
+    live: Run
+    if beginning is not None and beginning.is_own:
+        live = resumed = make(SessionWriter.reopen(out / "session.db"))
+        resumed.go_on_from(beginning)
+    else:
+        live = begun(recording, config, out, source, command, base, make)
     life.ready()
     metrics = live.execute()
     life.note(metrics=metrics)
@@ -62,15 +72,26 @@ class _LiveRun(Run):
     """A run whose steps come from other processes."""
 
     def __init__(
-        self, recording: Recording, config: Config, out: Path, session: SessionWriter, slam: Any,
-        followed: FollowedPipeline,
-    ) -> None:  # fmt: skip
-        super().__init__(recording, config, out, session, slam)
+        self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, session: SessionWriter
+    ) -> None:
+        super().__init__(recording, config, out, session, followed)
         self._followed = followed
+
+    def go_on_from(self, beginning: Beginning) -> None:
+        """Go on in the run's own session, whose map is the one to be found again: the cart may stand elsewhere."""
+        stored = Session(beginning.session)
+        try:
+            self.go_on(stored)
+        finally:
+            stored.close()
+        self.base = {"path": str(beginning.session), "keyframes": beginning.first_id, "localize_only": False}
 
     def _feed(self, progress: Progress | None) -> None:
         for step in self._followed.steps():
+            was_found = self.joined_t_ns is not None
             self._take(step)
+            if self.joined_t_ns is not None and not was_found:
+                self._followed.life.note(found_in_map=True)
 
 
 class _Front:
@@ -91,15 +112,20 @@ class _Front:
 class _Back:
     """What is known here of the back end, and the map."""
 
-    def __init__(self, mapper: Mapper | None) -> None:
-        self.mapper = mapper
+    def __init__(self, stage: MapStage | None) -> None:
+        self.stage = stage
         self.graph = EndedGraph(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), [], [])
         self._counters: dict[str, dict[str, int]] = {}
 
     @property
+    def mapper(self) -> Mapper | None:
+        """The map; None where it is off."""
+        return None if self.stage is None else self.stage.mapper
+
+    @property
     def counters(self) -> dict[str, dict[str, int]]:
         """Counters of its rooms, and of the map here."""
-        return self._counters | ({} if self.mapper is None else {"map": dict(self.mapper.counters)})
+        return self._counters | ({} if self.stage is None else self.stage.counters)
 
     def end(self, ended: BackEnded) -> None:
         """Take its last word."""
@@ -114,27 +140,54 @@ class FollowedPipeline:
     Keyframes come when the graph has them, later than their frames; the frame that is at hand then carries them.
     """
 
-    def __init__(self, life: Life, mapper: Mapper | None, frames: Inbox, keyframes: Inbox) -> None:
+    def __init__(self, life: Life, clock: StageClock, stage: MapStage | None, frames: Inbox, keyframes: Inbox) -> None:
         """Follow two queues, and feed a map."""
-        self.clock = StageClock()
+        self.clock = clock
         self.counters = {"frames_lost": 0, "relocalised": 0}
         self.front = _Front()
-        self._life = life
-        self._map = _Back(mapper)
+        self.life = life
+        self._map = _Back(stage)
         self._frames, self._keyframes = frames, keyframes
         self._late: deque[KeyframeStep] = deque()  # whose frame has not come yet
         self._back_ended: BackEnded | None = None
+        self._begun: GraphUpdate | None = None
         self._pieces = Pieces()
         self._newest_id = -1
+        self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # whose keyframe has not come yet
 
     @property
     def back(self) -> _Back | None:
         """The back end; None before the first keyframe."""
         return self._map if self._newest_id >= 0 else None
 
+    def wait_for_back(self) -> None:
+        """Wait until the back process has taken over the earlier session; raises HardwareError when it died."""
+        while self._begun is None:
+            message = self._keyframes.get(_WAIT_S)
+            if isinstance(message, BackBegun):
+                self._begun = message.update
+            elif self._keyframes.is_over or self.life.is_orphan:
+                raise HardwareError("the back process died before it had read the earlier session")
+
+    def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
+        """Begin where the back process did; return all its poses."""
+        assert self._begun is not None, "wait_for_back comes before"
+        update, first_id = self._begun, memory.front.keyframe_id + 1
+        if self._map.stage is not None:
+            self._map.stage.restore(memory.scans, memory.graph.T_map_body, memory.held > 0)
+            self._map.stage.move(update)
+        self._map.graph = EndedGraph(update.ids, update.T_map_body, [], [])
+        self._pieces = update.pieces.begun(first_id)
+        self._newest_id = first_id - 1
+        return update
+
+    def resume(self, memory: SlamMemory) -> GraphUpdate:
+        """Go on in an own session as in the map of another: where the cart is now, loops have to say."""
+        return self.begin_in_map(memory)
+
     def steps(self) -> Iterator[Step]:
         """Yield a step per frame, until the front process ends."""
-        while self.front.ended is None and not self._life.is_orphan:
+        while self.front.ended is None and not self.life.is_orphan:
             self._take_keyframes()
             message = self._frames.get(_WAIT_S)
             if message is None:
@@ -148,7 +201,7 @@ class FollowedPipeline:
 
     def finish(self) -> Finish:
         """Wait for the back process's last word; return what came after the last frame."""
-        while self._back_ended is None and not (self._life.is_orphan or self._keyframes.is_over):
+        while self._back_ended is None and not (self.life.is_orphan or self._keyframes.is_over):
             self._take_keyframes(_WAIT_S)
         ended = self._back_ended
         self._newest_id = 1 << 62
@@ -160,16 +213,17 @@ class FollowedPipeline:
             self.clock.add(timings)
             return Finish([], keyframes, None, None)
         self.clock.add(timings | ended.timings)
-        if ended.update is not None and self._map.mapper is not None:
-            with self.clock.measure("map finish"):
-                self._map.mapper.move(ended.update)
-                self._map.mapper.finish()
+        if ended.update is not None and self._map.stage is not None:
+            self._map.stage.move(ended.update)
+            self._map.stage.finish()
         return Finish([], keyframes, ended.update, ended.news)
 
     def _step(self, seen: Seen) -> Step:
         front = seen.step
         self.front.start, self.front.news = seen.start, seen.news
         self._newest_id = max(self._newest_id, front.keyframe_id)
+        if self._map.stage is not None and self._map.stage.wants_frames:
+            self._seen += seen_between(front)
         keyframes = self._ripe()
         before = self._pieces
         if keyframes:
@@ -192,19 +246,20 @@ class FollowedPipeline:
         ripe = []
         while self._late and self._late[0].odometry.packet.keyframe.id <= self._newest_id:
             ripe.append(self._late.popleft())
-        mapper = self._map.mapper
-        if not ripe or mapper is None:
+        stage = self._map.stage
+        if not ripe or stage is None:
             return ripe
+        update, scans = coalesced([step.update for step in ripe]), []
+        stage.move(update)
+        poses = dict(zip(update.ids.tolist(), update.T_map_body, strict=True))
         for step in ripe:
-            with self.clock.measure("map"):
-                mapper.add(step.odometry.packet.keyframe, step.update.T_map_odom @ step.odometry.T_odom_body)
-        with self.clock.measure("map move"):
-            mapper.move(coalesced([step.update for step in ripe]))
-        packed = [(step, mapper.packed(step.odometry.packet.keyframe.id)) for step in ripe]
-        return [
-            step if scan is None else replace(step, scans={step.odometry.packet.keyframe.id: scan})
-            for step, scan in packed
-        ]
+            odometry, keyframe_id = step.odometry, step.odometry.packet.keyframe.id
+            seen = []
+            while self._seen and self._seen[0].keyframe_id < keyframe_id:
+                seen.append(self._seen.popleft())
+            T_map_body = poses.get(keyframe_id, update.T_map_odom @ odometry.T_odom_body)
+            scans.append(stage.add(odometry, T_map_body, seen))
+        return [replace(step, scans=scan) for step, scan in zip(ripe, scans, strict=True)]
 
 
 def coalesced(updates: list[GraphUpdate]) -> GraphUpdate:

@@ -40,6 +40,13 @@ class ReplayedImu:
         self._next = 0
         self._newest_ns: int | None = None
 
+    @property
+    def temperature_c(self) -> None:
+        """No recording tells it."""
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Leave the samples as they were recorded."""
+
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return the samples whose time has come."""
         begin_ns = self._epoch.begin_ns()

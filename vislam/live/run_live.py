@@ -15,16 +15,20 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from vislam.config import Config
-from vislam.errors import HardwareError, UsageError, VislamError
+from vislam.errors import HardwareError, StorageError, UsageError, VislamError
 from vislam.hw.source import InertialSource
+from vislam.imu import BiasMemory
 from vislam.live import back_process, bridge, fast_process, front_process, map_process
+from vislam.live.beginning import Beginning
 from vislam.live.child import Failure, Flag, Life, Note, Ready, Signals, guarded
 from vislam.live.frames import FrameSource
 from vislam.live.slot import remove
 from vislam.recording import Recording
 from vislam.run import imu_noise
-from vislam.runfolder import write_json
+from vislam.runfolder import MapChoice, write_json
 
 _WATCH_S = 0.2
 _AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
@@ -68,24 +72,29 @@ class LiveRun:
         metrics: those of the run, when it has ended well.
     """
 
-    def __init__(self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str]) -> None:
+    def __init__(
+        self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str],
+        base: MapChoice | None = None, beginning: Beginning | None = None,
+    ) -> None:  # fmt: skip
         """Make the wires; nothing starts yet.
 
         Args:
             source: the sensors.
             config: of the run.
-            out: an existing folder for it.
+            out: a folder for it, which has to be there when it is executed.
             asked: the source as it was asked for.
             command: as it was typed.
+            base: the map of another run, to begin in.
+            beginning: what `base` holds, or the run itself in `out` that is to be resumed; None: it begins anew.
 
         Raises:
             UsageError: settings that only make sense with a recording, or a bridge that cannot be.
+            DataError: the file of remembered biases is damaged.
         """
         noise = imu_noise(config.imu, source.imu_noise)
         if noise is None:
             raise UsageError("a live run needs an IMU: leave imu.enabled on")
         for name, is_on in {
-            "map.mono_depth.enabled": config.map.mono_depth.enabled,
             "ekf.graph_feedback": config.ekf.graph_feedback,
             "ekf.vision_delay_s": config.ekf.vision_delay_s > 0.0,
         }.items():
@@ -99,10 +108,25 @@ class LiveRun:
         self._children: dict[str, _Child] = {}
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
-        self._roles = self._wire(source, config, out, asked, command, noise)
+        path = config.power_up.memory
+        self._memory_path = None if path is None else Path(path)
+        self._memory = BiasMemory(config.power_up.remembered)
+        if self._memory_path is not None:
+            self._memory = BiasMemory.read(self._memory_path, config.power_up.remembered)
+        self._is_zeroed = False  # power-up found a bias
+        self._unremembered: str | None = None  # why it is not kept
+        self._roles = self._wire(source, config, out, asked, command, noise, base, beginning)
 
     def _wire(
-        self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str], noise: Any
+        self,
+        source: LiveSource,
+        config: Config,
+        out: Path,
+        asked: str,
+        command: list[str],
+        noise: Any,
+        base: MapChoice | None,
+        beginning: Beginning | None,
     ) -> dict[str, Callable[[Life], None]]:
         """Return what each process does, with its ends of the wires."""
         bridges = bridge.asked(config.live)
@@ -124,19 +148,19 @@ class LiveRun:
             "fast": partial(
                 fast_process.run, config=replace(config, live=replace(config.live, send_to=send_to)), noise=noise,
                 T_body_camera=rig.T_body_cams[0], open_source=source.inertial(), samples=samples_in,
-                inbox=[fast_hears_front, fast_hears_back],
+                inbox=[fast_hears_front, fast_hears_back], memory=self._memory,
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),
-                samples=samples_out, to_fast=front_says, to_back=packets_out, to_map=frames_out,
+                samples=samples_out, to_fast=front_says, to_back=packets_out, to_map=frames_out, beginning=beginning,
             ),
             "back": partial(
                 back_process.run, config=config, rig=rig, noise=noise, keyframes=packets, to_fast=back_says,
-                to_map=keyframes_out,
+                to_map=keyframes_out, beginning=beginning,
             ),
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,
-                frames=frames, keyframes=keyframes,
+                frames=frames, keyframes=keyframes, beginning=beginning, base=base,
             ),
         }  # fmt: skip
 
@@ -196,7 +220,8 @@ class LiveRun:
         if self.metrics is None:
             raise HardwareError("the run ended before its folder was written; see what is said above")
         told = {name: value for name, value in self.notes.get("fast", {}).items() if name != "status"}
-        self.metrics = {**self.metrics, "live": told}
+        warnings = [*self.metrics["warnings"], *self._doubts]
+        self.metrics = {**self.metrics, "warnings": warnings, "live": told}
         write_json(self._out / "metrics.json", self.metrics)
         return self.metrics
 
@@ -242,6 +267,7 @@ class LiveRun:
                 elif isinstance(message, Note):
                     self.notes[role] = {**self.notes.get(role, {}), **message.values}
                     self.metrics = message.values.get("metrics", self.metrics)
+                    self._remember(message.values.get("power_up", {}))
                 else:
                     raised = _raised(message)
                     if self._failure is None:
@@ -250,6 +276,25 @@ class LiveRun:
                         self._failure.add_note(f"then: {raised}")
         except (EOFError, OSError):
             child.report.close()
+
+    @property
+    def _doubts(self) -> list[str]:
+        """What the user should know of power-up."""
+        told = self.notes.get("fast", {}).get("power_up", {})
+        doubts = [f"no zero at power-up: {told['refused']}"] if "refused" in told else []
+        return doubts + ([] if self._unremembered is None else [self._unremembered])
+
+    def _remember(self, told: dict[str, Any]) -> None:
+        """Keep the gyro's bias for the next power-up, once; here, for no sensor waits for a disk."""
+        temperature_c = told.get("temperature_c")
+        if self._memory_path is None or self._is_zeroed or temperature_c is None:
+            return
+        self._is_zeroed = True
+        self._memory.add(temperature_c, np.array(told["gyro_bias_rad_s"]))
+        try:
+            self._memory.write(self._memory_path)
+        except StorageError as error:
+            self._unremembered = str(error)
 
     def _end(self) -> None:
         """Make sure that nothing is left behind, whatever happened."""

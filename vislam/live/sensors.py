@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from vislam.camera import Rig
 from vislam.config import Config, SensorsConfig, validated
+from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
 from vislam.errors import DataError, UsageError
@@ -43,13 +45,25 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
         return cart, cart.settings(config)
     if asked.startswith("replay:"):
         return ReplaySource(asked.removeprefix("replay:"), config.seed), config
-    inertial, plus, camera = asked.partition("+")
-    if not plus or inertial.partition(":")[0] not in ("gy85", "serial"):
+    inertial, _, camera = asked.partition("+")
+    if not camera or inertial.partition(":")[0] not in ("gy85", "serial"):
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
             "(a camera's index or path in place of webcam)"
         )
-    return CartSensors(inertial, "" if camera == "webcam" else camera, config, sensors), config
+    return CartSensors(inertial, camera, config, sensors), with_clock(config)
+
+
+def stored_sensors(out: Path) -> SensorsConfig:
+    """Return the sensors of the live run in a folder; raises DataError when their file cannot be used."""
+    path = out / "sensors.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data, dict):
+            raise ValueError("it holds something else than settings")
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} does not tell the sensors of a live run: {error}; begin with --map {out}") from error
+    return validated(SensorsConfig, data, str(path))
 
 
 def _place_options(text: str) -> PlaceOptions:
@@ -83,18 +97,19 @@ class CartSensors:
             raise UsageError(
                 "a live camera needs its calibration: --calibration.camera FILE, which `vislam calibrate camera` writes"
             )
-        if config.calibration.imu is not None:
-            raise UsageError(
-                "live drivers take the IMU's calibration from the sensors file (--sensors FILE, section calibration of "
-                "gy85 or serial), not from --calibration.imu"
-            )
+        for name, path in (("imu", config.calibration.imu), ("mag", config.calibration.mag)):
+            if path is not None:
+                raise UsageError(
+                    "live drivers take the calibration of their chips from the sensors file (--sensors FILE, section "
+                    f"calibration of gy85 or serial), not from --calibration.{name}"
+                )
         found = read_cameras(Path(config.calibration.camera))[0]
         if found.T_body_cam is None:
             raise DataError(
                 f"{config.calibration.camera} does not say where the camera is on the body (T_cam_imu, T_BS); add it, "
                 "or run `vislam calibrate camera-imu`"
             )
-        self.name = f"live {inertial}+{camera or 'webcam'}"
+        self.name = f"live {inertial}+{camera}"
         self.rig = Rig((found.camera,), (found.T_body_cam,))
         rate_hz = sensors.gy85.rate_hz
         self.imu_noise: ImuNoise | None = ImuNoise(

@@ -18,6 +18,9 @@ def status_line(run: LiveRun) -> str:
     x, y, z = status["position_m"]
     health = Health(status["health"])
     names = " ".join((flag.name or "").lower() for flag in health) or "not levelled"
+    refused = told.get("power_up", {}).get("refused")
+    names += "  found in the map" if run.notes.get("map", {}).get("found_in_map") else ""
+    names += f"  no zero yet: {refused}" if refused else ""
     late = f"{latency['p50']:.2f}/{latency['p99']:.2f} ms" if "p50" in latency else "-"
     return (
         f"x {x:7.2f} y {y:7.2f} z {z:5.2f} m +-{status['sigma_m']:.2f}  {status['speed_m_s']:.2f} m/s  "

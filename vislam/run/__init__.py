@@ -3,6 +3,6 @@
 `drive` feeds the pipeline and keeps the folder, `metrics` says what came out, `view` what the viewer is shown.
 """
 
-from vislam.run.drive import Progress, Run, execute, imu_noise, resume
+from vislam.run.drive import Progress, Run, begun, execute, imu_noise, map_of, resume
 
-__all__ = ["Progress", "Run", "execute", "imu_noise", "resume"]
+__all__ = ["Progress", "Run", "begun", "execute", "imu_noise", "map_of", "resume"]

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -25,7 +26,7 @@ from vislam.loop.table import LoopRow, caption
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
 from vislam.memory import FrontMemory, FrontNews, GraphNews, KeyframeEntry, SlamMemory, StartFacts
-from vislam.messages import Array, Frame, ImuSample, LoopDecision, MagSample, NavState
+from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopDecision, MagSample, NavState
 from vislam.recording import Recording
 from vislam.run.loop_gallery import LoopGallery
 from vislam.run.metrics import accuracy, doubts, initialisation, judge
@@ -130,6 +131,14 @@ class Pipeline(Protocol):
         """The half at the rate of keyframes; None before the first."""
         ...
 
+    def resume(self, memory: SlamMemory) -> GraphUpdate:
+        """Go on where an earlier run was, before the first value; return all its poses."""
+        ...
+
+    def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
+        """Begin in the map of earlier runs, before the first value; return its poses."""
+        ...
+
     def finish(self) -> Finish:
         """Process what still waits and optimise a last time."""
         ...
@@ -172,12 +181,16 @@ class Run:
             raise UsageError(
                 f"the run in {self.out} came to its end; there is nothing to resume (`vislam report` writes its report)"
             )
+        return self.go_on(stored)
+
+    def go_on(self, stored: Session) -> bool:
+        """Go on after the last keyframe, as `resume`, though the run may have come to its end."""
+        info = stored.info()
         if not _still(info.get("config") or {}, json.loads(json.dumps(asdict(self.config)))):
             raise UsageError(f"{self.out / 'config.json'} was changed since the run began; start a new run")
         memory = recall(stored)
         if memory is None:
             return False
-        assert isinstance(self.slam, Slam)
         update = self.slam.resume(memory)
         self.base = info.get("map")
         self.log.restore(stored, memory)
@@ -197,7 +210,6 @@ class Run:
 
     def begin_in_map(self, memory: SlamMemory) -> None:
         """Begin in the map of another session, before `execute`."""
-        assert isinstance(self.slam, Slam)
         update = self.slam.begin_in_map(memory)
         self.log.begin_in_map(memory)
         self.base = self.session.base()
@@ -422,28 +434,43 @@ def execute(
 
     With `base` it begins in the map of another session, which stays as it is. Raises UsageError when that does not fit.
     """
+    return begun(recording, config, out, source, command, base).execute(progress)
+
+
+def begun(
+    recording: Recording,
+    config: Config,
+    out: Path,
+    source: str,
+    command: list[str],
+    base: MapChoice | None,
+    make: Callable[[SessionWriter], Run] | None = None,
+) -> Run:
+    """Return a run at its beginning, in the map `base` if there is one; see `execute`.
+
+    `make` makes another kind of run of its session.
+    """
     info = {"source": source, "config": asdict(config)}
     noise = imu_noise(config.imu, recording.imu_noise)
     path = out / "session.db"
+    make = make or partial(Run, recording, config, out)
     if base is None:
         write_setup(out, config, source, command)
-        session = SessionWriter(path, info, recording.rig, noise, config.imu.gravity_m_s2)
-        return Run(recording, config, out, session).execute(progress)
-    stored = Session(base.path / "session.db" if base.path.is_dir() else base.path)
+        return make(SessionWriter(path, info, recording.rig, noise, config.imu.gravity_m_s2))
+    stored = Session(base.session)
     try:
-        memory = _map_of(stored, recording, config, noise)
-        memory = replace(memory, held=len(memory.graph.packets) if base.localize_only else 0)
+        memory = map_of(stored, recording, config, noise, base.localize_only)
         write_setup(out, config, source, command, base)
         session = SessionWriter.in_map(path, stored, info, noise, base.localize_only)
     finally:
         stored.close()
-    run = Run(recording, config, out, session)
+    run = make(session)
     run.begin_in_map(memory)
     if not memory.scans and config.map.enabled:
         run.warnings.append(
             f"{stored.path} brings no clouds, or of another shape (--map.*): the map holds new ones only"
         )
-    return run.execute(progress)
+    return run
 
 
 def _still(began: Any, now: Any) -> bool:
@@ -453,8 +480,13 @@ def _still(began: Any, now: Any) -> bool:
     return bool(began == now)
 
 
-def _map_of(stored: Session, recording: Recording, config: Config, noise: ImuNoise | None) -> SlamMemory:
-    """Return the map of a session; raises UsageError when a recording cannot go on in it, DataError without one."""
+def map_of(
+    stored: Session, recording: Recording, config: Config, noise: ImuNoise | None, is_held: bool = False
+) -> SlamMemory:
+    """Return the map of a session; raises UsageError when a recording cannot go on in it, DataError without one.
+
+    With `is_held` it is not to change.
+    """
     info = stored.info()
     settings, sensors = info.get("config") or {}, json.loads(json.dumps(rig_data(recording.rig)))
     if settings.get("graph", {}).get("coupling") != "tight" or config.graph.coupling != "tight":
@@ -466,6 +498,7 @@ def _map_of(stored: Session, recording: Recording, config: Config, noise: ImuNoi
     memory = recall(stored)
     if memory is None:
         raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
+    memory = replace(memory, held=len(memory.graph.packets) if is_held else 0)
     if settings.get("map") != json.loads(json.dumps(asdict(config.map))):
         return replace(memory, scans={})  # of another shape
     return memory

@@ -52,7 +52,7 @@ VERBS = {
         "record the cart's IMU and camera", "vislam record --out recordings/ride --imu serial:/dev/ttyUSB0 --camera 0"
     ),
     "live": Verb(
-        "run the pipeline on live sensors and publish the pose",
+        "run the pipeline on live sensors and publish the pose; --resume RUN goes on with a run",
         "vislam live --source virtual-cart --out runs/cart",
     ),
     "report": Verb("write report.html of a run again", "vislam report runs/desk"),

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from vislam.config import Config, SensorsConfig, load, load_sensors
+from vislam.errors import UsageError
 from vislam.verbs.arguments import parse, take_path
 from vislam.verbs.results import print_metrics, written_up
 from vislam.verbs.terminal import rewritten_line
 
+if TYPE_CHECKING:
+    from vislam.live.run_live import LiveRun
+
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of `vislam live`."""
+    """Options of `vislam live`; `--resume RUN` goes on with a run, whose source, sensors and settings it takes."""
 
     out: Path
     """Folder to make for everything that the run leaves"""
@@ -28,6 +32,20 @@ class LiveOptions:
     """How long; None: until Ctrl-C, or the end of a replay"""
     overwrite: bool = False
     """Replace the run that the folder holds"""
+    map: Path | None = None
+    """Session (RUN/session.db or RUN) of an earlier run in whose map this one begins; it is not written"""
+    localize_only: bool = False
+    """With --map: find the way in it, and leave its keyframes and clouds as they are"""
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Options of `vislam live --resume RUN`; source, sensors and settings are those that the run began with."""
+
+    seconds: float | None = None
+    """How long; None: until Ctrl-C, or the end of a replay"""
     json: bool = False
     """Print the metrics as JSON instead of the table"""
 
@@ -35,19 +53,54 @@ class LiveOptions:
 def main(arguments: list[str]) -> int:
     """Run live until the time is over, the source ends or a signal comes."""
     command = ["vislam", "live", *arguments]
+    resumed = take_path(arguments, "--resume")
+    if resumed is not None:
+        return _resume(resumed, arguments, command)
     settings, sensors = load(take_path(arguments, "--config")), load_sensors(take_path(arguments, "--sensors"))
-    base = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
-    options = parse(LiveOptions, arguments, "live", base)
+    defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
+    options = parse(LiveOptions, arguments, "live", defaults)
+    if options.localize_only and options.map is None:
+        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    from vislam.live.beginning import in_map
     from vislam.live.run_live import LiveRun
     from vislam.live.sensors import open_live
-    from vislam.live.status import status_line
-    from vislam.runfolder import prepare
+    from vislam.runfolder import MapChoice, prepare, write_json
 
     source, settings = open_live(options.source, options.settings, options.sensors)
-    prepare(options.out, options.overwrite)
-    with written_up(options.out), rewritten_line() as show:
-        live = LiveRun(source, settings, options.out, options.source, command)
-        seconds = source.duration_s if options.seconds is None else options.seconds
+    base = None if options.map is None else MapChoice(options.map, options.localize_only)
+    beginning = None if base is None else in_map(base, source, settings)
+    live = LiveRun(source, settings, options.out, options.source, command, base, beginning)
+    prepare(options.out, options.overwrite, base)
+    write_json(options.out / "sensors.json", asdict(options.sensors))
+    return _execute(live, options.out, source.duration_s if options.seconds is None else options.seconds, options.json)
+
+
+def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
+    """Go on with the run in a folder, whatever ended it."""
+    from vislam.live.beginning import in_map, resumed
+    from vislam.live.run_live import LiveRun
+    from vislam.live.sensors import open_live, stored_sensors
+    from vislam.runfolder import prepare, read_setup, write_json
+
+    options = parse(ResumeOptions, arguments, "live")
+    asked, config, base = read_setup(out)
+    sensors = stored_sensors(out)
+    source, settings = open_live(asked, config, sensors)
+    beginning = resumed(out, source, settings)
+    is_new = beginning is None  # there was nothing yet to go on from
+    if is_new and base is not None:
+        beginning = in_map(base, source, settings)
+    live = LiveRun(source, settings, out, asked, command, base, beginning)
+    if is_new:
+        prepare(out, overwrite=True)
+        write_json(out / "sensors.json", asdict(sensors))
+    return _execute(live, out, source.duration_s if options.seconds is None else options.seconds, options.json)
+
+
+def _execute(live: LiveRun, out: Path, seconds: float | None, as_json: bool) -> int:
+    from vislam.live.status import status_line
+
+    with written_up(out), rewritten_line() as show:
         metrics = live.execute(lambda run: show(status_line(run)), seconds)
-    print_metrics(metrics, options.out, options.json)
+    print_metrics(metrics, out, as_json)
     return 0

@@ -89,6 +89,6 @@ def run_source(options: RunOptions, command: list[str]) -> dict[str, Any]:
     settings = with_clock(options.settings)
     recording = open_source(options.source, settings.seed, settings.calibration)
     base = None if options.map is None else MapChoice(options.map, options.localize_only)
-    prepare(options.out, options.overwrite)
+    prepare(options.out, options.overwrite, base)
     with written_up(options.out), progress_bar(recording.name) as progress:
         return execute(recording, settings, options.out, options.source, command, progress, base)

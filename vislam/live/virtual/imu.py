@@ -12,7 +12,7 @@ from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
 from vislam.live.virtual.motion import Follower
-from vislam.messages import ImuSample, MagSample
+from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
 _FIELD_UT = (18.2, -10.5, -43.0)  # central Europe, z up
@@ -36,6 +36,15 @@ class VirtualGy85:
         self._driver = Gy85(config)
         self._stack.callback(self._driver.close)
         self.rate_hz = self._driver.rate_hz
+
+    @property
+    def temperature_c(self) -> float | None:
+        """That of the driver."""
+        return self._driver.temperature_c
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Tell the driver."""
+        self._driver.zeroed_at(temperature_c, gyro_per_c)
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what the driver reads."""

@@ -1,0 +1,78 @@
+"""What a live run goes on from: the map of another session, or what it was itself when it ended."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vislam.config import Config
+from vislam.errors import DataError, UsageError
+from vislam.memory import SlamMemory
+from vislam.recording import Recording
+from vislam.run import imu_noise, map_of
+from vislam.runfolder import MapChoice
+from vislam.session import Session, has_begun, recall
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """An earlier session as each process has to know of it; who needs more reads the file."""
+
+    session: Path
+    is_own: bool  # the run is resumed: what comes is written into the same session
+    first_id: int  # of the new keyframes
+    next_track_id: int
+    held: int  # keyframes that are not to move
+
+
+def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
+    """Return the beginning in a map; raises UsageError when the sensors cannot go on in it, DataError without one."""
+    stored = Session(base.session)
+    try:
+        noise = imu_noise(config.imu, recording.imu_noise)
+        return _of(map_of(stored, recording, config, noise, base.localize_only), base.session, is_own=False)
+    finally:
+        stored.close()
+
+
+def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None:
+    """Return the beginning of a run that goes on in its folder; None where it had nothing yet to go on from.
+
+    Raises UsageError when its sensors are others now, or the machine was started anew, DataError when its session is
+    damaged.
+    """
+    path = out / "session.db"
+    if not has_begun(path):
+        return None
+    stored = Session(path)
+    try:
+        memory = recall(stored)
+        if memory is None:
+            return None
+        map_of(stored, recording, config, imu_noise(config.imu, recording.imu_noise))
+    finally:
+        stored.close()
+    if memory.front.t_ns >= time.monotonic_ns():
+        raise UsageError(
+            f"the machine was started anew since {out} was recorded, and its clock begins again; start a new run in "
+            f"that map: vislam live --map {out} --out NEW"
+        )
+    return _of(memory, path, is_own=True)
+
+
+def recalled(beginning: Beginning) -> SlamMemory:
+    """Read what a process needs of the session."""
+    stored = Session(beginning.session)
+    try:
+        memory = recall(stored)
+    finally:
+        stored.close()
+    if memory is None:
+        raise DataError(f"{beginning.session} was changed while the run began; start it again")
+    return replace(memory, held=beginning.held)
+
+
+def _of(memory: SlamMemory, session: Path, is_own: bool) -> Beginning:
+    front = memory.front
+    return Beginning(session, is_own, front.keyframe_id + 1, front.news.next_track_id, memory.held)

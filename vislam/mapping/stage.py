@@ -1,0 +1,81 @@
+"""The map as a stage of the pipeline: keyframes and poses in, what has to be stored of them out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from vislam.camera import Rig
+from vislam.clock import StageClock
+from vislam.config import MapConfig
+from vislam.mapping.mapper import Mapper
+from vislam.mapping.monodepth import MonoDepth, SeenFrame
+from vislam.memory import PackedScan
+from vislam.messages import Array, GraphUpdate
+from vislam.odometry_keyframe import OdometryKeyframe
+
+
+class MapStage:
+    """Owns the mapper, and the filter of depth where that comes from one moving camera.
+
+    Attributes:
+        held: what was restored is a map that is not to change: new keyframes are left out.
+    """
+
+    def __init__(self, config: MapConfig, rig: Rig, one_camera: bool, clock: StageClock) -> None:
+        """Prepare for a rig; with `one_camera` depth comes from frames between keyframes.
+
+        Raises DataError when settings and rig cannot make a map.
+        """
+        self.mapper = Mapper(config, rig, one_camera)
+        self.held = False
+        self._depth = MonoDepth(config.mono_depth, rig) if one_camera else None
+        self._clock = clock
+
+    @property
+    def wants_frames(self) -> bool:
+        """Whether `add` has use for the frames between two keyframes."""
+        return self._depth is not None and not self.held
+
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Counters of the rooms that there are."""
+        depth = {} if self._depth is None else {"mono depth": dict(self._depth.counters)}
+        return {"map": dict(self.mapper.counters), **depth}
+
+    def restore(self, scans: Mapping[int, PackedScan], T_map_body: Array, held: bool) -> None:
+        """Take over the scans of an earlier run, by keyframe, at the poses [M, 4, 4] of keyframes 0..M-1."""
+        self.mapper.restore(dict(scans), dict(enumerate(T_map_body)))
+        self.held = held
+
+    def move(self, update: GraphUpdate) -> None:
+        """Follow corrected poses."""
+        with self._clock.measure("map move"):
+            self.mapper.move(update)
+        if self._depth is not None:
+            self._depth.move(update.ids, update.T_map_body)
+
+    def add(self, odometry: OdometryKeyframe, T_map_body: Array, seen: list[SeenFrame]) -> dict[int, PackedScan]:
+        """Take a keyframe at its pose [4, 4], and the frames before it; return the scans that came with it.
+
+        They are its own, and that of an earlier keyframe whose depth is done now.
+        """
+        if self.held:
+            return {}
+        keyframe = odometry.packet.keyframe
+        with self._clock.measure("map"):
+            self.mapper.add(keyframe, T_map_body)
+        changed = [keyframe.id]
+        if self._depth is not None:
+            with self._clock.measure("depth"):
+                late = self._depth.add(odometry, T_map_body, seen)
+            if late is not None:
+                changed.append(late.keyframe_id)
+                with self._clock.measure("map"):
+                    self.mapper.add_depth(late)
+        packed = {i: self.mapper.packed(i) for i in changed}
+        return {i: scan for i, scan in packed.items() if scan is not None}
+
+    def finish(self) -> None:
+        """Bring the map to exactly the newest poses."""
+        with self._clock.measure("map finish"):
+            self.mapper.finish()
