@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.batch.graph_cholesky import Factor
+from vislam.batch.graph_clusters import ClusteredSolver, Clusters
 from vislam.batch.graph_kernels import linearise_2d, linearise_3d, retract_2d, retract_3d
 from vislam.batch.graph_ordering import adjacency, minimum_degree
 from vislam.batch.graph_problem import PoseGraphProblem
@@ -46,6 +47,26 @@ def test_solutions_are_those_of_the_dense_matrix(n, m, d, seed, chain):
     rhs = rng.normal(size=(n, d))
     expected = np.linalg.solve(A, rhs.ravel()).reshape(n, d)
     assert np.allclose(factor.solve(rhs), expected, rtol=1e-9, atol=1e-11 * np.abs(expected).max())
+
+
+@given(st.integers(1, 80), st.integers(0, 60), st.sampled_from([1, 3, 6]), st.integers(1, 20), st.integers(0, 10**6))
+@settings(deadline=None, max_examples=40)
+def test_conjugate_gradients_solve_what_the_factor_does(n, m, d, size, seed):
+    rng = np.random.default_rng(seed)
+    ends = rng.integers(-1 if n > 1 else 0, n, (m, 2))
+    ends = np.concatenate([ends[ends[:, 0] != ends[:, 1]], np.column_stack([np.arange(n - 1), np.arange(1, n)])])
+    symbolic, diagonal, off, A = _system(rng, n, ends[:, 0].copy(), ends[:, 1].copy(), d)
+    clusters = Clusters(n, ends, size)
+    assert sorted(set(clusters.of.tolist())) == list(range(len(clusters.first)))
+    assert np.array_equal(clusters.of[clusters.first], np.arange(len(clusters.first)))
+    solver = ClusteredSolver(clusters, d, 1e-10)
+    turned = (solver.later_is_to != symbolic.later_is_to)[:, None, None]
+    motions = np.eye(d) + 0.2 * rng.normal(size=(n, d, d))
+    assert solver.factorise(diagonal, np.where(turned, off.transpose(0, 2, 1), off), motions)
+    rhs = rng.normal(size=(n, d))
+    assert np.allclose(A @ solver.solve(rhs).ravel(), rhs.ravel(), atol=1e-6)
+    assert solver.solve(0.0 * rhs).tolist() == (0.0 * rhs).tolist()
+    assert not solver.factorise(-diagonal, off, motions)
 
 
 def test_large_fronts_and_what_is_not_definite():

@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vislam.batch import graph_certificate, graph_structure
 from vislam.batch.graph_g2o import read_g2o
 from vislam.batch.graph_optimize import optimize_pose_graph
 from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.config import PoseGraphConfig
+from vislam.batch.graph_uncertainty import Uncertainty
+from vislam.batch.graph_worlds import simulate_graph
+from vislam.config import GraphWorldConfig, PoseGraphConfig
+from vislam.errors import UsageError
 from vislam.geometry import invert, se3_exp
 
 BEST = {  # chi2; gtsam's Levenberg-Marquardt from certified optima
@@ -62,7 +66,7 @@ def test_all_starts_and_methods_find_the_same_optimum(d):
     freedom = problem.tangent * (len(problem.edges) - len(problem.ids) + 1)
     assert 0.7 < first.costs[-1] / freedom < 1.4
     assert np.abs(first.poses - truth)[:, :d, d].max() < 1.0
-    for start in ("file", "odometry", "tree", "chordal"):
+    for start in ("file", "odometry", "tree", "chordal", *(["angles"] if d == 2 else [])):
         for method in ("lm", "dogleg"):
             again = optimize_pose_graph(problem, PoseGraphConfig(start=start, method=method))
             assert again.costs[-1] == pytest.approx(first.costs[-1], rel=1e-7)
@@ -95,8 +99,56 @@ def test_parts_are_anchored_each_and_fixed_poses_stay(d):
         assert solution.costs[-1] < apart.chi2(poses)
 
 
+@pytest.mark.parametrize("shape", ["torus", "manhattan"])
+def test_conjugate_gradients_find_the_same_optimum(shape):
+    problem = simulate_graph(shape, GraphWorldConfig(poses=1000, loops_per_pose=2.0)).problem
+    fixed = problem.fixed.copy()
+    fixed[[5, 120]] = True
+    edges = problem.edges
+    keep = np.all(edges < 700, axis=1) | np.all(edges > 700, axis=1)  # two parts and a lone pose
+    apart = replace(
+        problem, fixed=fixed, edges=edges[keep], measurements=problem.measurements[keep],
+        information=problem.information[keep],
+    )  # fmt: skip
+    for made in (problem, apart):
+        best = optimize_pose_graph(made)
+        for method in ("lm", "dogleg"):
+            other = optimize_pose_graph(made, PoseGraphConfig(equations="gradients", method=method))
+            assert other.converged
+            assert other.costs[-1] == pytest.approx(best.costs[-1], rel=1e-7)
+            assert np.abs(other.poses - best.poses).max() < 0.02
+    again = optimize_pose_graph(apart, PoseGraphConfig(equations="gradients", method="dogleg"))
+    assert again.poses.tobytes() == other.poses.tobytes()
+
+
+def test_what_needs_a_factor_says_so_where_it_is_too_large(monkeypatch):
+    problem = simulate_graph("torus", GraphWorldConfig(poses=300, loops_per_pose=4.0)).problem
+    for module in (graph_structure, graph_certificate):
+        monkeypatch.setattr(module, "FACTOR_MAX_BYTES", 100_000)
+    solution = optimize_pose_graph(problem)
+    assert solution.converged
+    certificate = graph_certificate.certify(problem, solution.poses)
+    assert not certificate.certified
+    assert "factor" in certificate.reason
+    with pytest.raises(UsageError, match="300 poses and 1499 edges"):
+        Uncertainty(problem, solution.poses)
+    with pytest.raises(UsageError, match="fills a factor"):
+        optimize_pose_graph(problem, PoseGraphConfig(robust="gnc"))
+
+
+def test_a_long_walk_in_the_plane_starts_from_angles():
+    made = simulate_graph("manhattan", GraphWorldConfig(poses=10_000))
+    solution = optimize_pose_graph(made.problem)
+    assert solution.start_name == "angles"  # the chordal relaxation fades over 10,000 poses
+    assert len(solution.costs) <= 7
+    freedom = 3 * (len(made.problem.edges) - 9_999)
+    assert 0.97 < solution.costs[-1] / freedom < 1.03
+
+
 def test_what_has_no_start_gets_one():
     problem, _ = world(3)
+    with pytest.raises(UsageError, match="in the plane"):
+        optimize_pose_graph(problem, PoseGraphConfig(start="angles"))
     poses = problem.poses.copy()
     poses[[0, 7, 8, 30]] = np.nan
     best = optimize_pose_graph(problem).costs[-1]

@@ -23,6 +23,7 @@ from vislam.batch.graph_optimize import without_edges
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_solver import levenberg_marquardt
 from vislam.batch.graph_structure import Structure
+from vislam.batch.graph_symbolic import FACTOR_MAX_BYTES
 from vislam.messages import Array
 
 _GAP = 1e-6  # of the cost: a solution so near to the proven bound is the minimum
@@ -71,6 +72,8 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
     if (fixed := _tied(problem)) > 0:
         return _unproven(chi2, f"{fixed} poses are fixed, two or more in one part; the proof is for free poses")
     graph = IsotropicGraph(problem, *isotropic_weights(problem))
+    if graph.factor_bytes > FACTOR_MAX_BYTES:
+        return _unproven(chi2, f"its factor takes {graph.factor_bytes / 1e9:.1f} GB, more than is allowed")
     at = graph.minimise(poses)
     cost, spectrum = graph.value(at), graph.spectrum(at)
     size = problem.dimension * len(poses)

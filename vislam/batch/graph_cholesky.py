@@ -32,6 +32,7 @@ class Factor:
     def __init__(self, symbolic: Symbolic, d: int) -> None:
         """Allocate the factor; nothing is allocated later but what a solution returns."""
         self.symbolic, self.d = symbolic, d
+        self.later_is_to = symbolic.later_is_to
         self._panels = np.empty(symbolic.blocks * d * d)
         self._stack = np.empty(symbolic.stack_size * d * d)
         self.node = np.empty(symbolic.count, dtype=np.int64)  # the pose at each place

@@ -17,8 +17,9 @@ from scipy.stats import chi2
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_solver import Progress, levenberg_marquardt
 from vislam.batch.graph_starts import odometry_start
-from vislam.batch.graph_structure import NormalEquations, Structure
+from vislam.batch.graph_structure import NormalEquations, Structure, adjoints
 from vislam.config import PoseGraphConfig
+from vislam.geometry import invert_many
 from vislam.messages import Array
 
 Mask = NDArray[np.bool_]
@@ -146,15 +147,17 @@ def _tested(
 ) -> tuple[Array, Array]:
     """Return squared Mahalanobis distances of edges not in the structure, and the log-density at distance zero."""
     k = problem.tangent
-    equations = NormalEquations(structure)
-    equations.linearise(poses, np.ones(len(structure.problem.edges)))
     factor = structure.factor(k)
-    if not factor.factorise(equations.damped(1e-9), equations.off):
+    equations = NormalEquations(structure, factor)
+    equations.linearise(poses, np.ones(len(structure.problem.edges)))
+    if not equations.factorise(1e-9):
         return np.full(len(edges), np.inf), np.full(len(edges), -np.inf)
     ends = problem.edges[edges]
     jacobians = np.empty((len(edges), 2, k, k))
     jacobians[:, 1] = np.eye(k)
-    jacobians[:, 0] = -_adjoints(poses[ends[:, 0]], poses[ends[:, 1]])  # with Jr(r) = I: false loops are far off
+    jacobians[:, 0] = -adjoints(
+        invert_many(poses[ends[:, 1]]) @ poses[ends[:, 0]]
+    )  # with Jr(r) = I: false loops are far off
     S = factor.edge_covariances(structure.index[ends], jacobians)
     information = problem.information[edges]
     floor = _LEAST_INFORMATION * np.einsum("eii->e", information)
@@ -162,24 +165,6 @@ def _tested(
     r = problem.residuals(poses)[edges]
     distance = np.einsum("ea,ea->e", r, np.linalg.solve(innovation, r[:, :, None])[:, :, 0])
     return distance, -0.5 * (np.linalg.slogdet(innovation)[1] + k * math.log(2.0 * math.pi))
-
-
-def _adjoints(T_from: Array, T_to: Array) -> Array:
-    """Return Ad of T_to^-1 @ T_from [M, k, k]."""
-    d = T_from.shape[1] - 1
-    turn = T_to[:, :d, :d].transpose(0, 2, 1)
-    R = turn @ T_from[:, :d, :d]
-    p = (turn @ (T_from[:, :d, d] - T_to[:, :d, d])[:, :, None])[:, :, 0]
-    if d == 2:
-        out = np.zeros((len(R), 3, 3))
-        out[:, 0, 0] = 1.0
-        out[:, 1, 0], out[:, 2, 0] = p[:, 1], -p[:, 0]
-        out[:, 1:, 1:] = R
-        return out
-    out = np.zeros((len(R), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = R
-    out[:, 3:, :3] = np.cross(p[:, None, :], R.transpose(0, 2, 1)).transpose(0, 2, 1)
-    return out
 
 
 def graduated_non_convexity(

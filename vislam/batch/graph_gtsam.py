@@ -55,7 +55,7 @@ def gtsam_levenberg_marquardt(
     except FAILURES as error:
         raise DataError(f"gtsam cannot optimise the graph ({str(error).splitlines()[0][:80]})") from error
     costs[-1] = problem.chi2(solved, weights)
-    return Descent(solved, tuple(costs), len(costs) - 1, len(costs) <= iterations)
+    return Descent(solved, tuple(costs), len(costs) <= iterations)
 
 
 def isam2_replay(
@@ -72,7 +72,7 @@ def isam2_replay(
         except FAILURES:
             continue
         cost = problem.chi2(solved, weights)
-        return Descent(solved, (problem.chi2(poses, weights), cost), len(problem.ids), True)
+        return Descent(solved, (problem.chi2(poses, weights), cost), True)
     raise DataError("iSAM2 cannot take the graph in the order of its ids; choose another method")
 
 

@@ -64,6 +64,11 @@ class IsotropicGraph:
         self._motions = _motions(d)
         self._free = np.arange(n)
 
+    @property
+    def factor_bytes(self) -> int:
+        """Memory that the largest of its factors takes."""
+        return self._symbolic.bytes(len(self._motions))
+
     def value(self, poses: Array) -> float:
         """Return the cost of poses [N, d + 1, d + 1]."""
         return float(np.einsum("eab,eab,eb->", E := self._residuals(poses), E, self._D))

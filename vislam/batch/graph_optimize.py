@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from vislam.batch.graph_problem import Ids, PoseGraphProblem
 from vislam.batch.graph_solver import Descent, Progress, dogleg, levenberg_marquardt
-from vislam.batch.graph_starts import chordal_start, file_start, odometry_start, tree_start
+from vislam.batch.graph_starts import angles_start, chordal_start, file_start, odometry_start, tree_start
 from vislam.batch.graph_structure import Structure
 from vislam.config import PoseGraphConfig
-from vislam.errors import DataError
+from vislam.errors import DataError, UsageError
 from vislam.messages import Array
 
 
@@ -46,17 +46,18 @@ def optimize_pose_graph(
     """Return the poses of lowest chi2 (see `PoseGraphProblem`) that the method finds from the chosen start.
 
     One pose of each connected part keeps its value, fixed poses all do. Deterministic. Raises DataError when the graph
-    has no finite cost anywhere or the method fails.
+    has no finite cost anywhere or the method fails, UsageError for a start that the graph cannot have, and where the
+    search for false edges needs a factor that does not fit.
     """
     config = config or PoseGraphConfig()
     begun = time.process_time()
-    structure = Structure(problem)
+    structure = Structure(problem, config.equations)
     weights = np.ones(len(problem.edges))
     if config.robust == "gnc":
         from vislam.batch.graph_gnc import reject_false_edges
 
         weights = reject_false_edges(structure, config, progress)
-        structure = Structure(without_edges(problem, weights == 0.0))
+        structure = Structure(without_edges(problem, weights == 0.0), config.equations)
     start_name, start, start_costs = _start(structure, config)
     descent = _descend(structure, start, config, progress)
     parts = structure.parts
@@ -88,10 +89,15 @@ def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, d
     ones = np.ones(len(problem.edges))
     makers: dict[str, Callable[[], Array]] = {
         "chordal": lambda: chordal_start(structure, ones),
+        "angles": lambda: angles_start(structure, ones),
         "tree": lambda: tree_start(problem, structure.anchors),
         "odometry": lambda: odometry_start(problem, structure.anchors),
         "file": lambda: file_start(problem),
     }
+    if problem.dimension == 3:
+        del makers["angles"]
+    if config.start != "auto" and config.start not in makers:
+        raise UsageError(f"start '{config.start}' is for graphs in the plane; for this one: {', '.join(makers)}")
     if config.start != "auto":
         makers = {config.start: makers[config.start]}
     elif not problem.has_pose.any():

@@ -23,7 +23,6 @@ class Descent:
 
     poses: Array  # [N, d + 1, d + 1]
     costs: tuple[float, ...]  # at the start and after each iteration
-    factorisations: int
     converged: bool  # False: the limit of iterations, or no step that lowers the cost
 
 
@@ -40,18 +39,15 @@ def levenberg_marquardt(
 
     It ends when the decrease still to come, extrapolated from the last two, is below `tolerance` of the cost.
     """
-    equations = NormalEquations(structure)
-    factor = structure.factor(structure.problem.tangent)
+    equations = NormalEquations(structure, structure.solver(structure.problem.tangent))
     poses, candidate = poses.copy(), np.empty_like(poses)
     cost = equations.linearise(poses, weights)
-    costs, damping, tried, last_gain = [cost], 0.0, 0, 0.0
+    costs, damping, last_gain = [cost], 0.0, 0.0
     converged = not len(structure.free)
     while len(costs) <= iterations and not converged:
         while damping <= _DAMPING_MAX:
-            tried += 1
-            if factor.factorise(equations.damped(damping), equations.off):
-                step = factor.solve(-equations.gradient)
-                equations.retract(poses, step, candidate)
+            if equations.factorise(damping):
+                equations.retract(poses, equations.step(), candidate)
                 cost = structure.problem.chi2(candidate, weights)
                 if cost <= costs[-1] * (1.0 + 1e-12):
                     break
@@ -69,7 +65,7 @@ def levenberg_marquardt(
         damping = 0.0 if damping <= _DAMPING_FIRST else 0.1 * damping
         if not converged:
             equations.linearise(poses, weights)
-    return Descent(poses, tuple(costs), tried, converged)
+    return Descent(poses, tuple(costs), converged)
 
 
 def dogleg(
@@ -86,20 +82,17 @@ def dogleg(
     A rejected step costs no factorisation. Rosen, Kaess, Leonard, "RISE", T-RO 2014, section III. It ends as
     `levenberg_marquardt` does.
     """
-    equations = NormalEquations(structure)
-    factor = structure.factor(structure.problem.tangent)
+    equations = NormalEquations(structure, structure.solver(structure.problem.tangent))
     poses, candidate = poses.copy(), np.empty_like(poses)
     cost = equations.linearise(poses, weights)
-    costs, tried, radius, last_gain = [cost], 0, np.inf, 0.0
+    costs, radius, last_gain = [cost], np.inf, 0.0
     converged = not len(structure.free)
     while len(costs) <= iterations and not converged:
         gradient = equations.gradient
-        tried += 1
         damping = 0.0
-        while not factor.factorise(equations.damped(damping), equations.off) and damping <= _DAMPING_MAX:
+        while not equations.factorise(damping) and damping <= _DAMPING_MAX:
             damping = max(_DAMPING_FIRST, 10.0 * damping)
-            tried += 1
-        newton = factor.solve(-gradient)
+        newton = equations.step()
         slope, curvature = float(np.sum(gradient**2)), equations.curvature(gradient)
         descent = -gradient * (slope / max(curvature, 1e-300))
         radius = min(radius, float(np.linalg.norm(newton)))
@@ -128,7 +121,7 @@ def dogleg(
         last_gain = gain
         if not converged:
             equations.linearise(poses, weights)
-    return Descent(poses, tuple(costs), tried, converged)
+    return Descent(poses, tuple(costs), converged)
 
 
 def _dogleg_step(newton: Array, descent: Array, radius: float) -> Array:

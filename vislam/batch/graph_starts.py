@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vislam.batch.graph_clusters import ClusteredSolver
 from vislam.batch.graph_ordering import Ints
+from vislam.batch.graph_parts import poses_from_angles
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_structure import Structure
 from vislam.messages import Array
 
 Mask = NDArray[np.bool_]
+
+_TOLERANCE = 1e-4  # of the relaxations' solutions, where these are found by conjugate gradients
 
 
 def file_start(problem: PoseGraphProblem) -> Array:
@@ -63,6 +68,27 @@ def chordal_start(structure: Structure, weights: Array) -> Array:
     return poses
 
 
+def angles_start(structure: Structure, weights: Array) -> Array:
+    """Return poses in the plane by linear angles, made unique along a spanning tree of few edges, then positions.
+
+    In large graphs the chordal relaxation fades: matrices far from the anchor shrink as their measurements contradict
+    each other. Angles do not; they need cycles whose errors are below half a turn. Carlone, Aragues, Castellanos, Bona,
+    "A fast and accurate approximation for planar pose graph optimization", IJRR 2014.
+    """
+    problem, ends, n = structure.problem, structure.ends, len(structure.free)
+    rotation_weight, translation_weight = _isotropic(problem, weights)
+    poses = tree_start(problem, structure.anchors)
+    R, Z = poses[:, :2, :2], problem.measurements[:, :2, :2]
+    missed = Z.transpose(0, 2, 1) @ R[problem.edges[:, 0]].transpose(0, 2, 1) @ R[problem.edges[:, 1]]
+    pull = rotation_weight * np.arctan2(missed[:, 1, 0], missed[:, 0, 0])
+    rhs = _gathered(ends[:, 0], pull, n) - _gathered(ends[:, 1], pull, n)
+    total = _per_pose(ends, rotation_weight, n)
+    turn = _solve(structure, 1, total, -rotation_weight[:, None, None], rhs[:, None, None], lambda: np.ones((n, 1, 1)))
+    poses[structure.free] = poses_from_angles(np.zeros((n, 2)), turn[:, 0, 0]) @ poses[structure.free]
+    _place(structure, translation_weight, poses)
+    return poses
+
+
 def _relax(structure: Structure, weights: Array, motions: Array, known: Array) -> Array:
     """Return X [n, d, C] of the free poses that minimises the sum of weight |X_to - motion @ X_from|^2."""
     problem, ends = structure.problem, structure.ends
@@ -74,7 +100,7 @@ def _relax(structure: Structure, weights: Array, motions: Array, known: Array) -
     np.add.at(rhs, ends[from_held, 1], scaled[from_held] @ known[problem.edges[from_held, 0]])
     to_held = np.flatnonzero((ends[:, 1] < 0) & (ends[:, 0] >= 0))
     np.add.at(rhs, ends[to_held, 0], scaled[to_held].transpose(0, 2, 1) @ known[problem.edges[to_held, 1]])
-    return _solve(structure, d, total, -scaled, rhs)
+    return _solve(structure, d, total, -scaled, rhs, lambda: _carried(structure, motions))
 
 
 def _place(structure: Structure, weights: Array, poses: Array) -> None:
@@ -87,31 +113,57 @@ def _place(structure: Structure, weights: Array, poses: Array) -> None:
     anchored = weights[:, None, None] * poses[:, :d, d][problem.edges]  # [E, 2, d]
     rhs = np.zeros((n, d))
     for end, sign in ((1, 1.0), (0, -1.0)):
-        here = ends[:, end] >= 0
         terms = sign * moved
         held = ends[:, 1 - end] < 0
         terms[held] += anchored[held, 1 - end]
         for c in range(d):
-            rhs[:, c] += np.bincount(ends[here, end], terms[here, c], n)
-    solved = _solve(structure, 1, total, -weights[:, None, None], rhs[:, None, :])
+            rhs[:, c] += _gathered(ends[:, end], terms[:, c], n)
+    solved = _solve(structure, 1, total, -weights[:, None, None], rhs[:, None, :], lambda: np.ones((n, 1, 1)))
     poses[structure.free, :d, d] = solved[:, 0]
 
 
 def _per_pose(ends: Ints, weights: Array, n: int) -> Array:
     """Return the sum [n] of the weights of the edges at each free pose."""
-    both = np.concatenate([ends[:, 0], ends[:, 1]])
-    return np.bincount(both[both >= 0], np.tile(weights, 2)[both >= 0], n).astype(np.float64)
+    return _gathered(ends[:, 0], weights, n) + _gathered(ends[:, 1], weights, n)
 
 
-def _solve(structure: Structure, d: int, total: Array, blocks: Array, rhs: Array) -> Array:
-    """Return the solution [n, d, C] of equations with `total` [n] on the diagonal."""
-    factor = structure.factor(d)
-    off = np.ascontiguousarray(structure.directed(blocks))
+def _gathered(at: Ints, terms: Array, n: int) -> Array:
+    """Return the sums [n] of terms [E] at free poses; -1 stands for one that is not free."""
+    here = at >= 0
+    return np.bincount(at[here], terms[here], n).astype(np.float64)
+
+
+def _carried(structure: Structure, motions: Array) -> Array:
+    """Return products [n, d, d] of motions [E, d, d], chained to each pose from the first one of its cluster."""
+    problem, clusters, d = structure.problem, structure.clusters, motions.shape[1]
+    cluster = np.full(len(problem.ids), -1, dtype=np.int64)
+    cluster[structure.free] = clusters.of
+    inside = (structure.ends >= 0).all(axis=1) & (cluster[problem.edges[:, 0]] == cluster[problem.edges[:, 1]])
+    back = np.tile(np.eye(d + 1), (int(inside.sum()), 1, 1))  # products grow on the left: of the transposed ones
+    back[:, :d, :d] = motions[inside].transpose(0, 2, 1)
+    poses = np.tile(np.eye(d + 1), (len(cluster), 1, 1))
+    reached = _mask(problem, structure.free[clusters.first])
+    _chain(problem.edges[inside], back, np.zeros(len(back), dtype=np.bool_), reached, poses)
+    return np.ascontiguousarray(poses[structure.free, :d, :d].transpose(0, 2, 1))
+
+
+def _solve(
+    structure: Structure, d: int, total: Array, blocks: Array, rhs: Array, motions: Callable[[], Array]
+) -> Array:
+    """Return the solution [n, d, C] of equations with `total` [n] on the diagonal, `blocks` [E, d, d] (to, from).
+
+    `motions` gives what a motion of a pose's cluster is as one of the pose [n, d, d].
+    """
+    solver = structure.solver(d, _TOLERANCE)
+    # the block of the later pose's columns: where that is `from`, the transposed one
+    off = np.ascontiguousarray(np.where(solver.later_is_to[:, None, None], blocks.transpose(0, 2, 1), blocks))
     floor = 1e-9 * total.max(initial=1e-300)  # poses without information stay where they are put
     diagonal = np.maximum(total, floor)[:, None, None] * ((1.0 + 1e-12) * np.eye(d))
-    if not factor.factorise(diagonal, off):
-        factor.factorise(diagonal * (1.0 + 1e-6), off)
-    return np.stack([factor.solve(np.ascontiguousarray(rhs[:, :, c])) for c in range(rhs.shape[2])], axis=2)
+    if isinstance(solver, ClusteredSolver):
+        solver.factorise(diagonal * (1.0 + 1e-9), off, motions())
+    elif not solver.factorise(diagonal, off):
+        solver.factorise(diagonal * (1.0 + 1e-6), off)
+    return np.stack([solver.solve(np.ascontiguousarray(rhs[:, :, c])) for c in range(rhs.shape[2])], axis=2)
 
 
 def _isotropic(problem: PoseGraphProblem, weights: Array) -> tuple[Array, Array]:

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Literal
+
 import numpy as np
 
 from vislam.batch.graph_cholesky import Factor
+from vislam.batch.graph_clusters import ClusteredSolver, Clusters
 from vislam.batch.graph_kernels import linearise_2d, linearise_3d, retract_2d, retract_3d
 from vislam.batch.graph_problem import Ids, PoseGraphProblem
-from vislam.batch.graph_symbolic import analyse
+from vislam.batch.graph_symbolic import FACTOR_MAX_BYTES, analyse
+from vislam.errors import UsageError
+from vislam.geometry import invert_many
 from vislam.messages import Array
+
+_WORK_PER_EDGE = 40_000  # multiplications over the size of a block, from which on conjugate gradients are faster
+_STEP_TOLERANCE = 1e-3  # of a Newton step: what is missing of it costs the square of that
+
+Equations = Literal["auto", "cholesky", "gradients"]
 
 
 class Structure:
-    """The anchors of a problem, its free poses, and the elimination that all its linear systems share."""
+    """The anchors of a problem, its free poses, and the elimination or clusters that all its linear systems share."""
 
-    def __init__(self, problem: PoseGraphProblem) -> None:
-        """Analyse the graph; the values of its measurements do not matter here."""
+    def __init__(self, problem: PoseGraphProblem, equations: Equations = "auto") -> None:
+        """Analyse the graph; the values of its measurements do not matter here.
+
+        `equations`: "cholesky" factorises whatever the factor takes, "gradients" never does, "auto" does where the
+        factor is small.
+        """
         self.problem = problem
+        self._equations = equations
         labels = problem.components()
         self.parts = int(labels.max(initial=-1)) + 1
         self.anchors = problem.anchors_of(labels)
@@ -29,23 +45,41 @@ class Structure:
         self.symbolic = analyse(len(self.free), *np.ascontiguousarray(self.ends.T))
 
     def factor(self, d: int) -> Factor:
-        """Return a factor for blocks of size d."""
+        """Return a factor for blocks of size d. Raises UsageError where it does not fit into memory."""
+        needed = self.symbolic.bytes(d)
+        if needed > FACTOR_MAX_BYTES and self._equations != "cholesky":
+            raise UsageError(
+                f"the graph of {len(self.problem.ids)} poses and {len(self.problem.edges)} edges fills a factor of "
+                f"{needed / 1e9:.1f} GB; covariances and the search for false edges need it to fit "
+                f"{FACTOR_MAX_BYTES / 1e9:.1f} GB: leave edges out, or these"
+            )
         return Factor(self.symbolic, d)
 
-    def directed(self, blocks: Array) -> Array:
-        """Return what `Factor` takes as off-diagonal, from the blocks [E, d, d] of rows `to` and columns `from`.
+    def solver(self, d: int, tolerance: float = _STEP_TOLERANCE) -> Factor | ClusteredSolver:
+        """Return what solves systems with blocks of size d, to a relative tolerance where it is not a factor."""
+        if self.is_clustered(d):
+            return ClusteredSolver(self.clusters, d, tolerance)
+        return self.factor(d)
 
-        Where the pose `from` is the later one, the block there is the transposed one.
-        """
-        return np.where(self.symbolic.later_is_to[:, None, None], blocks.transpose(0, 2, 1), blocks)
+    def is_clustered(self, d: int) -> bool:
+        """Return whether systems with blocks of size d are solved by conjugate gradients."""
+        if self._equations != "auto":
+            return self._equations == "gradients"
+        slow = self.symbolic.work * d > _WORK_PER_EDGE * len(self.problem.edges)
+        return slow or self.symbolic.bytes(d) > FACTOR_MAX_BYTES
+
+    @cached_property
+    def clusters(self) -> Clusters:
+        """The poses in clusters, for conjugate gradients."""
+        return Clusters(len(self.free), self.ends)
 
 
 class NormalEquations:
     """The normal equations of a problem at some poses, in blocks: H = J^T W J and the gradient J^T W r."""
 
-    def __init__(self, structure: Structure) -> None:
-        """Allocate room for them."""
-        self._structure = structure
+    def __init__(self, structure: Structure, solver: Factor | ClusteredSolver) -> None:
+        """Allocate room for them; `solver` is one of the structure's, for blocks of the tangents' size."""
+        self._structure, self._solver = structure, solver
         n, k, m = len(structure.free), structure.problem.tangent, len(structure.problem.edges)
         self.diagonal = np.zeros((n, k, k))
         self.off = np.zeros((m, k, k))
@@ -57,11 +91,25 @@ class NormalEquations:
         """Form the equations at poses [N, d + 1, d + 1]; `weights` [E] multiply the edges. Return the cost."""
         s = self._structure
         p = s.problem
+        self._poses = poses
         cost: float = self._linearise(
-            p.edges, s.index, s.symbolic.later_is_to, poses, p.measurements, p.information, weights,
+            p.edges, s.index, self._solver.later_is_to, poses, p.measurements, p.information, weights,
             self.diagonal, self.off, self.gradient,
         )  # fmt: skip
         return cost
+
+    def factorise(self, damping: float) -> bool:
+        """Prepare to solve the equations, damped; False where they are not positive definite."""
+        diagonal = self.damped(damping)
+        if isinstance(self._solver, Factor):
+            return self._solver.factorise(diagonal, self.off)
+        clusters, at = self._structure.clusters, self._poses[self._structure.free]
+        motions = adjoints(invert_many(at) @ at[clusters.first[clusters.of]])
+        return self._solver.factorise(diagonal, self.off, motions)
+
+    def step(self) -> Array:
+        """Return the Newton step [n, k] of the equations as last prepared."""
+        return self._solver.solve(-self.gradient)
 
     def damped(self, damping: float) -> Array:
         """Return the diagonal blocks [n, k, k], their diagonals enlarged by this share of themselves (Marquardt)."""
@@ -79,11 +127,26 @@ class NormalEquations:
         s = self._structure
         total = float(np.einsum("na,nab,nb->", step, self.diagonal, step, optimize=True))
         both = np.flatnonzero((s.ends >= 0).all(axis=1))
-        later = np.where(s.symbolic.later_is_to[both], s.ends[both, 1], s.ends[both, 0])
-        earlier = np.where(s.symbolic.later_is_to[both], s.ends[both, 0], s.ends[both, 1])
+        to = self._solver.later_is_to[both]
+        later, earlier = np.where(to, s.ends[both, 1], s.ends[both, 0]), np.where(to, s.ends[both, 0], s.ends[both, 1])
         cross = np.einsum("eb,eba,ea->", step[earlier], self.off[both], step[later], optimize=True)
         return total + 2.0 * float(cross)
 
     def retract(self, poses: Array, step: Array, out: Array) -> None:
         """Write poses @ Exp(step) into out; step [n, k] is of the free poses."""
         self._retract(poses, self._structure.free, step, out)
+
+
+def adjoints(T: Array) -> Array:
+    """Return the adjoints [M, k, k] of poses [M, d + 1, d + 1]."""
+    d = T.shape[1] - 1
+    turn = 3 * (d - 1) - d
+    out = np.zeros((len(T), turn + d, turn + d))
+    out[:, turn:, turn:] = T[:, :d, :d]
+    if d == 2:
+        out[:, 0, 0] = 1.0
+        out[:, 1, 0], out[:, 2, 0] = T[:, 1, 2], -T[:, 0, 2]
+        return out
+    out[:, :3, :3] = T[:, :3, :3]
+    out[:, 3:, :3] = np.cross(T[:, None, :3, 3], T[:, :3, :3], axisa=2, axisb=1, axisc=1)
+    return out

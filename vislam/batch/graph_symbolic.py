@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vislam.batch.graph_ordering import Ints, adjacency, minimum_degree
 
 _NONE = -1
+FACTOR_MAX_BYTES = 1_500_000_000  # beyond, graphs of 100,000 poses would not be solved within 4 GB
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +41,16 @@ class Symbolic:
     def blocks(self) -> int:
         """Blocks that the factor has, those beneath and above the diagonal of pivots counted alike."""
         return int(self.panel_begin[-1])
+
+    @property
+    def work(self) -> float:
+        """Products of blocks that a factorisation takes, about."""
+        width, below = np.diff(self.first).astype(np.float64), np.diff(self.row_begin)
+        return float(np.dot(width, (width + below) ** 2))
+
+    def bytes(self, d: int) -> int:
+        """Return the memory that a factor with blocks of size d takes."""
+        return 8 * d * d * (self.blocks + self.stack_size)
 
 
 def analyse(count: int, a: Ints, b: Ints) -> Symbolic:

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from vislam.batch.graph_cholesky import Factor
 from vislam.batch.graph_optimize import without_edges
 from vislam.batch.graph_problem import Ids, PoseGraphProblem
-from vislam.batch.graph_structure import NormalEquations, Structure
+from vislam.batch.graph_structure import NormalEquations, Structure, adjoints
 from vislam.errors import DataError, UsageError
 from vislam.geometry import invert_many
 from vislam.messages import Array
@@ -27,15 +27,15 @@ class Uncertainty:
     def __init__(self, problem: PoseGraphProblem, poses: Array, weights: Array | None = None) -> None:
         """Factorise at poses [N, d + 1, d + 1]; edges with `weights` [E] of 0 (rejected ones) do not count.
 
-        Raises DataError where the measurements leave a pose undetermined.
+        Raises DataError where the measurements leave a pose undetermined, UsageError where the factor is too large.
         """
         self._problem = problem if weights is None else without_edges(problem, weights == 0.0)
         self._poses = np.ascontiguousarray(poses, dtype=np.float64)
         self._structure = Structure(self._problem)
-        equations = NormalEquations(self._structure)
+        self._factor = self._structure.factor(problem.tangent)
+        equations = NormalEquations(self._structure, self._factor)
         equations.linearise(self._poses, np.ones(len(self._problem.edges)))
-        self._factor = Factor(self._structure.symbolic, problem.tangent)
-        if not self._factor.factorise(equations.diagonal, equations.off):
+        if not equations.factorise(0.0):
             raise DataError(
                 "the measurements leave a pose undetermined, so there is no covariance; give its edges more"
             )
@@ -62,7 +62,7 @@ class Uncertainty:
             i, j = self._problem.ids[at[apart[0]]].tolist()
             raise UsageError(f"no measurements connect the poses {i} and {j}; their relative motion is unknown")
         between = invert_many(self._poses[at[:, 1]]) @ self._poses[at[:, 0]]
-        A = -_adjoints(between)
+        A = -adjoints(between)
         out = np.empty((len(at), self._problem.tangent, self._problem.tangent))
         for m, (i, j) in enumerate(at.tolist()):
             of_i, of_j = self._column(i), self._column(j)
@@ -146,18 +146,3 @@ def inverse_diagonal(factor: Factor) -> Array:
 
 def _symmetric(W: Array) -> Array:
     return 0.5 * (W + W.transpose(0, 2, 1))
-
-
-def _adjoints(T: Array) -> Array:
-    """Return the adjoints [M, k, k] of poses [M, d + 1, d + 1]."""
-    d = T.shape[1] - 1
-    turn = 3 * (d - 1) - d
-    out = np.zeros((len(T), turn + d, turn + d))
-    out[:, turn:, turn:] = T[:, :d, :d]
-    if d == 2:
-        out[:, 0, 0] = 1.0
-        out[:, 1, 0], out[:, 2, 0] = T[:, 1, 2], -T[:, 0, 2]
-        return out
-    out[:, :3, :3] = T[:, :3, :3]
-    out[:, 3:, :3] = np.cross(T[:, None, :3, 3], T[:, :3, :3], axisa=2, axisb=1, axisc=1)
-    return out

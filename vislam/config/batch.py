@@ -30,8 +30,9 @@ class BatchConfig:
 class PoseGraphConfig:
     """Optimisation of a pose graph from a file."""
 
-    start: Literal["auto", "file", "odometry", "tree", "chordal"] = "auto"  # auto: the one of lowest cost
+    start: Literal["auto", "file", "odometry", "tree", "chordal", "angles"] = "auto"  # auto: the one of lowest cost
     method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
+    equations: Literal["auto", "cholesky", "gradients"] = "auto"  # conjugate gradients where a factor would be large
     robust: Literal["none", "gnc"] = "none"  # gnc: edges that do not join successive ids may be rejected
     iterations: int = 100  # most of them; 3 to 8 as a rule
     tolerance: float = 1e-9  # of the cost: the decrease still to come at which to end
