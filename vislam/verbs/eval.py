@@ -67,8 +67,10 @@ def _evaluate(options: EvalOptions) -> dict[str, dict[str, Any]]:
         paths = {p.stem.removeprefix("trajectory_"): p for p in sorted(estimate.glob("trajectory_*.tum"))}
         truth = paths.pop("truth", None)
         reference = reference or truth
+    if not estimate.exists():
+        raise DataError(f"{estimate} does not exist; give a run folder or a trajectory file")
     if reference is None:
-        raise UsageError("no reference to evaluate against; give --reference FILE")
+        raise UsageError(f"{estimate} brings no truth to be evaluated against; give --reference FILE")
     if not paths:
         raise DataError(f"{estimate} holds no trajectory_*.tum; give a run folder or a trajectory file")
     true = read_trajectory(reference)
