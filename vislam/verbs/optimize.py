@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
@@ -63,8 +64,9 @@ class JoinOptions:
 
 def main(arguments: list[str]) -> int:
     """Optimise what the arguments name: a run, a pose-graph file, or several sessions."""
+    folders = [a for a in takewhile(lambda a: not a.startswith("-"), arguments) if Path(a).is_dir()]
     sessions = [a for a in arguments if (Path(a) / "session.db").is_file() or Path(a).name == "session.db"]
-    if len(sessions) > 1 or (sessions and any(a.partition("=")[0] == "--out" for a in arguments)):
+    if len(folders) > 1 or len(sessions) > 1 or (sessions and any(a.partition("=")[0] == "--out" for a in arguments)):
         return _join_sessions(parse(JoinOptions, arguments, "optimize"))
     if any(Path(argument).is_file() or argument.endswith(".g2o") for argument in arguments):
         return _optimize_graph(parse(OptimizeGraphOptions, arguments, "optimize"))
