@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -117,6 +117,23 @@ def test_the_filter_knows_its_error() -> None:
         squares.append(off @ np.linalg.solve(P + 1e-8 * np.eye(3), off) / 3.0)
     print(f"NEES of position per degree of freedom {np.mean(squares):.2f}")
     assert np.mean(squares) < 3.0
+
+
+def test_a_height_told_wrong_is_within_what_the_filter_says() -> None:
+    """Nothing on board shows the height: what a tape may be off stays an error of scale, and the filter says so."""
+    made, _, _ = driven()
+    told = from_data({"frontend": {"planar": {"height_m": 1.01 * HEIGHT_M, "height_sigma_m": 0.01 * HEIGHT_M}}}, "test")
+    _, steps = run(made, replace(told, frontend=replace(told.frontend, described_features=50)))
+    first, last = (s.state for s in (next(s for s in steps if s.state is not None), steps[-1]))
+    begin, end = (made.T_world_body[i] for i in (len(steps) - sum(s.state is not None for s in steps), len(steps) - 1))
+    assert first is not None and last is not None
+    way = np.linalg.norm(end[:2, 3] - begin[:2, 3])
+    seen = last.T_world_body[:3, 3] - first.T_world_body[:3, 3]
+    along = seen / np.linalg.norm(seen)
+    off_m, sigma_m = np.linalg.norm(seen) - way, np.sqrt(along @ last.covariance[3:6, 3:6] @ along)
+    print(f"{off_m * 1e3:.1f} mm too long after {way:.2f} m, sigma {sigma_m * 1e3:.1f} mm")
+    assert 0.007 * way < off_m < 0.015 * way
+    assert 0.5 < off_m / sigma_m < 1.5
 
 
 def test_it_stays_where_it_stands() -> None:

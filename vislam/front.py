@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
 from vislam.camera import Rig
 from vislam.clock import StageClock
-from vislam.config import Config
+from vislam.config import Config, EkfConfig
 from vislam.ekf import CameraCalibration, Correction, Ekf, Hint, MsckfEkf, make_ekf
 from vislam.errors import TrackingLostError, UsageError
-from vislam.frontend import TrackResult, make_frontend
+from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
 from vislam.frontend.planar import PlanarFrontEnd
@@ -127,9 +128,7 @@ class Front:
                 self.ekf_coupling = "tight" if self.frontend.mode == "mono" else "loose"
             if config.ekf.nonholonomic and self.ekf_coupling == "tight":
                 raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
-            readout_s = config.ekf.tight_readout_s
-            readout_s = config.frontend.readout_s if readout_s is None else readout_s
-            ekf_config = replace(config.ekf, coupling=self.ekf_coupling, tight_readout_s=readout_s)
+            ekf_config = _ekf_config(config, self.ekf_coupling, rig)
             self._make_ekf = partial(make_ekf, ekf_config, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
             self._ekf = self._make_ekf(noise=noise)
         self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
@@ -222,9 +221,9 @@ class Front:
             return True
         newest = self._buffer.newest_t_ns
         waited_s = (newest_frame_t_ns - frame_t_ns) * 1e-9
-        return (
-            newest is not None and newest > frame_t_ns + self.camera_clock.applied_ns
-        ) or waited_s > self._config.imu.max_wait_s
+        offset_ns = self.camera_clock.offset_ns(frame_t_ns)
+        most_s = self._config.imu.max_wait_s + max(offset_ns, 0) * 1e-9
+        return (newest is not None and newest > frame_t_ns + offset_ns) or waited_s > most_s
 
     def process(self, frame: Frame) -> FrontStep:
         """Track one frame, update the filter with it, and hand over keyframes that are ready."""
@@ -284,7 +283,10 @@ class Front:
     @property
     def calibration(self) -> dict[str, float]:
         """What was learned of the camera, with standard deviations: its clock, and over a floor its mount."""
-        clock = {"camera_offset_s": self.camera_clock.applied_s, "camera_offset_sigma_s": self.camera_clock.sigma_s}
+        told = self.camera_clock
+        clock = {"camera_offset_s": told.applied_s, "camera_offset_sigma_s": told.sigma_s}
+        if told.drift_sigma > 0.0:
+            clock |= {"camera_drift": told.drift, "camera_drift_sigma": told.drift_sigma}
         mount = self.frontend.calibration if isinstance(self.frontend, PlanarFrontEnd) else {}
         return {**(clock if self._has_imu else {}), **mount}
 
@@ -534,3 +536,11 @@ class Front:
         released = self._release(self._T_upright)
         self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
         return released
+
+
+def _ekf_config(config: Config, coupling: Literal["loose", "tight"], rig: Rig) -> EkfConfig:
+    """Return the settings of the filter with what the camera's settings say for it."""
+    readout_s = config.ekf.tight_readout_s
+    readout_s = config.frontend.readout_s if readout_s is None else readout_s
+    scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
+    return replace(config.ekf, coupling=coupling, tight_readout_s=readout_s, scale_sigma=scale_sigma)

@@ -18,7 +18,7 @@ from vislam.clock import StageClock
 from vislam.config import Config
 from vislam.errors import UsageError
 from vislam.front import Front, FrontStep
-from vislam.frontend import mode_for
+from vislam.frontend import lasting_scale_sigma, mode_for
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from vislam.loop.detector import LoopDetector
@@ -98,7 +98,9 @@ class Back:
         has_gravity = first_state is not None
         readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
         window = replace(config.window, readout_s=readout_s)
-        self.graph = PoseGraph(config.graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, window)
+        scale_sigma = float(np.hypot(config.graph.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
+        graph = replace(config.graph, scale_sigma=scale_sigma)
+        self.graph = PoseGraph(graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, window)
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self._false = None

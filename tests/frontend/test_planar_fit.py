@@ -130,11 +130,11 @@ def test_without_motion_nothing_is_learnt_of_scale() -> None:
     points = pair(np.zeros(3), np.zeros(4), noise_px=0.2)
     fit = joint_fit(points, points.usable(5.0), np.zeros(3), 0.3, 3.0, PRIOR, HEAVE_M)
     assert np.sqrt(fit.covariance[4, 4]) > 0.9 * np.sqrt(PRIOR[1, 1])
-    assert scale_sigma(fit, 0.003, np.eye(2)) == 0.003
+    assert scale_sigma(fit, np.eye(2)) == 0.0
     moved = pair(np.array([0.0, 0.4, 0.0]), np.zeros(4), noise_px=0.2)
     far = joint_fit(moved, moved.usable(5.0), np.array([0.0, 0.4, 0.0]), 0.3, 3.0, PRIOR, HEAVE_M)
     assert np.sqrt(far.covariance[4, 4]) < 0.5 * np.sqrt(PRIOR[1, 1])
-    half_degree = scale_sigma(far, 0.0, np.eye(2) * np.deg2rad(0.5) ** 2)
+    half_degree = scale_sigma(far, np.eye(2) * np.deg2rad(0.5) ** 2)
     assert 0.01 < half_degree < 0.05  # 2.5 % is the rule of thumb
 
 

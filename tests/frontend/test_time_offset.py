@@ -124,3 +124,32 @@ def test_a_real_camera_with_shifted_stamps(data_root, mode: str, offset_s: float
     # stereo sees this recording's own clock 1 ms off; mono, with another set of points, 0.3 ms
     assert abs(found.applied_s - offset_s) < 2e-3
     assert found.estimate.sigma_s < 1.5e-3
+
+
+def with_drift(start: Start, drift: float) -> Start:
+    """Stamp the frames of a start with a clock that runs too fast by this rate."""
+    begin = start.frames[0][0].t_ns
+    start.frames[:] = [
+        (replace(vo, t_ns=begin + round((vo.t_ns - begin) * (1.0 + drift))), *rest) for vo, *rest in start.frames
+    ]
+    return start
+
+
+@pytest.mark.parametrize("drift", [0.02, -0.02, 0.0])
+def test_a_clock_of_its_own_is_followed(drift: float) -> None:
+    """Delay and drift together: after 20 s the stamps would be off by 0.4 s."""
+    for seed in range(3):
+        start = with_drift(Start("moving", seed, offset_s=0.03, duration_s=20.0), drift)
+        begin = start.frames[0][0].t_ns
+        clock, stamps = follow(start, InitConfig(clock_drift=True))
+        true_ns = [begin + (vo.t_ns - begin) / (1.0 + drift) + 0.03 * NS for vo, _, _ in start.frames[: len(stamps)]]
+        off_ms = (np.array(stamps) - true_ns)[len(stamps) // 2 :] * 1e-6
+        print(f"{drift}, seed {seed}: off by {np.abs(off_ms).max():.1f} ms, drift {clock.drift:.4f}")
+        assert np.diff(stamps).min() > 0
+        assert np.abs(off_ms).max() < 12.0 and np.sqrt(np.mean(off_ms**2)) < 6.0
+        assert clock.drift == pytest.approx(-drift / (1.0 + drift), abs=max(4.0 * clock.drift_sigma, 1e-3))
+
+
+def test_a_clock_that_is_the_host_s_has_no_drift() -> None:
+    clock, _ = follow(Start("moving", 1, offset_s=0.03, duration_s=6.0), InitConfig())
+    assert clock.drift == 0.0 and clock.drift_sigma == 0.0

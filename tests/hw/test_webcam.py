@@ -17,7 +17,7 @@ from vislam.hw.health import Health
 from vislam.hw.mailbox import Mailbox
 from vislam.hw.source import CapturedImage
 from vislam.hw.video_camera import VideoCamera
-from vislam.hw.webcam import Webcam
+from vislam.hw.webcam import Webcam, _Stamper
 
 LONG_S = 30.0  # how long a test waits for what must come; never how long it takes
 AGE_NS = 20_000_000
@@ -304,3 +304,19 @@ def test_a_mailbox_gives_each_image_once() -> None:
     assert mailbox.replaced == 2
     assert mailbox.take(0.0) is None
     assert mailbox.wait_until_empty(0.0)
+
+
+@pytest.mark.parametrize("drift", [0.02, -0.02])
+def test_a_camera_s_own_clock_is_put_on_the_host_s(config: WebcamConfig, drift: float) -> None:
+    """Its rate is off by 2 %, and images arrive late by whatever the host is busy with: stamps still keep time."""
+    rng, stamper = np.random.default_rng(4), _Stamper(replace(config, delay_s=0.03))
+    true_ns = 50_000_000_000_000 + np.arange(900) * 1_000_000_000 // 30
+    arrivals = true_ns + 30_000_000 + np.round(rng.exponential(4e6, len(true_ns))).astype(np.int64)
+    own_ms = 1e3 + (true_ns - true_ns[0]) * (1.0 + drift) * 1e-6
+    stamps = np.array([
+        stamper.stamp(own, int(arrival), 10**18) for own, arrival in zip(own_ms, arrivals, strict=True)
+    ])  # fmt: skip
+    off_ms = (stamps - true_ns)[90:] * 1e-6
+    print(f"off by {off_ms.mean():.2f} ms, at most {np.abs(off_ms).max():.2f}; arrivals scatter by 4 ms")
+    assert stamper.source == "driver, clock of its own"
+    assert np.abs(off_ms).max() < 1.5 and off_ms.std() < 0.4

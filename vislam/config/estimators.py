@@ -21,6 +21,7 @@ class EkfConfig:
     imu_inflation: float = 10.0  # on the white-noise sigmas, for vibration; flying EuRoC: innovations fit at 10, not 4
     vo_inflation: float = 1.5  # on the sigmas of visual odometry: covariances from residuals miss model errors
     vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
+    scale_sigma: float = 0.0  # relative, of all metres of vision together: a baseline; over a floor its height joins it
     accumulated_sigma_m: float = 0.02  # fixed R of accumulated vision; 0.005 to 0.1 err alike, below this motions fail
     accumulated_sigma_deg: float = 0.5  # the gate, for the sum has drifted by more than R says
     gate_probability: float = 0.999  # chi-square gate on every innovation
@@ -155,6 +156,7 @@ class GraphConfig:
     direction_floor_deg: float = 0.2  # mono: direction of motion
     direction_soft_m: float = 0.005  # mono: baselines shorter than this lose their say on direction
     direction_scale_sigma: float = 5.0  # mono: relative, on the expected step; wide, for only the IMU knows the scale
+    scale_sigma: float = 0.0  # as in `ekf`; tells how sure the states are and moves nothing
     window_inflation: float = 2.0  # on sigma of a window's edges; consecutive ones share errors, here they are summed
     window_floor_deg: float = 0.01  # no calibration lets a window know more
     window_floor_m: float = 0.0005

@@ -131,4 +131,6 @@ class InitConfig:
     time_offset_sigma_s: float = 0.015  # of that; drivers that stamp on arrival are off by up to 30 ms
     time_offset_settled_s: float = 0.0005  # sigma at which the estimate is final
     time_offset_min_s: float = 0.001  # smaller corrections are not worth a step in time
+    clock_drift: bool = False  # the camera's stamps are of a clock of its own, as those of video files: follow its rate
+    clock_drift_sigma: float = 0.03  # of that rate: no clock that deserves the name is farther off
     max_time_offset_sigma_s: float = 0.003  # a metric start waits for this, no longer than its window: 3 mm at 1 m/s

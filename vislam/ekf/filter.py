@@ -224,7 +224,7 @@ class Ekf:
         """Return the state at the newest sample. Raises ValueError before `initialise`."""
         if self._history is None:
             raise ValueError("the filter has no state yet; call initialise first")
-        return _nav_state(self._t_ns, self._x, self._P)
+        return self._nav_state(self._t_ns, self._x, self._P)
 
     def state_at(self, t_ns: int) -> NavState | None:
         """Return the filtered state at a time within the history, None outside of it."""
@@ -233,7 +233,7 @@ class Ekf:
             return None
         x, P = checkpoint.x.copy(), checkpoint.P.copy()
         self._integrate(x, P, checkpoint.t_ns, t_ns)
-        return _nav_state(t_ns, x, P)
+        return self._nav_state(t_ns, x, P)
 
     def pose_at(self, t_ns: int) -> Array | None:
         """Return T_odom_body [4, 4] at a time within the history, interpolated; None outside of it."""
@@ -351,13 +351,20 @@ class Ekf:
         self._P[:] = checkpoint.P
         self._t_ns, self._applied, self._ledger = checkpoint.t_ns, checkpoint.applied, checkpoint.ledger
 
+    def _nav_state(self, t_ns: int, x: Array, P: Array) -> NavState:
+        """Return a state with the error of scale that vision cannot see: it stretches the whole way from the origin.
 
-def _nav_state(t_ns: int, x: Array, P: Array) -> NavState:
-    return NavState(
-        t_ns=t_ns,
-        T_world_body=kernels.pose(x, 0, 6),
-        velocity_world_m_s=x[3:6].copy(),
-        gyro_bias_rad_s=x[13:16].copy(),
-        accel_bias_m_s2=x[10:13].copy(),
-        covariance=P[:15, :15].copy(),
-    )
+        That is what a considered (Schmidt) parameter without gain adds to P. Its influence need not be propagated:
+        positions and velocities are as much too long as vision's metres are, rotations and biases are not touched.
+        """
+        covariance = P[:15, :15].copy()
+        by_scale = self._config.scale_sigma * x[:6]
+        covariance[3:9, 3:9] += np.outer(by_scale, by_scale)
+        return NavState(
+            t_ns=t_ns,
+            T_world_body=kernels.pose(x, 0, 6),
+            velocity_world_m_s=x[3:6].copy(),
+            gyro_bias_rad_s=x[13:16].copy(),
+            accel_bias_m_s2=x[10:13].copy(),
+            covariance=covariance,
+        )

@@ -14,7 +14,7 @@ from vislam.frontend.result import FrontEnd, TrackResult
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
 
-__all__ = ["FrontEnd", "TrackResult", "make_frontend", "mode_for"]
+__all__ = ["FrontEnd", "TrackResult", "lasting_scale_sigma", "make_frontend", "mode_for"]
 
 
 def _rgbd(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
@@ -46,6 +46,14 @@ def mode_for(config: FrontEndConfig, rig: Rig) -> str:
         return config.mode
     one_camera = "mono" if config.planar.height_m is None else "planar"
     return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
+
+
+def lasting_scale_sigma(config: FrontEndConfig, rig: Rig) -> float:
+    """Return the relative sigma of all metres together that motions do not tell of: over a floor, the height's."""
+    planar = config.planar
+    if mode_for(config, rig) != "planar" or planar.height_m is None:
+        return 0.0
+    return planar.height_sigma_m / planar.height_m
 
 
 def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:

@@ -27,7 +27,8 @@ class CameraClock:
     """Owns the offset that is applied and the estimator behind it.
 
     Attributes:
-        applied_ns: what is added to the camera's stamps now.
+        applied_ns: what was added to the newest stamp of the camera.
+        drift: by how many seconds more that gets in a second of the camera; 0 but for `init.clock_drift`.
         changes: how often that was changed.
     """
 
@@ -36,8 +37,12 @@ class CameraClock:
         self._config = config
         self._offset = TimeOffset(config)
         self.applied_ns = round(config.time_offset_s * _NS)
+        self.drift = 0.0
         self.changes = 0
-        self._keyframe_ns = self.applied_ns  # applied when the newest keyframe was stamped
+        self._offset_ns = self.applied_ns  # applied at the camera's time ...
+        self._offset_t_ns = 0  # ... since which the drift counts
+        self._corrected_ns = 0  # by changes of the offset so far ...
+        self._keyframe_ns = 0  # ... and when the newest keyframe was stamped
         self._frames = 0
         self._last_t_ns: int | None = None  # of the frame before, by the camera
         self._interval_ns = 0
@@ -49,8 +54,17 @@ class CameraClock:
 
     @property
     def applied_s(self) -> float:
-        """What is added to the camera's stamps now."""
+        """What was added to the newest stamp of the camera."""
         return self.applied_ns / _NS
+
+    def offset_ns(self, camera_t_ns: int) -> int:
+        """Return what is to be added to a stamp of the camera, by what is known now."""
+        return self._offset_ns + round(self.drift * (camera_t_ns - self._offset_t_ns))
+
+    @property
+    def drift_sigma(self) -> float:
+        """How well the drift is known; 0: it is not estimated."""
+        return self._offset.estimate.drift_sigma if self._config.clock_drift and self._config.time_offset else 0.0
 
     @property
     def sigma_s(self) -> float:
@@ -59,7 +73,7 @@ class CameraClock:
 
     def start_at(self, applied_s: float, sigma_s: float) -> None:
         """Take the offset that an earlier run applied and how well it knew that."""
-        self.applied_ns = self._keyframe_ns = round(applied_s * _NS)
+        self.applied_ns = self._offset_ns = round(applied_s * _NS)
         self._offset.tell(applied_s, sigma_s)
 
     def in_imu_time(self, frame: Frame) -> Frame:
@@ -67,11 +81,12 @@ class CameraClock:
         if self._last_t_ns is not None:
             self._interval_ns = frame.t_ns - self._last_t_ns
         self._last_t_ns = frame.t_ns
+        self.applied_ns = self.offset_ns(frame.t_ns)
         return replace(frame, t_ns=frame.t_ns + self.applied_ns) if self.applied_ns else frame
 
     def took_keyframe(self) -> None:
         """Take note that the newest frame became a keyframe."""
-        self._keyframe_ns = self.applied_ns
+        self._keyframe_ns = self._corrected_ns
 
     def gyro_sigma_rad_s(self, span: ImuSpan) -> float:
         """Return the sigma of a mean rate over a span for want of the exact time: it grows with the change of rate."""
@@ -80,7 +95,7 @@ class CameraClock:
 
     def loosened(self, vo: VoMeasurement, span: ImuSpan | None, state: NavState | None) -> VoMeasurement:
         """Return a motion with the noise that comes of two stamps made with different offsets; usually as it is."""
-        shift_s = abs(self.applied_ns - self._keyframe_ns) / _NS
+        shift_s = abs(self._corrected_ns - self._keyframe_ns) / _NS
         if shift_s == 0.0 or vo.T_keyframe_body is None:
             return vo
         rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
@@ -115,12 +130,18 @@ class CameraClock:
 
     def _change(self) -> int:
         found = self._offset.estimate
-        target_ns = round(found.offset_s * _NS)
-        shift_ns = target_ns - self.applied_ns
+        now_ns = self._last_t_ns
+        if now_ns is None:
+            return 0
+        if self._config.clock_drift and abs(found.drift) > _SIGNIFICANT * found.drift_sigma:
+            self._offset_ns, self._offset_t_ns, self.drift = self.applied_ns, now_ns, found.drift
+        shift_ns = round(found.at(now_ns) * _NS) - self.applied_ns
         needed_s = max(_SIGNIFICANT * found.sigma_s, self._config.time_offset_min_s)
         if abs(shift_ns) < needed_s * _NS:
             return 0
         shift_ns = max(shift_ns, -round(_MOST_BACK * self._interval_ns))
         self.applied_ns += shift_ns
+        self._offset_ns += shift_ns
+        self._corrected_ns += shift_ns
         self.changes += 1
         return shift_ns

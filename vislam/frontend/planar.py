@@ -24,7 +24,7 @@ from vislam.frontend.landmarks import move
 from vislam.frontend.planar_course import Course
 from vislam.frontend.planar_fit import Fit, FloorPair, camera_motion, joint_fit, no_fit, split_fit
 from vislam.frontend.planar_floor import Mount, Regions, Tilt, make_mount
-from vislam.frontend.planar_place import Place, by_jitter, by_mount, failure, weakness, yaw_prior
+from vislam.frontend.planar_place import Place, by_jitter, by_tilt, failure, weakness, yaw_prior
 from vislam.frontend.planar_tracks import FloorTracks, Steps
 from vislam.frontend.prediction import body_motion
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
@@ -173,7 +173,7 @@ class PlanarFrontEnd:
         why_not = failure(fit, candidates, self._course, self._planar)
         good, weak = fit.inliers.copy(), ""
         if not why_not:
-            covariance = covariance + by_mount(fit, T, self._tilt.covariance, self._planar, self._height_m)
+            covariance = covariance + by_tilt(fit, T, self._tilt.covariance, self._planar)
             covariance += by_jitter(self._course.rate, pair.R_now, self._planar.stamp_jitter_s)
             off_px = from_epipolar_segment(T, pair.rays, xy, 1.0 / self._config.min_depth_m) / pair.px
             with np.errstate(invalid="ignore"):

@@ -349,19 +349,13 @@ def camera_motion(fit: Fit, R_key: Array, R_now: Array) -> tuple[Array, Array]:
     return T, 0.5 * (out + out.T)
 
 
-def scale_sigma(fit: Fit, height_sigma: float, tilt_covariance: Array) -> float:
-    """Return the relative sigma of the way's length that errors of height and mean tilt cause, which last.
-
-    Args:
-        fit: a joint fit over some way.
-        height_sigma: relative, of the height.
-        tilt_covariance: [2, 2] of the mean tilt.
-    """
+def scale_sigma(fit: Fit, tilt_covariance: Array) -> float:
+    """Return the relative sigma of the way's length that errors [2, 2] of the mean tilt cause, which last."""
     length = float(np.linalg.norm(fit.motion[1:]))
     if length < 1e-3 or not np.isfinite(fit.covariance).all():
-        return height_sigma
+        return 0.0
     information = np.linalg.inv(fit.covariance + 1e-18 * np.eye(_UNKNOWNS))
     free = np.array([0, 1, 2, 5, 6, 7])  # what is fitted anew where the common tilt [3:5] is another one
     by_tilt = np.linalg.solve(information[np.ix_(free, free)], -information[free, 3:5])
     along = fit.motion[1:] @ by_tilt[1:3] / length**2
-    return float(np.sqrt(height_sigma**2 + along @ tilt_covariance @ along))
+    return float(np.sqrt(along @ tilt_covariance @ along))

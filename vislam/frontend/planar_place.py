@@ -48,8 +48,8 @@ def yaw_prior(course: Course) -> tuple[float, float] | None:
     return course.yaw_rad, _GYRO_KNOWN_ALREADY * (_LENS_YAW_RAD + course.yaw_sigma_rad)
 
 
-def by_mount(fit: Fit, T_key_cam: Array, tilt_covariance: Array, config: PlanarConfig, height_m: float) -> Array:
-    """Return the covariance [6, 6] by which errors of height and tilt, which last, exceed those of each motion.
+def by_tilt(fit: Fit, T_key_cam: Array, tilt_covariance: Array, config: PlanarConfig) -> Array:
+    """Return the covariance [6, 6] by which errors of the mean tilt, which last, exceed those of each motion.
 
     Their share of the way adds up over `correlation_m`, while a filter takes errors of motions for independent.
     """
@@ -58,11 +58,10 @@ def by_mount(fit: Fit, T_key_cam: Array, tilt_covariance: Array, config: PlanarC
     out = np.zeros((6, 6))
     if length < 1e-6:
         return out
-    relative = config.height_sigma_m / height_m
     if config.method == "split":
-        relative = float(np.hypot(relative, _SCALE_BY_TILT * np.sqrt(tilt_covariance[1, 1])))
+        relative = float(_SCALE_BY_TILT * np.sqrt(tilt_covariance[1, 1]))
     else:
-        relative = scale_sigma(fit, relative, tilt_covariance)
+        relative = scale_sigma(fit, tilt_covariance)
     out[3:, 3:] = relative**2 * max(length, config.correlation_m) / length * np.outer(way, way)
     return out
 

@@ -3,13 +3,15 @@
 A camera whose stamps are late or early sees the rotations that the gyroscope measures shifted in time. Rotation between
 a keyframe and a frame, by vision and by gyroscope, is compared over a sliding window; the difference is linear in time
 offset, gyro bias and a small misalignment of the axes, for which one least-squares problem is solved, integrated anew
-around every solution. Neither gravity nor scale is needed. The idea is that of Li and Mourikis, "Online temporal
+around every solution. A camera with a clock of its own (`init.clock_drift`) adds the rate by which that is off: its
+offset is then that of the newest frame, and never final. Neither gravity nor scale is needed. The idea is that of Li
+and Mourikis, "Online temporal
 calibration for camera-IMU systems", IJRR 2014, and of the rotation part of Kalibr (Furgale et al., IROS 2013).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -30,7 +32,9 @@ _TOLD_SIGMA_S = 1e-3  # what others find is believed no further: their models ha
 _TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
 _CAUCHY = 3.0  # standard deviations
 _ROUNDS = 5
-_UNKNOWNS = 7  # offset, gyro bias, misalignment
+_UNKNOWNS = 8  # offset, gyro bias, misalignment, drift
+_NO_DRIFT = 1e-7  # sigma of the drift of a clock that is the host's
+_KNOWN_S, _KNOWN_DRIFT = 0.003, 0.002  # sigmas below which an estimate is carried on as the next one's prior
 
 Ints = NDArray[np.int64]
 
@@ -45,6 +49,13 @@ class TimeOffsetEstimate:
     R_correction: Array  # [3] rotation vector, body axes: vision's body axes are those of the IMU turned by it
     R_correction_sigma: Array  # [3] rad
     frames: int
+    t_ns: int = 0  # the camera's time of which the offset is
+    drift: float = 0.0  # seconds by which the offset grows in a second of the camera
+    drift_sigma: float = 0.0
+
+    def at(self, camera_t_ns: int) -> float:
+        """Return the offset in seconds at a time of the camera."""
+        return self.offset_s + self.drift * (camera_t_ns - self.t_ns) / _NS
 
 
 class TimeOffset:
@@ -58,11 +69,12 @@ class TimeOffset:
     def __init__(self, config: InitConfig) -> None:
         """Start from the configured offset."""
         self._config = config
-        none = np.zeros(3)
+        none, drift_sigma = np.zeros(3), config.clock_drift_sigma if config.clock_drift else _NO_DRIFT
         self.estimate = TimeOffsetEstimate(
-            config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, _TURN_SIGMA), 0
-        )
-        self._prior = (config.time_offset_s, config.time_offset_sigma_s)  # of the offset: what else is known of it
+            config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, _TURN_SIGMA), 0,
+            drift_sigma=drift_sigma,
+        )  # fmt: skip
+        self._prior = self.estimate  # what else is known of offset and drift
         self.settled = not config.time_offset
         self._t_ns: list[int] = []  # of the frames, by the camera
         self._keyframe_ns: list[int] = []
@@ -73,8 +85,16 @@ class TimeOffset:
 
     @property
     def sigma_s(self) -> float:
-        """How well the offset is known; zero when it is not estimated but given."""
-        return self.estimate.sigma_s if self._config.time_offset else 0.0
+        """How well the offset is known now; zero when it is not estimated but given."""
+        return self._sigma_now_s if self._config.time_offset else 0.0
+
+    @property
+    def _sigma_now_s(self) -> float:
+        """The sigma of the estimate's offset, carried on to the newest frame."""
+        known, now_ns = self.estimate, self._last_t_ns
+        if not self._config.clock_drift or now_ns is None:
+            return known.sigma_s
+        return float(np.hypot(known.sigma_s, known.drift_sigma * (now_ns - known.t_ns) / _NS))
 
     def add(self, camera_t_ns: int, vo: VoMeasurement) -> None:
         """Take the rotation of one frame since its keyframe.
@@ -88,6 +108,9 @@ class TimeOffset:
         if vo.keyframe_id != self._keyframe_id:  # the frame before became the keyframe
             self._keyframe_id = vo.keyframe_id
             self._keyframe_t_ns = camera_t_ns if self._last_t_ns is None else self._last_t_ns
+        if self._last_t_ns is None:
+            self.estimate = replace(self.estimate, t_ns=camera_t_ns)
+            self._prior = replace(self._prior, t_ns=camera_t_ns)
         self._last_t_ns = camera_t_ns
         if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None or camera_t_ns <= self._keyframe_t_ns:
             return
@@ -103,42 +126,65 @@ class TimeOffset:
         """Return the interval of inertial data that `solve` can use; None while there is nothing to solve."""
         if self.settled or len(self._t_ns) < _MIN_FRAMES:
             return None
-        reach = round((abs(self.estimate.offset_s) + _SLACK_S) * _NS)
-        return self._keyframe_ns[0] - reach, self._t_ns[-1] + reach
+        begin_s, end_s = self.estimate.at(self._keyframe_ns[0]), self.estimate.at(self._t_ns[-1])
+        before, behind = min(begin_s, 0.0) - self._slack_s, max(end_s, 0.0) + self._slack_s
+        return self._keyframe_ns[0] + round(before * _NS), self._t_ns[-1] + round(behind * _NS)
+
+    @property
+    def _slack_s(self) -> float:
+        return _SLACK_S if not self._config.clock_drift else _SLACK_S + self._sigma_now_s
 
     def solve(self, span: ImuSpan) -> TimeOffsetEstimate:
         """Estimate from the frames that `span` covers, no bias taken off; keep the old estimate if that fails."""
-        problem = self._problem(span)
-        x = np.concatenate([[self.estimate.offset_s], self.estimate.gyro_bias_rad_s, self.estimate.R_correction])
-        sigmas = np.repeat([self._prior[1], _GYRO_BIAS_SIGMA, _TURN_SIGMA], [1, 3, 3])
-        mean = np.zeros(_UNKNOWNS)
-        mean[0] = self._prior[0]
+        problem, known, now_ns = self._problem(span), self.estimate, self._t_ns[-1]
+        guess_s = known.at(now_ns)
+        x = np.concatenate([[guess_s], known.gyro_bias_rad_s, known.R_correction, [known.drift]])
+        prior, mean = self._prior_at(now_ns)
         scale, H, used = 1.0, np.eye(_UNKNOWNS), 0
         for _ in range(_ROUNDS):
             H, g, squares, used = _normal_equations(*problem, x, scale)
             if used < _MIN_FRAMES:
                 return self.estimate
-            H += np.diag(1.0 / sigmas**2)
-            step = np.linalg.solve(H, g + (mean - x) / sigmas**2)
+            H += prior
+            step = np.linalg.solve(H, g + prior @ (mean - x))
             x = x + step
-            x[0] = float(np.clip(x[0], *(self._config.time_offset_s + _SLACK_S * np.array([-0.9, 0.9]))))
+            middle_s = guess_s if self._config.clock_drift else self._config.time_offset_s
+            x[0] = float(np.clip(x[0], *(middle_s + self._slack_s * np.array([-0.9, 0.9]))))
             scale = float(np.sqrt(max(np.median(squares[:used]) / 0.79, _MIN_RATIO)))  # 0.79: chi2 of 3, over 3
         deviations = np.sqrt(np.diag(np.linalg.inv(H)))
         if not np.isfinite(x).all():
             return self.estimate
-        sigma_s = min(float(deviations[0]), self._config.time_offset_sigma_s)
-        self.estimate = TimeOffsetEstimate(float(x[0]), sigma_s, x[1:4].copy(), x[4:].copy(), deviations[4:], used)
-        self.settled = sigma_s < self._config.time_offset_settled_s
+        config, sigma_s = self._config, float(deviations[0])
+        sigma_s = sigma_s if config.clock_drift else min(sigma_s, config.time_offset_sigma_s)
+        self.estimate = TimeOffsetEstimate(
+            float(x[0]), sigma_s, x[1:4].copy(), x[4:7].copy(), deviations[4:7], used, now_ns, float(x[7]),
+            float(deviations[7]),
+        )  # fmt: skip
+        self.settled = sigma_s < config.time_offset_settled_s and not config.clock_drift
+        if config.clock_drift and sigma_s < _KNOWN_S and deviations[7] < _KNOWN_DRIFT:
+            # loosely, since the frames of this estimate are among those of the next
+            self._prior = replace(self.estimate, sigma_s=config.time_offset_sigma_s, drift_sigma=_KNOWN_DRIFT)
         return self.estimate
+
+    def _prior_at(self, now_ns: int) -> tuple[Array, Array]:
+        """Return information [8, 8] and mean [8] of what is known before the frames, with the offset of a time."""
+        prior = self._prior
+        sigmas = np.repeat([_GYRO_BIAS_SIGMA, _TURN_SIGMA], 3)
+        information = np.diag([0.0, *(1.0 / sigmas**2), 1.0 / prior.drift_sigma**2])
+        then = np.zeros(_UNKNOWNS)  # the offset at the prior's time, by the unknowns
+        then[0], then[7] = 1.0, -(now_ns - prior.t_ns) / _NS
+        information += np.outer(then, then) / prior.sigma_s**2
+        mean = np.zeros(_UNKNOWNS)
+        mean[0], mean[7] = prior.at(now_ns), prior.drift
+        return information, mean
 
     def tell(self, offset_s: float, sigma_s: float) -> None:
         """Take an offset that was found by other means, with its sigma."""
-        if not self.settled and sigma_s < self.estimate.sigma_s:
-            e = self.estimate
-            self._prior = (offset_s, max(sigma_s, _TOLD_SIGMA_S))
-            self.estimate = TimeOffsetEstimate(
-                offset_s, sigma_s, e.gyro_bias_rad_s, e.R_correction, e.R_correction_sigma, e.frames
-            )
+        if not self.settled and sigma_s < self._sigma_now_s:
+            t_ns = self.estimate.t_ns if self._last_t_ns is None else self._last_t_ns
+            told_s = max(sigma_s, _TOLD_SIGMA_S)
+            self._prior = replace(self._prior, offset_s=offset_s, sigma_s=told_s, t_ns=t_ns)
+            self.estimate = replace(self.estimate, offset_s=offset_s, sigma_s=sigma_s, t_ns=t_ns)
 
     def _problem(self, span: ImuSpan) -> tuple[Array, Array, Array, Array, Array]:
         """Return times in seconds after the span's begin (samples, keyframes, frames), rates and visual rotations."""
@@ -198,10 +244,13 @@ def _at(t: float, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array) 
 
 @njit(cache=True, nogil=True)
 def _error(
-    begin_s: float, end_s: float, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array, turn: Array,
-    seen: Array, J: Array,
+    begin_s: float, end_s: float, since_s: Array, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array,
+    turn: Array, seen: Array, J: Array,
 ) -> Array:  # fmt: skip
-    """Return the turn [3] that gyroscope and vision, `seen` [3, 3], differ by, and its derivative in J [3, 7]."""
+    """Return the turn [3] that gyroscope and vision, `seen` [3, 3], differ by, and its derivative in J [3, 8].
+
+    `since_s` [2] is how long after the time of the offset the camera took keyframe and frame.
+    """
     R_a, total_a, rate_a = _at(begin_s, t_s, gyro, bias, R, total)
     R_b, total_b, rate_b = _at(end_s, t_s, gyro, bias, R, total)
     R_a_b, to_camera, by_bias, predicted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -216,9 +265,11 @@ def _error(
     _multiply(turn, R_a.T.copy(), from_a)
     _multiply(from_a, change, by_bias)
     for i in range(3):
-        J[i, 0] = 0.0
+        J[i, 0], J[i, 7] = 0.0, 0.0
         for j in range(3):
-            J[i, 0] += to_camera[i, j] * rate_b[j] - turn[i, j] * rate_a[j]
+            by_begin, by_end = -turn[i, j] * rate_a[j], to_camera[i, j] * rate_b[j]
+            J[i, 0] += by_end + by_begin
+            J[i, 7] += by_end * since_s[1] + by_begin * since_s[0]
             J[i, 1 + j] = -by_bias[i, j]
             J[i, 4 + j] = (1.0 if i == j else 0.0) - predicted[i, j]
     return so3_log(gap)
@@ -243,23 +294,24 @@ def _normal_equations(
     """Sum up the frames that the samples cover; what all frames of a keyframe have in common is eliminated.
 
     Returns:
-        H [7, 7], g [7], the squared residuals per axis in nominal sigmas, and how many frames were used.
+        H [8, 8], g [8], the squared residuals per axis in nominal sigmas, and how many frames were used.
     """
-    offset, bias, turn = x[0], x[1:4], so3_exp(x[4:7])
+    offset, bias, turn, drift = x[0], x[1:4], so3_exp(x[4:7]), x[7]
     R, total = _integrate(t_s, gyro, bias)
     H, g = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS)
     squares, used = np.zeros(len(frame_s)), 0
     weight0 = 1.0 / (_SIGMA_RAD * scale) ** 2
     shared_weight, link, head = weight0, np.zeros((_UNKNOWNS, 3)), np.zeros(3)
-    J = np.empty((3, _UNKNOWNS))
+    J, since_s = np.empty((3, _UNKNOWNS)), np.empty(2)
     for k in range(len(frame_s)):
         if k > 0 and keyframe_s[k] != keyframe_s[k - 1]:
             _take_out_common(H, g, shared_weight, link, head)
             shared_weight = weight0
-        begin, end = keyframe_s[k] + offset, frame_s[k] + offset
+        since_s[0], since_s[1] = keyframe_s[k] - frame_s[-1], frame_s[k] - frame_s[-1]
+        begin, end = keyframe_s[k] + offset + drift * since_s[0], frame_s[k] + offset + drift * since_s[1]
         if begin < t_s[0] or end > t_s[-1]:
             continue
-        error = _error(begin, end, t_s, gyro, bias, R, total, turn, rotations[k], J)
+        error = _error(begin, end, since_s, t_s, gyro, bias, R, total, turn, rotations[k], J)
         square = (error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / (3.0 * _SIGMA_RAD**2)
         squares[used] = square
         used += 1

@@ -222,8 +222,12 @@ class PoseGraph:
         return self._estimator.poses.copy()
 
     def states(self) -> list[NavState]:
-        """Return the state of each keyframe with its marginal covariance, NaN where gtsam cannot give one."""
-        return [self._state(k) for k in range(len(self._keyframes))]
+        """Return the state of each keyframe with its marginal covariance, NaN where gtsam cannot give one.
+
+        An error of scale that all measurements share is in it. As a variable it would keep its prior, for nothing here
+        knows metres better than a floor or a baseline, and would tie all factors to one; considered, it costs nothing.
+        """
+        return [self._stretched(self._state(k)) for k in range(len(self._keyframes))]
 
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
@@ -319,6 +323,14 @@ class PoseGraph:
         if abs(i - j) <= _NEAR_KEYFRAMES and self._pieces.of(i) == self._pieces.of(j):
             return self._travel.relative_covariance(i, j)
         return self.relative_covariance(i, j)
+
+    def _stretched(self, state: NavState) -> NavState:
+        """Return a state with the uncertainty that scale adds to its distance from the first keyframe."""
+        way = state.T_world_body[:3, 3] - self._estimator.poses[0, :3, 3]
+        by_scale = self._config.scale_sigma * np.concatenate([way, state.velocity_world_m_s])
+        covariance = state.covariance.copy()
+        covariance[3:9, 3:9] += np.outer(by_scale, by_scale)
+        return replace(state, covariance=covariance)
 
     def _state(self, k: int) -> NavState:
         return self._source.state(k, self._keyframes[k].t_ns, self._estimator)

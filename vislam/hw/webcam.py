@@ -13,8 +13,9 @@ from typing import Any, Protocol
 
 import cv2
 
-from vislam.config import WebcamConfig
+from vislam.config import BridgeClockConfig, WebcamConfig
 from vislam.errors import HardwareError
+from vislam.hw.bridge_clock import DeviceClock
 from vislam.hw.health import Health
 from vislam.hw.mailbox import Mailbox
 from vislam.hw.source import CapturedImage
@@ -24,6 +25,7 @@ _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1.0, 3.0  # V4L2_EXPOSURE_MANUAL, V4L2_EXPOSU
 _EXPOSURES_PER_S = 10_000.0  # V4L2 counts exposure in units of 100 us
 _PROBED = 5  # images after which it is settled whose stamps are used
 _EARLY_NS = 2_000_000  # clocks are read one after the other
+_NO_CLOCK, _OWN_CLOCK = "arrival", "driver, clock of its own"
 _JOIN_S = 1.0  # a driver may hold a thread for 10 s; it is then left to end by itself
 
 
@@ -57,8 +59,10 @@ class Setting:
 class Webcam:
     """Satisfies `ImageSource`. A thread captures; `read` never waits for the driver.
 
-    Images are stamped by the driver where its clock is CLOCK_MONOTONIC or the wall clock; otherwise at arrival minus
-    `config.delay_s`: `stamped_by` says which. A camera that goes away is looked for every `config.reopen_s`.
+    Images are stamped by the driver where its clock is CLOCK_MONOTONIC or the wall clock. Stamps of a clock of the
+    camera's own, whose rate may be off, are put on the line that lies under their arrivals, less `config.delay_s`;
+    without any stamps arrivals less as much have to do. `stamped_by` says which. A camera that goes away is looked
+    for every `config.reopen_s`.
     """
 
     def __init__(
@@ -187,6 +191,7 @@ class _Stamper:
     def __init__(self, config: WebcamConfig) -> None:
         self.bad = 0
         self.source = "not known yet"
+        self._clock = DeviceClock(BridgeClockConfig())  # of the camera, where it has one of its own
         self._max_age_ns = round(config.max_age_s * _NS)
         self._delay_ns = round(config.delay_s * _NS)
         self._votes: Counter[str] = Counter()
@@ -196,14 +201,18 @@ class _Stamper:
         driver_ns = round(driver_ms * 1e6)
         ages_ns = {"driver": arrival_ns - driver_ns, "driver, wall clock": wall_ns - driver_ns}
         possible = [name for name, age in ages_ns.items() if -_EARLY_NS <= age <= self._max_age_ns and driver_ns > 0]
+        on_line_ns = None if possible or driver_ns <= 0 else self._clock.stamp(driver_ns // 1000 % 2**32, arrival_ns)
         if self._votes.total() < _PROBED:
-            self._votes[possible[0] if possible else "arrival"] += 1
+            self._votes[possible[0] if possible else _NO_CLOCK] += 1
             self.source = self._votes.most_common(1)[0][0]
         if self.source in possible:
             age_ns = max(ages_ns[self.source], 0)
             self._delay_ns = age_ns  # for an image whose own stamp is bad
             return arrival_ns - age_ns
-        self.bad += self.source != "arrival"
+        if self.source in (_NO_CLOCK, _OWN_CLOCK):
+            self.source = _NO_CLOCK if on_line_ns is None else _OWN_CLOCK
+            return (arrival_ns if on_line_ns is None else on_line_ns) - self._delay_ns
+        self.bad += 1
         return arrival_ns - self._delay_ns
 
 

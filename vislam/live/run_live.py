@@ -19,6 +19,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.errors import HardwareError, StorageError, UsageError, VislamError
+from vislam.frontend import lasting_scale_sigma
 from vislam.hw.source import InertialSource
 from vislam.imu import BiasMemory
 from vislam.live import back_process, bridge, fast_process, front_process, map_process
@@ -142,13 +143,17 @@ class LiveRun:
             frames_out, frames, keyframes_out, keyframes,
         ]  # fmt: skip
         rig = source.rig
+        scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
+        fast = replace(
+            config, live=replace(config.live, send_to=send_to), ekf=replace(config.ekf, scale_sigma=scale_sigma)
+        )
         return {
             **source.helpers(),
             **{role: body for role, (_, body) in bridges.items()},
             "fast": partial(
-                fast_process.run, config=replace(config, live=replace(config.live, send_to=send_to)), noise=noise,
-                T_body_camera=rig.T_body_cams[0], open_source=source.inertial(), samples=samples_in,
-                inbox=[fast_hears_front, fast_hears_back], memory=self._memory,
+                fast_process.run, config=fast, noise=noise, T_body_camera=rig.T_body_cams[0],
+                open_source=source.inertial(), samples=samples_in, inbox=[fast_hears_front, fast_hears_back],
+                memory=self._memory,
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),
