@@ -10,6 +10,7 @@ have given from the start.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,6 +41,10 @@ class _Said:
     def of(cls, T_map_body: Array, marks: ScanMarks) -> _Said:
         return cls(T_map_body, marks.points, marks.blocks, zlib.compress(marks.bits.tobytes(), 1))
 
+    @property
+    def nbytes(self) -> int:
+        return self.blocks.nbytes + len(self.packed)
+
     def marks(self) -> ScanMarks:
         bits = np.frombuffer(zlib.decompress(self.packed), np.uint8)
         return ScanMarks(self.points, self.blocks, bits.reshape(-1, 2, 64))
@@ -50,6 +55,7 @@ class _Patch:
     """A correction under way: first keyframes that moved cast their rays, then blocks are made anew."""
 
     waiting: list[int]  # keyframes that have yet to cast their rays
+    gone: list[int]  # keyframes that are in the map and are not to be
     moved: dict[int, _Said] = field(default_factory=dict)
     blocks: OccupancyMap | None = None  # those that are made anew
     replayed: int = 0  # keyframes of which they hold what was said
@@ -86,9 +92,16 @@ class CorrectedOccupancy:
         self._occupancy.apply(marks)
         self._remember(keyframe_id, _Said.of(T_map_body, marks))
 
-    def restore(self, keyframe_id: int, T_map_body: Array) -> None:
-        """Note a keyframe of an earlier run, which is in the store already; `advance` and `finish` integrate it."""
-        self._poses[keyframe_id] = T_map_body
+    def enter(self, T_map_body: dict[int, Array]) -> None:
+        """Note keyframes that are in the store; `advance` and `finish` integrate them, in the order of ids."""
+        self._poses = dict(sorted((self._poses | T_map_body).items()))
+        self._patch = None  # its order is another now
+
+    def leave(self, keyframe_ids: Iterable[int]) -> None:
+        """Let keyframes go; `advance` and `finish` make the map as if they had never been in it."""
+        for keyframe_id in keyframe_ids:
+            del self._poses[keyframe_id]
+        self._patch = None
 
     def move(self, keyframe_ids: NDArray[np.int64], T_map_body: Array) -> None:
         """Note new poses [M, 4, 4] of keyframes; those that are not in the map are ignored."""
@@ -100,17 +113,18 @@ class CorrectedOccupancy:
         """Do one slice of a correction: begin when keyframes have moved by more than the limits, swap when complete."""
         if self._patch is None:
             moved = self._misplaced(self._config.move_voxels * self._config.resolution_m, self._config.move_deg)
-            if not moved:
+            gone = self._gone()
+            if not moved and not gone:
                 return
-            self._patch = _Patch(moved)
+            self._patch = _Patch(moved, gone)
         self._correct(self._patch, max_keyframes)
 
     def finish(self) -> None:
         """Bring every keyframe to exactly its newest pose."""
-        moved = self._misplaced(0.0, 0.0)
+        moved, gone = self._misplaced(0.0, 0.0), self._gone()
         begun = {} if self._patch is None else self._patch.moved
         done = {i: said for i, said in begun.items() if (said.T_map_body == self._poses[i]).all()}
-        self._patch = _Patch([i for i in moved if i not in done], done) if moved else None
+        self._patch = _Patch([i for i in moved if i not in done], gone, done) if moved or gone else None
         while self._patch is not None:
             self._correct(self._patch, len(self._poses))
 
@@ -132,6 +146,10 @@ class CorrectedOccupancy:
             moved = (old != new).any(axis=(1, 2))
         in_place = {i for i, is_moved in zip(there, moved.tolist(), strict=True) if not is_moved}
         return [i for i in self._poses if i not in in_place]
+
+    def _gone(self) -> list[int]:
+        """Return the keyframes that are in the map and are not to be."""
+        return [i for i in self._said if i not in self._poses]
 
     def _correct(self, patch: _Patch, max_keyframes: int) -> None:
         """Do the work of `max_keyframes` that cast rays, or of that many times `_REPLAYS` that do not."""
@@ -158,21 +176,23 @@ class CorrectedOccupancy:
             self._occupancy = self._occupancy.with_pool(self._occupancy.pool.replaced(patch.blocks.pool))
             for keyframe_id, said in patch.moved.items():
                 self._remember(keyframe_id, said)
+            for keyframe_id in patch.gone:
+                said = self._said.pop(keyframe_id)
+                self.counters["marks_bytes"] -= said.nbytes
             self._patch = None
             self.counters["rebuilds"] += 1
 
     def _dirty_blocks(self, patch: _Patch) -> OccupancyMap:
-        """Return a map that has all blocks which a moved keyframe touched, before or now, and knows nothing of them."""
+        """Return a map that knows nothing of the blocks that moved or gone keyframes touched, before or now."""
         touched = [said.blocks for said in patch.moved.values()]
-        touched += [self._said[i].blocks for i in patch.moved if i in self._said]
+        touched += [self._said[i].blocks for i in (*patch.moved, *patch.gone) if i in self._said]
         keys = np.unique(np.concatenate(touched))
         unknown = np.full((len(keys), BLOCK_VOXELS), np.nan, np.float32)
         return self._occupancy.with_pool(BlockPool.of(keys, unknown))
 
     def _remember(self, keyframe_id: int, said: _Said) -> None:
         old = self._said.get(keyframe_id)
-        self.counters["marks_bytes"] += said.blocks.nbytes + len(said.packed)
-        self.counters["marks_bytes"] -= 0 if old is None else old.blocks.nbytes + len(old.packed)
+        self.counters["marks_bytes"] += said.nbytes - (0 if old is None else old.nbytes)
         self._said[keyframe_id] = said
 
     def _trace(self, keyframe_id: int, scan: Scan, T_map_body: Array) -> ScanMarks:

@@ -21,11 +21,11 @@ from vislam.mapping.mesh import Mesh, fuse_mesh
 from vislam.mapping.monodepth import LateDepth
 from vislam.mapping.occupancy import Occupancy, OccupancyMap
 from vislam.mapping.octree import Octree
-from vislam.mapping.products import write_products
+from vislam.mapping.products import remove_products, write_products
 from vislam.mapping.store import KeyframeStore, Scan
 from vislam.mapping.surfels import SurfelMap, Surfels
 from vislam.memory import PackedScan
-from vislam.messages import GraphUpdate, Keyframe
+from vislam.messages import GraphUpdate, Keyframe, Pieces
 
 Array = NDArray[np.float64]
 
@@ -42,12 +42,15 @@ class Mapper:
         Raises DataError when the settings or the rig cannot make a map.
         """
         self._config = config
+        self._rig = rig
         self._one_camera = one_camera
         self._extractor = ScanExtractor(config, rig, one_camera)
         self._store = KeyframeStore(self._extractor.view.size)
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
         self._drive = DriveMap(config)
         self._surfels = SurfelMap(config.surfel_m)
+        self._pieces = Pieces()
+        self._apart: dict[int, Array] = {}  # newest poses of keyframes in pieces that no loop has joined with the map
         self.notes: dict[str, str] = {}  # what was left out of an export, and why
 
     @property
@@ -71,9 +74,11 @@ class Mapper:
         return self._occupancy.occupancy.copy()
 
     def add(self, keyframe: Keyframe, T_map_body: Array) -> None:
-        """Integrate a keyframe at its pose [4, 4].
+        """Integrate a keyframe at its pose [4, 4], after the `move` that knows its piece of trajectory.
 
-        Raises DataError on a pose that is not rigid, an id seen before, or images that are not the camera's size.
+        Where no loop has joined that piece with the oldest one, it waits outside of the map, for its pose there means
+        nothing. Raises DataError on a pose that is not rigid, an id seen before, or images of another size than the
+        camera's.
         """
         T = np.array(T_map_body, dtype=np.float64)
         _check_rigid(T[None], np.array([keyframe.id]))
@@ -81,7 +86,7 @@ class Mapper:
         if scan is None:
             return
         self._store.add(keyframe.id, keyframe.t_ns, scan)
-        self._occupancy.add(keyframe.id, scan, T)
+        self._place(keyframe.id, scan, T)
 
     def add_depth(self, late: LateDepth) -> None:
         """Integrate depth that became known after its keyframe.
@@ -93,7 +98,7 @@ class Mapper:
         _check_rigid(T[None], np.array([late.keyframe_id]))
         scan = self._extractor.late(late.depth_m, late.image)
         self._store.add(late.keyframe_id, late.t_ns, scan)
-        self._occupancy.add(late.keyframe_id, scan, T)
+        self._place(late.keyframe_id, scan, T)
 
     def packed(self, keyframe_id: int) -> PackedScan | None:
         """Return what is kept of a keyframe's geometry, None if there was none."""
@@ -111,15 +116,23 @@ class Mapper:
         _check_rigid(np.array([T_map_body[i] for i in ids]), np.array(ids))
         for i in ids:
             self._store.put(i, scans[i])
-            self._occupancy.restore(i, T_map_body[i])
+        self._apart |= {i: np.array(T_map_body[i], dtype=np.float64) for i in ids}
+        self._sort()
 
     def move(self, update: GraphUpdate) -> None:
         """Take over corrected poses, and re-integrate a bounded number of keyframes if some moved by a voxel.
 
+        Keyframes of pieces that were joined come into the map so, and those of pieces that came apart leave it.
         Raises DataError, and changes nothing, when a pose is not rigid.
         """
         _check_rigid(np.asarray(update.T_map_body, dtype=np.float64), update.ids)
         self._occupancy.move(update.ids, update.T_map_body)
+        for keyframe_id, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
+            if keyframe_id in self._apart:
+                self._apart[keyframe_id] = np.array(T, dtype=np.float64)
+        if update.pieces != self._pieces:
+            self._pieces = update.pieces
+            self._sort()
         self._occupancy.advance(self._config.rebuild_keyframes_per_call)
 
     def finish(self) -> None:
@@ -171,7 +184,7 @@ class Mapper:
 
         Only keyframes that are new since the last call are looked at; those that were moved take their surfels along.
         """
-        for keyframe_id in self._store.ids:
+        for keyframe_id in self._occupancy.poses:
             if keyframe_id not in self._surfels:
                 self._surfels.add(keyframe_id, self._store.scan(keyframe_id), self._extractor.view)
         surfels = self._surfels.surfels(self._occupancy.poses)
@@ -181,17 +194,55 @@ class Mapper:
     def export(self, folder: Path, step: Callable[[str], None] | None = None) -> dict[str, Path]:
         """Write the configured products of the map; return what was written, and note what could not be.
 
-        Each file is replaced whole. `step` is told the name of each product before it is made. Raises StorageError
-        when one cannot be written.
+        Keyframes of pieces that are not joined with the map get one of their own, in a folder `piece_N`. Each file is
+        replaced whole. `step` is told the name of each product before it is made. Raises StorageError when one cannot
+        be written.
         """
         written, self.notes = write_products(self, folder, self._config, step)
+        layers = self._layers()
+        for old in sorted(folder.glob("piece_*")):
+            if old.name not in layers:
+                remove_products(old)
+        for name, layer in layers.items():
+            files, _ = write_products(layer, folder / name, self._config)
+            written |= {f"{name}_{product}": path for product, path in files.items()}
+            self.notes[f"{name} in the map"] = (
+                f"no loop joined these {len(layer._store.ids)} keyframes with it; {folder.name}/{name} is their own"
+            )
         if left_out := self._occupancy.left_out:
             self.notes[f"occupancy of {len(left_out)} keyframes"] = next(iter(left_out.values()))
         return written
 
+    def _place(self, keyframe_id: int, scan: Scan, T_map_body: Array) -> None:
+        if self._pieces.group(keyframe_id) == 0:
+            self._occupancy.add(keyframe_id, scan, T_map_body)
+        else:
+            self._apart[keyframe_id] = T_map_body
+
+    def _sort(self) -> None:
+        """Take keyframes in and out of the map by what is joined with the oldest piece now."""
+        pieces = self._pieces
+        joined = {i: T for i, T in self._apart.items() if pieces.group(i) == 0}
+        apart = {i: T for i, T in self._occupancy.poses.items() if pieces.group(i) != 0}
+        self._apart = {i: T for i, T in self._apart.items() if i not in joined} | apart
+        if joined:
+            self._occupancy.enter(joined)
+        if apart:
+            self._occupancy.leave(apart)
+
+    def _layers(self) -> dict[str, Mapper]:
+        """Return the maps of the pieces that are not joined with the map, complete, by name."""
+        layers: dict[str, Mapper] = {}
+        for piece in sorted({self._pieces.group(i) for i in self._apart}):
+            poses = {i: T for i, T in self._apart.items() if self._pieces.group(i) == piece}
+            layer = layers[f"piece_{piece}"] = Mapper(self._config, self._rig, self._one_camera)
+            layer.restore({i: scan for i in poses if (scan := self._store.packed(i)) is not None}, poses)
+            layer.finish()
+        return layers
+
     def _scans(self) -> Iterator[tuple[Scan, Array]]:
-        for keyframe_id in self._store.ids:
-            yield self._store.scan(keyframe_id), self._occupancy.poses[keyframe_id]
+        for keyframe_id, T_map_body in self._occupancy.poses.items():
+            yield self._store.scan(keyframe_id), T_map_body
 
     def _averaged(self, voxel_m: float, max_points: int) -> tuple[VoxelAverage, bool]:
         """Return the average of all keyframes' points in each voxel, and whether none of them has dense depth."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -94,6 +95,16 @@ def write_products(
             if path.suffix == ".pgm":
                 written[f"{product}_yaml"] = path.with_suffix(".yaml")
     return written, notes
+
+
+def remove_products(folder: Path) -> None:
+    """Remove the files of a map, and its folder if nothing else is in it."""
+    for name in FILES.values():
+        (folder / name).unlink(missing_ok=True)
+    for product in ("grid", "drive"):
+        (folder / f"{product}.yaml").unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _write_octree(path: Path, content: bytes) -> None:

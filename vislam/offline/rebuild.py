@@ -22,8 +22,8 @@ from vislam.frontend import mode_for
 from vislam.mapping.extract import ScanExtractor
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
-from vislam.memory import PackedScan
-from vislam.messages import Array, Frame, GraphUpdate, Keyframe
+from vislam.memory import LoopPlace, PackedScan
+from vislam.messages import Array, Frame, GraphUpdate, Keyframe, Pieces
 from vislam.runfolder import read_setup, write_json
 from vislam.session import Session
 from vislam.sources import open_source
@@ -63,10 +63,12 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
         mapper = Mapper(config, rig, one_camera)
         from_session = ran.map.enabled and (one_camera or _same_extraction(ran.map, config, rig))
+        nothing = GraphUpdate(0, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None, pieces=_pieces(session))
+        mapper.move(nothing)
         total = len(placed) + len(config.products)
         tell = _teller(progress, total)
         if from_session:
-            _from_session(session, mapper, placed, config.rebuild_keyframes_per_call, tell)
+            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, tell)
         else:
             _from_recording(session, mapper, placed, read_setup(run)[0], ran, tell)
     finally:
@@ -122,13 +124,27 @@ def _poses(session: Session, run: Path, poses: str) -> dict[int, Array]:
     return {i: T[k] for k, (i, _) in enumerate(inside)}
 
 
+def _pieces(session: Session) -> Pieces:
+    """Return the pieces of trajectory, and which of them the loops that the graph held at the end have joined."""
+    pieces = Pieces()
+    for packet in session.packets(light=True):
+        if packet.begins_piece and packet.keyframe.id > 0:
+            pieces = pieces.begun(packet.keyframe.id)
+    held = [loop.edge for loop in session.loops() if loop.state.place in (LoopPlace.GRAPH, LoopPlace.SPARE)]
+    return pieces.joined_by((edge.from_id, edge.to_id) for edge in held)
+
+
 def _from_session(
-    session: Session, mapper: Mapper, placed: dict[int, Array], at_once: int, tell: Callable[[int, str], None]
+    session: Session,
+    mapper: Mapper,
+    placed: dict[int, Array],
+    nothing: GraphUpdate,
+    at_once: int,
+    tell: Callable[[int, str], None],
 ) -> None:
     rows = session.rows("SELECT id, t_ns, depth_png, points, colors FROM scans ORDER BY id")
     scans = {i: PackedScan(*row) for i, *row in rows if i in placed}
     mapper.restore(scans, placed)
-    nothing = GraphUpdate(0, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
     for done in range(0, len(scans), at_once):
         tell(done, "octree")
         mapper.move(nothing)
