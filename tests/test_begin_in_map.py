@@ -102,6 +102,15 @@ def test_maps_are_chained_and_a_run_in_one_is_resumed(yesterday, tmp_path, capsy
     assert run_verb(["eval", str(today), "--loops"]) == 0
 
 
+def test_a_run_that_ends_before_gravity_is_known_leaves_the_map_as_it_was(yesterday, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run(TODAY, tmp_path / "today", MapChoice(yesterday, False), stop_at=5)
+    metrics = json.loads((tmp_path / "today" / "metrics.json").read_text())
+    assert metrics["initialisation"]["status"] == "none"
+    assert metrics["keyframes"] == 0
+    np.testing.assert_allclose(poses_of(tmp_path / "today"), poses_of(yesterday), atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("source", "arguments", "code", "message"),
     [

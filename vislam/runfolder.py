@@ -90,8 +90,8 @@ def _read_json(path: Path) -> dict[str, Any]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise UsageError(
-            f"{path.parent} holds no run to resume ({path.name} is missing); `vislam run SOURCE --out {path.parent}` "
-            "starts one, with --overwrite if the folder exists"
+            f"{path.parent} holds no run to resume ({path.name} is missing); start one with --out {path.parent}, and "
+            "with --overwrite if the folder exists"
         ) from error
     except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be read: {error}; start the run anew with --overwrite") from error

@@ -95,7 +95,7 @@ class Back:
         T_map_body: Array,
     ) -> None:
         """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity."""
-        has_gravity = first_state is not None
+        self._has_gravity = has_gravity = first_state is not None
         readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
         window = replace(config.window, readout_s=readout_s)
         scale_sigma = float(np.hypot(config.graph.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
@@ -138,10 +138,16 @@ class Back:
             self.graph.hold(memory.held)
         return update
 
-    def begin_recording(self, state: NavState | None, T_odom_body: Array) -> None:
-        """Prepare for the first keyframe of a new recording, whose axes are those of map until loops say otherwise."""
+    def begin_recording(self, state: NavState | None, T_odom_body: Array) -> bool:
+        """Prepare for the first keyframe of a new recording, whose axes are those of map until loops say otherwise.
+
+        False, and nothing begins, where the map knows gravity and the recording ended or gave up before it did.
+        """
+        if state is None and self._has_gravity:
+            return False
         self.graph.begin_recording(state, T_odom_body)
         self.T_map_odom = np.eye(4)
+        return True
 
     def add(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> KeyframeStep:
         """Take one keyframe and the frames before it in: find its loops, optimise, follow with the map."""
@@ -291,16 +297,19 @@ class Slam:
         for odometry in keyframes:
             if odometry.packet.keyframe.id == self._seen_again and self.back is not None:
                 self.back.graph.go_on(odometry.packet, odometry.T_odom_body)
-            else:
+            elif self._enters(odometry):
                 steps.append(self._add_new(odometry))
         return steps
+
+    def _enters(self, odometry: OdometryKeyframe) -> bool:
+        """Return whether a keyframe can be added; into a map that knows gravity only if the recording does."""
+        if self._begins_recording and self.back is not None:
+            self._begins_recording = not self.back.begin_recording(self.front.first_state, odometry.T_odom_body)
+        return not self._begins_recording
 
     def _add_new(self, odometry: OdometryKeyframe) -> KeyframeStep:
         if self.back is None:
             self.back = self._make_back(self.front.noise, self.clock, self.front.first_state, odometry.T_odom_body)
-        if self._begins_recording:
-            self.back.begin_recording(self.front.first_state, odometry.T_odom_body)
-            self._begins_recording = False
         seen = list(self._seen)
         self._seen.clear()
         step = self.back.add(odometry, seen)

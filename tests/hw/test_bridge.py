@@ -242,6 +242,25 @@ def test_saturation_and_temperature_are_told(config: SerialConfig) -> None:
     assert not any(isinstance(sample, MagSample) for sample in samples)
 
 
+def test_the_drift_since_the_zero_is_taken_off(config: SerialConfig) -> None:
+    def warm(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (20.0, -10.0, -43.0), 31.0
+
+    with BridgeEmulator(Path(config.port), warm, errors=EXACT):
+        bridge = SerialBridge(config)
+        before = imu(collect(bridge, lambda found: len(found) > 100))
+        assert bridge.temperature_c == pytest.approx(31.0, abs=0.1)
+        bridge.zeroed_at(29.0, np.array([0.01, 0.0, -0.02]))
+        collect(bridge, lambda found: len(found) > 100)  # what had been read before
+        after = imu(collect(bridge, lambda found: len(found) > 100))
+        assert Health.TEMPERATURE_DRIFT not in bridge.health()
+        bridge.zeroed_at(15.0, np.zeros(3))
+        assert Health.TEMPERATURE_DRIFT in bridge.health()
+        bridge.close()
+    change = np.mean([s.gyro_rad_s for s in after], axis=0) - np.mean([s.gyro_rad_s for s in before], axis=0)
+    np.testing.assert_allclose(change, [-0.02, 0.0, 0.04], atol=2e-3)
+
+
 def test_a_board_may_go_away_while_it_is_opened(
     config: SerialConfig, board: BridgeEmulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -169,5 +169,7 @@ def test_the_command_line_goes_on_and_says_what_it_cannot(first, tmp_path: Path,
         error = capsys.readouterr().err.strip()
         assert message in error
         assert len(error.splitlines()) == 1
+    assert run_verb(["run", "--resume", str(out)]) == 2
+    assert f"vislam live --resume {out}" in capsys.readouterr().err
     assert (out / "session.db").is_file()
     assert not (tmp_path / "new").exists()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
 import uuid
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from vislam.errors import DataError, UsageError, VislamError
 from vislam.live.epoch import Epoch
 from vislam.live.run_live import LiveRun
 from vislam.live.sensors import open_live
+from vislam.live.slot import SlotWriter
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.imu import _truth
 from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
@@ -58,6 +61,19 @@ def test_other_processes_see_the_same_motion_and_chips_its_derivatives() -> None
             assert force[2] == 9.81
     finally:
         drive.close()
+
+
+def test_who_follows_waits_for_the_first_segment() -> None:
+    name = f"vislam-test-{uuid.uuid4().hex}"
+    slot, first = SlotWriter(name, 1024), Segment(0.0, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.0)
+    values = [getattr(first, field.name) for field in fields(first)]
+    late = threading.Timer(0.1, lambda: slot.write(np.array(values).tobytes()))
+    late.start()
+    try:
+        assert Follower.waiting(name).at(0.0) == first
+    finally:
+        late.join()
+        slot.close()
 
 
 def test_the_pilot_drives_the_course_to_its_end() -> None:
@@ -121,10 +137,26 @@ def test_wrong_sources_are_told(asked: str, message: str) -> None:
         open_live(asked, Config(), SensorsConfig())
 
 
-def test_a_second_calibration_of_the_imu_is_refused(tmp_path: Path) -> None:
-    config = load(None, {"calibration.camera": str(tmp_path / "cam.yaml"), "calibration.imu": "imu.yaml"})
+@pytest.mark.parametrize("chip", ["imu", "mag"])
+def test_a_second_calibration_of_a_chip_is_refused(chip: str, tmp_path: Path) -> None:
+    config = load(None, {"calibration.camera": str(tmp_path / "cam.yaml"), f"calibration.{chip}": "found.yaml"})
     with pytest.raises(UsageError, match="sensors file"):
         open_live("gy85+webcam", config, SensorsConfig())
+
+
+def test_the_webcam_of_the_settings_keeps_its_name_and_its_clock(tmp_path: Path) -> None:
+    file = tmp_path / "camchain.yaml"
+    file.write_text(
+        "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n"
+        "  intrinsics: [500, 500, 320, 240]\n  resolution: [640, 480]\n  timeshift_cam_imu: 0.02\n"
+        "  T_cam_imu: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]\n"
+    )
+    config = load(None, {"calibration.camera": str(file)})
+    source, settings = open_live("gy85+webcam", config, SensorsConfig())
+    assert source.cameras().args[0] == "webcam"
+    assert settings.init.time_offset_s == pytest.approx(0.02)
+    with pytest.raises(UsageError, match="no live source"):
+        open_live("gy85+", config, SensorsConfig())
 
 
 @pytest.mark.slow

@@ -55,8 +55,9 @@ def run(
         if back is None:
             back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, keyframe.odometry.T_odom_body)
         if begins_recording:
-            back.begin_recording(keyframe.first_state, keyframe.odometry.T_odom_body)
-            begins_recording = False
+            begins_recording = not back.begin_recording(keyframe.first_state, keyframe.odometry.T_odom_body)
+            if begins_recording:
+                continue  # ended before gravity was known
         step = back.add(keyframe.odometry, [])
         _tell(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
         _put(life, outbox, step)

@@ -71,6 +71,8 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     from vislam.sources import open_source
 
     options = parse(ResumeOptions, arguments, "run")
+    if (out / "sensors.json").is_file():
+        raise UsageError(f"{out} is a live run; go on with it by vislam live --resume {out}")
     source, config, base = read_setup(out)
     recording = open_source(source, config.seed, config.calibration)
     with written_up(out), progress_bar(recording.name) as progress:

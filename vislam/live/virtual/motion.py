@@ -6,11 +6,13 @@ seconds of them; whoever needs the truth (chips, camera, evaluation) evaluates t
 
 from __future__ import annotations
 
+import time
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vislam.errors import DataError
 from vislam.geometry import so3_exp, transform
 from vislam.live.slot import SlotReader, SlotWriter, wait_for
 from vislam.messages import Array
@@ -19,6 +21,7 @@ SEGMENT_S = 0.05
 LEAD = 2  # segments decided ahead: a command takes 0.1 to 0.15 s to act, as on a real cart
 _KEPT = 120  # segments that are published: 6 s
 _COLUMNS = 8
+_FIRST_S = 60.0  # that somebody who follows waits for the first one
 _GAUSS = np.polynomial.legendre.leggauss(4)  # over 50 ms at 1 rad/s its error is below a nanometre
 
 
@@ -114,7 +117,14 @@ class Follower:
     @classmethod
     def waiting(cls, name: str) -> Follower:
         """Open what a `Drive` publishes, or is about to. Raises DataError when there is none for long."""
-        return cls(wait_for(name))
+        follower, deadline = cls(wait_for(name)), time.monotonic() + _FIRST_S
+        follower._read()
+        while not follower._segments:  # the memory is there a moment before what is in it
+            if time.monotonic() > deadline:
+                raise DataError(f"the virtual cart tells nothing in {name}; was its process stopped?")
+            time.sleep(0.01)
+            follower._read()
+        return follower
 
     def at(self, t_s: float) -> Segment:
         """Return the cart at a time in the last seconds; before the first segment it stands."""
