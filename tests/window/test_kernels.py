@@ -75,7 +75,7 @@ def normal_equations(scene: Scene) -> tuple[Array, Array, Array, Array]:
 
 
 def views_cost(scene: Scene, X: Array, points: Array, calibration: Array) -> float:
-    squares = np.zeros((len(scene.views.xy), 2))
+    squares = np.zeros((len(scene.views.values), 2))
     return visual.cost(X, points, calibration, scene.views, scene.camera, squares)
 
 

@@ -12,7 +12,26 @@ from numba import njit
 from vislam.messages import Array
 from vislam.window import inertial
 from vislam.window.layout import CALIBRATION, Camera, Links, Views
-from vislam.window.projection import COLUMNS, chain, derivative, place_host, residual, scratch, shift, weigh
+from vislam.window.projection import (
+    CALIBRATED,
+    COLUMNS,
+    ERROR,
+    POINT,
+    SEEN,
+    Hosted,
+    Measured,
+    Mount,
+    Place,
+    hosted,
+    lens,
+    linearised,
+    measured,
+    mounted,
+    place,
+    residual,
+    shift,
+    sight,
+)
 from vislam.window.schur import invert
 
 _MAX_RHO = 20.0  # 1/m: nothing is seen nearer than 5 cm
@@ -76,142 +95,125 @@ def innovations(
         squares: [N] gets the squared innovations, chi-square with two degrees of freedom; infinite behind the camera,
             NaN for older views.
     """
-    w, r, J = scratch(camera, calibration), np.empty(3), np.empty((3, COLUMNS))
+    mount, J = mounted(camera, calibration), np.zeros((3, COLUMNS))
     newest, width = len(X) - 1, 6 * len(X) + CALIBRATION
     own_block, inverse, cross = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, width))
+    H, spread = np.empty((2, width)), np.empty((2, width))
+    first, hosts, keyframes, cameras, values = views
+    cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
     squares[:] = np.nan
     for p in range(len(points)):
-        host, own = views.host[p], views.first[p]
+        host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
         own_block[:], cross[:] = 0.0, 0.0
         own_block[2, 2] = camera.rho_information
-        dt_host = shift(views, camera, calibration, own, host)
-        place_host(X, host, camera, dt_host, points[p], w)
-        for n in range(own, views.first[p + 1]):  # in order of time: the newest ones come last
-            seen, rho = views.keyframe[n], points[p, 2]
-            if seen != newest:
-                dt = dt_host if seen == host else shift(views, camera, calibration, n, seen)
-                chain(X, seen, camera, dt, rho, views.camera[n], w)
-                if residual(w, views, n, rho, r):
-                    derivative(w, views, n, own, rho, seen == host, J)
-                    weigh(J, r, 3 if views.depth_weight[n] > 0.0 else 2, camera.huber_k)
-                    _add_older(J, views.depth_weight[n] > 0.0, host, seen, len(X), camera.active, own_block, cross)
+        at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
+        landmark = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
+        for n in range(first[p], first[p + 1]):  # in order of time: the newest ones come last
+            k, view, cam = keyframes[n], measured(values, n), lens(cams, cameras[n])
+            at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
+            if k != newest:
+                seen = sight(landmark, at, mount, cam)
+                ahead, error = residual(seen.in_cam, rho, view)
+                if ahead:
+                    linearised(landmark, seen, mount, view, active, k == host, error, camera.huber_k, J)
+                    _add_older(J, view.depth_weight > 0.0, host, k, len(X), own_block, cross)
                 continue
             squares[n] = np.inf
             if not invert(own_block, 0.0, inverse):
                 continue
             rho_information = 1.0 / inverse[2, 2]
-            dt = shift(views, camera, calibration, n, seen)
-            rho = _best_depth(X, points[p], rho_information, camera, dt_host, dt, views, n, host, seen, own, w, r, J)
-            if not np.isfinite(rho):
+            best = _best_depth(landmark, rho_information, mount, at, cam, view, active, J)
+            if not np.isfinite(best):
                 continue
-            squares[n] = _square(J, r, host, seen, len(X), camera.active, own_block, cross, covariance)
-            squares[n] += rho_information * (rho - points[p, 2]) ** 2
+            squares[n] = _square(J, host, k, len(X), own_block, cross, covariance, H, spread)
+            squares[n] += rho_information * (best - rho) ** 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _square(
-    J: Array,
-    r: Array,
-    host: int,
-    seen: int,
-    count: int,
-    active: Array,
-    own_block: Array,
-    cross: Array,
-    covariance: Array,
-) -> float:
+    J: Array, host: int, seen: int, count: int, own_block: Array, cross: Array, covariance: Array, H: Array,
+    spread: Array,
+) -> float:  # fmt: skip
     """Return the squared error of a view whose derivative is J, by the spread that bearing and poses leave it."""
     known, inverse = own_block.copy(), np.empty((3, 3))
     known[2, 2] += _DEPTH_IS_TAKEN
     if not invert(known, 0.0, inverse):
         return np.inf
-    H, by_point, S = np.zeros((2, cross.shape[1])), np.zeros((2, 3)), np.eye(2)
+    S, by_point = np.eye(2), np.zeros((2, 3))
     for k in range(2):
-        _scatter(J, k, host, seen, count, active, 1.0, H[k])
         for i in range(3):
             for j in range(3):
-                by_point[k, i] += J[k, 17 + j] * inverse[j, i]
-            for j in range(len(H[k])):
-                H[k, j] -= by_point[k, i] * cross[i, j]
+                by_point[k, i] += J[k, POINT + j] * inverse[j, i]
+        a, b, c = by_point[k, 0], by_point[k, 1], by_point[k, 2]
+        for j in range(H.shape[1]):
+            H[k, j] = -(a * cross[0, j] + b * cross[1, j] + c * cross[2, j])
+        _scatter(J, k, host, seen, count, 1.0, H[k])
     for a in range(2):
         for b in range(2):
             for i in range(3):
-                S[a, b] += by_point[a, i] * J[b, 17 + i]
-    _add_spread(H, covariance, S)
+                S[a, b] += by_point[a, i] * J[b, POINT + i]
+    _add_spread(H, covariance, spread, S)
+    e0, e1 = J[0, ERROR], J[1, ERROR]
     det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
-    return (r[0] * r[0] * S[1, 1] - 2.0 * r[0] * r[1] * S[0, 1] + r[1] * r[1] * S[0, 0]) / det
+    return (e0 * e0 * S[1, 1] - 2.0 * e0 * e1 * S[0, 1] + e1 * e1 * S[0, 0]) / det
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_depth(
-    X: Array,
-    point: Array,
-    rho_information: float,
-    camera: Camera,
-    dt_host: float,
-    dt: float,
-    views: Views,
-    n: int,
-    host: int,
-    seen: int,
-    own: int,
-    w: Array,
-    r: Array,
+    landmark: Hosted, rho_information: float, mount: Mount, at: Place, cam: Mount, view: Measured, active: Array,
     J: Array,
-) -> float:
-    """Return the inverse depth that explains view n best, and r and J of it; NaN if none is in front of the camera."""
-    trial = point.copy()
-    trial[2] = rho = min(max(point[2], 0.0), _MAX_RHO)
+) -> float:  # fmt: skip
+    """Return the inverse depth that explains a view best, and J of it; NaN if none is in front of the camera."""
+    rho = min(max(landmark.rho, 0.0), _MAX_RHO)
     for step in range(_DEPTH_STEPS + 1):
-        place_host(X, host, camera, dt_host, trial, w)
-        chain(X, seen, camera, dt, rho, views.camera[n], w)
-        if not residual(w, views, n, rho, r):
+        trial = hosted(landmark.place, mount, landmark.row, landmark.bearing[0], landmark.bearing[1], rho)
+        seen = sight(trial, at, mount, cam)
+        ahead, error = residual(seen.in_cam, rho, view)
+        if not ahead:
             return np.nan
-        derivative(w, views, n, own, rho, False, J)
+        linearised(trial, seen, mount, view, active, False, error, np.inf, J)
         if step < _DEPTH_STEPS:
-            slope = J[0, 19] * r[0] + J[1, 19] * r[1] + rho_information * (rho - point[2])
-            curvature = J[0, 19] * J[0, 19] + J[1, 19] * J[1, 19] + rho_information
-            trial[2] = rho = min(max(rho - slope / curvature, 0.0), _MAX_RHO)
+            slope = J[0, POINT + 2] * error[0] + J[1, POINT + 2] * error[1] + rho_information * (rho - landmark.rho)
+            curvature = J[0, POINT + 2] * J[0, POINT + 2] + J[1, POINT + 2] * J[1, POINT + 2] + rho_information
+            rho = min(max(rho - slope / curvature, 0.0), _MAX_RHO)
     return rho
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_older(
-    J: Array, deep: bool, host: int, seen: int, count: int, active: Array, own_block: Array, cross: Array
-) -> None:
+def _add_older(J: Array, deep: bool, host: int, seen: int, count: int, own_block: Array, cross: Array) -> None:
     """Add an older view to what is known of a landmark [3, 3] and how that depends on poses [3, 6 M + 5]."""
     for k in range(3 if deep else 2):
         for i in range(3):
             for j in range(3):
-                own_block[i, j] += J[k, 17 + i] * J[k, 17 + j]
+                own_block[i, j] += J[k, POINT + i] * J[k, POINT + j]
             if seen != host:
-                _scatter(J, k, host, seen, count, active, J[k, 17 + i], cross[i])
+                _scatter(J, k, host, seen, count, J[k, POINT + i], cross[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scatter(J: Array, k: int, host: int, seen: int, count: int, active: Array, factor: float, out: Array) -> None:
+def _scatter(J: Array, k: int, host: int, seen: int, count: int, factor: float, out: Array) -> None:
     """Add row k of a derivative, times a factor, where its poses and the calibration lie."""
     for i in range(6):
         out[6 * host + i] += factor * J[k, i]
-        out[6 * seen + i] += factor * J[k, 6 + i]
+        out[6 * seen + i] += factor * J[k, SEEN + i]
     for i in range(CALIBRATION):
-        if active[i]:
-            out[6 * count + i] += factor * J[k, 12 + i]
+        out[6 * count + i] += factor * J[k, CALIBRATED + i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_spread(H: Array, covariance: Array, S: Array) -> None:
-    """Add H @ covariance @ H.T to S [2, 2], passing over columns of zeros."""
+def _add_spread(H: Array, covariance: Array, spread: Array, S: Array) -> None:
+    """Add H @ covariance @ H.T to S [2, 2], passing over columns of zeros; `spread` [2, D] is room for half of it."""
     width = H.shape[1]
+    spread[:] = 0.0
     for i in range(width):
-        if H[0, i] == 0.0 and H[1, i] == 0.0:
+        a, b, row = H[0, i], H[1, i], covariance[i]
+        if a == 0.0 and b == 0.0:
             continue
-        row = covariance[i]
-        first, second = 0.0, 0.0
         for j in range(width):
-            first += row[j] * H[0, j]
-            second += row[j] * H[1, j]
-        S[0, 0] += H[0, i] * first
-        S[0, 1] += H[0, i] * second
-        S[1, 0] += H[1, i] * first
-        S[1, 1] += H[1, i] * second
+            spread[0, j] += a * row[j]
+            spread[1, j] += b * row[j]
+    for j in range(width):
+        S[0, 0] += H[0, j] * spread[0, j]
+        S[0, 1] += H[0, j] * spread[1, j]
+        S[1, 0] += H[1, j] * spread[0, j]
+        S[1, 1] += H[1, j] * spread[1, j]

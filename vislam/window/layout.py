@@ -30,11 +30,8 @@ class Views(NamedTuple):
     host: Ints  # [L] keyframe whose camera 0 holds bearing and inverse depth
     keyframe: Ints  # [N]
     camera: Ints  # [N] 0 or 1
-    xy: Array  # [N, 2] on z = 1
-    white: Array  # [N, 2, 2] turns an error on z = 1 into standard deviations
-    row: Array  # [N] of the image, -0.5 at the top to 0.5
-    inverse_depth: Array  # [N] 1/m, measured
-    depth_weight: Array  # [N] 1 / sigma; 0 where not measured
+    values: Array  # [N, 9] x and y on z = 1; [2, 2] that turns an error there into standard deviations; row of the
+    # image, -0.5 at the top to 0.5; 1/z that was measured, 1/m, and 1 / its sigma, 0 where it was not
 
 
 class Links(NamedTuple):

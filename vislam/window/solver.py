@@ -158,7 +158,7 @@ class _Equations:
     def _estimate(self, X: Array, points: Array, calibration: Array) -> _Estimate:
         p = self._problem
         dx = inertial.prior_shift(X, p.X_first, calibration, p.prior.calibration, self._held_by_prior, self._size)
-        squares = np.zeros((len(p.views.xy), 2))
+        squares = np.zeros((len(p.views.values), 2))
         cost = visual.cost(X, points, calibration, p.views, p.camera, squares)
         cost += inertial.cost(X, p.links, p.gravity_m_s2) + float(p.prior.b @ dx + 0.5 * (dx @ (p.prior.H @ dx)))
         return _Estimate(X, points, calibration, dx, squares, cost)

@@ -13,7 +13,7 @@ from vislam.errors import DataError
 from vislam.messages import Array, Observations
 from vislam.window.layout import Ints, Views
 
-_VALUES = 9  # x, y, whitening (4), row, inverse depth, its weight
+_VALUES = 9  # of a view, see Views
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,17 +91,12 @@ class TrackTable:
         slot = self.slot[rows]
         starts = np.flatnonzero(np.diff(slot, prepend=-1))
         keyframe = np.searchsorted(ids, self.keyframe[rows]).astype(np.int64)
-        values = self._values[rows]
         views = Views(
-            first=np.append(starts, len(rows)).astype(np.int64),
+            first=np.append(starts, len(rows)),
             host=keyframe[starts],
             keyframe=keyframe,
             camera=self.camera[rows],
-            xy=np.ascontiguousarray(values[:, :2]),
-            white=np.ascontiguousarray(values[:, 2:6]).reshape(-1, 2, 2),
-            row=np.ascontiguousarray(values[:, 6]),
-            inverse_depth=np.ascontiguousarray(values[:, 7]),
-            depth_weight=np.ascontiguousarray(values[:, 8]),
+            values=self._values[rows],
         )
         return Selection(views, slot[starts], rows)
 

@@ -15,53 +15,53 @@ from numba import njit
 from vislam.messages import Array
 from vislam.window.layout import CALIBRATION, Camera, Views
 from vislam.window.projection import (
+    CALIBRATED,
     COLUMNS,
-    F_CAM,
-    chain,
-    derivative,
-    place_host,
+    ERROR,
+    POINT,
+    SEEN,
+    Mount,
+    Place,
+    hosted,
+    lens,
+    linearised,
+    measured,
+    mounted,
+    place,
     residual,
     robust,
-    scratch,
     shift,
-    weigh,
+    sight,
 )
 from vislam.window.schur import invert
+from vislam.window.small import minus
 
 _BEHIND_COST = 50.0  # of a view that the landmark lies behind; constant, so that it neither pulls nor stops a step
+_OWN = 16  # columns of a view that belong to its landmark: host, calibration, point, error
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Camera, squares: Array) -> float:
     """Return half the robust cost of all views; `squares` [N, 2] gets the squared errors of pixel and depth."""
-    w, r = scratch(camera, calibration), np.empty(3)
-    total = 0.0
+    mount, total = mounted(camera, calibration), 0.0
+    first, hosts, keyframes, cameras, values = views
+    cams, rates, offsets_s, huber_k = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.huber_k
     for p in range(len(points)):
-        host, own = views.host[p], views.first[p]
-        dt_host = shift(views, camera, calibration, own, host)
-        place_host(X, host, camera, dt_host, points[p], w)
-        total += camera.rho_information * points[p, 2] * points[p, 2]
-        for n in range(own, views.first[p + 1]):
-            seen = views.keyframe[n]
-            dt = dt_host if seen == host else shift(views, camera, calibration, n, seen)
-            chain(X, seen, camera, dt, points[p, 2], views.camera[n], w)
-            if not residual(w, views, n, points[p, 2], r):
+        host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
+        at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
+        landmark = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
+        total += camera.rho_information * rho * rho
+        for n in range(first[p], first[p + 1]):
+            k, view = keyframes[n], measured(values, n)
+            at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
+            ahead, e = residual(sight(landmark, at, mount, lens(cams, cameras[n])).in_cam, rho, view)
+            if not ahead:
                 total += _BEHIND_COST
                 squares[n, 0], squares[n, 1] = 1e6, 0.0
                 continue
-            squares[n, 0], squares[n, 1] = r[0] * r[0] + r[1] * r[1], r[2] * r[2]
-            total += robust(squares[n, 0], camera.huber_k)[1] + robust(squares[n, 1], camera.huber_k)[1]
+            squares[n, 0], squares[n, 1] = e[0] * e[0] + e[1] * e[1], e[2] * e[2]
+            total += robust(squares[n, 0], huber_k)[1] + robust(squares[n, 1], huber_k)[1]
     return 0.5 * total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _where_linearised(X: Array, X_first: Array, held: Array) -> Array:
-    out = X.copy()
-    for k in range(len(X)):
-        if held[k]:
-            for i in range(X.shape[1]):
-                out[k, i] = X_first[k, i]
-    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -97,83 +97,89 @@ def linearise(
         g_points: their gradients [L, 3], overwritten.
         cross: landmarks by poses and calibration [L, 3, D - poses_at], overwritten.
     """
-    w, r, J, waste = scratch(camera, calibration), np.empty(3), np.empty((3, COLUMNS)), np.empty(3)
-    X_by = _where_linearised(X, X_first, held)
+    mount, calibrated = mounted(camera, calibration), poses_at + 6 * len(X)
+    first, hosts, keyframes, cameras, values = views
+    cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
+    J, ours, theirs = np.zeros((3, COLUMNS)), np.empty((POINT + 3, _OWN)), np.empty((6, COLUMNS))
     cross[:] = 0.0
     for p in range(len(points)):
-        host, own, rho = views.host[p], views.first[p], points[p, 2]
-        A_points[p] = 0.0
-        g_points[p] = 0.0
-        A_points[p, 2, 2] = camera.rho_information
-        g_points[p, 2] = camera.rho_information * rho
-        dt_host = shift(views, camera, calibration, own, host)
-        placed = False
-        for n in range(own, views.first[p + 1]):
-            seen = views.keyframe[n]
-            dt = dt_host if seen == host else shift(views, camera, calibration, n, seen)
-            if not placed:
-                place_host(X, host, camera, dt_host, points[p], w)
-                placed = True
-            chain(X, seen, camera, dt, rho, views.camera[n], w)
-            if not residual(w, views, n, rho, r):
+        host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
+        dt_host = shift(offsets_s, calibration, host, row)
+        at_host = at_fixed = place(X, host, rates, dt_host)
+        landmark = fixed = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
+        if held[host]:
+            at_fixed = place(X_first, host, rates, dt_host)
+            fixed = hosted(at_fixed, mount, row, points[p, 0], points[p, 1], rho)
+        ours[:] = 0.0
+        for n in range(first[p], first[p + 1]):
+            k, view, cam = keyframes[n], measured(values, n), lens(cams, cameras[n])
+            dt = shift(offsets_s, calibration, k, view.row)
+            at = at_host if k == host else place(X, k, rates, dt)
+            seen = sight(landmark, at, mount, cam)
+            ahead, error = residual(seen.in_cam, rho, view)
+            if ahead and (held[host] or held[k]):
+                if k == host:
+                    at = at_fixed
+                elif held[k]:
+                    at = place(X_first, k, rates, dt)
+                seen = sight(fixed, at, mount, cam)
+                ahead = residual(seen.in_cam, rho, view)[0]
+            if not ahead:
                 continue
-            if held[host] or held[seen]:
-                if held[host]:
-                    place_host(X_by, host, camera, dt_host, points[p], w)
-                    placed = False
-                chain(X_by, seen, camera, dt, rho, views.camera[n], w)
-                if not residual(w, views, n, rho, waste):
-                    continue
-            derivative(w, views, n, own, rho, seen == host, J)
-            rows = 3 if views.depth_weight[n] > 0.0 else 2
-            weigh(J, r, rows, camera.huber_k)
-            for k in range(rows):
-                for i in range(3):
-                    g_points[p, i] += J[k, 17 + i] * r[k]
-                    for j in range(3):
-                        A_points[p, i, j] += J[k, 17 + i] * J[k, 17 + j]
-            if seen != host:
-                _accumulate(J, r, rows, host, seen, len(X), camera.active, poses_at, p, A, g, cross)
+            linearised(fixed, seen, mount, view, active, k == host, error, camera.huber_k, J)
+            rows = 3 if view.depth_weight > 0.0 else 2
+            _add_squares(J, rows, 0, ours)
+            if k != host:
+                theirs[:] = 0.0
+                _add_squares(J, rows, SEEN, theirs)
+                _add_seen(theirs, 6 * host, 6 * k, poses_at, calibrated, A, g, cross, p)
+        _add_own(ours, 6 * host, poses_at, calibrated, A, g, cross, p)
+        for i in range(3):
+            g_points[p, i] = ours[POINT + i, ERROR]
+            for j in range(3):
+                A_points[p, i, j] = ours[POINT + i, POINT + j]
+        A_points[p, 2, 2] += camera.rho_information
+        g_points[p, 2] += camera.rho_information * rho
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _accumulate(
-    J: Array,
-    r: Array,
-    rows: int,
-    host: int,
-    seen: int,
-    count: int,
-    active: Array,
-    poses_at: int,
-    p: int,
-    A: Array,
-    g: Array,
-    cross: Array,
+def _add_squares(J: Array, rows: int, column: int, out: Array) -> None:
+    """Add to `out` [R, C] the products of R columns of J, from `column` on, with its first C columns."""
+    for k in range(rows):
+        for i in range(out.shape[0]):
+            value = J[k, column + i]
+            for j in range(out.shape[1]):
+                out[i, j] += value * J[k, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_own(ours: Array, host: int, poses_at: int, calibrated: int, A: Array, g: Array, cross: Array, p: int) -> None:
+    """Add what all views of a landmark say of its host and the calibration, and of how the landmark hangs on them."""
+    for i in range(POINT):
+        at = poses_at + host + i if i < CALIBRATED else calibrated + i - CALIBRATED
+        g[at] += ours[i, ERROR]
+        for j in range(i, POINT):
+            A[at, poses_at + host + j if j < CALIBRATED else calibrated + j - CALIBRATED] += ours[i, j]
+        for j in range(3):
+            cross[p, j, at - poses_at] += ours[i, POINT + j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_seen(
+    theirs: Array, host: int, seen: int, poses_at: int, calibrated: int, A: Array, g: Array, cross: Array, p: int
 ) -> None:
-    """Add one view of landmark p to the normal equations of poses and calibration."""
-    blocks = (6 * host, 6 * seen, 6 * count)  # ascending, for the host is the first to see it
-    for i in range(CALIBRATION):
-        if not active[i]:
-            for k in range(rows):
-                J[k, 12 + i] = 0.0
-    for a in range(3):
-        for i in range(6 if a < 2 else CALIBRATION):
-            column, at = 6 * a + i, blocks[a] + i
-            for k in range(rows):
-                value = J[k, column]
-                g[poses_at + at] += value * r[k]
-                for j in range(3):
-                    cross[p, j, at] += J[k, 17 + j] * value
-            out = A[poses_at + at]
-            for b in range(a, 3):
-                start = i if b == a else 0
-                first = poses_at + blocks[b]
-                for j in range(start, 6 if b < 2 else CALIBRATION):
-                    total = J[0, column] * J[0, 6 * b + j] + J[1, column] * J[1, 6 * b + j]
-                    if rows == 3:
-                        total += J[2, column] * J[2, 6 * b + j]
-                    out[first + j] += total
+    """Add what a view says of the pose that sees, which is later than the host's, with all else that it hangs on."""
+    for i in range(6):
+        at = poses_at + seen + i
+        g[at] += theirs[i, ERROR]
+        for j in range(6):
+            A[poses_at + host + j, at] += theirs[i, j]
+            if j >= i:
+                A[at, poses_at + seen + j] += theirs[i, SEEN + j]
+        for j in range(CALIBRATION):
+            A[at, calibrated + j] += theirs[i, CALIBRATED + j]
+        for j in range(3):
+            cross[p, j, seen + i] += theirs[i, POINT + j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -184,66 +190,63 @@ def start(
 
     Once through the linear equation for the inverse depth, then three Gauss-Newton steps with the poses fixed.
     """
-    w = scratch(camera, calibration)
+    mount = mounted(camera, calibration)
+    first, hosts, keyframes, cameras, values = views
+    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
     for p in range(len(points)):
         if not wanted[p]:
             continue
-        point, host, own = points[p], views.host[p], views.first[p]
-        point[0], point[1] = views.xy[own, 0], views.xy[own, 1]
-        dt_host = shift(views, camera, calibration, own, host)
+        host, own = hosts[p], measured(values, first[p])
+        at_host = place(X, host, rates, shift(offsets_s, calibration, host, own.row))
+        far = hosted(at_host, mount, own.row, own.x, own.y, 0.0)
+        near = hosted(at_host, mount, own.row, own.x, own.y, 1.0)
         numerator, denominator = 1e2 * rho_start, 1e2
-        for n in range(own, views.first[p + 1]):
-            seen, cam = views.keyframe[n], views.camera[n]
-            dt = dt_host if seen == host else shift(views, camera, calibration, n, seen)
-            point[2] = 0.0
-            place_host(X, host, camera, dt_host, point, w)
-            chain(X, seen, camera, dt, 0.0, cam, w)
-            far_x, far_y, far_z = w[F_CAM, 0], w[F_CAM, 1], w[F_CAM, 2]
-            point[2] = 1.0
-            place_host(X, host, camera, dt_host, point, w)
-            chain(X, seen, camera, dt, 1.0, cam, w)
-            by_z = w[F_CAM, 2] - far_z
-            weight = views.white[n, 0, 0] ** 2
-            for i in range(2):
-                far = far_x if i == 0 else far_y
-                a = (w[F_CAM, i] - far) - views.xy[n, i] * by_z
-                numerator -= weight * a * (far - views.xy[n, i] * far_z)
-                denominator += weight * a * a
-            if views.depth_weight[n] > 0.0:
-                a = 1.0 - views.inverse_depth[n] * by_z
-                numerator += views.depth_weight[n] ** 2 * a * views.inverse_depth[n] * far_z
-                denominator += views.depth_weight[n] ** 2 * a * a
-        point[2] = min(max(numerator / denominator, 1e-3), 5.0)
-        _refine(X, calibration, views, camera, p, point, dt_host, w)
+        for n in range(first[p], first[p + 1]):
+            k, view, cam = keyframes[n], measured(values, n), lens(cams, cameras[n])
+            at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
+            at_infinity = sight(far, at, mount, cam).in_cam
+            by_rho = minus(sight(near, at, mount, cam).in_cam, at_infinity)
+            weight = view.white_xx**2
+            ax, ay = by_rho[0] - view.x * by_rho[2], by_rho[1] - view.y * by_rho[2]
+            numerator -= weight * ax * (at_infinity[0] - view.x * at_infinity[2])
+            numerator -= weight * ay * (at_infinity[1] - view.y * at_infinity[2])
+            denominator += weight * (ax * ax + ay * ay)
+            if view.depth_weight > 0.0:
+                a = 1.0 - view.inverse_depth * by_rho[2]
+                numerator += view.depth_weight**2 * a * view.inverse_depth * at_infinity[2]
+                denominator += view.depth_weight**2 * a * a
+        points[p, 0], points[p, 1], points[p, 2] = own.x, own.y, min(max(numerator / denominator, 1e-3), 5.0)
+        _refine(X, calibration, views, camera, p, points[p], at_host, mount)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refine(
-    X: Array, calibration: Array, views: Views, camera: Camera, p: int, point: Array, dt_host: float, w: Array
+    X: Array, calibration: Array, views: Views, camera: Camera, p: int, point: Array, at_host: Place, mount: Mount
 ) -> None:
     """Move landmark p [3] by three Gauss-Newton steps with the poses fixed."""
-    host, own, r, J = views.host[p], views.first[p], np.empty(3), np.empty((3, COLUMNS))
+    first, hosts, keyframes, cameras, values = views
+    cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
+    host, row, J = hosts[p], values[first[p], 6], np.zeros((3, COLUMNS))
     H, b, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(3):
         for i in range(3):
             b[i] = camera.rho_information * point[i]
             for j in range(3):
                 H[i, j] = camera.rho_information if i == j else 0.0
-        place_host(X, host, camera, dt_host, point, w)
-        for n in range(own, views.first[p + 1]):
-            seen = views.keyframe[n]
-            dt = dt_host if seen == host else shift(views, camera, calibration, n, seen)
-            chain(X, seen, camera, dt, point[2], views.camera[n], w)
-            if not residual(w, views, n, point[2], r):
+        landmark = hosted(at_host, mount, row, point[0], point[1], point[2])
+        for n in range(first[p], first[p + 1]):
+            k, view = keyframes[n], measured(values, n)
+            at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
+            seen = sight(landmark, at, mount, lens(cams, cameras[n]))
+            ahead, error = residual(seen.in_cam, landmark.rho, view)
+            if not ahead:
                 continue
-            derivative(w, views, n, own, point[2], seen == host, J)
-            rows = 3 if views.depth_weight[n] > 0.0 else 2
-            weigh(J, r, rows, camera.huber_k)
-            for k in range(rows):
+            linearised(landmark, seen, mount, view, active, k == host, error, camera.huber_k, J)
+            for m in range(3 if view.depth_weight > 0.0 else 2):
                 for i in range(3):
-                    b[i] += J[k, 17 + i] * r[k]
+                    b[i] += J[m, POINT + i] * J[m, ERROR]
                     for j in range(3):
-                        H[i, j] += J[k, 17 + i] * J[k, 17 + j]
+                        H[i, j] += J[m, POINT + i] * J[m, POINT + j]
         if not invert(H, 0.0, inverse):
             break
         for i in range(3):
