@@ -9,7 +9,7 @@ from window_world import RGBD, STEREO, World, start_state
 
 from vislam.config import WindowConfig
 from vislam.messages import Array
-from vislam.window import inertial, linear, visual
+from vislam.window import inertial, linear, schur, visual
 from vislam.window.layout import CALIBRATION, Camera, Links, Views, positions, retract
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import TrackTable
@@ -60,18 +60,17 @@ def make_scene(rig, seed: int) -> Scene:
     return Scene(np.array(X), points, calibration, selection.views, camera, links.arrays)
 
 
-def normal_equations(scene: Scene) -> tuple[Array, Array, Array, Array]:
+def normal_equations(scene: Scene) -> tuple[Array, Array]:
     count = len(scene.X)
     D = 15 * count + CALIBRATION
-    L = len(scene.points)
     A, g = np.zeros((D, D)), np.zeros(D)
-    A_points, g_points, cross = np.empty((L, 3, 3)), np.empty((L, 3)), np.empty((L, 3, 6 * count + CALIBRATION))
+    landmarks = schur.room_for(len(scene.points), 6 * count + CALIBRATION)
     held = np.zeros(count, dtype=np.bool_)
     visual.linearise(
         scene.X, scene.X, held, scene.points, scene.calibration, scene.views, scene.camera, 9 * count,
-        A, g, A_points, g_points, cross,
+        A, g, landmarks,
     )  # fmt: skip
-    return A, g, A_points, g_points
+    return g, landmarks.gradients
 
 
 def views_cost(scene: Scene, X: Array, points: Array, calibration: Array) -> float:
@@ -83,7 +82,7 @@ def views_cost(scene: Scene, X: Array, points: Array, calibration: Array) -> flo
 @pytest.mark.parametrize("seed", [1, 2])
 def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
     scene = make_scene(rig, seed)
-    _, g, _, g_points = normal_equations(scene)
+    g, g_points = normal_equations(scene)
     where = positions(len(scene.X), True)
     step = 1e-6
     for k in range(len(scene.X)):
@@ -113,7 +112,7 @@ def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
 def test_gradient_by_extrinsic_rotation() -> None:
     scene = make_scene(STEREO, 3)
     scene = scene._replace(calibration=np.array([0.008, 0.0, 0.0, 0.0, 0.012]))  # where its tangent is its difference
-    _, g, _, _ = normal_equations(scene)
+    g, _ = normal_equations(scene)
     for i in range(1, 4):
         costs = []
         for sign in (1e-6, -1e-6):

@@ -21,7 +21,7 @@ from vislam.window import visual
 from vislam.window.layout import CALIBRATION, STATE, Camera, Links, Prior
 from vislam.window.linear import joint_covariance
 from vislam.window.posterior import pose, scale_sigma
-from vislam.window.solver import Problem, optimise
+from vislam.window.solver import Problem, Room, optimise
 from vislam.window.spans import information, jacobian_by_bias
 from vislam.window.tracks import TrackTable
 
@@ -107,6 +107,7 @@ def solve(
         Problem(X, X.copy(), held, points, calibration, selection.views, camera, links, gauge, gravity_m_s2, True),
         max_iterations,
         _TOLERANCE,
+        Room(),
     )
     poses_at = 9 * count
     index = np.concatenate([np.arange(poses_at, poses_at + 6 * count), np.arange(9), np.arange(poses_at - 9, poses_at)])

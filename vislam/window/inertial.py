@@ -102,16 +102,15 @@ def _scatter(J: Array, information: Array, r: Array, where: Ints, k: int, A: Arr
             for j in range(width):
                 weighted[m, j] += factor * J[n, j]
     for i in range(width):
-        row[:] = 0.0
+        row[i:] = 0.0
         for m in range(rows):
             factor = weighted[m, i]
             g[at[i]] += factor * r[m]
-            for j in range(width):
-                row[j] += factor * J[m, j]
-        out = A[at[i]]
-        for j in range(width):
-            if at[j] >= at[i]:
-                out[at[j]] += row[j]
+            if factor != 0.0:
+                for j in range(i, width):
+                    row[j] += factor * J[m, j]
+        for j in range(i, width):
+            A[min(at[i], at[j]), max(at[i], at[j])] += row[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -167,23 +166,24 @@ def linearise(
     They are the upper triangle of A [D, D] and g [D]. `where` [M, 15] (or [M, 6]) says at which unknown each
     keyframe's error lies; with six there are no velocities.
     """
-    J9, waste9, J6, waste6 = np.empty((9, 30)), np.empty((9, 30)), np.empty((6, 12)), np.empty((6, 12))
-    weights = np.zeros((6, 6))
+    J9, J6, weights = np.empty((9, 30)), np.empty((6, 12)), np.zeros((6, 6))
     full = where.shape[1] == 15
     for k in range(count):
         a = X_first[k] if held[k] else X[k]
         b = X_first[k + 1] if held[k + 1] else X[k + 1]
         if full:
             if links.inertial[k]:
-                r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, waste9)
-                imu_error(a, b, links, k, gravity_m_s2, J9)
+                r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, J9)
+                if held[k] or held[k + 1]:
+                    imu_error(a, b, links, k, gravity_m_s2, J9)
                 _scatter(J9, links.information[k], r, where, k, A, g)
             for i in range(6, 15):  # velocity, biases
                 weight = links.velocity_weight[k] ** 2 if i < 9 else links.walk_information[k, i - 9]
                 _diagonal(where[k, i], where[k + 1, i], weight, X[k + 1, 6 + i] - X[k, 6 + i], A, g)
         if links.guess_weight[k, 0] > 0.0:
-            r = guess_error(X[k], X[k + 1], links.guess[k], waste6)
-            guess_error(a, b, links.guess[k], J6)
+            r = guess_error(X[k], X[k + 1], links.guess[k], J6)
+            if held[k] or held[k + 1]:
+                guess_error(a, b, links.guess[k], J6)
             for i in range(6):
                 weights[i, i] = links.guess_weight[k, i // 3] ** 2
             _scatter(J6, weights, r, where, k, A, g)

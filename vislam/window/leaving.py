@@ -19,9 +19,8 @@ def split(tracks: TrackTable, ids: Ints, least: int) -> tuple[Ints, Ints]:
     so that no two neighbouring keyframes lose all that ties them at once. A track too short to part loses its oldest
     observation. Parting costs three equations once in a while, where dropping costs two for each keyframe.
     """
-    order = np.lexsort((tracks.camera, tracks.keyframe, tracks.slot))
+    order, starts = tracks.ordered()
     slot, keyframe = tracks.slot[order], tracks.keyframe[order]
-    starts = np.flatnonzero(np.diff(slot, prepend=-1))
     ends = np.append(starts[1:], len(slot))
     given: list[Ints] = []
     dropped: list[Ints] = []

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from vislam.messages import Array
 
@@ -31,12 +30,14 @@ def solve(U: Array, rhs: Array) -> Array:
 
 def trailing_covariance(U: Array, start: int) -> Array:
     """Return the covariance [D - start, D - start] of the unknowns that were eliminated last."""
-    lower, _ = dtrtri(U[start:, start:].T.copy(order="F"), lower=1, overwrite_c=1)
-    half = np.tril(lower)  # of the transpose
-    return np.asarray(half.T @ half)
+    half, _ = dpotri(U[start:, start:].T.copy(order="F"), lower=1, overwrite_c=1)
+    half = np.tril(half)
+    return np.asarray(half + np.tril(half, -1).T)
 
 
 def joint_covariance(U: Array, index: NDArray[np.int64]) -> Array:
     """Return the covariance [N, N] of some of the unknowns, from the factor [D, D] of the information of all."""
-    half = solve_triangular(U, np.eye(len(U))[:, index], trans="T", check_finite=False)
+    columns = np.zeros((len(U), len(index)), order="F")
+    columns[index, np.arange(len(index))] = 1.0
+    half, _ = dtrtrs(U.T, columns, lower=1, overwrite_b=1)
     return np.asarray(half.T @ half)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vislam.messages import Array, NavState
 from vislam.window import inertial, schur, visual
 from vislam.window.layout import CALIBRATION, Camera, Links, Prior, Views, positions, prior_positions
-from vislam.window.solver import add_prior
+from vislam.window.solver import Room, add_prior
 
 _NOTHING = 1e-12  # relative to the largest: information below it is rounding
 
@@ -34,42 +34,46 @@ def marginalise(
     prior: Prior,
     gravity_m_s2: float,
     full: bool,
+    room: Room,
 ) -> Prior:
     """Return the prior [5 + (M - 1) * S] on calibration and the keyframes after the first.
 
     States that the old prior holds keep their linearisation; the others are linearised at X, so the caller sets
     `X_first` of every keyframe that the new prior touches to where it was, or to X. The views in `leaving`, the link
-    of keyframe 0 and its rest must not be used again.
+    of keyframe 0 and its rest must not be used again. What lies in the room is lost.
     """
     count, size = len(X), 15 if full else 6
     D = size * count + CALIBRATION
     poses_at = 9 * count if full else 0
     where = positions(count, full)
-    A, g = np.zeros((D, D)), np.zeros(D)
+    (A, landmarks), g = room.of(D, len(leaving.points), D - poses_at), np.zeros(D)
+    A[:] = 0.0
     held_count = (len(prior.b) - CALIBRATION) // size
     dx = inertial.prior_shift(X, X_first, calibration, prior.calibration, held_count, size)
     add_prior(prior, dx, prior_positions(count, held_count, full), A, g)
     inertial.linearise(X, X_first, held, links, gravity_m_s2, where, min(1, count - 1), 1, A, g)
-    L = len(leaving.points)
-    A_points, g_points, cross = np.empty((L, 3, 3)), np.empty((L, 3)), np.empty((L, 3, D - poses_at))
     visual.linearise(
-        X, X_first, held, leaving.points, calibration, leaving.views, camera, poses_at, A, g, A_points, g_points, cross
-    )
-    schur.eliminate(np.empty((L, 3, 3)), A_points, g_points, cross, 0.0, poses_at, A, g)
-    A = np.triu(A) + np.triu(A, 1).T  # only the upper triangle counts
-    gone = where[0]
-    kept = np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
-    gain = A[np.ix_(kept, gone)] @ _inverse(A[np.ix_(gone, gone)])
-    H = A[np.ix_(kept, kept)] - gain @ A[np.ix_(gone, kept)]
-    gradient = g[kept] - gain @ g[gone]
-    H = 0.5 * (H + H.T)
+        X, X_first, held, leaving.points, calibration, leaving.views, camera, poses_at, A, g, landmarks
+    )  # fmt: skip
+    schur.eliminate(landmarks, 0.0, poses_at, A, g)
+    gone, kept = where[0], np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
+    told = np.flatnonzero(np.diag(A)[kept])  # of the others nothing is said: their rows and columns are zero
+    rows = np.concatenate([gone, kept[told]])
+    A = A[np.ix_(rows, rows)]
+    A += A.T - np.diag(np.diag(A))  # below the diagonal was nothing
+    n = len(gone)
+    gain = A[n:, :n] @ _inverse(A[:n, :n])
+    left = A[n:, n:] - gain @ A[:n, n:]
+    H, gradient = np.zeros((len(kept),) * 2), np.zeros(len(kept))
+    H[np.ix_(told, told)] = 0.5 * (left + left.T)
+    gradient[told] = g[kept[told]] - gain @ g[gone]
     shift = np.concatenate([dx[:CALIBRATION], np.zeros(len(kept) - CALIBRATION)])
     for k in range(1, held_count):
         if held[k]:
             shift[CALIBRATION + (k - 1) * size : CALIBRATION + k * size] = dx[
                 CALIBRATION + k * size : CALIBRATION + (k + 1) * size
             ]
-    return Prior(np.ascontiguousarray(H), gradient - H @ shift, prior.calibration)
+    return Prior(H, gradient - H @ shift, prior.calibration)
 
 
 def touched(prior: Prior, count: int, full: bool) -> NDArray[np.bool_]:

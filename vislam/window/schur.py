@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from scipy.linalg.blas import dsyrk
 
 from vislam.messages import Array
 
@@ -25,48 +28,74 @@ def invert(H: Array, damping: float, inverse: Array) -> bool:
     return True
 
 
-def eliminate(
-    points_at: Array, A_points: Array, g_points: Array, cross: Array, damping: float, poses_at: int, A: Array, g: Array
-) -> bool:
+class Landmarks(NamedTuple):
+    """The landmarks' part of the normal equations, and what is left of it when they are taken out.
+
+    The blocks are `L @ L.T`. What is carried is `inv(L)` times what it is named after.
+    """
+
+    blocks: Array  # [L, 3, 3]
+    gradients: Array  # [L, 3]
+    cross: Array  # [L, 3, K] by poses and calibration
+    roots: Array  # [L, 3, 3] inv(L), lower
+    carried_gradients: Array  # [L, 3]
+    carried: Array  # [L, 3, K]
+
+
+def room_for(landmarks: int, width: int) -> Landmarks:
+    """Return room for so many landmarks, `width` K, with nothing in it yet."""
+    shapes = ((3, 3), (3,), (3, width), (3, 3), (3,), (3, width))
+    return Landmarks(*(np.empty((landmarks, *shape)) for shape in shapes))
+
+
+def eliminate(landmarks: Landmarks, damping: float, poses_at: int, A: Array, g: Array) -> bool:
     """Take the landmarks out of the normal equations A, g (Schur complement); False if one is indefinite.
 
-    `points_at` [L, 3, 3] gets the inverses of the landmarks' own blocks, for `follow`. The upper triangle of A is what
-    counts; the lower one is filled with what the product leaves there.
+    Only the upper triangle of A is changed.
     """
-    carried = np.empty_like(cross)
-    if not _carry(points_at, A_points, cross, damping, carried):
+    if not _carry(landmarks, damping):
         return False
-    rows = carried.reshape(-1, cross.shape[2])
-    A[poses_at:, poses_at:] -= rows.T @ cross.reshape(rows.shape)
-    g[poses_at:] -= rows.T @ g_points.ravel()
+    rows = landmarks.carried.reshape(-1, landmarks.carried.shape[2])
+    if len(rows) > 0:
+        A[poses_at:, poses_at:] -= dsyrk(1.0, rows.T, lower=1).T
+        g[poses_at:] -= landmarks.carried_gradients.ravel() @ rows
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _carry(points_at: Array, A_points: Array, cross: Array, damping: float, carried: Array) -> bool:
-    """Multiply the landmarks' inverses [L, 3, 3] with their cross terms [L, 3, D]; False if one is indefinite."""
-    for p in range(len(A_points)):
-        inverse, W, y = points_at[p], cross[p], carried[p]
-        if not invert(A_points[p], damping, inverse):
+def _carry(landmarks: Landmarks, damping: float) -> bool:
+    """Factorise the landmarks' own blocks, damped, and carry what hangs on them; False if one is indefinite."""
+    blocks, gradients, cross, roots, carried_gradients, carried = landmarks
+    for p in range(len(blocks)):
+        a, b, c = (
+            blocks[p, 0, 0] * (1.0 + damping),
+            blocks[p, 1, 1] * (1.0 + damping),
+            blocks[p, 2, 2] * (1.0 + damping),
+        )
+        ba, ca, cb = blocks[p, 1, 0], blocks[p, 2, 0], blocks[p, 2, 1]
+        second = b - ba * ba / a
+        between = cb - ca * ba / a
+        third = c - ca * ca / a - between * between / second
+        if not (a > 0.0 and second > 0.0 and second * third > 1e-14 * b * c):
             return False
-        for i in range(3):
-            for j in range(cross.shape[2]):
-                y[i, j] = inverse[i, 0] * W[0, j] + inverse[i, 1] * W[1, j] + inverse[i, 2] * W[2, j]
+        xx, yy, zz = 1.0 / np.sqrt(a), 1.0 / np.sqrt(second), 1.0 / np.sqrt(third)
+        yx = -yy * ba / a
+        zy = -zz * between / second
+        zx = -zz * ca / a - zy * ba / a
+        roots[p] = 0.0
+        roots[p, 0, 0], roots[p, 1, 0], roots[p, 1, 1] = xx, yx, yy
+        roots[p, 2, 0], roots[p, 2, 1], roots[p, 2, 2] = zx, zy, zz
+        x, y, z = gradients[p, 0], gradients[p, 1], gradients[p, 2]
+        carried_gradients[p, 0], carried_gradients[p, 1] = xx * x, yx * x + yy * y
+        carried_gradients[p, 2] = zx * x + zy * y + zz * z
+        for j in range(cross.shape[2]):
+            carried[p, 0, j] = xx * cross[p, 0, j]
+            carried[p, 1, j] = yx * cross[p, 0, j] + yy * cross[p, 1, j]
+            carried[p, 2, j] = zx * cross[p, 0, j] + zy * cross[p, 1, j] + zz * cross[p, 2, j]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def follow(points: Array, points_at: Array, g_points: Array, cross: Array, step: Array, out: Array) -> None:
-    """Move the landmarks [L, 3] to where the step [D - poses_at] of poses and calibration wants them, into `out`."""
-    b = np.empty(3)
-    for p in range(len(points)):
-        for i in range(3):
-            total = g_points[p, i]
-            W = cross[p, i]
-            for j in range(len(step)):
-                total += W[j] * step[j]
-            b[i] = total
-        for i in range(3):
-            out[p, i] = points[p, i] - (
-                points_at[p, i, 0] * b[0] + points_at[p, i, 1] * b[1] + points_at[p, i, 2] * b[2]
-            )
+def follow(landmarks: Landmarks, step: Array) -> Array:
+    """Return how far the landmarks [L, 3] move with the step [K] of poses and calibration."""
+    b = landmarks.carried @ step + landmarks.carried_gradients
+    return -(landmarks.roots.transpose(0, 2, 1) @ b[:, :, None])[:, :, 0]

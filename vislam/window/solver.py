@@ -25,7 +25,7 @@ class Solution(NamedTuple):
     X: Array  # [M, 21]
     points: Array  # [L, 3]
     calibration: Array  # [5]
-    U: Array  # [D, D] upper factor of the information of all states at the solution, landmarks eliminated
+    U: Array  # [D, D] upper factor of the information of all states where it was last linearised, without landmarks
     squares: Array  # [N, 2] squared whitened errors of the views: pixel, depth
     cost: float  # half the robust sum of squares
     iterations: int
@@ -63,17 +63,37 @@ class _Estimate:
     cost: float
 
 
-def optimise(problem: Problem, max_iterations: int, tolerance: float) -> Solution:
-    """Minimise the robust cost; `tolerance` is the relative decrease below which it has converged."""
-    equations = _Equations(problem)
+class Room:
+    """Memory for the normal equations, kept between problems of about one size: fresh pages cost time."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._A = np.empty((0, 0))
+        self._landmarks = schur.room_for(0, 0)
+
+    def of(self, unknowns: int, landmarks: int, width: int) -> tuple[Array, schur.Landmarks]:
+        """Return a matrix [unknowns, unknowns] and the room of landmarks, with whatever was in them."""
+        if len(self._A) != unknowns:
+            self._A = np.empty((unknowns, unknowns))
+        if len(self._landmarks.blocks) < landmarks or self._landmarks.cross.shape[2] != width:
+            self._landmarks = schur.room_for(landmarks + landmarks // 4, width)
+        return self._A, schur.Landmarks(*(a[:landmarks] for a in self._landmarks))
+
+
+def optimise(problem: Problem, max_iterations: int, tolerance: float, room: Room) -> Solution:
+    """Minimise the robust cost; the answer's factor lies in the room, till the room is used again.
+
+    It has converged when the cost decreased, or can be expected to decrease in another round, by less than
+    `tolerance`, relative.
+    """
+    equations = _Equations(problem, room)
     now = equations.start()
     ok, done, iterations, damping = True, False, 0, 0.0
     while not done and iterations < max_iterations:
         iterations += 1
-        equations.linearise(now)
         new, solved = None, False
         for _ in range(_MAX_TRIES):
-            solved = equations.solve(damping)
+            solved = equations.solve(now, damping)
             new = equations.moved(now) if solved else None
             if new is not None and new.cost <= now.cost + (tolerance if damping == 0.0 else 0.0) * abs(now.cost):
                 break
@@ -81,11 +101,13 @@ def optimise(problem: Problem, max_iterations: int, tolerance: float) -> Solutio
         if new is None or new.cost > now.cost:  # first estimates: the last step may lead up by a hair
             ok = solved
             break
-        done = now.cost - new.cost < tolerance * (1.0 + abs(new.cost))
+        gained = now.cost - new.cost
+        left = min(gained, equations.expected(gained)) if damping == 0.0 else gained
+        done = left < tolerance * (1.0 + abs(new.cost))
         now, damping = new, 0.0 if damping < 10.0 * _FIRST_DAMPING else 0.1 * damping
     ok = (
         ok
-        and (equations.undamped or equations.solve(0.0))
+        and (equations.undamped or equations.solve(now, 0.0))
         and bool(np.isfinite(now.X).all())
         and bool(np.isfinite(now.cost))
     )
@@ -95,29 +117,29 @@ def optimise(problem: Problem, max_iterations: int, tolerance: float) -> Solutio
 class _Equations:
     """The normal equations of a problem and room to solve them."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, room: Room) -> None:
         self._problem = problem
-        count, landmarks = len(problem.X), len(problem.points)
+        count = len(problem.X)
         self._size = 15 if problem.full else 6
         self._poses_at = 9 * count if problem.full else 0
         D = self._size * count + CALIBRATION
         self._where = positions(count, problem.full)
         self._held_by_prior = (len(problem.prior.b) - CALIBRATION) // self._size
         self._prior_where = prior_positions(count, self._held_by_prior, problem.full)
-        self._A, self._g = np.empty((D, D)), np.empty(D)
-        self.U = np.empty((D, D))  # the factor of what was solved last
-        self.undamped = False  # and whether that was the system itself
-        self._step = np.empty(D)
-        self._blocks, self._inverses = np.empty((landmarks, 3, 3)), np.empty((landmarks, 3, 3))
-        self._gradients = np.empty((landmarks, 3))
-        self._cross = np.empty((landmarks, 3, D - self._poses_at))
+        self.U, self._landmarks = room.of(  # the system, and once it is solved its factor
+            D, len(problem.points), D - self._poses_at
+        )
+        self._g, self._step = np.empty(D), np.empty(D)
+        self.undamped = False  # whether U is the factor of the system itself
+        self.promised = 0.0  # decrease of the cost by the last step, were everything linear
 
     def start(self) -> _Estimate:
         p = self._problem
         return self._estimate(p.X, p.points, p.calibration)
 
-    def linearise(self, now: _Estimate) -> None:
-        p, A, g = self._problem, self._A, self._g
+    def solve(self, now: _Estimate, damping: float) -> bool:
+        """Linearise and solve, damped; False if the equations are indefinite."""
+        p, A, g = self._problem, self.U, self._g
         A[:], g[:] = 0.0, 0.0
         add_prior(p.prior, now.dx, self._prior_where, A, g)
         count = len(now.X)
@@ -128,20 +150,15 @@ class _Equations:
         A[fixed, fixed] += 1.0
         visual.linearise(
             now.X, p.X_first, p.held, now.points, now.calibration, p.views, p.camera, self._poses_at,
-            A, g, self._blocks, self._gradients, self._cross,
+            A, g, self._landmarks,
         )  # fmt: skip
-
-    def solve(self, damping: float) -> bool:
-        """Solve the damped equations; False if they are indefinite."""
-        S, s = self.U, self._g.copy()
-        S[:] = self._A
-        np.fill_diagonal(S, np.diag(S) * (1.0 + damping))
-        if not schur.eliminate(
-            self._inverses, self._blocks, self._gradients, self._cross, damping, self._poses_at, S, s
-        ) or not linear.factorise(S):
-            self.undamped = False
+        if damping > 0.0:
+            np.fill_diagonal(A, np.diag(A) * (1.0 + damping))
+        left = g.copy()
+        self.undamped = False
+        if not schur.eliminate(self._landmarks, damping, self._poses_at, A, left) or not linear.factorise(A):
             return False
-        self._step, self.undamped = linear.solve(S, -s), damping == 0.0
+        self._step, self.undamped = linear.solve(A, -left), damping == 0.0
         return True
 
     def moved(self, now: _Estimate) -> _Estimate | None:
@@ -149,11 +166,21 @@ class _Equations:
         step = self._step
         if not np.isfinite(step).all():
             return None
-        X, points = moved_states(now.X, step, self._where), np.empty_like(now.points)
-        schur.follow(now.points, self._inverses, self._gradients, self._cross, step[self._poses_at :], points)
+        X = moved_states(now.X, step, self._where)
+        follow = schur.follow(self._landmarks, step[self._poses_at :])
+        self.promised = -0.5 * float(self._g @ step + np.sum(self._landmarks.gradients * follow))
+        points = now.points + follow
         np.minimum(points[:, 2], _MAX_RHO, out=points[:, 2])
         calibration = move_calibration(now.calibration, step[-CALIBRATION:], self._problem.camera.active)
         return self._estimate(X, points, calibration)
+
+    def expected(self, gained: float) -> float:
+        """Return what another round may gain after an undamped step that gained so much.
+
+        Were the problem linear, the step would have gained what was promised and left no gradient. By the part by
+        which that is wrong, the gradient is still there, and what it promises goes with its square.
+        """
+        return (gained - self.promised) ** 2 / self.promised if self.promised > 0.0 else np.inf
 
     def _estimate(self, X: Array, points: Array, calibration: Array) -> _Estimate:
         p = self._problem

@@ -67,37 +67,32 @@ class TrackTable:
 
     def select(self, ids: Ints) -> Selection:
         """Return the views of all landmarks that two views or a depth fix; `ids` [M] are the window's keyframes."""
-        order = np.lexsort((self.camera, self.keyframe, self.slot))
-        slot = self.slot[order]
-        starts = np.flatnonzero(np.diff(slot, prepend=-1))
-        counts = np.diff(starts, append=len(slot))
+        order, starts = self.ordered()
+        counts = np.diff(starts, append=len(order))
         with_depth = np.zeros(len(starts), dtype=bool)
         if len(starts) > 0:
             with_depth = np.maximum.reduceat(self._values[order, 8], starts) > 0.0
-        wanted = (counts >= 2) | with_depth
-        return self.arrange(order[np.repeat(wanted, counts)], ids)
+        return self.arrange(order[np.repeat((counts >= 2) | with_depth, counts)], ids)
 
-    def continued(self, ids: Ints) -> tuple[Selection, Selection]:
-        """Return all views of the landmarks that the newest keyframe saw again, and the older ones of them."""
-        all_views = self.select(ids)
-        views = all_views.views
-        newest = len(ids) - 1
-        again = (views.host < newest) & (views.keyframe[views.first[1:] - 1] == newest)
-        rows = all_views.rows[np.repeat(again, np.diff(views.first))]
-        return self.arrange(rows, ids), self.arrange(rows[self.keyframe[rows] != ids[newest]], ids)
+    def continued(self, ids: Ints) -> Ints:
+        """Return the rows of all views of the landmarks that the newest keyframe `ids[-1]` saw again, ordered."""
+        order, starts = self.ordered()
+        counts = np.diff(starts, append=len(order))
+        keyframe = self.keyframe[order]
+        again = (keyframe[starts] < ids[-1]) & (keyframe[starts + counts - 1] == ids[-1])
+        return order[np.repeat(again, counts)]
+
+    def ordered(self) -> tuple[Ints, Ints]:
+        """Return the rows ordered by slot, keyframe, camera, and where in that order each slot's begin."""
+        order = np.argsort(self.slot, kind="stable")  # rows came in the order of keyframe, camera
+        return order, np.flatnonzero(np.diff(self.slot[order], prepend=-1))
 
     def arrange(self, rows: Ints, ids: Ints) -> Selection:
-        """Return views of these rows [N] of the table, which are ordered by slot, keyframe, camera."""
+        """Return views of these rows [N] of the table, ordered as `ordered` does; `ids` [M] are the keyframes."""
         slot = self.slot[rows]
         starts = np.flatnonzero(np.diff(slot, prepend=-1))
-        keyframe = np.searchsorted(ids, self.keyframe[rows]).astype(np.int64)
-        views = Views(
-            first=np.append(starts, len(rows)),
-            host=keyframe[starts],
-            keyframe=keyframe,
-            camera=self.camera[rows],
-            values=self._values[rows],
-        )
+        keyframe = np.searchsorted(ids, self.keyframe[rows])
+        views = Views(np.append(starts, len(rows)), keyframe[starts], keyframe, self.camera[rows], self._values[rows])
         return Selection(views, slot[starts], rows)
 
     def remove(self, gone: NDArray[np.bool_]) -> None:

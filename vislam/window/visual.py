@@ -33,7 +33,7 @@ from vislam.window.projection import (
     shift,
     sight,
 )
-from vislam.window.schur import invert
+from vislam.window.schur import Landmarks, invert
 from vislam.window.small import minus
 
 _BEHIND_COST = 50.0  # of a view that the landmark lies behind; constant, so that it neither pulls nor stops a step
@@ -76,9 +76,7 @@ def linearise(
     poses_at: int,
     A: Array,
     g: Array,
-    A_points: Array,
-    g_points: Array,
-    cross: Array,
+    landmarks: Landmarks,
 ) -> None:
     """Add the views' normal equations at X: poses and calibration into the upper triangle of A and into g [D].
 
@@ -93,14 +91,13 @@ def linearise(
         poses_at: where the poses begin among the unknowns; calibration follows them.
         A: [D, D], added to.
         g: [D], added to.
-        A_points: the landmarks' own blocks [L, 3, 3], overwritten.
-        g_points: their gradients [L, 3], overwritten.
-        cross: landmarks by poses and calibration [L, 3, D - poses_at], overwritten.
+        landmarks: the blocks, gradients and cross terms of L landmarks, overwritten.
     """
     mount, calibrated = mounted(camera, calibration), poses_at + 6 * len(X)
     first, hosts, keyframes, cameras, values = views
     cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
     J, ours, theirs = np.zeros((3, COLUMNS)), np.empty((POINT + 3, _OWN)), np.empty((6, COLUMNS))
+    blocks, gradients, cross = landmarks.blocks, landmarks.gradients, landmarks.cross
     cross[:] = 0.0
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
@@ -135,11 +132,11 @@ def linearise(
                 _add_seen(theirs, 6 * host, 6 * k, poses_at, calibrated, A, g, cross, p)
         _add_own(ours, 6 * host, poses_at, calibrated, A, g, cross, p)
         for i in range(3):
-            g_points[p, i] = ours[POINT + i, ERROR]
+            gradients[p, i] = ours[POINT + i, ERROR]
             for j in range(3):
-                A_points[p, i, j] = ours[POINT + i, POINT + j]
-        A_points[p, 2, 2] += camera.rho_information
-        g_points[p, 2] += camera.rho_information * rho
+                blocks[p, i, j] = ours[POINT + i, POINT + j]
+        blocks[p, 2, 2] += camera.rho_information
+        gradients[p, 2] += camera.rho_information * rho
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -26,7 +26,7 @@ from vislam.window.linear import joint_covariance, trailing_covariance
 from vislam.window.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowTilt, WindowUpdate
 from vislam.window.posterior import edges, nav_state, pose, scale_sigma, tilt
-from vislam.window.solver import Problem, Solution, optimise
+from vislam.window.solver import Problem, Room, Solution, optimise
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import Selection, TrackTable, check_observations
 
@@ -71,6 +71,7 @@ class SlidingWindow:
         self._full = False
         self._tracks = TrackTable(config, rig)
         self._links = LinkStore(config, noise, gravity_m_s2)
+        self._room = Room()
         self._last_edges: list[WindowEdge] = []
         self._sure: bool = False
         self._at_rest: bool = False
@@ -337,13 +338,16 @@ class SlidingWindow:
         if self._known is None or not self._sure or self._at_rest or not self._links.arrays.inertial[-1]:
             return 0
         covariance = gate.predicted_covariance(self._known, self._X, self._links.arrays, self._gravity_m_s2)
-        views, older = self._tracks.continued(self._ids)
-        if covariance is None or len(views.slots) == 0:
+        rows = self._tracks.continued(self._ids)
+        if covariance is None or len(rows) == 0:
             return 0
+        views = self._tracks.arrange(rows, self._ids)
         points = self._tracks.points[views.slots]
         fresh = self._tracks.host[views.slots] != self._ids[views.views.host]
         camera = self._camera()
-        visual.start(self._X, self._calibration, older.views, camera, fresh, _RHO_START, points)
+        if fresh.any():
+            older = self._tracks.arrange(rows[self._tracks.keyframe[rows] != self._ids[-1]], self._ids)
+            visual.start(self._X, self._calibration, older.views, camera, fresh, _RHO_START, points)
         squares = np.empty(len(views.rows))
         gate.innovations(self._X, points, self._calibration, views.views, camera, covariance, squares)
         tested, bad = ~np.isnan(squares), squares > self._gate
@@ -364,7 +368,7 @@ class SlidingWindow:
             selection.views, self._camera(), self._links.arrays, self._prior, self._gravity_m_s2, self._full,
         )  # fmt: skip
         iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
-        return optimise(problem, iterations, self._config.tolerance)
+        return optimise(problem, iterations, self._config.tolerance, self._room)
 
     def _take(self, selection: Selection, solution: Solution) -> None:
         self._X = solution.X
@@ -452,7 +456,7 @@ class SlidingWindow:
         leaving = Leaving(selection.views, self._tracks.points[selection.slots])
         self._prior = marginalise(
             self._X, self._X_first, self._held, self._calibration, leaving, self._camera(), self._links.arrays,
-            self._prior, self._gravity_m_s2, self._full,
+            self._prior, self._gravity_m_s2, self._full, self._room,
         )  # fmt: skip
         gone = np.zeros(len(self._tracks), dtype=bool)
         gone[given] = gone[dropped] = True
