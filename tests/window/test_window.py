@@ -220,7 +220,7 @@ def test_memory_and_work_stay_bounded() -> None:
     most = 40 * (HONEST.keyframes + 1)
     assert len(window._tracks) <= most
     assert len(window._tracks.host) <= most
-    assert len(window._X) == HONEST.keyframes and len(window._prior.b) == 5 + 15 * HONEST.keyframes - 15 + 15
+    assert len(window._keyframes) == HONEST.keyframes and len(window._prior.b) == 5 + 15 * HONEST.keyframes - 15 + 15
 
 
 def test_one_camera_alone_is_refused() -> None:

@@ -23,9 +23,8 @@ from vislam.window.linear import joint_covariance
 from vislam.window.posterior import pose, scale_sigma
 from vislam.window.solver import Problem, Room, optimise
 from vislam.window.spans import information, jacobian_by_bias
-from vislam.window.tracks import TrackTable
+from vislam.window.tracks import RHO_START, TrackTable
 
-_RHO_START = 0.2  # 1/m
 _TOLERANCE = 1e-6
 
 
@@ -100,7 +99,7 @@ def solve(
     calibration = np.zeros(CALIBRATION)
     points = np.zeros((len(selection.slots), 3))
     fresh = np.ones(len(points), dtype=np.bool_)
-    visual.start(X, calibration, selection.views, camera, fresh, _RHO_START, points)
+    visual.start(X, calibration, selection.views, camera, fresh, RHO_START, points)
     held = np.zeros(count, dtype=np.bool_)
     links, gauge = _links(problem, noise), _gauge(problem, config)
     solution = optimise(

@@ -2,13 +2,55 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vislam.geometry import skew, tangent_basis, transform
 from vislam.messages import Array, NavState
+from vislam.window.linear import trailing_covariance
 from vislam.window.messages import WindowTilt
 
 _NO_MOTION_M = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Covariance of what is eliminated last: velocity and biases of the newest keyframe, all poses, calibration."""
+
+    covariance: Array  # [9 + 6 M + 5] in both directions; without the first 9 where there are poses alone
+    count: int  # of keyframes, M
+    others: int  # 9, or 0
+
+    @classmethod
+    def of(cls, U: Array, count: int, full: bool) -> Posterior:
+        """Return it from the upper factor of the information of all unknowns."""
+        return cls(trailing_covariance(U, 9 * (count - 1) if full else 0), count, 9 if full else 0)
+
+    @property
+    def poses(self) -> Array:
+        """Return the covariance [6 M, 6 M] of all poses."""
+        at, end = self.others, self.others + 6 * self.count
+        return np.ascontiguousarray(self.covariance[at:end, at:end])
+
+    @property
+    def calibration(self) -> Array:
+        """Return the covariance [5, 5] of the calibration."""
+        at = self.others + 6 * self.count
+        return self.covariance[at:, at:]
+
+    @property
+    def newest_state(self) -> Array:
+        """Return the covariance [15, 15] of the newest keyframe, in the order of NavState."""
+        at = self.others + 6 * (self.count - 1)
+        index = np.concatenate([np.arange(at, at + 6), np.arange(9)])
+        return self.covariance[np.ix_(index, index)]
+
+    def of_newest(self, count: int) -> Array:
+        """Return the covariance of newest velocity and biases, the newest `count` poses, and calibration."""
+        gone = 6 * (self.count - count)
+        kept = np.concatenate([np.arange(9), np.arange(9 + gone, len(self.covariance))])
+        return self.covariance[np.ix_(kept, kept)]
 
 
 def edges(X: Array, poses: Array) -> tuple[Array, Array]:

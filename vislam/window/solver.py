@@ -178,9 +178,10 @@ class _Equations:
         """Return what another round may gain after an undamped step that gained so much.
 
         Were the problem linear, the step would have gained what was promised and left no gradient. By the part by
-        which that is wrong, the gradient is still there, and what it promises goes with its square.
+        which that is wrong, here doubled to be safe, the gradient is still there, and what it promises goes with its
+        square.
         """
-        return (gained - self.promised) ** 2 / self.promised if self.promised > 0.0 else np.inf
+        return (2.0 * (gained - self.promised)) ** 2 / self.promised if self.promised > 0.0 else np.inf
 
     def _estimate(self, X: Array, points: Array, calibration: Array) -> _Estimate:
         p = self._problem

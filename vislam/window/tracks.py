@@ -13,6 +13,7 @@ from vislam.errors import DataError
 from vislam.messages import Array, Observations
 from vislam.window.layout import Ints, Views
 
+RHO_START = 0.2  # 1/m: 5 m, where nothing is known
 _VALUES = 9  # of a view, see Views
 
 
@@ -94,6 +95,12 @@ class TrackTable:
         keyframe = np.searchsorted(ids, self.keyframe[rows])
         views = Views(np.append(starts, len(rows)), keyframe[starts], keyframe, self.camera[rows], self._values[rows])
         return Selection(views, slot[starts], rows)
+
+    def remove_rows(self, rows: Ints) -> None:
+        """Forget rows by their numbers; see `remove`."""
+        gone = np.zeros(len(self), dtype=np.bool_)
+        gone[rows] = True
+        self.remove(gone)
 
     def remove(self, gone: NDArray[np.bool_]) -> None:
         """Forget rows [N]; a landmark without rows frees its slot, one that lost its host starts again."""

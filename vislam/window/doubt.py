@@ -1,0 +1,70 @@
+"""What a window takes out again: views that it did not expect, before they are used, and such as fit to nothing, after.
+
+The first is the test of `gate`; see there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from vislam.config import WindowConfig
+from vislam.messages import Array
+from vislam.window import gate, visual
+from vislam.window.keyframes import Keyframes
+from vislam.window.layout import Camera
+from vislam.window.solver import Solution
+from vislam.window.tracks import RHO_START, Selection, TrackTable
+
+_CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of wrong tracks, ...
+_STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expectation
+
+
+class Doubt:
+    """Owns how often in a row hardly anything was as expected."""
+
+    def __init__(self, config: WindowConfig) -> None:
+        """Start without any."""
+        self._gate = float(chi2.ppf(config.gate_probability, 2))
+        self._track_fraction = config.gate_track_fraction
+        self._contradictions = 0  # keyframes in a row
+
+    def newest(
+        self, tracks: TrackTable, keyframes: Keyframes, covariance: Array, calibration: Array, camera: Camera
+    ) -> int:
+        """Take out what the newest keyframe saw and nobody expected; return of how many tracks.
+
+        `covariance` [6 M + 5, 6 M + 5] is that of all poses, the newest a prediction, and of the calibration. If hardly
+        anything is as expected, again and again, it is the expectation that is wrong, and all of it stays.
+        """
+        rows = tracks.continued(keyframes.ids)
+        if len(rows) == 0:
+            return 0
+        X, views = keyframes.X, tracks.arrange(rows, keyframes.ids)
+        points = tracks.points[views.slots]
+        fresh = tracks.host[views.slots] != keyframes.ids[views.views.host]
+        if fresh.any():
+            older = tracks.arrange(rows[tracks.keyframe[rows] != keyframes.ids[-1]], keyframes.ids)
+            visual.start(X, calibration, older.views, camera, fresh, RHO_START, points)
+        squares = np.empty(len(rows))
+        gate.innovations(X, points, calibration, views.views, camera, covariance, squares)
+        tested, bad = ~np.isnan(squares), squares > self._gate
+        contradicted = bad.sum() > (1.0 - _CONTRADICTED) * tested.sum()
+        self._contradictions = self._contradictions + 1 if contradicted else 0
+        if self._contradictions > _STUBBORN_KEYFRAMES:
+            return 0
+        tracks.remove_rows(rows[bad])
+        return int(bad.sum())
+
+    def solved(self, tracks: TrackTable, selection: Selection, solution: Solution) -> int:
+        """Take out views beyond the gate, and tracks with too many of them; return how many tracks."""
+        bad: NDArray[np.bool_] = solution.squares.max(axis=1, initial=0.0) > self._gate
+        if not bad.any():
+            return 0
+        first = selection.views.first
+        counts = np.add.reduceat(bad.astype(np.int64), first[:-1])
+        hopeless = counts > self._track_fraction * np.diff(first)
+        hopeless |= bad[first[:-1]]  # the host's own view: without it the landmark has no bearing
+        tracks.remove_rows(selection.rows[bad | np.repeat(hopeless, np.diff(first))])
+        return int(hopeless.sum())

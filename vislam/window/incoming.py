@@ -1,0 +1,54 @@
+"""What may enter a window: checks of a first state and of a keyframe, made before anything is changed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.errors import DataError
+from vislam.messages import Array, ImuSpan, KeyframePacket, NavState
+from vislam.window.tracks import check_observations
+
+
+def check_state(state: NavState) -> None:
+    """Raise DataError unless a first state is finite and its covariance positive semidefinite."""
+    values = [state.T_world_body, state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2]
+    if not all(np.isfinite(v).all() for v in values) or not np.isfinite(state.covariance).all():
+        raise DataError("the first state of the window is not finite; initialise again")
+    if float(np.linalg.eigvalsh(0.5 * (state.covariance + state.covariance.T))[0]) < -1e-9:
+        raise DataError("the covariance of the window's first state has a negative eigenvalue; initialise again")
+
+
+def check_packet(packet: KeyframePacket, T_odom_body: Array | None, newest: tuple[int, int] | None) -> None:
+    """Raise DataError unless a keyframe is finite and follows the newest one, of which id and time are given."""
+    where = f"keyframe {packet.keyframe.id} at {packet.keyframe.t_ns} ns"
+    check_observations(packet.observations, where)
+    if not np.isfinite(packet.time_offset_s):
+        raise DataError(f"{where}: its time offset is {packet.time_offset_s}; it must be a number of seconds")
+    if T_odom_body is not None and not np.isfinite(T_odom_body).all():
+        raise DataError(f"{where}: its pose by odometry is not finite; leave it out")
+    T_vo = packet.vo.T_keyframe_body
+    if T_vo is not None and not np.isfinite(T_vo).all():
+        raise DataError(f"{where}: its motion by visual odometry is not finite; report it as lost instead")
+    if newest is None:
+        return
+    newest_id, newest_t_ns = newest
+    if packet.keyframe.t_ns <= newest_t_ns or packet.keyframe.id <= newest_id:
+        raise DataError(
+            f"{where} does not follow keyframe {newest_id} at {newest_t_ns} ns; add keyframes in time order"
+        )
+    if packet.imu is not None:
+        _check_span(packet.imu, newest_t_ns, packet.keyframe.t_ns, where)
+
+
+def _check_span(span: ImuSpan, t0_ns: int, t1_ns: int, where: str) -> None:
+    if len(span.t_ns) == 0:
+        return
+    if not (np.isfinite(span.gyro_rad_s).all() and np.isfinite(span.accel_m_s2).all()):
+        raise DataError(f"{where}: its inertial span has values that are not finite; leave such samples out")
+    if len(span.t_ns) > 1 and int(np.diff(span.t_ns).min()) <= 0:
+        raise DataError(f"{where}: its inertial span goes back in time; sort the samples and drop duplicates")
+    if int(span.t_ns[0]) != t0_ns or int(span.t_ns[-1]) != t1_ns:
+        raise DataError(
+            f"{where}: its inertial span covers [{span.t_ns[0]}, {span.t_ns[-1]}] ns instead of [{t0_ns}, {t1_ns}]; "
+            "cut it with ImuBuffer.span"
+        )
