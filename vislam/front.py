@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config, EkfConfig
-from vislam.ekf import CameraCalibration, Correction, Ekf, Hint, MsckfEkf, make_ekf
+from vislam.ekf import Correction, Ekf, Hint
+from vislam.ekf.filtering import Filtering
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend
 from vislam.frontend.camera_clock import CameraClock
@@ -37,12 +35,11 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.odometry_keyframe import OdometryKeyframe, first_keyframe_state, pose_before, restamped
+from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state
 from vislam.trajectory import Alignment, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
-_STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,11 +106,11 @@ class Front:
         self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0, "pieces": 1}
         self._config = config
         self._clock = clock
-        self.noise = self._noise_told = noise  # `noise` is gone by: raised where the samples show more
+        self.noise = noise  # what is gone by: raised where the samples show more
         self._has_imu = noise is not None
         self.camera_clock = CameraClock(config.init)
         self.uniform = UniformMotion(config.init)
-        self._ekf: Ekf | MsckfEkf | None = None
+        self._filter: Filtering | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu)
             self.envelope = NoiseEnvelope(noise)
@@ -123,16 +120,9 @@ class Front:
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
                 config.frontend.track_sigma_px,
             )  # fmt: skip
-            self.ekf_coupling = config.ekf.coupling
-            if self.ekf_coupling == "auto":
-                self.ekf_coupling = "tight" if self.frontend.mode == "mono" else "loose"
-            if config.ekf.nonholonomic and self.ekf_coupling == "tight":
-                raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
-            ekf_config = _ekf_config(config, self.ekf_coupling, rig)
-            self._make_ekf = partial(make_ekf, ekf_config, gravity_m_s2=config.imu.gravity_m_s2, rig=rig)
-            self._ekf = self._make_ekf(noise=noise)
-        self._seen: deque[tuple[int, TrackResult, bool]] = deque()  # on its way to the filter, with its time
-        self._told: list[Correction] = []  # to the filter, with the frame at hand
+            ekf_config = _ekf_config(config, self.frontend.mode, rig)
+            self._filter = Filtering(ekf_config, noise, config.imu.gravity_m_s2, rig)
+            self.ekf_coupling = self._filter.coupling
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
@@ -145,7 +135,7 @@ class Front:
         self._T_odom_keyframe: Array | None = None
         self._T_odom_body: Array | None = None
         self._T_vo_body = self._T_vo_keyframe.copy()
-        self._waiting: list[OdometryKeyframe] = []  # in frame `vo`, until gravity is known
+        self._waiting = WaitingKeyframes()  # in frame `vo`, until gravity is known
         self._resumed: FrontMemory | None = None  # until its keyframe was seen again
         self._first_id = 0  # of the keyframes of this recording
 
@@ -157,8 +147,8 @@ class Front:
         self._resumed = memory
         self.frontend.begin_at(memory.keyframe_id, memory.news)
         self._T_vo_keyframe, self._T_vo_body = memory.T_odom_body, memory.T_odom_body.copy()
-        start, state, camera = memory.start, memory.state, memory.news.filter_camera
-        if start is None or state is None or self._ekf is None:
+        start, state = memory.start, memory.state
+        if start is None or state is None or self._filter is None:
             return
         self.camera_clock.start_at(memory.time_offset_s, memory.news.time_offset_sigma_s)
         self.first_state, self.last_refusal = start.first_state, start.reason
@@ -167,12 +157,8 @@ class Front:
             excitation_m_s2=start.excitation_m_s2,
         )  # fmt: skip
         self.noise = start.noise
-        ekf = self._ekf = self._make_ekf(noise=start.noise)
-        if isinstance(ekf, MsckfEkf) and camera is not None:
-            found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
-            ekf.initialise(state, None, found)
-        else:
-            ekf.initialise(state, identity_motion(memory.t_ns, memory.keyframe_id, True, 0))
+        vo = identity_motion(memory.t_ns, memory.keyframe_id, True, 0)
+        self._filter.resume(state, vo, start.noise, memory.news.filter_camera)
 
     def begin_in_map(self, keyframe_id: int, next_track_id: int) -> None:
         """Number keyframes and tracks on from those of a map, before the first frame; the first begins a new piece."""
@@ -193,27 +179,22 @@ class Front:
     @property
     def news(self) -> FrontNews:
         """What was learned so far, beside the filter's state."""
-        camera = None
-        if isinstance(self._ekf, MsckfEkf):
-            found = self._ekf.calibration
-            camera = np.array([
-                found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
-            ])  # fmt: skip
+        camera = None if self._filter is None else self._filter.camera
         return replace(self.frontend.news, time_offset_sigma_s=self.camera_clock.sigma_s, filter_camera=camera)
 
     def add(self, value: ImuSample | MagSample) -> None:
         """Take a sample of an inertial sensor; the filter predicts at once."""
         if isinstance(value, MagSample):
             self._mag = value
-        elif self._has_imu and self._ekf is not None and self._buffer.add(value):
-            self._ekf.predict(value)
+        elif self._has_imu and self._filter is not None and self._buffer.add(value):
+            self._filter.ekf.predict(value)
             if self.envelope.add(value) and self.initialisation is None:
                 self._follow_noise()
 
     def add_hint(self, hint: Hint) -> None:
         """Tell the filter what holds a body while the camera sees nothing."""
-        if isinstance(self._ekf, Ekf):
-            hint.apply(self._ekf)
+        if self._filter is not None and isinstance(self._filter.ekf, Ekf):
+            hint.apply(self._filter.ekf)
 
     def is_ready(self, frame_t_ns: int, newest_frame_t_ns: int) -> bool:
         """Whether a frame can be processed: an inertial sample newer than it is there, or none will come in time."""
@@ -229,7 +210,7 @@ class Front:
         """Track one frame, update the filter with it, and hand over keyframes that are ready."""
         frame = self.camera_clock.in_imu_time(frame)
         span = self._span(self._last_frame_t_ns, frame.t_ns)
-        before = self._ekf.state() if self._ekf is not None and self._ekf.initialised else None
+        before = None if self._filter is None else self._filter.state
         with self._clock.measure("track"):
             track = self.frontend.track(frame, *self._without_bias(span, before), self._predicted(frame.t_ns, before))
             track = self._linked(frame, track)
@@ -244,23 +225,20 @@ class Front:
             self._T_vo_body = self._T_vo_keyframe @ scaled_motion(track.vo)
         with self._clock.measure("ekf"):
             ready = self._initialise(span, track, still_image)
-            T_odom_body, state = self._filter(frame, track, at_rest)
+            T_odom_body, state = self._correct(frame, track, at_rest)
         T_keyframe_body = self._since_keyframe(T_vo_keyframe_body, T_odom_body)
         if track.keyframe is not None:
             ready += self._take_keyframe(track, T_odom_body, state)
             T_keyframe_body = np.eye(4)
         self._last_frame_t_ns = frame.t_ns
         self._follow_clock(track.vo)
-        told, self._told = self._told, []
+        told = [] if self._filter is None else self._filter.take_told()
         return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready, told)
 
     def feed_back(self, update: GraphUpdate) -> None:
         """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
-        newest = update.newest
-        if newest is None or self._ekf is None or not self._ekf.initialised or not self._config.ekf.graph_feedback:
-            return
-        sigmas = np.sqrt(np.diag(newest.covariance))
-        self._ekf.feed_back(newest.gyro_bias_rad_s, newest.accel_bias_m_s2, sigmas[9:12], sigmas[12:15])
+        if self._filter is not None:
+            self._filter.feed_back(update)
 
     def give_up_waiting(self) -> list[OdometryKeyframe]:
         """Return the keyframes that still wait for gravity when the recording ends: vision alone has to do.
@@ -300,14 +278,14 @@ class Front:
             counters["imu"] = dict(self._buffer.counters)
             counters["initialisation refused"] = dict(self._initialiser.refusals)
             counters["camera clock"] = {"changes": self.camera_clock.changes}
-        if self._ekf is not None:
-            counters["ekf"] = dict(self._ekf.counters)
+        if self._filter is not None:
+            counters["ekf"] = dict(self._filter.ekf.counters)
         return counters
 
     @property
     def nis_statistics(self) -> dict[str, tuple[int, float, int]]:
         """Innovations that the filter accepted, by measurement: count, sum of NIS, sum of degrees of freedom."""
-        return {} if self._ekf is None else self._ekf.nis_statistics
+        return {} if self._filter is None else self._filter.ekf.nis_statistics
 
     def _linked(self, frame: Frame, track: TrackResult) -> TrackResult:
         """Return the track, tied to the keyframes of an earlier run where it begins anew."""
@@ -340,31 +318,18 @@ class Front:
 
     def _predicted(self, t_ns: int, state: NavState | None) -> Array | None:
         """Return the motion since the last frame where the filter knows it to centimetres."""
-        if self._ekf is None or state is None or self._last_frame_t_ns is None:
+        if self._filter is None or state is None or self._last_frame_t_ns is None:
             return None
         dt_s = (t_ns - self._last_frame_t_ns) * 1e-9
         if np.sqrt(np.trace(state.covariance[6:9, 6:9])) * dt_s > _KNOWN_MOTION_M:
             return None
-        T_last, T_now = self._ekf.pose_at(self._last_frame_t_ns), self._ekf.pose_at(t_ns)
-        return None if T_last is None or T_now is None else invert(T_last) @ T_now
+        return self._filter.motion(self._last_frame_t_ns, t_ns)
 
     def _follow_noise(self) -> None:
         """Raise the noise model, until the first state is found, to what the quietest half second shows."""
         self.noise = self.envelope.at_least_seen(self._config.imu.noise_tolerance)
         self._rest.trust(self.noise)
         self._initialiser.trust(self.noise)
-
-    def _start_filter(self, ekf: Ekf | MsckfEkf, state: NavState, vo: VoMeasurement) -> Ekf | MsckfEkf:
-        """Return the filter, started; another one if the noise is not what it was told at first."""
-        newest_t_ns = self._buffer.newest_t_ns
-        if self.noise is not None and self.noise != self._noise_told and newest_t_ns is not None:
-            ekf = self._make_ekf(noise=self.noise)
-            span = self._buffer.span(state.t_ns, newest_t_ns)
-            if span is not None:
-                for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
-                    ekf.predict(ImuSample(t_ns, gyro, accel))
-        ekf.initialise(state, vo)
-        return ekf
 
     def _follow_clock(self, vo: VoMeasurement) -> None:
         """Learn the camera's time offset; what waits for gravity is stamped anew, what left stays as it was."""
@@ -384,13 +349,7 @@ class Front:
         self._last_frame_t_ns += shift_ns
         self._keyframe_t_ns += shift_ns
         self.camera_clock.took_keyframe()
-        before_ns: int | None = None
-        for i, waiting in enumerate(self._waiting):
-            packet = restamped(waiting.packet, shift_ns)
-            t_ns = packet.keyframe.t_ns
-            imu = None if before_ns is None or waiting.packet.imu is None else self._buffer.span(before_ns, t_ns)
-            self._waiting[i] = replace(waiting, packet=replace(packet, imu=imu))
-            before_ns = t_ns
+        self._waiting.restamp(shift_ns, self._buffer.span)
 
     def _count(self, track: TrackResult, at_rest: bool) -> None:
         self.counters["frames_lost"] += track.vo.tracking == Tracking.LOST
@@ -400,7 +359,7 @@ class Front:
 
     def _initialise(self, span: ImuSpan | None, track: TrackResult, still_image: bool) -> list[OdometryKeyframe]:
         """Look for the first gravity-aligned state; once found, start the filter and release what waited."""
-        if self._ekf is None or self.initialisation is not None:
+        if self._filter is None or self.noise is None or self.initialisation is not None:
             return []
         self._initialiser.time_offset_sigma_s = self.camera_clock.sigma_s
         found = self._initialiser.add(span, track.vo, still_image, track.observations)
@@ -409,7 +368,7 @@ class Front:
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
         self.initialisation = found
-        self._ekf = self._start_filter(self._ekf, found.last, track.vo)
+        self._filter.start(found.last, track.vo, self.noise, self._buffer)
         return self._release(found.T_odom_vo)
 
     def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
@@ -418,55 +377,32 @@ class Front:
         Without scale the visual chain has no positions; those that the initialisation solved for take their place.
         """
         found = self.initialisation
-        solved = {}
-        if found is not None and found.T_odom_body is not None and self.frontend.mode == "mono":
-            solved = self._carried_back(found) | dict(zip(found.t_ns, found.T_odom_body, strict=True))
-        released = [
-            OdometryKeyframe(w.packet, solved.get(w.packet.keyframe.t_ns, T_odom_vo @ w.T_odom_body))
-            for w in self._waiting
-        ]
-        self._waiting = []
-        self._T_odom_keyframe = T_odom_vo @ self._T_vo_keyframe
-        if self.frontend.mode == "mono":
-            self._T_odom_keyframe = solved.get(self._keyframe_t_ns)
-        if released and found is not None and found.first is not None:
-            self.first_state = first_keyframe_state(found.first, released[0])
+        first = None if found is None else found.first
+        is_mono = self.frontend.mode == "mono"
+        solved: dict[int, Array] = {}
+        if is_mono and found is not None and first is not None and found.T_odom_body is not None:
+            solved = self._waiting.carried_back(first, self._buffer.span, self._config.imu.gravity_m_s2)
+            solved |= dict(zip(found.t_ns, found.T_odom_body, strict=True))
+        released = self._waiting.release(T_odom_vo, solved)
+        self._T_odom_keyframe = solved.get(self._keyframe_t_ns) if is_mono else T_odom_vo @ self._T_vo_keyframe
+        if released and first is not None:
+            self.first_state = first_keyframe_state(first, released[0])
         return released
 
-    def _carried_back(self, found: Initialisation) -> dict[int, Array]:
-        """Return the poses of waiting keyframes older than the window that was solved, by inertial data alone."""
-        assert found.first is not None
-        poses: dict[int, Array] = {}
-        for waiting in self._waiting:
-            t_ns = waiting.packet.keyframe.t_ns
-            span = self._buffer.span(t_ns, found.first.t_ns)  # None: not older
-            if span is not None:
-                poses[t_ns] = pose_before(found.first, span, self._config.imu.gravity_m_s2)
-        return poses
-
-    def _filter(self, frame: Frame, track: TrackResult, at_rest: bool) -> tuple[Array | None, NavState | None]:
+    def _correct(self, frame: Frame, track: TrackResult, at_rest: bool) -> tuple[Array | None, NavState | None]:
         """Return the pose in `odom` and the filter's state after this frame."""
-        if self._ekf is None:
+        if self._filter is None:
             return self._T_vo_body.copy(), None
-        if not self._ekf.initialised:
+        ekf = self._filter.ekf
+        if not ekf.initialised:
             return None, None
-        self._seen.append((frame.t_ns, track, at_rest))
-        newest_ns = frame.t_ns - round(self._config.ekf.vision_delay_s * 1e9) + _STAMP_JITTER_NS
-        while self._seen and self._seen[0][0] <= newest_ns:
-            self._correct(self._ekf, *self._seen.popleft())
-        T_odom_body = self._ekf.pose_at(frame.t_ns)
+        keyframe_id = None if track.keyframe is None else track.keyframe.id
+        self._filter.see(frame.t_ns, track.vo, track.observations, at_rest, keyframe_id)
+        T_odom_body = ekf.pose_at(frame.t_ns)
         if T_odom_body is None:
             T_odom_body = self._without_filter(track.vo)
         self._T_odom_body = T_odom_body
-        return T_odom_body, self._ekf.state_at(frame.t_ns)
-
-    def _correct(self, ekf: Ekf | MsckfEkf, t_ns: int, track: TrackResult, at_rest: bool) -> None:
-        """Give the filter what was seen in a frame, in time or later."""
-        keyframe_id = None if track.keyframe is None else track.keyframe.id
-        on_wheels = self._config.ekf.nonholonomic and not at_rest
-        correction = Correction(t_ns, track.vo, track.observations, at_rest, on_wheels, keyframe_id)
-        correction.apply(ekf)
-        self._told.append(correction)
+        return T_odom_body, ekf.state_at(frame.t_ns)
 
     def _without_filter(self, vo: VoMeasurement) -> Array | None:
         """Return the pose in `odom` where inertial data stopped before the frame: vision carries the last one on."""
@@ -477,7 +413,7 @@ class Front:
     def _since_keyframe(self, T_vo_keyframe_body: Array | None, T_odom_body: Array | None) -> Array | None:
         if T_vo_keyframe_body is not None:
             return T_vo_keyframe_body
-        if self._ekf is not None and T_odom_body is not None and self._T_odom_keyframe is not None:
+        if self._filter is not None and T_odom_body is not None and self._T_odom_keyframe is not None:
             return invert(self._T_odom_keyframe) @ T_odom_body
         return None
 
@@ -506,7 +442,7 @@ class Front:
         self._T_odom_keyframe = T_odom_body
         if T_odom_body is not None:
             return [OdometryKeyframe(packet, T_odom_body)]
-        self._waiting.append(OdometryKeyframe(packet, self._T_vo_body.copy()))
+        self._waiting.add(OdometryKeyframe(packet, self._T_vo_body.copy()))
         return self._give_up_if_late(keyframe.t_ns)
 
     def _bridged(self, t_ns: int, imu: ImuSpan | None, variance_m2: float) -> bool:
@@ -523,7 +459,7 @@ class Front:
 
     def _give_up_if_late(self, now_t_ns: int) -> list[OdometryKeyframe]:
         """Go on without the IMU when gravity could not be found for too long; keyframes must not wait for ever."""
-        waited_s = (now_t_ns - self._waiting[0].packet.keyframe.t_ns) * 1e-9
+        waited_s = self._waiting.waited_s(now_t_ns)
         if waited_s < self._config.init.give_up_s:
             return []
         if self.frontend.mode == "mono":
@@ -532,14 +468,19 @@ class Front:
                 "start, begin at rest, or use a second camera or depth"
             )
         self.counters["imu_given_up"] = 1
-        self._ekf, self._has_imu = None, False
+        self._filter, self._has_imu = None, False
         released = self._release(self._T_upright)
         self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
         return released
 
 
-def _ekf_config(config: Config, coupling: Literal["loose", "tight"], rig: Rig) -> EkfConfig:
-    """Return the settings of the filter with what the camera's settings say for it."""
+def _ekf_config(config: Config, mode: str, rig: Rig) -> EkfConfig:
+    """Return the settings of the filter with what front end and camera say for it."""
+    coupling = config.ekf.coupling
+    if coupling == "auto":
+        coupling = "tight" if mode == "mono" else "loose"
+    if config.ekf.nonholonomic and coupling == "tight":
+        raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
     readout_s = config.ekf.tight_readout_s
     readout_s = config.frontend.readout_s if readout_s is None else readout_s
     scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,52 @@ class OdometryKeyframe:
     T_odom_body: Array  # [4, 4]
 
 
-def restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
+class WaitingKeyframes:
+    """Keyframes in the frame of visual odometry, oldest first, that wait until gravity is known."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._keyframes: list[OdometryKeyframe] = []
+
+    def add(self, keyframe: OdometryKeyframe) -> None:
+        """Let a keyframe wait."""
+        self._keyframes.append(keyframe)
+
+    def waited_s(self, now_t_ns: int) -> float:
+        """Return how long the first has waited."""
+        return (now_t_ns - self._keyframes[0].packet.keyframe.t_ns) * 1e-9
+
+    def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
+        """Bring all `shift_ns` later in the IMU's time; `cut` gives the inertial data between two times."""
+        before_ns: int | None = None
+        for i, waiting in enumerate(self._keyframes):
+            packet = _restamped(waiting.packet, shift_ns)
+            t_ns = packet.keyframe.t_ns
+            imu = None if before_ns is None or waiting.packet.imu is None else cut(before_ns, t_ns)
+            self._keyframes[i] = replace(waiting, packet=replace(packet, imu=imu))
+            before_ns = t_ns
+
+    def carried_back(
+        self, first: NavState, cut: Callable[[int, int], ImuSpan | None], gravity_m_s2: float
+    ) -> dict[int, Array]:
+        """Return the poses, by time, of those that are older than a state: by inertial data alone."""
+        poses = {}
+        for waiting in self._keyframes:
+            t_ns = waiting.packet.keyframe.t_ns
+            span = cut(t_ns, first.t_ns)  # None: not older
+            if span is not None:
+                poses[t_ns] = pose_before(first, span, gravity_m_s2)
+        return poses
+
+    def release(self, T_odom_vo: Array, solved: Mapping[int, Array]) -> list[OdometryKeyframe]:
+        """Return all in `odom`, at the pose that was solved for their time, if any; none waits any longer."""
+        waiting, self._keyframes = self._keyframes, []
+        return [
+            OdometryKeyframe(w.packet, solved.get(w.packet.keyframe.t_ns, T_odom_vo @ w.T_odom_body)) for w in waiting
+        ]
+
+
+def _restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
     """Return the packet `shift_ns` later in the IMU's time; its inertial data have to be cut anew."""
     keyframe, t_ns = packet.keyframe, packet.keyframe.t_ns + shift_ns
     return replace(

@@ -10,11 +10,11 @@ from inertial_world import GRAVITY_M_S2, NS, T0_NS
 from point_world import KINDS, Start, initialiser
 
 from vislam.config import ImuConfig
-from vislam.front import pose_before
 from vislam.frontend.initialisation import Initialisation, Phase
 from vislam.geometry import invert, so3_log
 from vislam.imu import ImuBuffer
 from vislam.messages import ImuSample, NavState
+from vislam.odometry_keyframe import pose_before
 
 _STARTS = {"static": 4, "moving": 10, "gentle": 2, "rotation": 3, "uniform": 3, "accelerating": 3}
 

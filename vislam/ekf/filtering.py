@@ -1,0 +1,106 @@
+"""The filter of a run: how it starts, and when it hears of what was seen."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vislam.config import EkfConfig
+from vislam.ekf import Ekf, make_ekf
+from vislam.ekf.correction import Correction
+from vislam.ekf.msckf import CameraCalibration, MsckfEkf
+from vislam.geometry import invert
+from vislam.imu import ImuBuffer, ImuNoise
+from vislam.messages import Array, GraphUpdate, ImuSample, NavState, Observations, VoMeasurement
+
+if TYPE_CHECKING:  # the fast path must not load OpenCV
+    from vislam.camera import Rig
+
+_STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
+
+
+class Filtering:
+    """Owns the filter and what is on its way to it.
+
+    Attributes:
+        ekf: the filter, another one after a start with other noise.
+        coupling: "loose" takes motions of visual odometry, "tight" takes tracks.
+    """
+
+    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+        """Make the filter that `config.coupling` asks for."""
+        self.coupling = config.coupling
+        self._config = config
+        self._make = partial(make_ekf, config, gravity_m_s2=gravity_m_s2, rig=rig)
+        self._noise = noise
+        self.ekf: Ekf | MsckfEkf = self._make(noise=noise)
+        self._seen: deque[Correction] = deque()  # on its way to the filter
+        self._told: list[Correction] = []  # since somebody asked
+
+    @property
+    def state(self) -> NavState | None:
+        """The newest state; None before the first."""
+        return self.ekf.state() if self.ekf.initialised else None
+
+    def start(self, state: NavState, vo: VoMeasurement, noise: ImuNoise, buffer: ImuBuffer) -> None:
+        """Start at a state in the past; another filter where the noise is not what this one was told at first."""
+        newest_t_ns = buffer.newest_t_ns
+        if noise != self._noise and newest_t_ns is not None:
+            self.ekf = self._make(noise=noise)
+            span = buffer.span(state.t_ns, newest_t_ns)
+            if span is not None:
+                for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
+                    self.ekf.predict(ImuSample(t_ns, gyro, accel))
+        self.ekf.initialise(state, vo)
+
+    def resume(self, state: NavState, vo: VoMeasurement, noise: ImuNoise, camera: Array | None) -> None:
+        """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""
+        self.ekf = self._make(noise=noise)
+        if isinstance(self.ekf, MsckfEkf) and camera is not None:
+            found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
+            self.ekf.initialise(state, None, found)
+        else:
+            self.ekf.initialise(state, vo)
+
+    @property
+    def camera(self) -> Array | None:
+        """What a tight filter learned of the camera [8]: time offset, its sigma, rotation, its sigmas (s, rad)."""
+        if not isinstance(self.ekf, MsckfEkf):
+            return None
+        found = self.ekf.calibration
+        return np.array([
+            found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
+        ])  # fmt: skip
+
+    def see(
+        self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None
+    ) -> None:
+        """Take what was seen in a frame, and tell the filter what it is to know by now."""
+        on_wheels = self._config.nonholonomic and not at_rest
+        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id))
+        newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
+        while self._seen and self._seen[0].t_ns <= newest_ns:
+            correction = self._seen.popleft()
+            correction.apply(self.ekf)
+            self._told.append(correction)
+
+    def take_told(self) -> list[Correction]:
+        """Return what the filter was told since this was asked last."""
+        told, self._told = self._told, []
+        return told
+
+    def motion(self, from_t_ns: int, to_t_ns: int) -> Array | None:
+        """Return T_from_to [4, 4] between two times of the filter's memory; None outside of it."""
+        T_from, T_to = self.ekf.pose_at(from_t_ns), self.ekf.pose_at(to_t_ns)
+        return None if T_from is None or T_to is None else invert(T_from) @ T_to
+
+    def feed_back(self, update: GraphUpdate) -> None:
+        """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
+        newest = update.newest
+        if newest is None or not self.ekf.initialised or not self._config.graph_feedback:
+            return
+        sigmas = np.sqrt(np.diag(newest.covariance))
+        self.ekf.feed_back(newest.gyro_bias_rad_s, newest.accel_bias_m_s2, sigmas[9:12], sigmas[12:15])
