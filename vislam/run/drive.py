@@ -1,39 +1,35 @@
-"""One recording through the pipeline into a run folder: the library's side of `vislam run`."""
+"""The run itself: the pipeline driven over one recording, and the run folder kept."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.clock import StageClock
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, UsageError, VislamError
-from vislam.factor_log import rig_data
-from vislam.factors.gate import EdgeReport
-from vislam.front import FrontReport
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
-from vislam.memory import FrontMemory, FrontNews, GraphNews, KeyframeEntry, SlamMemory, StartFacts
-from vislam.messages import Array, Frame, GraphUpdate, ImuSample, LoopDecision, MagSample, NavState
+from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
+from vislam.messages import Frame, ImuSample, LoopDecision, MagSample
 from vislam.recording import Recording
 from vislam.run.loop_gallery import LoopGallery
 from vislam.run.metrics import accuracy, doubts, initialisation, judge
+from vislam.run.pipeline import Pipeline
 from vislam.run.view import show_map, show_paths, show_step
-from vislam.runfolder import MapChoice, RunLog, storage, write_json, write_setup
-from vislam.session import Session, SessionWriter, has_begun, recall
-from vislam.slam import Finish, KeyframeStep, Slam, Step
+from vislam.runfolder import RunLog, write_json
+from vislam.session import Session, SessionWriter, recall
+from vislam.slam import KeyframeStep, Slam, Step
 from vislam.trajectory import Trajectory
 from vislam.viewer import NullViewer, open_viewer
 
@@ -51,97 +47,6 @@ def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
         return None
     overrides = {name: value for name in asdict(recorded) if (value := getattr(config, name, None)) is not None}
     return ImuNoise(**{**asdict(recorded), **overrides})
-
-
-class FrontHalf(Protocol):
-    """What a run asks of the front half, in this process or another."""
-
-    @property
-    def start(self) -> StartFacts | None:
-        """How gravity was found."""
-        ...
-
-    @property
-    def news(self) -> FrontNews:
-        """What was learned so far."""
-        ...
-
-    def report(self) -> FrontReport:
-        """Return what there is to say of the run."""
-        ...
-
-
-class FinalGraph(Protocol):
-    """What a run asks of the graph when it is finished."""
-
-    @property
-    def ids(self) -> NDArray[np.int64]:
-        """Keyframes [M]."""
-        ...
-
-    def poses(self) -> Array:
-        """Return T_map_body [M, 4, 4]."""
-        ...
-
-    def states(self) -> list[NavState]:
-        """Return the states of the keyframes; empty without an IMU."""
-        ...
-
-    def edge_reports(self) -> list[EdgeReport]:
-        """Return what became of every offered loop."""
-        ...
-
-
-class BackHalf(Protocol):
-    """What a run asks of the back end, in this process or another."""
-
-    @property
-    def graph(self) -> FinalGraph:
-        """The graph."""
-        ...
-
-    @property
-    def mapper(self) -> Mapper | None:
-        """The map; None where it is off."""
-        ...
-
-    @property
-    def counters(self) -> dict[str, dict[str, int]]:
-        """Counters of the rooms."""
-        ...
-
-
-class Pipeline(Protocol):
-    """What a run asks of the pipeline beside its steps: `Slam`, or processes that do the same."""
-
-    counters: dict[str, int]
-
-    @property
-    def clock(self) -> StageClock:
-        """Durations of the stages of this process."""
-        ...
-
-    @property
-    def front(self) -> FrontHalf:
-        """The half at the rate of the sensors."""
-        ...
-
-    @property
-    def back(self) -> BackHalf | None:
-        """The half at the rate of keyframes; None before the first."""
-        ...
-
-    def resume(self, memory: SlamMemory) -> GraphUpdate:
-        """Go on where an earlier run was, before the first value; return all its poses."""
-        ...
-
-    def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
-        """Begin in the map of earlier runs, before the first value; return its poses."""
-        ...
-
-    def finish(self) -> Finish:
-        """Process what still waits and optimise a last time."""
-        ...
 
 
 class Run:
@@ -421,117 +326,8 @@ def _length_s(stamps_ns: NDArray[np.int64]) -> float:
     return float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
 
 
-def execute(
-    recording: Recording,
-    config: Config,
-    out: Path,
-    source: str,
-    command: list[str],
-    progress: Progress | None = None,
-    base: MapChoice | None = None,
-) -> dict[str, Any]:
-    """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`.
-
-    With `base` it begins in the map of another session, which stays as it is. Raises UsageError when that does not fit.
-    """
-    return begun(recording, config, out, source, command, base).execute(progress)
-
-
-def begun(
-    recording: Recording,
-    config: Config,
-    out: Path,
-    source: str,
-    command: list[str],
-    base: MapChoice | None,
-    make: Callable[[SessionWriter], Run] | None = None,
-) -> Run:
-    """Return a run at its beginning, in the map `base` if there is one; see `execute`.
-
-    `make` makes another kind of run of its session.
-    """
-    info = {"source": source, "config": asdict(config)}
-    noise = imu_noise(config.imu, recording.imu_noise)
-    path = out / "session.db"
-    make = make or partial(Run, recording, config, out)
-    if base is None:
-        write_setup(out, config, source, command)
-        return make(SessionWriter(path, info, recording.rig, noise, config.imu.gravity_m_s2))
-    stored = Session(base.session)
-    try:
-        memory = map_of(stored, recording, config, noise, base.localize_only)
-        write_setup(out, config, source, command, base)
-        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only)
-    finally:
-        stored.close()
-    run = make(session)
-    run.begin_in_map(memory)
-    if not memory.scans and config.map.enabled:
-        run.warnings.append(
-            f"{stored.path} brings no clouds, or of another shape (--map.*): the map holds new ones only"
-        )
-    return run
-
-
 def _still(began: Any, now: Any) -> bool:
     """Return whether settings are what they were; those that a newer version has besides are at their defaults."""
     if isinstance(began, dict) and isinstance(now, dict):
         return all(name in now and _still(value, now[name]) for name, value in began.items())
     return bool(began == now)
-
-
-def map_of(
-    stored: Session, recording: Recording, config: Config, noise: ImuNoise | None, is_held: bool = False
-) -> SlamMemory:
-    """Return the map of a session; raises UsageError when a recording cannot go on in it, DataError without one.
-
-    With `is_held` it is not to change.
-    """
-    info = stored.info()
-    settings, sensors = info.get("config") or {}, json.loads(json.dumps(rig_data(recording.rig)))
-    if settings.get("graph", {}).get("coupling") != "tight" or config.graph.coupling != "tight":
-        raise UsageError("a map is made and continued with tight coupling only; use --graph.coupling tight for both")
-    if info.get("rig") != sensors:
-        raise UsageError(f"{stored.path} was made with other cameras, or another calibration, than {recording.name}")
-    if (info.get("imu_noise") is None) != (noise is None):
-        raise UsageError(f"{stored.path} and {recording.name} must both have an IMU, or both none")
-    memory = recall(stored)
-    if memory is None:
-        raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
-    memory = replace(memory, held=len(memory.graph.packets) if is_held else 0)
-    if settings.get("map") != json.loads(json.dumps(asdict(config.map))):
-        return replace(memory, scans={})  # of another shape
-    return memory
-
-
-def resume(
-    recording: Recording,
-    config: Config,
-    out: Path,
-    source: str,
-    command: list[str],
-    progress: Progress | None = None,
-    base: MapChoice | None = None,
-) -> dict[str, Any]:
-    """Go on with the run in `out` after its last stored keyframe and return the metrics of the whole.
-
-    A run that had no keyframe yet, or had not found gravity, begins again, in the map `base` if it began there. Raises
-    UsageError when it is finished or `config` is not what it began with, DataError when its session is damaged or the
-    recording is another one.
-    """
-    path = out / "session.db"
-    if has_begun(path):
-        session = SessionWriter.reopen(path)
-        run = Run(recording, config, out, session)
-        stored = Session(path)
-        try:
-            is_begun = run.resume(stored)
-        finally:
-            stored.close()
-        if is_begun:
-            return run.execute(progress)
-        session.close()
-    with storage(path):
-        for name in ("session.db", "session.db-wal", "session.db-shm"):
-            (out / name).unlink(missing_ok=True)
-    return execute(recording, config, out, source, command, progress, base)

@@ -1,0 +1,129 @@
+"""How a run begins: anew, in the map of another session, or where it was killed or interrupted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from vislam.config import Config
+from vislam.errors import DataError, UsageError
+from vislam.factor_log import rig_data
+from vislam.imu import ImuNoise
+from vislam.memory import SlamMemory
+from vislam.recording import Recording
+from vislam.run.drive import Progress, Run, imu_noise
+from vislam.runfolder import MapChoice, storage, write_setup
+from vislam.session import Session, SessionWriter, has_begun, recall
+
+
+def execute(
+    recording: Recording,
+    config: Config,
+    out: Path,
+    source: str,
+    command: list[str],
+    progress: Progress | None = None,
+    base: MapChoice | None = None,
+) -> dict[str, Any]:
+    """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`.
+
+    With `base` it begins in the map of another session, which stays as it is. Raises UsageError when that does not fit.
+    """
+    return begun(recording, config, out, source, command, base).execute(progress)
+
+
+def resume(
+    recording: Recording,
+    config: Config,
+    out: Path,
+    source: str,
+    command: list[str],
+    progress: Progress | None = None,
+    base: MapChoice | None = None,
+) -> dict[str, Any]:
+    """Go on with the run in `out` after its last stored keyframe and return the metrics of the whole.
+
+    A run that had no keyframe yet, or had not found gravity, begins again, in the map `base` if it began there. Raises
+    UsageError when it is finished or `config` is not what it began with, DataError when its session is damaged or the
+    recording is another one.
+    """
+    path = out / "session.db"
+    if has_begun(path):
+        session = SessionWriter.reopen(path)
+        run = Run(recording, config, out, session)
+        stored = Session(path)
+        try:
+            is_begun = run.resume(stored)
+        finally:
+            stored.close()
+        if is_begun:
+            return run.execute(progress)
+        session.close()
+    with storage(path):
+        for name in ("session.db", "session.db-wal", "session.db-shm"):
+            (out / name).unlink(missing_ok=True)
+    return execute(recording, config, out, source, command, progress, base)
+
+
+def begun(
+    recording: Recording,
+    config: Config,
+    out: Path,
+    source: str,
+    command: list[str],
+    base: MapChoice | None,
+    make: Callable[[SessionWriter], Run] | None = None,
+) -> Run:
+    """Return a run at its beginning, in the map `base` if there is one; see `execute`.
+
+    `make` makes another kind of run of its session.
+    """
+    info = {"source": source, "config": asdict(config)}
+    noise = imu_noise(config.imu, recording.imu_noise)
+    path = out / "session.db"
+    make = make or partial(Run, recording, config, out)
+    if base is None:
+        write_setup(out, config, source, command)
+        return make(SessionWriter(path, info, recording.rig, noise, config.imu.gravity_m_s2))
+    stored = Session(base.session)
+    try:
+        memory = map_of(stored, recording, config, noise, base.localize_only)
+        write_setup(out, config, source, command, base)
+        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only)
+    finally:
+        stored.close()
+    run = make(session)
+    run.begin_in_map(memory)
+    if not memory.scans and config.map.enabled:
+        run.warnings.append(
+            f"{stored.path} brings no clouds, or of another shape (--map.*): the map holds new ones only"
+        )
+    return run
+
+
+def map_of(
+    stored: Session, recording: Recording, config: Config, noise: ImuNoise | None, is_held: bool = False
+) -> SlamMemory:
+    """Return the map of a session; raises UsageError when a recording cannot go on in it, DataError without one.
+
+    With `is_held` it is not to change.
+    """
+    info = stored.info()
+    settings, sensors = info.get("config") or {}, json.loads(json.dumps(rig_data(recording.rig)))
+    if settings.get("graph", {}).get("coupling") != "tight" or config.graph.coupling != "tight":
+        raise UsageError("a map is made and continued with tight coupling only; use --graph.coupling tight for both")
+    if info.get("rig") != sensors:
+        raise UsageError(f"{stored.path} was made with other cameras, or another calibration, than {recording.name}")
+    if (info.get("imu_noise") is None) != (noise is None):
+        raise UsageError(f"{stored.path} and {recording.name} must both have an IMU, or both none")
+    memory = recall(stored)
+    if memory is None:
+        raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
+    memory = replace(memory, held=len(memory.graph.packets) if is_held else 0)
+    if settings.get("map") != json.loads(json.dumps(asdict(config.map))):
+        return replace(memory, scans={})  # of another shape
+    return memory
