@@ -14,9 +14,11 @@ from numba import njit
 
 from vislam.batch.graph_ordering import Ints
 from vislam.batch.graph_symbolic import Symbolic
-from vislam.batch.native_calls import POTRF, SYRK, TRSM, blas_addresses, call_void
+from vislam.batch.native_calls import call_void, scipy_addresses
 from vislam.messages import Array
 
+_ROUTINES = ("cython_blas.dtrsm", "cython_blas.dsyrk", "cython_lapack.dpotrf")
+_TRSM, _SYRK, _POTRF = range(3)
 _SMALL = 24  # pivots' columns up to which loops beat BLAS
 _SMALL_WORK = 40_000  # multiplications up to which they do
 
@@ -37,7 +39,7 @@ class Factor:
         self._stack = np.empty(symbolic.stack_size * d * d)
         self.node = np.empty(symbolic.count, dtype=np.int64)  # the pose at each place
         self.node[symbolic.place] = np.arange(symbolic.count)
-        self._blas = blas_addresses()
+        self._blas = scipy_addresses(*_ROUTINES)
 
     def factorise(self, diagonal: Array, off: Array) -> bool:
         """Replace the factor by that of another matrix; False where that is not positive definite."""
@@ -248,7 +250,7 @@ def _eliminate_by_blas(width, height, panel, update, blas, integers):  # type: i
     integers[:] = (width, below, height, 0)
     at = integers.ctypes.data
     address = panel.ctypes.data
-    call_void(blas[POTRF], (text, at, address, at + 8, at + 12))
+    call_void(blas[_POTRF], (text, at, address, at + 8, at + 12))
     for j in range(width):
         if not panel[j * height + j] > 0.0:  # dpotrf lets NaN pass
             return False
@@ -256,8 +258,8 @@ def _eliminate_by_blas(width, height, panel, update, blas, integers):  # type: i
         return False
     if below > 0:
         beneath = address + 8 * width
-        call_void(blas[TRSM], (text + 1, text, text + 2, text + 3, at + 4, at, one, address, at + 8, beneath, at + 8))
-        call_void(blas[SYRK], (text, text + 3, at + 4, at, minus, beneath, at + 8, one, update.ctypes.data, at + 4))
+        call_void(blas[_TRSM], (text + 1, text, text + 2, text + 3, at + 4, at, one, address, at + 8, beneath, at + 8))
+        call_void(blas[_SYRK], (text, text + 3, at + 4, at, minus, beneath, at + 8, one, update.ctypes.data, at + 4))
     return True
 
 

@@ -16,7 +16,7 @@ from vislam.errors import UsageError
 from vislam.geometry import invert_many
 from vislam.messages import Array
 
-_WORK_PER_EDGE = 40_000  # multiplications over the size of a block, from which on conjugate gradients are faster
+_WORK_PER_EDGE = 20_000  # multiplications over the size of a block, from which on conjugate gradients are faster
 _STEP_TOLERANCE = 1e-3  # of a Newton step: what is missing of it costs the square of that
 
 Equations = Literal["auto", "cholesky", "gradients"]

@@ -14,14 +14,11 @@ from numba import types
 from numba.extending import get_cython_function_address, intrinsic
 from numpy.typing import NDArray
 
-_BLAS = ("dtrsm", "dsyrk", "dgemm", "dtrsv", "dgemv")
-TRSM, SYRK, GEMM, TRSV, GEMV, POTRF = range(6)  # places in `blas_addresses()`
 
-
-def blas_addresses() -> NDArray[np.int64]:
-    """Return the addresses of the Fortran routines dtrsm, dsyrk, dgemm, dtrsv, dgemv, dpotrf in this process."""
-    blas = [get_cython_function_address("scipy.linalg.cython_blas", name) for name in _BLAS]
-    return np.array([*blas, get_cython_function_address("scipy.linalg.cython_lapack", "dpotrf")], dtype=np.int64)
+def scipy_addresses(*routines: str) -> NDArray[np.int64]:
+    """Return the addresses in this process of routines of scipy.linalg, as "cython_blas.dtrsm"."""
+    names = [routine.split(".") for routine in routines]
+    return np.array([get_cython_function_address(f"scipy.linalg.{at}", name) for at, name in names], dtype=np.int64)
 
 
 def strtod_address() -> int:
