@@ -234,7 +234,7 @@ def test_a_budget_ends_it_in_time(video: Path, sensors: SensorsConfig, tmp_path:
         in_real_time=False,
     )  # fmt: skip
     assert "--max-gb" in recorded.ended
-    assert 2e5 <= recorded.bytes_written < 2e6 < 40 * 1e5
+    assert 2e5 <= recorded.bytes_written < 35e5  # what is queued is still written; the whole video would be 40e5
     assert len(events_of(tmp_path / "r")[2]) >= 1
 
 
