@@ -64,6 +64,18 @@ def error_of(state: NavState, world: World, k: int) -> np.ndarray:
     )
 
 
+def test_an_error_of_scale_is_told_by_the_distance_from_the_start() -> None:
+    shared = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0, scale_sigma=0.01)
+    (plain, _, _), (stretched, _, _) = run(World(4.0)), run(World(4.0), config=shared)
+    np.testing.assert_array_equal(plain.poses(), stretched.poses())
+    before, after = plain.states()[-1], stretched.states()[-1]
+    way = before.T_world_body[:3, 3] - plain.poses()[0, :3, 3]
+    more = after.covariance - before.covariance
+    np.testing.assert_allclose(more[3:6, 3:6], 1e-4 * np.outer(way, way), atol=1e-9)
+    np.testing.assert_allclose(more[3:6, 6:9], 1e-4 * np.outer(way, before.velocity_world_m_s), atol=1e-9)
+    np.testing.assert_allclose(more[:3], 0.0, atol=1e-9)
+
+
 def test_graph_beats_odometry_and_biases_converge() -> None:
     world = World(60.0)
     graph, updates, packets = run(world, loop_every=10)
