@@ -28,6 +28,7 @@ from vislam.memory import FrameEntry, SlamMemory
 from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDecision, NavState, RetrievedKeyframe
 from vislam.session import Session
 from vislam.slam import KeyframeStep, Step
+from vislam.sources import recorded_path
 from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
 
 _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
@@ -74,7 +75,7 @@ def read_setup(out: Path) -> tuple[str, Config, MapChoice | None]:
     source = manifest.get("source")
     if not isinstance(source, str):
         raise UsageError(f"{out / 'manifest.json'} names no source; start the run anew with --overwrite")
-    if fingerprint(_path_of(source)) != manifest.get("data_sha256"):
+    if _fingerprint_of(source) != manifest.get("data_sha256"):
         raise DataError(f"{source} is not the recording that {out} began with; start a new run")
     base = manifest.get("map")
     try:
@@ -143,7 +144,7 @@ def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
     """Return what identifies a run: code, packages, data, seed, command, machine."""
     return {
         "source": source,
-        "data_sha256": fingerprint(_path_of(source)),
+        "data_sha256": _fingerprint_of(source),
         "command": command,
         "seed": config.seed,
         "code_revision": code_revision(),
@@ -153,8 +154,9 @@ def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
     }
 
 
-def _path_of(source: str) -> Path:
-    return Path(source.partition(":")[2] or source)
+def _fingerprint_of(source: str) -> str | None:
+    path = recorded_path(source)
+    return None if path is None else fingerprint(path)
 
 
 def fingerprint(path: Path) -> str | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +14,9 @@ from vislam.recording import Recording
 
 if TYPE_CHECKING:
     from vislam.sim import MeasuredInertial
+
+_SCHEMES = re.compile(r"(?:[a-z]+:)+")
+_SENSORS = re.compile(r"virtual-cart(,|$)|gy85\+|serial:")
 
 
 def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None = None) -> Recording:
@@ -41,6 +46,27 @@ def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None =
     from vislam.datasets import open_dataset
 
     return open_dataset(uri, calibration)
+
+
+def recorded_path(source: str) -> Path | None:
+    """Return where a source, also a live one that replays it, is read from; None for worlds and sensors."""
+    scheme, name, _ = split_source(source.removeprefix("replay:"))
+    return None if is_world(scheme, name) or _SENSORS.match(source) else Path(name)
+
+
+def split_source(source: str) -> tuple[str, str, str]:
+    """Return schemes with their colons ("points:euroc:"), the name or path, and ",option=value"s; each may be empty."""
+    first, comma, options = source.partition(",")
+    match = _SCHEMES.match(first)
+    scheme = match[0] if match else ""
+    return scheme, first[len(scheme) :], comma + options
+
+
+def is_world(scheme: str, name: str) -> bool:
+    """Whether a source is simulated altogether, and its name therefore no path."""
+    from vislam.sim import POINT_WORLD_NAMES
+
+    return scheme == "sim:" or (scheme == "points:" and name in POINT_WORLD_NAMES)
 
 
 def measured_inertial(uri: str) -> MeasuredInertial:

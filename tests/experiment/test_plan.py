@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from vislam.errors import UsageError
-from vislam.experiment.identity import code_sha256, is_world, source_identity, split_source
+from vislam.experiment.identity import code_sha256, source_identity
 from vislam.experiment.jobs import JITTER, expand, unique, variants
 from vislam.experiment.plan import load_plan, plan_from_data
 from vislam.experiment.trials import estimates
-from vislam.sources import open_source
+from vislam.sources import is_world, open_source, recorded_path, split_source
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -126,6 +126,11 @@ def test_the_data_counts_and_not_where_they_lie(tmp_path):
     assert source_identity("sim:handheld-room,duration_s=3") == "sim:handheld-room,duration_s=3"
     assert "missing" in source_identity("euroc:/no/such/folder")
     assert split_source("/bare/path,with=option") == ("", "/bare/path", ",with=option")
+    live = ("virtual-cart", "virtual-cart,seed=2", "gy85+webcam", "serial:/dev/ttyUSB0+0")
+    for no_file in ("sim:corridor-loop", "points:straight", *live):
+        assert recorded_path(no_file) is None
+    for source in ("/rides/one", "euroc:/rides/one", "points:euroc:/rides/one,rig=mono", "replay:/rides/one"):
+        assert recorded_path(source) == Path("/rides/one")
 
 
 def test_code_that_only_shows_results_does_not_make_them_new(tmp_path):

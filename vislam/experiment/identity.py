@@ -5,17 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import re
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from vislam.runfolder import fingerprint
+from vislam.sources import is_world, split_source
 
 HARNESS_VERSION = 1  # of what a job does and measures beside the code below; a new one makes all results new
 
-_SCHEMES = re.compile(r"(?:[a-z]+:)+")
 _PACKAGE = Path(__file__).resolve().parent.parent
 _PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "llvmlite")
 # they show results or ask for them and cannot change a number; all other code can
@@ -58,21 +57,6 @@ def source_identity(source: str) -> str:
     if is_world(scheme, name):
         return source
     return f"{scheme}{fingerprint(Path(name)) or 'missing'}{options}"
-
-
-def split_source(source: str) -> tuple[str, str, str]:
-    """Return schemes with their colons ("points:euroc:"), the name or path, and ",option=value"s; each may be empty."""
-    first, comma, options = source.partition(",")
-    match = _SCHEMES.match(first)
-    scheme = match[0] if match else ""
-    return scheme, first[len(scheme) :], comma + options
-
-
-def is_world(scheme: str, name: str) -> bool:
-    """Whether a source is simulated altogether, and its name therefore no path."""
-    from vislam.sim import POINT_WORLD_NAMES
-
-    return scheme == "sim:" or (scheme == "points:" and name in POINT_WORLD_NAMES)
 
 
 def sha256_of(data: Any) -> str:

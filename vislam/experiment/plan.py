@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vislam.config import validated
 from vislam.errors import UsageError
-from vislam.experiment.identity import is_world, split_source
+from vislam.sources import is_world, split_source
 
 Scalar = bool | int | float | str
 Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.coupling": "tight"}
