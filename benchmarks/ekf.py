@@ -146,19 +146,14 @@ def cost(rounds: int) -> None:
     rate0[5] += GRAVITY_M_S2
     rate1[5] += GRAVITY_M_S2
     H, noise, residual = rng.normal(size=(6, 21)), 1e-2 * np.eye(6), rng.normal(size=6) * 1e-3
-    work = np.zeros((21, 21))
     plain = NumpyFilter(x, P)
     params = gtsam.PreintegrationParams.MakeSharedU(GRAVITY_M_S2)
     peer = gtsam.NavStateImuEKF(gtsam.NavState(), P[:9, :9].copy(), params)
     H9, mean = np.ascontiguousarray(H[:, :9]), 0.5 * (rate0 + rate1)
 
-    def correct() -> None:
-        _, K = kernels.innovation(P, H, noise, residual)
-        kernels.correct(x, P, K, H, noise, residual)
-
     ours = {
-        "predict": lambda: kernels.predict(x, P, rate0, rate1, DT, 0.0, SIGMAS, GRAVITY_M_S2, work),
-        "correct": correct,
+        "predict": lambda: kernels.predict(x, P, rate0, rate1, DT, 0.0, SIGMAS, GRAVITY_M_S2),
+        "correct": lambda: kernels.update(x, P, H, noise, residual, 1e3, np.eye(21)),
     }
     numpy_ = {"predict": lambda: plain.predict(rate0, rate1, DT), "correct": lambda: plain.correct(H, noise, residual)}
     gtsam_ = {

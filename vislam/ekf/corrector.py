@@ -36,6 +36,11 @@ class Corrector:
         self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)]
         self._axle = np.array(config.axle_m, dtype=np.float64)
         self._reset_sigmas = reset_sigmas(config)
+        self._all = np.eye(kernels.ERRORS)
+        self._only_biases = np.diag(np.repeat([0.0, 1.0, 0.0], [9, 6, 6]))
+        self._not_the_past = np.eye(kernels.ERRORS)  # the body moves as much as its place against the clone
+        self._not_the_past[3:6, 18:21] = -np.eye(3)
+        self._not_the_past[18:21] = 0.0
 
     def apply(self, event: Event, x: Array, P: Array, ledger: Ledger, gyro_rad_s: Array) -> Ledger:
         """Apply an event to x [23] and P [21, 21] in place, write its outcome into it, and return the new ledger."""
@@ -56,7 +61,7 @@ class Corrector:
             return ledger
         assert event.bias is not None
         known = biases(x, event.bias[:3], event.bias[3:6], event.bias[6:])
-        self._correct(event, known, x, P, "bias", only=slice(9, 15))
+        self._correct(event, known, x, P, "bias")
         return ledger
 
     def _begin_keyframe(self, event: Event, x: Array, P: Array, ledger: Ledger) -> Ledger:
@@ -132,30 +137,24 @@ class Corrector:
             rejects = 0
         return replace(ledger, rejects=rejects, rejects_since_ns=since)
 
-    def _correct(
-        self, event: Event, measurement: LinearMeasurement, x: Array, P: Array, name: str, only: slice | None = None
-    ) -> None:
-        """Gate and apply; `only` lets the gain move just these error states (Schmidt-Kalman).
+    def _correct(self, event: Event, measurement: LinearMeasurement, x: Array, P: Array, name: str) -> None:
+        """Gate and apply. Not everything that the optimal gain would move may move (Schmidt-Kalman).
 
-        A continuous odom is the same idea: tilt that is learned metres away from the origin would swing the body about
-        it. With the gain of the clone's position at zero the past stays where it is, and P keeps the uncertainty of it.
+        Biases that the graph knows move biases only. And a continuous odom: tilt that is learned metres away from the
+        origin would swing the body about it. With the gain of the clone's position at zero the past stays where it is,
+        and P keeps the uncertainty of it.
         """
-        residual, H, noise = measurement.residual, measurement.H, measurement.noise
-        nis, K = kernels.innovation(P, H, noise, residual)
-        event.nis, event.degrees = float(nis), len(residual)
-        limit = self._limits[len(residual)]
+        limit, moves = self._limits[len(measurement.residual)], self._all
+        if event.kind is Kind.BIAS:
+            moves = self._only_biases
+        elif event.vo is not None and event.vo.has_scale and self._config.odom == "continuous":
+            moves = self._not_the_past
+        gate = -1.0 if measurement.impossible else limit
+        event.nis = kernels.update(x, P, measurement.H, measurement.noise, measurement.residual, gate, moves)
+        event.degrees = len(measurement.residual)
         if measurement.impossible:
             event.outcome, event.reason = f"{name}_opposed", measurement.impossible
-            return
-        if not nis <= limit:
-            event.outcome, event.reason = f"{name}_gated", f"innovation {nis:.1f} of at most {limit:.1f}"
-            return
-        if only is not None:
-            masked = np.zeros_like(K)
-            masked[only] = K[only]
-            K = masked
-        elif event.vo is not None and event.vo.has_scale and self._config.odom == "continuous":
-            K[3:6] -= K[18:21]  # the body moves as much as its place against the clone is corrected
-            K[18:21] = 0.0
-        kernels.correct(x, P, K, H, noise, residual)
-        event.outcome, event.accepted = f"{name}_accepted", True
+        elif not event.nis <= limit:
+            event.outcome, event.reason = f"{name}_gated", f"innovation {event.nis:.1f} of at most {limit:.1f}"
+        else:
+            event.outcome, event.accepted = f"{name}_accepted", True

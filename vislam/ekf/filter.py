@@ -75,7 +75,6 @@ class Ekf:
         self._history: History | None = None
         self._x = np.zeros(kernels.NOMINAL)
         self._P = np.zeros((kernels.ERRORS, kernels.ERRORS))
-        self._work = np.zeros((kernels.ERRORS, kernels.ERRORS))
         self._t_ns = 0
         self._applied = 0
         self._ledger = Ledger()
@@ -162,9 +161,7 @@ class Ekf:
             self._run()
             return
         values = self._series.values  # the way of nearly every sample: one step, no measurement on it
-        kernels.predict(
-            self._x, self._P, values[-2], values[-1], dt_ns * 1e-9, 0.0, self._sigmas, self._gravity, self._work
-        )
+        kernels.predict(self._x, self._P, values[-2], values[-1], dt_ns * 1e-9, 0.0, self._sigmas, self._gravity)
         self._series.extra[-1] = self._x[:10]
         self._t_ns = sample.t_ns
         if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
@@ -295,9 +292,7 @@ class Ekf:
             return
         piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
         track = np.empty((len(piece.t_ns), 10))
-        kernels.predict_run(
-            x, P, piece.t_ns, piece.samples, piece.gaps_s, track, self._sigmas, self._gravity, self._work
-        )
+        kernels.predict_run(x, P, piece.t_ns, piece.samples, piece.gaps_s, track, self._sigmas, self._gravity)
         if keep:
             keep_track(self._series, piece, track)
 

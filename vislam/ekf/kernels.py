@@ -19,6 +19,7 @@ from vislam.messages import Array
 
 NOMINAL = 23
 ERRORS = 21
+_MOVING = 9  # the first of them: rotation, position and velocity; biases and clone stay as they are in a prediction
 _HOLE_STEP_S = 0.01
 _HOLE_STEPS = 2000  # at most: a clock that leaps by a year must not stop the filter for as long
 
@@ -106,7 +107,6 @@ def predict(
     gap_s: float,
     sigmas: Array,
     gravity: float,
-    work: Array,
 ) -> None:
     """Move x [23] and P [21, 21] by one step, in place.
 
@@ -123,45 +123,52 @@ def predict(
         sigmas: [6] gyro and accel noise densities, gyro and accel bias walks, then what mean rate and force may have
             done unseen inside a hole (rad/s and m/s^2).
         gravity: m/s^2.
-        work: scratch [21, 21].
     """
+    _step(x, P, rate0, rate1, dt, gap_s, sigmas, gravity, np.zeros((2, _MOVING, ERRORS)))
+
+
+@njit(cache=True, nogil=True)
+def _step(
+    x: Array,
+    P: Array,
+    rate0: Array,
+    rate1: Array,
+    dt: float,
+    gap_s: float,
+    sigmas: Array,
+    gravity: float,
+    work: Array,
+) -> None:
+    """Do what `predict` says. `work` [2, 9, 21]: scratch, all zero at first, for many steps."""
     wx = (0.5 * (rate0[0] + rate1[0]) - x[13]) * dt
     wy = (0.5 * (rate0[1] + rate1[1]) - x[14]) * dt
     wz = (0.5 * (rate0[2] + rate1[2]) - x[15]) * dt
     ax = 0.5 * (rate0[3] + rate1[3]) - x[10]
     ay = 0.5 * (rate0[4] + rate1[4]) - x[11]
     az = 0.5 * (rate0[5] + rate1[5]) - x[12]
-    E = np.empty((3, 3))  # Exp(-w dt)
-    A = np.empty((3, 3))  # velocity by rotation
-    B = np.empty((3, 3))  # velocity by gyro bias
-    M = np.empty((3, 3))  # R at mid-step
-    R = np.empty((3, 3))
-    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
-    c = math.cos(0.5 * angle)
-    s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
-    _rotation(c, -s * wx, -s * wy, -s * wz, E)
+    R, M = np.empty((3, 3)), np.empty((3, 3))  # attitude at the start and half way
     _rotation(x[6], x[7], x[8], x[9], R)
     turn(x, 6, 0.5 * wx, 0.5 * wy, 0.5 * wz)
     _rotation(x[6], x[7], x[8], x[9], M)
     turn(x, 6, 0.5 * wx, 0.5 * wy, 0.5 * wz)
-    # Velocity by rotation at the start: -R [b]x dt with b = R^T M a, the force seen from there.
     fx = M[0, 0] * ax + M[0, 1] * ay + M[0, 2] * az
     fy = M[1, 0] * ax + M[1, 1] * ay + M[1, 2] * az
     fz = M[2, 0] * ax + M[2, 1] * ay + M[2, 2] * az
-    bx = R[0, 0] * fx + R[1, 0] * fy + R[2, 0] * fz
-    by = R[0, 1] * fx + R[1, 1] * fy + R[2, 1] * fz
-    bz = R[0, 2] * fx + R[1, 2] * fy + R[2, 2] * fz
+
+    F = work[0]  # the rows of the transition that are not those of the identity
+    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
+    s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
+    _rotation(math.cos(0.5 * angle), -s * wx, -s * wy, -s * wz, F)  # Exp(-w dt)
+    _right_jacobian(wx, wy, wz, -dt, F[:3, 9:12])
+    _across(fx, fy, fz, R, -dt, F[6:9, :3])
+    _across(fx, fy, fz, M, 0.5 * dt * dt, F[6:9, 9:12])
+    F[6:9, 12:15] = -dt * M
+    F[3:6] = 0.5 * dt * F[6:9]
     for i in range(3):
-        A[i, 0] = -dt * (R[i, 1] * bz - R[i, 2] * by)
-        A[i, 1] = -dt * (R[i, 2] * bx - R[i, 0] * bz)
-        A[i, 2] = -dt * (R[i, 0] * by - R[i, 1] * bx)
-        B[i, 0] = 0.5 * dt * dt * (M[i, 1] * az - M[i, 2] * ay)
-        B[i, 1] = 0.5 * dt * dt * (M[i, 2] * ax - M[i, 0] * az)
-        B[i, 2] = 0.5 * dt * dt * (M[i, 0] * ay - M[i, 1] * ax)
-    J = np.empty((3, 3))
-    _right_jacobian(wx, wy, wz, dt, J)
-    _propagate(P, work, E, J, A, B, M, dt)
-    _add_noise(P, dt, gap_s, sigmas)
+        F[3 + i, 3 + i] = F[6 + i, 6 + i] = 1.0
+        F[3 + i, 6 + i] = dt
+    _propagate(P, F, work[1], dt, gap_s, sigmas)
+
     fz -= gravity
     x[0] += dt * x[3] + 0.5 * dt * dt * fx
     x[1] += dt * x[4] + 0.5 * dt * dt * fy
@@ -172,33 +179,35 @@ def predict(
 
 
 @njit(cache=True, nogil=True)
-def _propagate(P: Array, T: Array, E: Array, J: Array, A: Array, B: Array, M: Array, dt: float) -> None:
-    """P = F P F^T, using that F has only a few blocks off the identity; the result is exactly symmetric."""
-    for j in range(ERRORS):
-        for i in range(3):
-            rotation = 0.0
-            velocity = 0.0
-            for k in range(3):
-                rotation += E[i, k] * P[k, j] - J[i, k] * P[9 + k, j]
-                velocity += A[i, k] * P[k, j] + B[i, k] * P[9 + k, j] - dt * M[i, k] * P[12 + k, j]
-            T[i, j] = rotation
-            T[3 + i, j] = P[3 + i, j] + dt * P[6 + i, j] + 0.5 * dt * velocity
-            T[6 + i, j] = P[6 + i, j] + velocity
-        for i in range(9, ERRORS):
-            T[i, j] = P[i, j]
-    for i in range(ERRORS):
-        for j in range(3):
-            rotation = 0.0
-            velocity = 0.0
-            for k in range(3):
-                rotation += E[j, k] * T[i, k] - J[j, k] * T[i, 9 + k]
-                velocity += A[j, k] * T[i, k] + B[j, k] * T[i, 9 + k] - dt * M[j, k] * T[i, 12 + k]
-            P[i, j] = rotation
-            P[i, 3 + j] = T[i, 3 + j] + dt * T[i, 6 + j] + 0.5 * dt * velocity
-            P[i, 6 + j] = T[i, 6 + j] + velocity
-        for j in range(9, ERRORS):
-            P[i, j] = T[i, j]
-    symmetrise(P)
+def _across(fx: float, fy: float, fz: float, R: Array, scale: float, out: Array) -> None:
+    """Write scale * [f]x @ R into `out`."""
+    for j in range(3):
+        out[0, j] = scale * (fy * R[2, j] - fz * R[1, j])
+        out[1, j] = scale * (fz * R[0, j] - fx * R[2, j])
+        out[2, j] = scale * (fx * R[1, j] - fy * R[0, j])
+
+
+@njit(cache=True, nogil=True)
+def _propagate(P: Array, F: Array, rows: Array, dt: float, gap_s: float, sigmas: Array) -> None:
+    """P = F P F^T + Q, in place; the result is exactly symmetric."""
+    # Inside a hole the unseen error is constant, so it grows with the square of time; spread over steps as white noise.
+    gyro = (sigmas[0] * sigmas[0] + sigmas[4] * sigmas[4] * gap_s) * dt
+    accel = (sigmas[1] * sigmas[1] + sigmas[5] * sigmas[5] * gap_s) * dt
+    np.dot(F, P, rows)
+    columns = np.ascontiguousarray(rows.T)  # BLAS takes twice as long for a small matrix that is transposed
+    block = F @ columns
+    symmetrise(block)
+    P[:_MOVING] = rows
+    P[:, :_MOVING] = columns
+    P[:_MOVING, :_MOVING] = block
+    for i in range(3):
+        P[i, i] += gyro
+        P[3 + i, 3 + i] += accel * dt * dt / 3.0
+        P[6 + i, 6 + i] += accel
+        P[3 + i, 6 + i] += 0.5 * dt * accel
+        P[6 + i, 3 + i] += 0.5 * dt * accel
+        P[9 + i, 9 + i] += sigmas[2] * sigmas[2] * dt
+        P[12 + i, 12 + i] += sigmas[3] * sigmas[3] * dt
 
 
 @njit(cache=True, nogil=True)
@@ -209,22 +218,6 @@ def symmetrise(P: Array) -> None:
             mean = 0.5 * (P[i, j] + P[j, i])
             P[i, j] = mean
             P[j, i] = mean
-
-
-@njit(cache=True, nogil=True)
-def _add_noise(P: Array, dt: float, gap_s: float, sigmas: Array) -> None:
-    # Inside a hole the unseen error is constant, so it grows with the square of time; spread over steps as white noise.
-    gyro = (sigmas[0] * sigmas[0] + sigmas[4] * sigmas[4] * gap_s) * dt
-    accel = (sigmas[1] * sigmas[1] + sigmas[5] * sigmas[5] * gap_s) * dt
-    gyro_walk, accel_walk = sigmas[2] * sigmas[2] * dt, sigmas[3] * sigmas[3] * dt
-    for i in range(3):
-        P[i, i] += gyro
-        P[3 + i, 3 + i] += accel * dt * dt / 3.0
-        P[6 + i, 6 + i] += accel
-        P[3 + i, 6 + i] += 0.5 * dt * accel
-        P[6 + i, 3 + i] += 0.5 * dt * accel
-        P[9 + i, 9 + i] += gyro_walk
-        P[12 + i, 12 + i] += accel_walk
 
 
 @njit(cache=True, nogil=True)
@@ -257,24 +250,24 @@ def predict_run(
     track: Array,
     sigmas: Array,
     gravity: float,
-    work: Array,
 ) -> None:
     """Predict through samples [N, 6] at `t_ns` [N], the state being at the first; store x[:10] of each in `track`.
 
     `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
     """
     before, after = np.empty(6), np.empty(6)
+    work = np.zeros((2, _MOVING, ERRORS))
     store(x, track[0])
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
         pieces = pieces_of(dt, gaps_s[k])
         for j in range(pieces):
             if pieces == 1:  # not even rounding may tell this from a single `predict`
-                predict(x, P, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, work)
+                _step(x, P, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, work)
                 break
             between(samples[k - 1], samples[k], j / pieces, before)
             between(samples[k - 1], samples[k], (j + 1) / pieces, after)
-            predict(x, P, before, after, dt / pieces, gaps_s[k], sigmas, gravity, work)
+            _step(x, P, before, after, dt / pieces, gaps_s[k], sigmas, gravity, work)
         store(x, track[k])
 
 
@@ -288,30 +281,15 @@ def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Arra
     vision and gravity cannot tell, heading and position, then stays untold however often the state is corrected.
     """
     G = np.eye(ERRORS)  # from the error about the old state to that about the new
-    _move_all(x, _product(K, residual.reshape(-1, 1))[:, 0].copy(), G)
-    GK = _product(G, K)
-    A = _product(GK, H)
-    for i in range(ERRORS):
-        for j in range(ERRORS):
-            A[i, j] = G[i, j] - A[i, j]
-    prior = _product(_product(A, P), A.T.copy())
-    told = _product(_product(GK, noise), GK.T.copy())
-    for i in range(ERRORS):
-        for j in range(ERRORS):
-            P[i, j] = prior[i, j] + told[i, j]
+    _move_all(x, K @ residual, G)
+    GK = G @ K
+    A = GK @ H
+    np.subtract(G, A, A)
+    np.dot(A, P, G)
+    np.dot(G, np.ascontiguousarray(A.T), P)
+    np.dot(GK @ noise, np.ascontiguousarray(GK.T), A)
+    P += A
     symmetrise(P)
-
-
-@njit(cache=True, nogil=True)
-def _product(A: Array, B: Array) -> Array:
-    """Return A @ B; for matrices this small, calling BLAS costs more than multiplying."""
-    out = np.zeros((A.shape[0], B.shape[1]))
-    for i in range(A.shape[0]):
-        for k in range(A.shape[1]):
-            a = A[i, k]
-            for j in range(B.shape[1]):
-                out[i, j] += a * B[k, j]
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -366,36 +344,42 @@ def _move(x: Array, d: Array, G: Array, at: int, error: int, row: int, R: Array,
 def innovation(P: Array, H: Array, noise: Array, residual: Array) -> tuple[float, Array]:
     """Return the normalised innovation squared and the optimal gain [21, m]."""
     m = len(residual)
-    PHt = _product(P, H.T.copy())
-    S = _product(H, PHt)
-    for i in range(m):
-        for j in range(m):
-            S[i, j] += noise[i, j]
+    HP = H @ P
+    S = HP @ np.ascontiguousarray(H.T) + noise
     symmetrise(S)
-    for i in range(m):  # S = L L^T, L in the lower half
+    whiten = np.zeros((m, m))  # inverse of L, where S = L L^T with L in the lower half
+    for i in range(m):
         for j in range(i + 1):
             for k in range(j):
                 S[i, j] -= S[i, k] * S[j, k]
             S[i, j] = math.sqrt(S[i, j]) if i == j else S[i, j] / S[j, j]
-    nis = 0.0
-    whitened = np.empty(m)
-    for i in range(m):
-        whitened[i] = residual[i]
-        for k in range(i):
-            whitened[i] -= S[i, k] * whitened[k]
-        whitened[i] /= S[i, i]
-        nis += whitened[i] * whitened[i]
-    K = PHt
-    for i in range(ERRORS):  # K L L^T = P H^T
-        for j in range(m):
-            for k in range(j):
-                K[i, j] -= K[i, k] * S[j, k]
-            K[i, j] /= S[j, j]
-        for j in range(m - 1, -1, -1):
-            for k in range(j + 1, m):
-                K[i, j] -= K[i, k] * S[k, j]
-            K[i, j] /= S[j, j]
-    return nis, K
+        whiten[i, i] = 1.0 / S[i, i]
+        for j in range(i):
+            for k in range(j, i):
+                whiten[i, j] -= S[i, k] * whiten[k, j]
+            whiten[i, j] *= whiten[i, i]
+    whitened = whiten @ residual
+    KT = np.ascontiguousarray(whiten.T) @ (whiten @ HP)
+    return np.sum(whitened * whitened), np.ascontiguousarray(KT.T)
+
+
+@njit(cache=True, nogil=True)
+def update(x: Array, P: Array, H: Array, noise: Array, residual: Array, limit: float, moves: Array) -> float:
+    """Correct x and P in place, unless the normalised innovation squared is above the limit; return that.
+
+    Args:
+        x: nominal state [23].
+        P: covariance [21, 21].
+        H: Jacobian [m, 21].
+        noise: [m, m].
+        residual: [m].
+        limit: of the gate; negative: change nothing.
+        moves: [21, 21] what becomes of the optimal gain; the identity leaves it as it is.
+    """
+    nis, K = innovation(P, H, noise, residual)
+    if nis <= limit:
+        correct(x, P, moves @ K, H, noise, residual)
+    return nis
 
 
 def clone(x: Array, P: Array) -> None:
