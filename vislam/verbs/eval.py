@@ -68,7 +68,7 @@ def _evaluate(options: EvalOptions) -> dict[str, dict[str, Any]]:
         truth = paths.pop("truth", None)
         reference = reference or truth
     if not estimate.exists():
-        raise DataError(f"{estimate} does not exist; give a run folder or a trajectory file")
+        raise UsageError(f"{estimate} does not exist; give a run folder, or a trajectory file and --reference FILE")
     if reference is None:
         raise UsageError(f"{estimate} brings no truth to be evaluated against; give --reference FILE")
     if not paths:
