@@ -105,7 +105,7 @@ def fast(signals, samples, inbox, name: str, address: str, epoch, table, report)
     from functools import partial
 
     from vislam.config import load
-    from vislam.imu import ImuNoise
+    from vislam.imu import BiasMemory, ImuNoise
     from vislam.live import fast_process
     from vislam.live.child import guarded
     from vislam.live.replayed_imu import ReplayedImu
@@ -115,6 +115,7 @@ def fast(signals, samples, inbox, name: str, address: str, epoch, table, report)
     body = partial(
         fast_process.run, config=config, noise=noise, T_body_camera=np.eye(4),
         open_source=partial(ReplayedImu, table, epoch), samples=samples, inbox=inbox,
+        memory=BiasMemory(limit=1),
     )  # fmt: skip
     guarded("fast", report, signals, body)
 
@@ -123,7 +124,7 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
     """Measure."""
     import socket
 
-    from vislam.live.child import Flag, Ready, Signals
+    from vislam.live.child import Failure, Flag, Ready, Signals
     from vislam.live.epoch import Epoch
     from vislam.live.replayed_imu import InertialTable
 
@@ -149,8 +150,9 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
         for process in (listener, publisher, back):
             process.start()
         ready.wait()
-        while not isinstance(hears.recv(), Ready):
-            continue
+        while not isinstance(said := hears.recv(), Ready):
+            if isinstance(said, Failure):
+                raise SystemExit(said.traceback)
         grown.wait()
         front = context.Process(target=correct, args=(front_says, seconds - 1.0, epoch.begin_ns()))
         front.start()
