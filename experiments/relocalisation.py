@@ -13,7 +13,6 @@ on the map's own keyframes (SE(3)).
 from __future__ import annotations
 
 import argparse
-import copy
 import json
 import time
 from dataclasses import asdict, dataclass, replace
@@ -29,6 +28,7 @@ from vislam.front import Front
 from vislam.geometry import align_points, invert, level_rotation, so3_log, transform
 from vislam.graph import PoseGraph
 from vislam.loop.detector import LoopDetector
+from vislam.memory import PlacesMemory
 from vislam.messages import Array, Frame, Keyframe, KeyframePacket, Observations, Tracking, VoMeasurement
 from vislam.sim import open_world
 from vislam.sim.simulation import Simulation
@@ -47,7 +47,7 @@ MAP_SIGMAS = np.repeat([np.deg2rad(0.05), 0.002], 3)  # between keyframes of the
 class SavedMap:
     """What a run leaves: keyframes that loop detection knows, and where they are."""
 
-    detector: LoopDetector
+    places: PlacesMemory
     T_map_body: Array  # [M, 4, 4]
     T_truth_map: Array  # [4, 4]
     ate_m: float
@@ -68,18 +68,18 @@ class Answer:
 def make_map(recording: Simulation, config: Config) -> SavedMap:
     """Run the whole pipeline over a recording."""
     slam = Slam(config, recording.rig, recording.imu_noise)
-    t_ns = []
-    for value in recording.events():
-        for step in slam.feed(value):
-            t_ns += [k.odometry.packet.keyframe.t_ns for k in step.keyframes]
+    steps = [k for value in recording.events() for step in slam.feed(value) for k in step.keyframes]
     slam.finish()
+    keyframes = [k.odometry.packet.keyframe for k in steps]
     assert slam.back is not None and slam.back.loops is not None
     poses = slam.back.graph.poses()
-    truth = recording.truth().at(np.array(t_ns, dtype=np.int64))
+    truth = recording.truth().at(np.array([k.t_ns for k in keyframes], dtype=np.int64))
     T_truth_map = align_points(poses[:, :3, 3], truth[:, :3, 3])
     moved = np.array([T_truth_map @ T for T in poses])
     ate_m = float(np.sqrt(np.mean(np.sum((moved[:, :3, 3] - truth[:, :3, 3]) ** 2, axis=1))))
-    return SavedMap(slam.back.loops, poses, T_truth_map, ate_m)
+    tags = {k.id: step.tags for k, step in zip(keyframes, steps, strict=True)}
+    places = PlacesMemory(keyframes, poses, slam.back.loops.words(), tags, 0)
+    return SavedMap(places, poses, T_truth_map, ate_m)
 
 
 def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGraph:
@@ -99,7 +99,8 @@ def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGrap
 
 def ask(known: SavedMap, recording: Simulation, first: int, config: Config) -> Answer:
     """Begin at a frame of the second recording and go on until the place is found, or the time is up."""
-    detector, graph = copy.deepcopy(known.detector), graph_of(known, config, recording)
+    detector, graph = LoopDetector(config.loop, recording.rig, config.seed, True), graph_of(known, config, recording)
+    detector.restore(known.places)
     front = Front(config, recording.rig, None, StageClock())
     count, T_map_odom, T_up, cpu_ms = len(known.T_map_body), np.eye(4), None, []
     begin_ns = recording.render(first).t_ns
