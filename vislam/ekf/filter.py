@@ -353,8 +353,9 @@ class Ekf:
         positions and velocities are as much too long as vision's metres are, rotations and biases are not touched.
         """
         covariance = P[:15, :15].copy()
-        by_scale = self._config.scale_sigma * x[:6]
-        covariance[3:9, 3:9] += np.outer(by_scale, by_scale)
+        if self._config.scale_sigma > 0.0:  # asked at the rate of the IMU
+            by_scale = self._config.scale_sigma * x[:6]
+            covariance[3:9, 3:9] += np.outer(by_scale, by_scale)
         return NavState(
             t_ns=t_ns,
             T_world_body=kernels.pose(x, 0, 6),
