@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDeci
 from vislam.session import Session
 from vislam.slam import KeyframeStep, Step
 from vislam.sources import recorded_path
-from vislam.trajectory import Trajectory, write_states_csv, write_text, write_tum
+from vislam.trajectory import Alignment, Trajectory, write_states_csv, write_text, write_tum
 
 _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
@@ -127,6 +127,15 @@ def read_metrics(run: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be used: {error}; remove it, or run the recording again") from error
     return metrics
+
+
+def recorded_alignment(metrics: dict[str, Any]) -> Alignment:
+    """Return how a run's own trajectories were aligned to the truth; "se3" where its metrics do not say it soundly."""
+    accuracy = metrics.get("accuracy")
+    entry = accuracy.get("graph") if isinstance(accuracy, dict) else None
+    asked = entry.get("alignment") if isinstance(entry, dict) else None
+    known: tuple[Alignment, ...] = get_args(Alignment)
+    return next((alignment for alignment in known if alignment == asked), "se3")
 
 
 def plain(data: Any) -> Any:

@@ -19,7 +19,7 @@ from vislam.graph import PoseGraph
 from vislam.loop.table import read_loops
 from vislam.memory import GraphNews, LoopPlace, LoopState, OfferedLoop, SlamMemory
 from vislam.messages import GraphUpdate, LoopDecision
-from vislam.runfolder import RunLog, read_metrics, write_json
+from vislam.runfolder import RunLog, read_metrics, recorded_alignment, write_json
 from vislam.session import Session, SessionWriter, recall
 from vislam.trajectory import evaluate, read_tum, write_states_csv, write_tum
 
@@ -162,9 +162,8 @@ def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any]) -> l
             stamps = log.stamps_ns
             with suppress(VislamError):  # nothing in common to compare: the run's own metrics say so
                 accuracy = metrics.setdefault("accuracy", {})
-                alignment = accuracy.get("graph", {}).get("alignment", "se3")
                 span = (int(stamps[0]), int(stamps[-1]))
-                accuracy["graph"] = evaluate(final, read_tum(truth), alignment, span_ns=span)
+                accuracy["graph"] = evaluate(final, read_tum(truth), recorded_alignment(metrics), span_ns=span)
         write_json(run / "metrics.json", metrics)
         written.append("metrics.json")
     return written

@@ -16,7 +16,7 @@ from vislam.config import BatchConfig, Config, from_data
 from vislam.errors import DataError, UsageError, VislamError
 from vislam.factor_log import FactorLog
 from vislam.messages import NavState
-from vislam.runfolder import read_metrics, write_json
+from vislam.runfolder import read_metrics, recorded_alignment, write_json
 from vislam.session import Session
 from vislam.trajectory import Alignment, Trajectory, evaluate, read_tum, write_states_csv, write_tum
 
@@ -37,10 +37,11 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     trajectory = _placed(log, result.states, settings.imu.max_gap_s)
     metrics = read_metrics(run)
     entry = _entry(result, log, trajectory)
-    accuracy = _accuracy(run, trajectory, log, _alignment(metrics), entry["warnings"])
+    alignment = recorded_alignment(metrics)  # so that the batch's errors stand beside the run's
+    accuracy = _accuracy(run, trajectory, log, alignment, entry["warnings"])
     entry |= {"accuracy": accuracy, "wall_s": time.perf_counter() - start, "config": asdict(config)}
     if accuracy:
-        metrics.setdefault("accuracy", {})[name] = accuracy[_alignment(metrics)]
+        metrics.setdefault("accuracy", {})[name] = accuracy[alignment]
     metrics.setdefault("batch", {})[name] = entry
     write_tum(trajectory, run / f"trajectory_{name}.tum")
     write_states_csv(run / f"states_{name}.csv", range(len(result.states)), result.states)
@@ -115,12 +116,6 @@ def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory) -> dict[
     }
 
 
-def _alignment(metrics: dict[str, Any]) -> Alignment:
-    """Return how the run's own trajectories were aligned, so that those of the batch stand beside them."""
-    entry = metrics.get("accuracy", {}).get("graph", {})
-    return entry.get("alignment", "se3")  # type: ignore[no-any-return]  # a run killed early has no metrics
-
-
 def _accuracy(
     run: Path, trajectory: Trajectory, log: FactorLog, alignment: Alignment, warnings: list[str]
 ) -> dict[str, Any]:
@@ -130,7 +125,7 @@ def _accuracy(
         return {}
     truth, stamps = read_tum(path), log.frames.t_ns
     span = (int(np.min(stamps)), int(np.max(stamps))) if len(stamps) else None
-    modes: tuple[Alignment, ...] = ("se3", "yaw", "sim3") if alignment == "sim3" else ("se3", "yaw")
+    modes: dict[Alignment, None] = dict.fromkeys(("se3", "yaw", alignment))
     try:
         return {mode: evaluate(trajectory, truth, mode, span_ns=span) for mode in modes}
     except VislamError as error:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vislam.errors import VislamError
 from vislam.geometry import invert, sim3_parts, transform
 from vislam.report.run_files import RunFiles
+from vislam.runfolder import recorded_alignment
 from vislam.trajectory import Trajectory, align, associate, nees
 
 Array = NDArray[np.float64]
@@ -36,7 +37,6 @@ class Scene:
 
     zero_ns: int
     end_s: float
-    alignment: str  # "" without truth
     paths: dict[str, Trajectory] = field(default_factory=dict)
     truth: Trajectory | None = None
     errors: dict[str, ErrorCurve] = field(default_factory=dict)
@@ -57,20 +57,20 @@ def build_scene(run: RunFiles) -> Scene:
         stamps.append(run.tracking.t_ns)
     zero = min((int(t[0]) for t in stamps), default=0)
     end = max((int(t[-1]) for t in stamps), default=zero)
-    scene = Scene(zero, (end - zero) * 1e-9, "")
+    scene = Scene(zero, (end - zero) * 1e-9)
     if run.metrics.get("has_imu") is False:
         scene.has_gravity = False
         scene.labels["ekf"] = "odometry"  # without an IMU there is no filter
     if run.truth is None:
         scene.paths = dict(run.estimates)
         return scene
-    scene.alignment = _alignment(run)
+    alignment = recorded_alignment(run.metrics)
     aligned: dict[str, Trajectory] = {}
     base = np.eye(4)  # the truth's world as seen from the map
     for name, estimate in run.estimates.items():
         try:
             pairs = associate(estimate, run.truth)
-            S = align(pairs, scene.alignment)  # type: ignore[arg-type]
+            S = align(pairs, alignment)
         except VislamError as error:
             scene.notes.append(f"{name} cannot be aligned to the truth: {error}")
             continue
@@ -99,13 +99,6 @@ def loop_segments(run: RunFiles, scene: Scene, decision: str) -> Array:
     t_ns = np.array([[loop.from_t_ns, loop.to_t_ns] for loop in rows], dtype=np.int64).reshape(-1, 2)
     t_ns = np.clip(t_ns, path.t_ns[0], path.t_ns[-1])  # a keyframe may lie just outside the per-frame trajectory
     return path.at(t_ns.ravel())[:, :3, 3].reshape(-1, 2, 3)
-
-
-def _alignment(run: RunFiles) -> str:
-    accuracy = run.metrics.get("accuracy")
-    entry = accuracy.get("graph") if isinstance(accuracy, dict) else None
-    asked = entry.get("alignment") if isinstance(entry, dict) else None
-    return asked if asked in ("se3", "sim3", "yaw", "first", "none") else "se3"
 
 
 def _add_nees(run: RunFiles, scene: Scene) -> None:
