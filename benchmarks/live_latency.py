@@ -1,6 +1,7 @@
 """How late is the published pose while the back end closes a loop over 1,000 keyframes? Real processes, real time.
 
     .venv/bin/python benchmarks/live_latency.py processes --seconds 60
+    .venv/bin/python benchmarks/live_latency.py processes --priority 50        # SCHED_FIFO, where the system permits
     .venv/bin/python benchmarks/live_latency.py filter
     NUMBA_DISABLE_JIT=1 .venv/bin/python benchmarks/live_latency.py filter     # what it costs without a compiler
 
@@ -14,6 +15,7 @@ arithmetic, least of many short rounds.
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import sys
 import tempfile
@@ -36,7 +38,7 @@ LATE_S = 0.05
 KEYFRAMES = 1000
 
 
-def correct(connection, seconds: float, begin_ns: int) -> None:
+def correct(connection, seconds: float, ready, go, epoch) -> None:
     """Send the corrections of a body at rest, each 50 ms late."""
     from vislam.ekf import Correction
     from vislam.imu import ImuNoise
@@ -45,6 +47,10 @@ def correct(connection, seconds: float, begin_ns: int) -> None:
 
     noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
     nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+    ready.wait()
+    while not go.wait(1.0):
+        continue
+    begin_ns = epoch.begin_ns()
     for k in range(int(seconds * RATE_HZ / FRAME_EVERY)):
         t_ns = begin_ns + int((0.5 + k * FRAME_EVERY / RATE_HZ) * 1e9)
         time.sleep(max(0.0, (t_ns - time.monotonic_ns()) * 1e-9 + LATE_S))
@@ -88,7 +94,8 @@ def listen(address: str, results, ready) -> None:
     from vislam.live.publisher import PoseListener
 
     listener = PoseListener(address)
-    ready.set()
+    gc.disable()  # a collection would keep it from reading for a hundred milliseconds
+    ready.wait()
     ages, sequences, quiet = [], [], 0
     while quiet < 5 or not ages:
         pose = listener.next(1.0)
@@ -100,7 +107,7 @@ def listen(address: str, results, ready) -> None:
     results.put((np.array(ages), np.array(sequences)))
 
 
-def fast(signals, samples, inbox, name: str, address: str, epoch, table, report) -> None:
+def fast(signals, samples, inbox, settings, epoch, table, report) -> None:
     """Run the fast process as `vislam live` does."""
     from functools import partial
 
@@ -110,7 +117,7 @@ def fast(signals, samples, inbox, name: str, address: str, epoch, table, report)
     from vislam.live.child import guarded
     from vislam.live.replayed_imu import ReplayedImu
 
-    config = load(None, {"live.name": name, "live.send_to": [address]})
+    config = load(None, settings)
     noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
     body = partial(
         fast_process.run, config=config, noise=noise, T_body_camera=np.eye(4),
@@ -120,7 +127,7 @@ def fast(signals, samples, inbox, name: str, address: str, epoch, table, report)
     guarded("fast", report, signals, body)
 
 
-def processes(seconds: float) -> None:  # noqa: PLR0915
+def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
     """Measure."""
     import socket
 
@@ -129,7 +136,7 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
     from vislam.live.replayed_imu import InertialTable
 
     context = get_context("spawn")
-    ready, grown, stop, go = context.Event(), context.Event(), Flag(), Flag()
+    ready, grown, stop, go = context.Barrier(3), context.Event(), Flag(), Flag()
     signals, epoch, results = Signals(go, stop), Epoch(), context.Queue()
     count = int(seconds * RATE_HZ)
     rng = np.random.default_rng(0)
@@ -141,23 +148,28 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
     hears, says = context.Pipe(duplex=False)
     with context.Manager() as manager, tempfile.TemporaryDirectory() as folder:
         closed, address = manager.list(), f"unix:{folder}/pose.sock"
+        settings = {
+            "live.name": f"bench-{os.getpid()}",
+            "live.send_to": [address],
+            "live.realtime_priority": priority,
+        }
         listener = context.Process(target=listen, args=(address, results, ready))
         publisher = context.Process(
-            target=fast,
-            args=(signals, to_front, [hears_front, hears_back], f"bench-{os.getpid()}", address, epoch, table, says),
+            target=fast, args=(signals, to_front, [hears_front, hears_back], settings, epoch, table, says)
         )
+        front = context.Process(target=correct, args=(front_says, seconds - 1.0, ready, go, epoch))
         back = context.Process(target=close_loops, args=(back_says, stop, grown, closed))
-        for process in (listener, publisher, back):
+        for process in (listener, publisher, front, back):
             process.start()
         ready.wait()
+        last = {}
         while not isinstance(said := hears.recv(), Ready):
             if isinstance(said, Failure):
                 raise SystemExit(said.traceback)
+            last = {**last, **said.values}
         grown.wait()
-        front = context.Process(target=correct, args=(front_says, seconds - 1.0, epoch.begin_ns()))
-        front.start()
         go.set()
-        taken, last = 0, {}
+        taken = 0
         at_front.settimeout(2.0)
         while True:
             try:
@@ -176,6 +188,7 @@ def processes(seconds: float) -> None:  # noqa: PLR0915
         listener.join()
         loops = list(closed)
     fresh = np.diff(poses[:, 1], prepend=poses[0, 1]) > 0  # the others are heartbeats, as is the first
+    print(f"SCHED_FIFO {priority}" if priority and "warning" not in last else "no real-time priority")
     print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, {count} samples in {seconds:g} s")
     print(f"loops closed over {KEYFRAMES} keyframes: {len(loops)}, at most {max(loops, default=0.0):.2f} s each")
     inside = (poses[fresh, 2] - poses[fresh, 1]) / 1e6
@@ -229,11 +242,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["processes", "filter"])
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--priority", type=int, default=0, help="live.realtime_priority of the fast process")
     arguments = parser.parse_args()
     if arguments.what == "filter":
         filter_cost()
     else:
-        processes(arguments.seconds)
+        processes(arguments.seconds, arguments.priority)
 
 
 if __name__ == "__main__":

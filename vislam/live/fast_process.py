@@ -97,7 +97,7 @@ def _loop(
         if not values:
             sender.flush()
         for connection in list(inbox):
-            _take_messages(connection, fast, inbox)
+            _take_message(connection, fast, inbox)
         now_ns = time.monotonic_ns()
         if now_ns - published_ns > heartbeat_ns:
             published_ns = now_ns
@@ -115,10 +115,10 @@ def power_up(fast: FastPath, source: InertialSource) -> None:
         source.zeroed_at(zero.temperature_c, fast.bias_per_c)
 
 
-def _take_messages(connection: Connection, fast: FastPath, inbox: list[Connection]) -> None:
-    """Take all that is here; a process that has ended sends no more."""
+def _take_message(connection: Connection, fast: FastPath, inbox: list[Connection]) -> None:
+    """Take one, for a sample must not wait for more than that; a process that has ended sends none."""
     try:
-        while connection.poll():
+        if connection.poll():
             fast.correct(connection.recv())
     except (EOFError, OSError):
         inbox.remove(connection)

@@ -178,8 +178,10 @@ def _quaternion_xyzw(T: Array) -> Array:
 
 
 def _pose(position_m: Array, orientation_xyzw: Array) -> Array:
-    R = rotation_from_quaternion_xyzw(orientation_xyzw.astype(np.float64))
-    return transform(R, position_m.astype(np.float64))
+    T = np.eye(4)  # not `transform`: loading what is compiled would make a reader miss its first third of a second
+    T[:3, :3] = rotation_from_quaternion_xyzw(orientation_xyzw.astype(np.float64))
+    T[:3, 3] = position_m
+    return T
 
 
 def of_base(
