@@ -8,12 +8,14 @@ are counted in keyframes, so a replay gives the same bytes however long a traini
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from pathlib import Path
 from threading import Event
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +26,19 @@ from vislam.loop.view import View
 from vislam.loop.vocabulary import Vocabulary, depth_for, train
 from vislam.memory import WordsMemory
 
-_RESTORING_THREADS = 2  # their compiled parts run side by side; the cores of the smallest machine that is meant
+_THREADS = 2  # whose compiled parts run side by side; the cores of the smallest machine that is meant
+_BLOCK = 50  # keyframes that a thread takes at a time
+
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+def side_by_side(work: Callable[[Sequence[A]], list[B]], items: Sequence[A]) -> list[B]:
+    """Return what `work` makes of blocks of items, in their order, in threads whose compiled parts do not wait."""
+    blocks = [items[begin : begin + _BLOCK] for begin in range(0, len(items), _BLOCK)]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return [result for results in pool.map(work, blocks) for result in results]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,8 +133,8 @@ class PlaceDatabase:
         if words is not None:
             vocabulary = Vocabulary.from_bytes(words.data, "of the session")
             self._words = _Words(vocabulary, InvertedIndex(vocabulary.idf), words.data)
-        with ThreadPoolExecutor(_RESTORING_THREADS) as pool:
-            bags = list(pool.map(self._words.vocabulary.transform, [view.descriptors for view in views]))
+        vocabulary = self._words.vocabulary
+        bags = side_by_side(lambda block: [vocabulary.transform(view.descriptors) for view in block], views)
         for view, bag in zip(views, bags, strict=True):
             self._words.index.add(view.id, bag)
         if words is None:

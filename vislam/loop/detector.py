@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,11 @@ from vislam.config import LoopConfig
 from vislam.geometry import invert_many, transform_points
 from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
 from vislam.loop.checks import Judgement, Measured, agree, agrees_with_map, judge, objection, tilt_error_rad
-from vislam.loop.database import PlaceDatabase
+from vislam.loop.database import PlaceDatabase, side_by_side
 from vislam.loop.pose_table import PoseTable
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verifier import Verification, Verifier
-from vislam.loop.view import View, make_view
+from vislam.loop.view import View, make_view, make_views
 from vislam.loop.vocabulary import Vocabulary
 from vislam.memory import PlacesMemory, TagSighting, WordsMemory
 from vislam.messages import (
@@ -93,7 +94,7 @@ class LoopDetector:
 
         Raises DataError when features or vocabulary are damaged.
         """
-        views = [make_view(keyframe, self._rig) for keyframe in memory.keyframes]
+        views = side_by_side(partial(make_views, rig=self._rig), memory.keyframes)
         self._views = {view.id: view for view in views}
         for view, T_map_body in zip(views, memory.T_map_body, strict=True):
             self._poses.add(view.id, T_map_body)

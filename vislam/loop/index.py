@@ -39,6 +39,8 @@ def _cells_needed(slot: int, words: Int32s, counts: Int32s, lists: Int64s) -> in
     """Return how many cells adding a bag takes from the end of the pool, at most."""
     needed = 0
     for i in range(len(words)):
+        if i + _FAR < len(words):
+            prefetch(lists, 2 * np.int64(words[i + _FAR]))
         single = counts[i] == 1
         row = 2 * words[i] + (0 if single else 1)
         entries = lists[row, _FILL] + 1 + ((slot - lists[row, _LAST]) // _SKIP if single else 0)
@@ -87,6 +89,9 @@ def _append(
 ) -> int:  # fmt: skip
     """Append a posting to each word's list; return how much of the pool is used afterwards."""
     for i in range(len(words)):
+        if i + _NEAR < len(words):
+            ahead = 2 * np.int64(words[i + _NEAR]) + (0 if counts[i + _NEAR] == 1 else 1)
+            prefetch(pool, lists[ahead, _START] + lists[ahead, _FILL] // 2)
         single = counts[i] == 1
         row = 2 * words[i] + (0 if single else 1)
         gap = slot - lists[row, _LAST]

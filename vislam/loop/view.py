@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -50,6 +51,34 @@ def make_view(keyframe: Keyframe, rig: Rig) -> View:
 
     Points behind the camera or not finite become unknown. Raises DataError when arrays disagree in length.
     """
+    return make_views([keyframe], rig)[0]
+
+
+def make_views(keyframes: Sequence[Keyframe], rig: Rig) -> list[View]:
+    """Make the views of keyframes, at least one, as `make_view` does: at once, so that other threads go on beside."""
+    counts = [_checked_count(keyframe) for keyframe in keyframes]
+    xy = rig.cameras[0].normalise(np.concatenate([keyframe.keypoints_px for keyframe in keyframes]))
+    points = [
+        np.full((count, 3), np.nan) if keyframe.points_body_m is None else keyframe.points_body_m
+        for keyframe, count in zip(keyframes, counts, strict=True)
+    ]
+    points_cam = _points_in_camera(np.concatenate(points, dtype=np.float64), invert(rig.T_body_cams[0]))
+    descriptors = np.concatenate([keyframe.descriptors for keyframe in keyframes])
+    seen = np.isfinite(xy[:, 0])
+    ends = np.cumsum([0, *counts])
+    if not seen.all():
+        xy, points_cam, descriptors = xy[seen], points_cam[seen], descriptors[seen]
+        ends = np.concatenate([[0], np.cumsum(seen)])[ends]
+    xy_32 = xy.astype(np.float32)
+    out = []
+    for keyframe, begin, end in zip(keyframes, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        own = None if keyframe.points_body_m is None else points_cam[begin:end]
+        out.append(View(keyframe.id, keyframe.t_ns, descriptors[begin:end], xy_32[begin:end], own))
+    return out
+
+
+def _checked_count(keyframe: Keyframe) -> int:
+    """Return how many features a keyframe has; raises DataError when its arrays do not fit together."""
     packed(keyframe.descriptors)  # refuses other descriptors
     count = len(keyframe.descriptors)
     points = keyframe.points_body_m
@@ -58,12 +87,7 @@ def make_view(keyframe: Keyframe, rig: Rig) -> View:
             f"keyframe {keyframe.id}: {count} descriptors, but keypoints {list(keyframe.keypoints_px.shape)} "
             f"and points {None if points is None else list(points.shape)}; expected [{count}, 2] and [{count}, 3]"
         )
-    xy = rig.cameras[0].normalise(keyframe.keypoints_px)
-    seen = np.isfinite(xy[:, 0])
-    points_cam = None
-    if points is not None:
-        points_cam = _points_in_camera(points[seen].astype(np.float64), invert(rig.T_body_cams[0]))
-    return View(keyframe.id, keyframe.t_ns, keyframe.descriptors[seen], xy[seen].astype(np.float32), points_cam)
+    return count
 
 
 @njit(cache=True, nogil=True)

