@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import uuid
 from dataclasses import fields
@@ -13,16 +14,19 @@ import pytest
 
 from vislam.config import Config, SensorsConfig, load
 from vislam.errors import DataError, UsageError, VislamError
+from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
 from vislam.live.run_live import LiveRun
 from vislam.live.sensors import open_live
 from vislam.live.slot import SlotWriter
+from vislam.live.status import status_line
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.imu import _truth
 from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
 from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
 from vislam.live.virtual.place import course
 from vislam.runfolder import prepare
+from vislam.session import Session
 
 
 def test_a_segment_is_the_exact_integral_of_its_accelerations() -> None:
@@ -135,6 +139,50 @@ def test_the_virtual_cart_tells_its_wheels_and_its_camera() -> None:
 def test_wrong_sources_are_told(asked: str, message: str) -> None:
     with pytest.raises(VislamError, match=message):
         open_live(asked, Config(), SensorsConfig())
+
+
+def test_sensors_without_a_camera_need_no_calibration_of_one() -> None:
+    for asked in ("gy85+none", "serial:/dev/ttyUSB0+none", "virtual-cart,rig=none"):
+        source, _ = open_live(asked, Config(), SensorsConfig())
+        assert not source.has_camera and "camera" not in source.helpers()
+        camera = source.cameras()()
+        assert camera.read(0.0) is None and camera.health() == Health(0)
+
+
+def test_without_a_camera_attitude_is_published_until_ctrl_c_and_the_folder_is_complete(tmp_path: Path) -> None:
+    out, name = tmp_path / "run", f"vislam-test-blind-{os.getpid()}"
+    prepare(out, overwrite=False)
+    base = load(None, {"live.name": name, "live.send_to": (), "power_up.window_s": 1.0})
+    source, config = open_live("virtual-cart,rig=none,laps=0", base, SensorsConfig())
+    live = LiveRun(source, config, out, "virtual-cart", ["vislam", "live"])
+    told: list[dict] = []
+    interrupted = []
+
+    def watch(run: LiveRun) -> None:
+        status_line(run)
+        status = run.notes.get("fast", {}).get("status")
+        if status:
+            told.append(status)
+            if Health.LEVELLED in Health(status["health"]) and not interrupted:
+                interrupted.append(True)
+                os.kill(os.getpid(), signal.SIGINT)
+
+    metrics = live.execute(watch, duration_s=60.0)
+    last = Health(told[-1]["health"])
+    assert interrupted and Health.LEVELLED in last and Health.CAMERA_MISSING not in last
+    assert all(Health.INVALID in Health(status["health"]) for status in told)
+    assert np.isinf(told[-1]["sigma_m"])
+    assert metrics["frames"] == 0 and metrics["live"]["counters"]["samples"] > 100
+    assert any("no camera" in warning for warning in metrics["warnings"])
+    assert "gyro_bias_rad_s" in metrics["live"]["power_up"]
+    files = {path.name for path in out.iterdir()}
+    assert files >= {"manifest.json", "config.json", "metrics.json", "tracking.csv", "session.db", "run.rrd"}
+    stored = Session(out / "session.db")
+    try:
+        assert stored.info()["finished"]
+    finally:
+        stored.close()
+    assert not list(Path("/dev/shm").glob(f"*{name}*"))
 
 
 @pytest.mark.parametrize("chip", ["imu", "mag"])

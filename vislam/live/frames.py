@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from typing import Protocol
 
 import cv2
+import numpy as np
 
+from vislam.camera import Camera, Rig
 from vislam.hw.health import Health
 from vislam.hw.source import ImageSource
 from vislam.messages import Frame
@@ -59,3 +62,26 @@ class OneCamera:
     def close(self) -> None:
         """Give the camera back."""
         self._camera.close()
+
+
+NO_CAMERA = Rig((Camera(160, 120, 110.0, 110.0, 79.5, 59.5),), (np.eye(4),))  # stages are made for a rig, never fed
+
+
+class NoCamera:
+    """In the place of the cameras of a run by the IMU alone: no frame ever comes."""
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Wait, and return None."""
+        time.sleep(timeout_s)
+        return None
+
+    def health(self) -> Health:
+        """Return nothing: a camera that nobody asked for is not missing."""
+        return Health(0)
+
+    def counters(self) -> dict[str, int]:
+        """Return nothing."""
+        return {}
+
+    def close(self) -> None:
+        """Do nothing."""

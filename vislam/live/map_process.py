@@ -35,7 +35,7 @@ _WAIT_S = 0.05
 
 def run(
     life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
-    keyframes: Connection, beginning: Beginning | None, base: MapChoice | None,
+    keyframes: Connection, beginning: Beginning | None, base: MapChoice | None, has_camera: bool,
 ) -> None:  # fmt: skip
     """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
 
@@ -50,13 +50,14 @@ def run(
         keyframes: `BackBegun` if there is a `beginning`, `KeyframeStep` from the back process, then `BackEnded`.
         beginning: the session that the run goes on from.
         base: the map among them, if it is that of another run.
+        has_camera: False where no frame can come, and none is asked for.
     """
     clock = StageClock()
     stage = map_stage(config, recording.rig, clock)
     pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes))
     if beginning is not None:
         pipeline.wait_for_back()
-    make = partial(_LiveRun, recording, config, out, pipeline)
+    make = partial(_LiveRun, recording, config, out, pipeline, has_camera)
     live: Run
     if beginning is not None and beginning.is_own:
         live = resumed = make(SessionWriter.reopen(out / "session.db"))
@@ -72,10 +73,14 @@ class _LiveRun(Run):
     """A run whose steps come from other processes."""
 
     def __init__(
-        self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, session: SessionWriter
-    ) -> None:
+        self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, has_camera: bool,
+        session: SessionWriter,
+    ) -> None:  # fmt: skip
         super().__init__(recording, config, out, session, followed)
         self._followed = followed
+        self.wants_frames = has_camera
+        if not has_camera:
+            self.warnings.append("there was no camera: attitude alone was published, and there is no trajectory")
 
     def go_on_from(self, beginning: Beginning) -> None:
         """Go on in the run's own session, whose map is the one to be found again: the cart may stand elsewhere."""

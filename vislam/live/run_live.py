@@ -40,6 +40,7 @@ class LiveSource(Recording, Protocol):
     """Sensors: what a recording says of itself, and how to open them, each in the process that reads it."""
 
     duration_s: float | None  # after which there is no more; None: endless
+    has_camera: bool  # without one, attitude alone is published
 
     def inertial(self) -> Callable[[], InertialSource]:
         """Return what opens the IMU; it travels to the fast process."""
@@ -165,7 +166,7 @@ class LiveRun:
             ),
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,
-                frames=frames, keyframes=keyframes, beginning=beginning, base=base,
+                frames=frames, keyframes=keyframes, beginning=beginning, base=base, has_camera=source.has_camera,
             ),
         }  # fmt: skip
 

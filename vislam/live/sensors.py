@@ -18,7 +18,7 @@ from vislam.hw.sensors import open_camera, open_inertial
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
 from vislam.live.child import Life
-from vislam.live.frames import FrameSource, OneCamera
+from vislam.live.frames import NO_CAMERA, FrameSource, NoCamera, OneCamera
 from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
@@ -49,7 +49,7 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
     if not camera or inertial.partition(":")[0] not in ("gy85", "serial"):
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
-            "(a camera's index or path in place of webcam)"
+            "(a camera's index or path in place of webcam, or none: attitude by the IMU alone)"
         )
     return CartSensors(inertial, camera, config, sensors), with_clock(config)
 
@@ -91,26 +91,17 @@ class CartSensors:
     def __init__(self, inertial: str, camera: str, config: Config, sensors: SensorsConfig) -> None:
         """Read the calibration files; the devices are opened by the processes that read them.
 
-        Raises UsageError without a camera calibration, DataError when a file cannot be used.
+        Raises UsageError where a camera has no calibration, DataError when a file cannot be used.
         """
-        if config.calibration.camera is None:
-            raise UsageError(
-                "a live camera needs its calibration: --calibration.camera FILE, which `vislam calibrate camera` writes"
-            )
         for name, path in (("imu", config.calibration.imu), ("mag", config.calibration.mag)):
             if path is not None:
                 raise UsageError(
                     "live drivers take the calibration of their chips from the sensors file (--sensors FILE, section "
                     f"calibration of gy85 or serial), not from --calibration.{name}"
                 )
-        found = read_cameras(Path(config.calibration.camera))[0]
-        if found.T_body_cam is None:
-            raise DataError(
-                f"{config.calibration.camera} does not say where the camera is on the body (T_cam_imu, T_BS); add it, "
-                "or run `vislam calibrate camera-imu`"
-            )
         self.name = f"live {inertial}+{camera}"
-        self.rig = Rig((found.camera,), (found.T_body_cam,))
+        self.has_camera = camera != "none"
+        self.rig = _rig(config.calibration.camera) if self.has_camera else NO_CAMERA
         rate_hz = sensors.gy85.rate_hz
         self.imu_noise: ImuNoise | None = ImuNoise(
             sensors.gyro_noise_density, sensors.accel_noise_density, sensors.gyro_bias_walk, sensors.accel_bias_walk,
@@ -128,7 +119,7 @@ class CartSensors:
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens the camera."""
-        return partial(_open_one, self._camera, self._sensors)
+        return partial(_open_one, self._camera, self._sensors) if self.has_camera else NoCamera
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return nothing: real sensors need no processes."""
@@ -144,6 +135,21 @@ class CartSensors:
     def truth(self) -> Trajectory | None:
         """Return nothing: nobody knows it."""
         return None
+
+
+def _rig(calibration: str | None) -> Rig:
+    if calibration is None:
+        raise UsageError(
+            "a live camera needs its calibration: --calibration.camera FILE, which `vislam calibrate camera` writes; "
+            "without a camera, attitude alone: +none in its place"
+        )
+    found = read_cameras(Path(calibration))[0]
+    if found.T_body_cam is None:
+        raise DataError(
+            f"{calibration} does not say where the camera is on the body (T_cam_imu, T_BS); add it, "
+            "or run `vislam calibrate camera-imu`"
+        )
+    return Rig((found.camera,), (found.T_body_cam,))
 
 
 def _open_one(name: str, sensors: SensorsConfig) -> OneCamera:

@@ -70,7 +70,7 @@ def doubts(front: FrontReport, log: RunLog, final: Trajectory, has_imu: bool) ->
     warnings += _contradictions(front.counters.get("ekf", {}))
     if has_imu:
         warnings += _apart(log.odometry_trajectory(), final)
-        if front.start is None:
+        if front.start is None and len(log):
             warnings.append(f"gravity was never found, vision alone gave the motion: {front.refusal}")
     return warnings
 

@@ -25,7 +25,7 @@ class LiveOptions:
     out: Path
     """Folder to make for everything that the run leaves"""
     source: str = "virtual-cart"
-    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, serial:PORT+webcam"""
+    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, serial:PORT+webcam, gy85+none"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     seconds: float | None = None

@@ -17,7 +17,7 @@ from vislam.errors import DataError
 from vislam.imu import ImuNoise
 from vislam.live.child import Life
 from vislam.live.epoch import Epoch
-from vislam.live.frames import FrameSource
+from vislam.live.frames import FrameSource, NoCamera
 from vislam.live.slot import remove
 from vislam.live.virtual.camera import VirtualCamera, run_camera
 from vislam.live.virtual.imu import VirtualGy85
@@ -44,6 +44,7 @@ class VirtualCart:
         """Choose names for what its processes share; nothing starts yet."""
         self.name = "virtual cart"
         self.rig = virtual_rig(options)
+        self.has_camera = options.rig != "none"
         self.imu_noise: ImuNoise | None = NOISE
         self.frame_count = 0
         self.problems: dict[str, int] = {}
@@ -80,17 +81,21 @@ class VirtualCart:
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens its camera."""
+        if not self.has_camera:
+            return NoCamera
         return partial(VirtualCamera, f"{self._shared}-camera")
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return the processes that move it and that render."""
         names = f"{self._shared}-cart", self._epoch, self.options
-        return {
-            "cart": partial(_run_cart, shared=names, command_name=self.command_name, truth=self._truth),
-            "camera": partial(
-                run_camera, name=f"{self._shared}-camera", cart=names[0], epoch=self._epoch, options=self.options
-            ),
+        found: dict[str, Callable[[Life], None]] = {
+            "cart": partial(_run_cart, shared=names, command_name=self.command_name, truth=self._truth)
         }
+        if self.has_camera:
+            found["camera"] = partial(
+                run_camera, name=f"{self._shared}-camera", cart=names[0], epoch=self._epoch, options=self.options
+            )
+        return found
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
         """Raise DataError: live sensors cannot be read twice."""
