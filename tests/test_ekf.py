@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, SimulatedVision, to_span
 
 from vislam.config import EkfConfig
-from vislam.ekf import Ekf, kernels
-from vislam.ekf.measurements import chi_square_limit, relative_motion, with_shared_error
+from vislam.ekf import Ekf, kernels, visual_motion
+from vislam.ekf.measurements import chi_square_limit
+from vislam.ekf.visual_motion import relative_motion, shared_error, why_unusable
 from vislam.geometry import (
     quaternion_wxyz,
     se3_exp,
@@ -239,8 +240,7 @@ def test_motions_tell_nothing_about_heading_and_place() -> None:
         T = se3_exp(rng.normal(size=6) * 0.5)
         unscaled = T.copy()
         unscaled[:3, 3] /= np.linalg.norm(T[:3, 3])
-        vo = VoMeasurement(0, 0, unscaled if i % 2 else T, np.eye(6) * 1e-2, i % 2 == 0, Tracking.OK, 50)
-        m = relative_motion(x, P, vo, LEVER, 1.0)
+        m, _ = relative_motion(x, P, unscaled if i % 2 else T, np.eye(6) * 1e-2, i % 2 == 0, LEVER)
         _, K = kernels.innovation(P, m.H, m.noise, m.residual)
         kernels.correct(x, P, K, m.H, m.noise, m.residual)
     np.testing.assert_allclose(information(), start, rtol=1e-6, atol=1e-6 * np.abs(start).max())
@@ -272,13 +272,14 @@ def test_shared_error_does_not_average_out() -> None:
     P[:6, :6] = np.eye(6)
     covariance, shared = np.eye(6) * 1e-4, np.zeros((6, 6))
     T = transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
-    vo = VoMeasurement(0, 0, T, covariance, True, Tracking.OK, 50)
     for _ in range(100):
-        measurement = relative_motion(x, P, vo, np.zeros(3), 1.0)
-        white, more, shared = with_shared_error(measurement, 0.5, shared)
+        seen, _ = relative_motion(x, P, T, covariance, True, np.zeros(3))
+        white = 0.5 * seen.noise
+        more = shared_error(seen.H[:, 15:].copy(), 0.5 * seen.noise, shared)
+        shared += more
         P[15:, 15:] += more
-        _, K = kernels.innovation(P, white.H, white.noise, white.residual)
-        kernels.correct(x, P, K, white.H, white.noise, white.residual)
+        _, K = kernels.innovation(P, seen.H, white, seen.residual)
+        kernels.correct(x, P, K, seen.H, white, seen.residual)
     np.testing.assert_allclose(np.diag(P)[:6], 0.5e-4, rtol=0.05)
 
 
@@ -525,6 +526,30 @@ def test_unusable_motion_is_refused(scene: Scene, change: dict, reason: str) -> 
     assert reason in result.reason
     assert ekf.counters["vo_invalid"] == 1
     assert_same(before, ekf.state())
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e4])
+def test_what_is_a_covariance_is_what_its_eigenvalues_say(scale: float) -> None:
+    rng = np.random.default_rng(12)
+    for rank in range(7):
+        Q = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+        values = scale * rng.uniform(0.1, 1.0, 6) * (np.arange(6) < rank)
+        for lowest, reason in ((-0.5, ""), (-2.0, "the covariance is not positive semidefinite")):
+            values[5] = lowest * 1e-9 * (1.0 + values[:5].sum())
+            vo = VoMeasurement(0, 0, np.eye(4), (Q * values) @ Q.T, True, Tracking.OK, 50)
+            assert why_unusable(vo) == reason
+
+
+def test_no_layout_of_numbers_is_compiled_for(scene: Scene) -> None:
+    """A compiler at work would keep the pose waiting for a second."""
+    ekf = scene.run(scene.ekf())
+    known = len(visual_motion.correct.signatures), len(kernels.update.signatures)
+    vo = scene.motions[-1]
+    T, covariance = np.asfortranarray(vo.T_keyframe_body, dtype=np.float32), np.asfortranarray(vo.covariance)
+    accepted = ekf.counters["vo_accepted"]
+    ekf.update_vo(replace(vo, T_keyframe_body=T, covariance=np.broadcast_to(covariance, (6, 6))))
+    assert ekf.counters["vo_accepted"] == accepted + 1
+    assert known == (len(visual_motion.correct.signatures), len(kernels.update.signatures))
 
 
 def test_too_late_and_too_early() -> None:

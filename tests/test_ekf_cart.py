@@ -35,12 +35,12 @@ def test_derivatives_are_those_of_the_axle_s_velocity() -> None:
     x[6] = x[19] = 1.0
     x = perturbed(x, rng.normal(0.0, 0.3, 15))
     gyro = rng.normal(0.0, 0.5, 3)
-    measured = on_wheels(x, gyro, AXLE_M, 0.02, (0.1, 0.01))
-    assert measured.H.shape == (3, kernels.ERRORS) and on_wheels(x, gyro, AXLE_M, 0.02, None).H.shape[0] == 2
+    measured = on_wheels(x, gyro, AXLE_M, 0.02, 0.1, 0.01)
+    assert measured.H.shape == (3, kernels.ERRORS) and on_wheels(x, gyro, AXLE_M, 0.02, 0.1, 0.0).H.shape[0] == 2
     h = 1e-6
     for k in range(15):
         d = h * np.eye(15)[k]
-        ahead, behind = (on_wheels(perturbed(x, s * d), gyro, AXLE_M, 0.02, (0.1, 0.01)).residual for s in (1, -1))
+        ahead, behind = (on_wheels(perturbed(x, s * d), gyro, AXLE_M, 0.02, 0.1, 0.01).residual for s in (1, -1))
         assert np.allclose(measured.H[:, k], (behind - ahead) / (2 * h), atol=1e-6)
 
 

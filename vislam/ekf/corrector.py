@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from vislam.config import EkfConfig
-from vislam.ekf import kernels
+from vislam.ekf import kernels, visual_motion
 from vislam.ekf.history import Event, Kind, Ledger
 from vislam.ekf.measurements import (
     LinearMeasurement,
@@ -15,9 +16,7 @@ from vislam.ekf.measurements import (
     biases,
     chi_square_limit,
     on_wheels,
-    relative_motion,
     where_rest_began,
-    with_shared_error,
     zero_velocity,
 )
 from vislam.ekf.timeline import REST_PAUSE_NS, reset_sigmas
@@ -33,8 +32,12 @@ class Corrector:
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
         per_sample = config.imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
         self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
-        self._limits = [0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)]
+        self._limits = np.array([0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)])
         self._axle = np.array(config.axle_m, dtype=np.float64)
+        self._floor_sigma = float(config.floor_sigma_m or 0.0)
+        self._vo_variance = float(config.vo_inflation) ** 2
+        self._fraction = float(config.vo_shared_fraction)
+        self._nothing = np.zeros((6, 6))
         self._reset_sigmas = reset_sigmas(config)
         self._all = np.eye(kernels.ERRORS)
         self._only_biases = np.diag(np.repeat([0.0, 1.0, 0.0], [9, 6, 6]))
@@ -54,10 +57,9 @@ class Corrector:
         if event.kind is Kind.ZERO_VELOCITY:
             return self._apply_rest(event, x, P, ledger, gyro_rad_s)
         if event.kind is Kind.NONHOLONOMIC:
-            config = self._config
-            floor = None if config.floor_sigma_m is None else (ledger.floor_z_m, config.floor_sigma_m)
-            sigma_m_s = config.nonholonomic_sigma_m_s
-            self._correct(event, on_wheels(x, gyro_rad_s, self._axle, sigma_m_s, floor), x, P, "nonholonomic")
+            sigma_m_s = float(self._config.nonholonomic_sigma_m_s)
+            known = on_wheels(x, gyro_rad_s, self._axle, sigma_m_s, ledger.floor_z_m, self._floor_sigma)
+            self._correct(event, known, x, P, "nonholonomic")
             return ledger
         assert event.bias is not None
         known = biases(x, event.bias[:3], event.bias[3:6], event.bias[6:])
@@ -80,9 +82,9 @@ class Corrector:
         config = self._config
         goes_on = ledger.rested_t_ns is not None and event.t_ns - ledger.rested_t_ns <= REST_PAUSE_NS
         holds = ledger.clone_rests and goes_on
-        at_rest = zero_velocity(x, gyro_rad_s, config.zero_velocity_sigma_m_s, self._zero_rate_sigma)
+        at_rest = zero_velocity(x, gyro_rad_s, float(config.zero_velocity_sigma_m_s), self._zero_rate_sigma)
         if holds:
-            at_rest = where_rest_began(x, at_rest, np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m)
+            at_rest = where_rest_began(x, at_rest, math.radians(config.rest_sigma_deg), float(config.rest_sigma_m))
         self._correct(event, at_rest, x, P, "zero_velocity")
         if not event.accepted:
             return replace(ledger, clone_rests=False, rested_t_ns=None)
@@ -98,18 +100,23 @@ class Corrector:
         config = self._config
         if config.vision == "accumulated":
             return self._apply_accumulated(event, event.vo, x, P, ledger)
-        measurement = relative_motion(x, P, event.vo, self._lever, config.vo_inflation)
-        if ledger.shared is None:
-            self._correct(event, measurement, x, P, "vo")
-            return self._after_vo(event, P, ledger)
-        white, more, shared = with_shared_error(measurement, config.vo_shared_fraction, ledger.shared)
-        widened = P.copy()
-        widened[15:, 15:] += more
-        self._correct(event, white, x, widened, "vo")
-        if event.accepted:
-            P[:] = widened
-            ledger = replace(ledger, shared=shared)
-        return self._after_vo(event, P, ledger)
+        assert event.vo.T_keyframe_body is not None
+        # a clone that several keyframes share has their errors already
+        fraction, already = (0.0, self._nothing) if ledger.shared is None else (self._fraction, ledger.shared)
+        event.nis, event.degrees, opposed_m, more = visual_motion.correct(
+            x,
+            P,
+            visual_motion.numbers(event.vo.T_keyframe_body),
+            self._vo_variance * visual_motion.numbers(event.vo.covariance),
+            event.vo.has_scale,
+            self._lever,
+            fraction,
+            already,
+            self._limits,
+            self._moves(event),
+        )
+        self._judge(event, "vo", opposed_m)
+        return self._after_vo(event, P, ledger, None if ledger.shared is None else ledger.shared + more)
 
     def _apply_accumulated(self, event: Event, vo: VoMeasurement, x: Array, P: Array, ledger: Ledger) -> Ledger:
         """Chain the motion to the keyframe's pose, and take the sum for a measured pose in `odom`."""
@@ -121,12 +128,13 @@ class Corrector:
         T_odom_vo = ledger.T_odom_keyframe @ vo.T_keyframe_body
         chained = absolute_pose(x, T_odom_vo, np.deg2rad(config.accumulated_sigma_deg), config.accumulated_sigma_m)
         self._correct(event, chained, x, P, "vo")
-        return self._after_vo(event, P, replace(ledger, T_odom_vo=T_odom_vo, vo_t_ns=event.t_ns))
+        ledger = replace(ledger, T_odom_vo=T_odom_vo, vo_t_ns=event.t_ns)
+        return self._after_vo(event, P, ledger, ledger.shared)
 
-    def _after_vo(self, event: Event, P: Array, ledger: Ledger) -> Ledger:
-        """Count rejections in a row; too many for too long widen the covariance."""
+    def _after_vo(self, event: Event, P: Array, ledger: Ledger, shared: Array | None) -> Ledger:
+        """Count rejections in a row; too many for too long widen the covariance. `shared`: if it was accepted."""
         if event.accepted:
-            return replace(ledger, rejects=0, last_vo_t_ns=event.t_ns)
+            return replace(ledger, rejects=0, last_vo_t_ns=event.t_ns, shared=shared)
         config = self._config
         since = event.t_ns if ledger.rejects == 0 else ledger.rejects_since_ns
         rejects = ledger.rejects + 1
@@ -137,23 +145,30 @@ class Corrector:
             rejects = 0
         return replace(ledger, rejects=rejects, rejects_since_ns=since)
 
-    def _correct(self, event: Event, measurement: LinearMeasurement, x: Array, P: Array, name: str) -> None:
-        """Gate and apply. Not everything that the optimal gain would move may move (Schmidt-Kalman).
+    def _moves(self, event: Event) -> Array:
+        """Return [21, 21] what becomes of the optimal gain: not all that it would move may move (Schmidt-Kalman).
 
         Biases that the graph knows move biases only. And a continuous odom: tilt that is learned metres away from the
         origin would swing the body about it. With the gain of the clone's position at zero the past stays where it is,
         and P keeps the uncertainty of it.
         """
-        limit, moves = self._limits[len(measurement.residual)], self._all
         if event.kind is Kind.BIAS:
-            moves = self._only_biases
-        elif event.vo is not None and event.vo.has_scale and self._config.odom == "continuous":
-            moves = self._not_the_past
-        gate = -1.0 if measurement.impossible else limit
-        event.nis = kernels.update(x, P, measurement.H, measurement.noise, measurement.residual, gate, moves)
-        event.degrees = len(measurement.residual)
-        if measurement.impossible:
-            event.outcome, event.reason = f"{name}_opposed", measurement.impossible
+            return self._only_biases
+        is_held = event.vo is not None and event.vo.has_scale and self._config.odom == "continuous"
+        return self._not_the_past if is_held else self._all
+
+    def _correct(self, event: Event, measurement: LinearMeasurement, x: Array, P: Array, name: str) -> None:
+        """Gate and apply a measurement."""
+        residual, H, noise = measurement
+        event.degrees = len(residual)
+        event.nis = kernels.update(x, P, H, noise, residual, self._limits[event.degrees], self._moves(event))
+        self._judge(event, name)
+
+    def _judge(self, event: Event, name: str, opposed_m: float = 0.0) -> None:
+        """Write down what the gate said."""
+        limit = self._limits[event.degrees]
+        if opposed_m > 0.0:
+            event.outcome, event.reason = f"{name}_opposed", f"moved {opposed_m:.2f} m against the direction seen"
         elif not event.nis <= limit:
             event.outcome, event.reason = f"{name}_gated", f"innovation {event.nis:.1f} of at most {limit:.1f}"
         else:

@@ -23,8 +23,8 @@ from vislam.config import EkfConfig
 from vislam.ekf import kernels
 from vislam.ekf.corrector import Corrector
 from vislam.ekf.history import OUTCOMES, Checkpoint, Event, History, Kind, Ledger, add_nis
-from vislam.ekf.measurements import why_unusable
 from vislam.ekf.timeline import bias_measurement, keep_track, pose_between, stretch
+from vislam.ekf.visual_motion import why_unusable
 from vislam.geometry import invert, quaternion_wxyz, skew
 from vislam.imu import ImuNoise, ImuSeries
 from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement

@@ -7,6 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -141,7 +142,6 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
     dt_ns = round(_NS / noise.rate_hz)
     fast = FastPath(config, noise, T_body_camera, _ignore)
     keyframe = VoMeasurement(60 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
-    frame = VoMeasurement(100 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
     nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
     state = NavState(keyframe.t_ns, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15) * 1e-4)
     AttitudeFilter(config.attitude, config.imu.gravity_m_s2, np.eye(3), np.zeros(3)).add(
@@ -151,8 +151,9 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
         fast.add(ImuSample(k * dt_ns, np.zeros(3), rest))
         if k == 80:
             fast.correct(Start(state, keyframe, noise))
-        if k == 120:
-            fast.correct(Correction(frame.t_ns, frame, nothing, True, False, 1))
+        if k in (120, 140, 160):  # a keyframe at rest, rest that goes on, wheels
+            frame = replace(keyframe, t_ns=(k - 20) * dt_ns, keyframe_id=int(k > 120))
+            fast.correct(Correction(frame.t_ns, frame, nothing, k < 160, k == 160, 1 if k == 120 else None))
         fast.publish(k * dt_ns, _well)
 
 
