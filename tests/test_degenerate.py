@@ -101,10 +101,11 @@ def test_a_lost_filter_is_told(tmp_path):
 
 @pytest.mark.parametrize(("world", "uniform"), [("straight", True), ("laps", False)])
 def test_uniform_motion_of_one_camera_is_told(tmp_path, world, uniform):
-    """Without a change of acceleration nothing shows scale any more."""
-    metrics, _, _ = run(tmp_path, f"points:{world},rig=mono,duration_s=28,{CAMERA}", graph__coupling="loose")
+    """Without a change of acceleration nothing shows scale any more, and noise must not pass for it in the filter."""
+    metrics, errors, _ = run(tmp_path, f"points:{world},rig=mono,duration_s=28,{CAMERA}", graph__coupling="loose")
     assert any("uniform motion for" in warning for warning in metrics["warnings"]) == uniform
     assert (metrics["counters"]["front"]["frames_without_excitation"] > 150) == uniform
+    assert errors["ekf"]["ate_max_m"] < (2.0 if uniform else 0.2)
 
 
 def test_a_point_is_on_its_epipolar_segment_and_a_walker_is_not():

@@ -397,7 +397,7 @@ class Front:
         if not ekf.initialised:
             return None, None
         keyframe_id = None if track.keyframe is None else track.keyframe.id
-        self._filter.see(frame.t_ns, track.vo, track.observations, at_rest, keyframe_id)
+        self._filter.see(frame.t_ns, track.vo, track.observations, at_rest, keyframe_id, self.uniform.shows_scale)
         T_odom_body = ekf.pose_at(frame.t_ns)
         if T_odom_body is None:
             T_odom_body = self._without_filter(track.vo)

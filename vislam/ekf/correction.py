@@ -23,10 +23,14 @@ class Correction:
     at_rest: bool
     on_wheels: bool  # of a cart that moves: its axle goes neither sideways nor up; loose filters only
     keyframe_id: int | None  # None: no keyframe
+    shows_scale: bool = True  # False: one camera, and motion too uniform; of no use to a loose filter
 
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
         """Give everything to a filter; return what it said to the motion."""
-        answer = ekf.update_vision(self.vo, self.observations)
+        if isinstance(ekf, Ekf):
+            answer = ekf.update_vision(self.vo, self.observations)
+        else:
+            answer = ekf.update_vision(self.vo, self.observations, self.shows_scale)
         if self.at_rest:
             ekf.update_zero_velocity(self.t_ns)
         elif self.on_wheels and isinstance(ekf, Ekf):

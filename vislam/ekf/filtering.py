@@ -76,11 +76,12 @@ class Filtering:
         ])  # fmt: skip
 
     def see(
-        self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None
-    ) -> None:
+        self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,
+        shows_scale: bool,
+    ) -> None:  # fmt: skip
         """Take what was seen in a frame, and tell the filter what it is to know by now."""
         on_wheels = self._config.nonholonomic and not at_rest
-        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id))
+        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
         while self._seen and self._seen[0].t_ns <= newest_ns:
             correction = self._seen.popleft()

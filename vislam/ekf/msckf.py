@@ -211,17 +211,18 @@ class MsckfEkf:
         self._counts["keyframes"] += 1
         return UpdateResult(True, float("nan"), "")
 
-    def update_vision(self, vo: VoMeasurement, observations: Observations) -> UpdateResult:
+    def update_vision(self, vo: VoMeasurement, observations: Observations, shows_scale: bool = True) -> UpdateResult:
         """Take the tracks of a frame; its motion only says when it was and whether vision is lost.
 
         `nis` of the result is that of all rows used, after compression. A frame may use nothing, since tracks are used
-        when they end or have been followed through the whole window.
+        when they end or have been followed through the whole window. No new point is kept in the state while the motion
+        does not show scale.
         """
         if vo.tracking is Tracking.LOST:
             return self._refuse("vision_lost", "tracking lost")
         if self._history is not None and self._history.has_frame(vo.t_ns):
             return self._refuse("vision_duplicate", f"a frame of {vo.t_ns} ns is here already")
-        frame = prepare(vo.t_ns, observations, self._rig, self._config.tight_readout_s or 0.0)
+        frame = prepare(vo.t_ns, observations, self._rig, self._config.tight_readout_s or 0.0, shows_scale)
         if not len(frame.ids):
             return self._refuse("vision_invalid", "no track with finite pixels inside the camera model")
         return self._insert(Event(vo.t_ns, Kind.FRAME, frame=frame))

@@ -24,6 +24,7 @@ class FrameTracks:
     pixels_px: Array  # [N, 2]
     seen: Array  # [N, 14] rows of `msckf_features`
     unused: NDArray[np.bool_]  # [N] each observation is used once
+    shows_scale: bool = True  # False: the motion before it was too uniform for one camera to see how large things are
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +38,7 @@ class Ripe:
     alive: NDArray[np.bool_]  # [F] still followed
 
 
-def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float) -> FrameTracks:
+def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float, shows_scale: bool = True) -> FrameTracks:
     """Return the usable observations of a frame: finite, one per track, with a ray in the camera model."""
     ids, first = np.unique(np.asarray(observations.track_ids, dtype=np.int64), return_index=True)
     at_once = observations.instant_px is not None
@@ -55,7 +56,7 @@ def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float) -
     rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
     seen[:, 13] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
     fit = np.isfinite(seen[:, :6]).all(axis=1) & np.isfinite(seen[:, 13])
-    return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_))
+    return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_), shows_scale)
 
 
 def _rays(camera: Camera, pixels: Array) -> Array:

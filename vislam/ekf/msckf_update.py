@@ -269,8 +269,11 @@ class Updater:
         """Take the tracks whose depth is known best into the state, as far as there is room.
 
         How well the poses are known counts too: as long as scale is not, a point in the state would be linearised at
-        the wrong place for good.
+        the wrong place for good. And where the motion does not show scale, the noise of one point after the other would
+        be taken for it.
         """
+        if not window.frames[-1].shows_scale:
+            return window
         free = max(self._config.tight_points - len(window.point_ids), 0)
         if not len(rows.ids) or not free:
             return window

@@ -32,6 +32,11 @@ class UniformMotion:
         self.frames = 0
         self.longest_s = 0.0
 
+    @property
+    def shows_scale(self) -> bool:
+        """Whether the last 4 s show scale, or are not yet over."""
+        return self._lasted_s == 0.0
+
     def add(self, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
         """Take a frame's inertial span and the filter's state at its end; rest holds scale, and outages start anew."""
         if span is None or state is None or at_rest:
