@@ -143,6 +143,13 @@ def test_alignment_undoes_a_change_of_world(rotation, translation, scale):
     assert scale_error(associate(truth.transformed(sim3(scale, R, t)), truth)) == pytest.approx(1 / scale - 1, rel=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
+def test_there_is_no_scale_without_motion():
+    still = Trajectory(smooth(10).t_ns, np.tile(np.eye(4), (10, 1, 1)))
+    for pairs in (associate(still, smooth(10)), associate(smooth(10), still)):
+        assert np.isnan(scale_error(pairs))
+
+
 def test_yaw_alignment_does_not_hide_a_tilt():
     truth = smooth(200)
     tilted = truth.transformed(transform(Rotation.from_rotvec([0.05, 0, 0]).as_matrix(), np.zeros(3)))

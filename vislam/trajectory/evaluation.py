@@ -159,10 +159,10 @@ def rpe(pairs: Pairs, duration_s: float | None = None, length_m: float | None = 
 def scale_error(pairs: Pairs) -> float:
     """Return s - 1, s the factor that the estimate must be multiplied with to fit the reference best (Sim3).
 
-    NaN when the estimate does not move: it then has no scale. Raises DataError with fewer than 3 pairs.
+    NaN when one of them does not move: there is no scale then. Raises DataError with fewer than 3 pairs.
     """
-    points = pairs.estimate[:, :3, 3]
-    if len(points) >= 3 and np.ptp(points, axis=0).max() < 1e-9:
+    extents_m = [np.ptp(poses[:, :3, 3], axis=0).max() for poses in (pairs.estimate, pairs.reference) if len(poses) >= 3]
+    if extents_m and min(extents_m) < 1e-9:
         return float("nan")
     return sim3_parts(align(pairs, "sim3"))[0] - 1.0
 
