@@ -161,9 +161,9 @@ def scale_error(pairs: Pairs) -> float:
 
     NaN when one of them does not move: there is no scale then. Raises DataError with fewer than 3 pairs.
     """
-    extents_m = [np.ptp(poses[:, :3, 3], axis=0).max() for poses in (pairs.estimate, pairs.reference) if len(poses) >= 3]
-    if extents_m and min(extents_m) < 1e-9:
-        return float("nan")
+    for poses in (pairs.estimate, pairs.reference):
+        if len(poses) >= 3 and np.ptp(poses[:, :3, 3], axis=0).max() < 1e-9:
+            return float("nan")
     return sim3_parts(align(pairs, "sim3"))[0] - 1.0
 
 
