@@ -20,7 +20,6 @@ from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
 from vislam.factors.solver import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
-from vislam.geometry import invert
 from vislam.messages import Array
 
 _BATCH_ITERATIONS = 50
@@ -266,10 +265,8 @@ class Estimator(Generic[L]):
 
     def _step(self, k: int, values: gtsam.Values) -> Step:
         before = read_guess(values, k - 1, self.has_imu)
-        motion = np.eye(4)
-        if k > 1:
-            motion = nearest_rigid(invert(values.atPose3(X(k - 2)).matrix()) @ before.T_map_body)
-        return self._odometry.step(k, before, motion, self.vo_scale)
+        earlier = values.atPose3(X(k - 2)).matrix() if k > 1 else None
+        return self._odometry.step(k, before, earlier, self.vo_scale)
 
     def _extend(
         self, factors: list[gtsam.NonlinearFactor], named: dict[Label, gtsam.NonlinearFactor], guess: Guess

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.errors import DataError
 from vislam.factors.keys import nearest_rigid
-from vislam.factors.noise import checked_covariance
+from vislam.factors.noise import checked_covariance, checked_covariances
 from vislam.memory import WindowRecord
 from vislam.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
 
@@ -84,6 +85,31 @@ def start_record(state: NavState | None, T_map_body: Array | None = None) -> Sta
 
 def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> KeyframeRecord:
     """Return the record of a packet that follows `previous`; raises DataError on anything the graph must not see."""
+    return keyframe_records([packet], previous)[0]
+
+
+def keyframe_records(packets: Sequence[KeyframePacket], previous: KeyframeRecord | None = None) -> list[KeyframeRecord]:
+    """Return the records of packets that follow each other, as `keyframe_record` does, checking all at once."""
+    out: list[KeyframeRecord] = []
+    steps_s: list[float] = []
+    for packet in packets:
+        out.append(_as_said(packet, previous))
+        steps_s.append(np.inf if previous is None else (out[-1].t_ns - previous.t_ns) * 1e-9)
+        previous = out[-1]
+    odd = [n for n, record in enumerate(out) if record.T_previous_body is not None]
+    whats = [f"keyframe {out[n].id} at {out[n].t_ns} ns: odometry" for n in odd]
+    T = checked_poses([record.T_previous_body for record in out if record.T_previous_body is not None], whats)
+    covariances = checked_covariances([packets[n].vo.covariance for n in odd], 6, whats)
+    has_scale = np.array([out[n].has_scale for n in odd], dtype=np.bool_)
+    useful = _are_useful(T, covariances, has_scale, np.array(steps_s)[odd])
+    for n, motion, covariance, is_useful in zip(odd, T, covariances, useful.tolist(), strict=True):
+        measured = (motion, covariance) if is_useful else (None, None)
+        out[n] = replace(out[n], T_previous_body=measured[0], covariance=measured[1])
+    return out
+
+
+def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> KeyframeRecord:
+    """Return the record of a packet whose odometry is not checked yet."""
     keyframe, vo = packet.keyframe, packet.vo
     expected = 0 if previous is None else previous.id + 1
     what = f"keyframe {keyframe.id} at {keyframe.t_ns} ns"
@@ -100,10 +126,7 @@ def keyframe_record(packet: KeyframePacket, previous: KeyframeRecord | None) -> 
     if vo.tracking is not Tracking.LOST and vo.T_keyframe_body is not None:
         if vo.keyframe_id != previous.id:
             raise DataError(f"{what}: its odometry is relative to keyframe {vo.keyframe_id}, expected {previous.id}")
-        T = checked_pose(vo.T_keyframe_body, f"{what}: odometry")
-        covariance = checked_covariance(vo.covariance, 6, f"{what}: odometry")
-        if not _is_useful(T, covariance, vo.has_scale, (keyframe.t_ns - previous.t_ns) * 1e-9):
-            T = covariance = None
+        T, covariance = vo.T_keyframe_body, vo.covariance
     imu = None if packet.imu is None else _checked_span(packet.imu, previous.t_ns, keyframe.t_ns, what)
     degraded = vo.tracking is Tracking.DEGRADED
     rest_from = None
@@ -122,24 +145,32 @@ def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:
     return LoopRecord(edge.id, edge.from_id, edge.to_id, T, covariance, edge.has_scale, newest_id)
 
 
-def _is_useful(T: Array, covariance: Array, has_scale: bool, duration_s: float) -> bool:
-    """Return whether odometry says something that can be believed; Gauss-Newton diverges on motions without."""
-    sigma_rad = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) if has_scale else 0.0
-    speed = float(np.linalg.norm(T[:3, 3])) / duration_s if has_scale else 0.0
-    return bool(sigma_rad < _USELESS_RAD and sigma_m < _USELESS_M and speed < SPEED_MAX_M_S)
+def _are_useful(T: Array, covariances: Array, has_scale: NDArray[np.bool_], durations_s: Array) -> NDArray[np.bool_]:
+    """Return whether odometry [N] says what can be believed; Gauss-Newton diverges on motions without."""
+    sigma_rad = np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1])
+    sigma_m = np.sqrt(np.linalg.eigvalsh(covariances[:, 3:, 3:])[:, -1])
+    speed = np.linalg.norm(T[:, :3, 3], axis=1) / durations_s
+    metric = (sigma_m < _USELESS_M) & (speed < SPEED_MAX_M_S)
+    return np.asarray((sigma_rad < _USELESS_RAD) & (metric | ~has_scale))
 
 
 def checked_pose(T: Array, what: str) -> Array:
     """Return a rigid motion [4, 4] freed from rounding; DataError naming `what` when it is none."""
-    matrix = np.array(T, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
-        raise DataError(f"{what}: pose must be 4x4 and finite, got shape {matrix.shape}")
-    R = matrix[:3, :3]
-    error = float(np.max(np.abs(R.T @ R - np.eye(3))))
-    if error > _RIGID or np.linalg.det(R) < 0.0 or not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-        raise DataError(f"{what}: pose is not a rigid motion, R^T R misses identity by {error:.3g}")
-    return nearest_rigid(matrix)
+    return np.asarray(checked_poses([T], [what])[0])
+
+
+def checked_poses(T: Sequence[Array], whats: Sequence[str]) -> Array:
+    """Return rigid motions [N, 4, 4], each as `checked_pose` takes it; DataError names one that is none."""
+    for matrix, what in zip(T, whats, strict=True):
+        if np.shape(matrix) != (4, 4) or not np.isfinite(matrix).all():
+            raise DataError(f"{what}: pose must be 4x4 and finite, got shape {np.shape(matrix)}")
+    matrices = np.array(T, dtype=np.float64).reshape(-1, 4, 4)
+    R = matrices[:, :3, :3]
+    errors = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
+    broken = (errors > _RIGID) | (np.linalg.det(R) < 0.0) | (matrices[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)
+    for n in np.flatnonzero(broken).tolist():
+        raise DataError(f"{whats[n]}: pose is not a rigid motion, R^T R misses identity by {errors[n]:.3g}")
+    return nearest_rigid(matrices)
 
 
 def _checked_span(span: ImuSpan, t0_ns: int, t1_ns: int, what: str) -> ImuSpan:

@@ -32,14 +32,15 @@ def bias_of(gyro_rad_s: Array, accel_m_s2: Array) -> gtsam.imuBias.ConstantBias:
 
 
 def nearest_rigid(T: Array) -> Array:
-    """Return the rigid motion [4, 4] nearest to T, whose rotation is orthonormal but for rounding.
+    """Return the rigid motion [..., 4, 4] nearest to T, whose rotation is orthonormal but for rounding.
 
     Without this, rounding grows by a constant factor where motions are continued from the ones before.
     """
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    out = np.eye(4)
-    out[:3, :3] = U @ Vt
-    out[:3, 3] = T[:3, 3]
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    out = np.zeros(T.shape)
+    out[..., :3, :3] = U @ Vt
+    out[..., :3, 3] = T[..., :3, 3]
+    out[..., 3, 3] = 1.0
     return out
 
 

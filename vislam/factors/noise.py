@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -16,18 +18,26 @@ def checked_covariance(covariance: Array, size: int, what: str) -> Array:
 
     Allowed is any symmetric, finite, positive semi-definite matrix that is not zero.
     """
-    matrix = np.asarray(covariance, dtype=np.float64)
-    if matrix.shape != (size, size):
-        raise DataError(f"{what}: covariance has shape {matrix.shape}, asked for ({size}, {size})")
-    if not np.all(np.isfinite(matrix)):
-        raise DataError(f"{what}: covariance holds NaN or infinity; report lost tracking instead")
-    scale = float(np.max(np.abs(matrix)))
-    if scale == 0.0 or float(np.max(np.abs(matrix - matrix.T))) > _ASYMMETRY * scale:
-        raise DataError(f"{what}: covariance must be symmetric and not zero, its largest entry is {scale:.3g}")
-    symmetric = 0.5 * (matrix + matrix.T)
-    smallest = float(np.linalg.eigvalsh(symmetric)[0])
-    if smallest < -_ASYMMETRY * scale:
-        raise DataError(f"{what}: covariance is not positive, its smallest eigenvalue is {smallest:.3g}")
+    return np.asarray(checked_covariances([covariance], size, [what])[0])
+
+
+def checked_covariances(covariances: Sequence[Array], size: int, whats: Sequence[str]) -> Array:
+    """Return symmetrised covariances [N, size, size], each as `checked_covariance` takes it; DataError names one."""
+    for covariance, what in zip(covariances, whats, strict=True):
+        if np.shape(covariance) != (size, size):
+            raise DataError(f"{what}: covariance has shape {np.shape(covariance)}, asked for ({size}, {size})")
+    matrices = np.array(covariances, dtype=np.float64).reshape(-1, size, size)
+    for n in np.flatnonzero(~np.isfinite(matrices).all(axis=(1, 2))).tolist():
+        raise DataError(f"{whats[n]}: covariance holds NaN or infinity; report lost tracking instead")
+    turned = matrices.transpose(0, 2, 1)
+    scales = np.abs(matrices).max(axis=(1, 2))
+    crooked = (scales == 0.0) | (np.abs(matrices - turned).max(axis=(1, 2)) > _ASYMMETRY * scales)
+    for n in np.flatnonzero(crooked).tolist():
+        raise DataError(f"{whats[n]}: covariance must be symmetric and not zero, its largest entry is {scales[n]:.3g}")
+    symmetric = 0.5 * (matrices + turned)
+    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
+    for n in np.flatnonzero(smallest < -_ASYMMETRY * scales).tolist():
+        raise DataError(f"{whats[n]}: covariance is not positive, its smallest eigenvalue is {smallest[n]:.3g}")
     return np.asarray(symmetric)
 
 
@@ -45,8 +55,10 @@ def conditioned(covariance: Array, ratio_max: float) -> Array:
 
 def inflated(covariance: Array, sigma_factor: float, floor_rad: float, floor_m: float) -> Array:
     """Return `sigma_factor**2 * covariance` plus the variance of a floor; pose covariance [6, 6], rotation first."""
-    floor = np.repeat([floor_rad**2, floor_m**2], 3)
-    return np.asarray(sigma_factor**2 * covariance + np.diag(floor))
+    out = np.array(sigma_factor**2 * covariance, order="C")
+    out.ravel()[:21:7] += floor_rad**2
+    out.ravel()[21::7] += floor_m**2
+    return out
 
 
 def gaussian(covariance: Array, ratio_max: float) -> gtsam.noiseModel.Gaussian:

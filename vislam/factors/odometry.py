@@ -6,10 +6,12 @@ from dataclasses import replace
 from typing import Protocol
 
 import gtsam
+import numpy as np
 
 from vislam.factors.builder import Builder, Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, KeyframeRecord, StartRecord
 from vislam.factors.keys import nearest_rigid
+from vislam.geometry import invert
 from vislam.messages import Array
 
 
@@ -23,10 +25,10 @@ class Odometry(Protocol):
     def start(self) -> tuple[list[gtsam.NonlinearFactor], Guess]:
         """Return the priors and the first guess of keyframe 0."""
 
-    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+    def step(self, k: int, before: Guess, T_map_earlier: Array | None, vo_scale: float) -> Step:
         """Return what ties keyframe k to the one before, whose state is `before`.
 
-        `last_motion` [4, 4] is the motion of the step before; `vo_scale` multiplies the sigma of visual odometry.
+        `T_map_earlier` [4, 4] is the pose of the one before that; `vo_scale` multiplies the sigma of visual odometry.
         """
 
     def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
@@ -63,8 +65,11 @@ class MotionOdometry:
         assert self._start is not None
         return self._builder.start(self._start)
 
-    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+    def step(self, k: int, before: Guess, T_map_earlier: Array | None, vo_scale: float) -> Step:
         """See Odometry."""
+        last_motion = np.eye(4)
+        if T_map_earlier is not None:
+            last_motion = nearest_rigid(invert(T_map_earlier) @ before.T_map_body)
         record, previous = self._records[k], self._records[k - 1]
         floor_m = 0.0 if self._start is None else float(self._start.T_map_body[2, 3])
         return self._builder.keyframe(

@@ -106,7 +106,7 @@ class _Chain:
     def start(self) -> tuple[list[gtsam.NonlinearFactor], Guess]:
         return [self._prior], _guess(self._T_first)
 
-    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+    def step(self, k: int, before: Guess, T_map_earlier: Array | None, vo_scale: float) -> Step:
         edge = self.edges[k]
         assert edge is not None
         moved = edge.T_from_to if edge.from_id == k - 1 else invert(edge.T_from_to)

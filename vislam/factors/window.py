@@ -81,12 +81,13 @@ class WindowOdometry:
         bias = bias_of(start.gyro_bias_rad_s, start.accel_bias_m_s2)
         return [prior], Guess(start.T_map_body, start.velocity_map_m_s, bias)
 
-    def step(self, k: int, before: Guess, last_motion: Array, vo_scale: float) -> Step:
+    def step(self, k: int, before: Guess, T_map_earlier: Array | None, vo_scale: float) -> Step:
         """See Odometry."""
         edge = self._edges[k]
         assert edge is not None and self._newest is not None
         T = nearest_rigid(before.T_map_body @ edge.T_previous_body)
-        named: dict[Label, gtsam.NonlinearFactor] = {("edge", k): self._edge_factor(edge, vo_scale)}
+        covariance = self.covariance(edge, vo_scale)
+        named: dict[Label, gtsam.NonlinearFactor] = {("edge", k): self._edge_factor(edge, covariance)}
         if k in self._tilts:
             named["tilt", k] = self._tilt_factor(self._tilts[k])
         rest_from, still = self._rest_from[k], list[gtsam.NonlinearFactor]()
@@ -96,13 +97,13 @@ class WindowOdometry:
             still.append(on_floor(k, float(self._start.T_map_body[2, 3]), self._config.floor_sigma_m))
         note = self._newest.note if k == self._newest.id else ""
         guess = Guess(T, before.velocity_map_m_s, before.bias)
-        return Step(still, guess, *self._variances(edge, vo_scale), note=note, named=named)
+        return Step(still, guess, *_variances(covariance), note=note, named=named)
 
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
         """Return older keyframes whose edge changed with the newest one, with its variances in rad^2 and m^2."""
         assert self._newest is not None
         older = [edge for edge in self._newest.edges if edge.to_id != self._newest.id]
-        return [(edge.to_id, *self._variances(edge, vo_scale)) for edge in older]
+        return [(edge.to_id, *_variances(self.covariance(edge, vo_scale))) for edge in older]
 
     def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         """See Odometry."""
@@ -110,7 +111,7 @@ class WindowOdometry:
         out: dict[Label, gtsam.NonlinearFactor] = {}
         for edge in self._newest.edges:
             if edge.to_id != self._newest.id:
-                out["edge", edge.to_id] = self._edge_factor(edge, vo_scale)
+                out["edge", edge.to_id] = self._edge_factor(edge, self.covariance(edge, vo_scale))
         for tilt in self._newest.tilts:
             out["tilt", tilt.id] = self._tilt_factor(tilt)
         return out
@@ -136,16 +137,17 @@ class WindowOdometry:
         floor_rad = np.deg2rad(config.window_floor_deg)
         return inflated(edge.covariance, vo_scale * config.window_inflation, floor_rad, config.window_floor_m)
 
-    def _variances(self, edge: EdgeRecord, vo_scale: float) -> tuple[float, float]:
-        covariance = self.covariance(edge, vo_scale)
-        return float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0
-
-    def _edge_factor(self, edge: EdgeRecord, vo_scale: float) -> gtsam.NonlinearFactor:
+    def _edge_factor(self, edge: EdgeRecord, covariance: Array) -> gtsam.NonlinearFactor:
         config = self._config
-        model = huber(gaussian(self.covariance(edge, vo_scale), config.covariance_ratio_max), config.huber_k)
+        model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
         return pose_factor(X(edge.to_id - 1), X(edge.to_id), edge.T_previous_body, model)
 
     def _tilt_factor(self, tilt: TiltRecord) -> gtsam.NonlinearFactor:
         sigma_rad = float(np.hypot(tilt.sigma_rad, np.deg2rad(self._config.tilt_floor_deg)))
         model = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad)
         return gtsam.AttitudeFactorPose3(X(tilt.id), _UP, model, gtsam.Unit3(tilt.up_body))
+
+
+def _variances(covariance: Array) -> tuple[float, float]:
+    """Return the variances in rad^2 and m^2 per axis of an edge's covariance [6, 6]."""
+    return float(np.trace(covariance[:3, :3])) / 3.0, float(np.trace(covariance[3:, 3:])) / 3.0

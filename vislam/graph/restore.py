@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from vislam.config import GraphConfig
 from vislam.errors import DataError
-from vislam.factors.journal import KeyframeRecord, Record, StartRecord, keyframe_record, loop_record
+from vislam.factors.journal import KeyframeRecord, LoopRecord, Record, StartRecord, keyframe_records, loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.joining import weak_link
 from vislam.memory import GraphMemory, LoopPlace, OfferedLoop
@@ -28,8 +28,8 @@ def restored_journal(
     journal: list[Record] = [start]
     loops = iter(memory.loops)
     loop = next(loops, None)
-    for k, packet in enumerate(memory.packets):
-        record = keyframe_record(packet, keyframes[-1] if keyframes else None)
+    for k, measured in enumerate(keyframe_records(memory.packets)):
+        record = measured
         if record.begins_piece:  # tied to the one before as the map has them
             before, now = memory.T_map_body[k - 1 : k + 1]
             record = weak_link(record, before, before, now, has_gravity, config)
@@ -39,8 +39,9 @@ def restored_journal(
         keyframes.append(record)
         journal += [record, memory.windows[k]] if is_tight else [record]
         while loop is not None and loop.offered_with <= k:
-            if _was_usable(loop, k):
-                journal.append(loop_record(loop.edge, k))
+            taken = _as_taken(loop, k)
+            if taken is not None:
+                journal.append(taken)
             loop = next(loops, None)
     if loop is not None:
         raise DataError(f"loop {loop.edge.id} was offered with keyframe {loop.offered_with} of {count}")
@@ -68,12 +69,11 @@ def _check_window(memory: GraphMemory, k: int) -> None:
         raise DataError(f"the window's record of keyframe {k} has no edge that ends there")
 
 
-def _was_usable(loop: OfferedLoop, k: int) -> bool:
-    """Return whether the graph took a loop when it was offered; one of those that it kept must be."""
+def _as_taken(loop: OfferedLoop, k: int) -> LoopRecord | None:
+    """Return a loop as the graph took it when it was offered; None where it could not, which it never kept."""
     try:
-        loop_record(loop.edge, k)
+        return loop_record(loop.edge, k)
     except DataError:
         if loop.state.place is not LoopPlace.OUT:
             raise
-        return False
-    return True
+        return None
