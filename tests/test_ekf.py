@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, SimulatedVision, to_span
 
 from vislam.config import EkfConfig
-from vislam.ekf import Ekf, kernels, visual_motion
+from vislam.ekf import Correction, Ekf, kernels, visual_motion
 from vislam.ekf.measurements import chi_square_limit
 from vislam.ekf.visual_motion import relative_motion, shared_error, why_unusable
 from vislam.geometry import (
@@ -29,6 +30,7 @@ from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, 
 from vislam.relative_motion import camera_displacement, direction_residual, metric_residual
 
 LEVER = np.array([0.1, -0.05, 0.2])
+NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
 
 def random_pose(rng: np.random.Generator) -> Array:
@@ -550,6 +552,39 @@ def test_no_layout_of_numbers_is_compiled_for(scene: Scene) -> None:
     ekf.update_vo(replace(vo, T_keyframe_body=T, covariance=np.broadcast_to(covariance, (6, 6))))
     assert ekf.counters["vo_accepted"] == accepted + 1
     assert known == (len(visual_motion.correct.signatures), len(kernels.update.signatures))
+
+
+def through_a_pipe(correction: Correction) -> Correction:
+    hears, says = Pipe(duplex=False)
+    with hears, says:
+        says.send(correction)
+        return hears.recv()
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_all_that_a_late_frame_tells_is_replayed_once(scene: Scene, at_rest: bool) -> None:
+    together, apart = scene.run(scene.ekf()), scene.run(scene.ekf())
+    vo = replace(scene.motions[-2], t_ns=scene.stamps[-2] + 1)
+    correction = Correction(vo.t_ns, vo, NOTHING_SEEN, at_rest, not at_rest, 77)
+    before = together.counters["rewinds"]
+    said = through_a_pipe(correction).apply(together)
+    assert together.counters["rewinds"] == before + 1
+    answer = apart.update_vo(vo)
+    apart.update_zero_velocity(vo.t_ns) if at_rest else apart.update_nonholonomic(vo.t_ns)
+    apart.add_keyframe(77, vo.t_ns)
+    assert apart.counters["rewinds"] == before + 3
+    assert said == answer and said.accepted
+    assert_same(together.state(), apart.state())
+
+
+@pytest.mark.parametrize("T", [None, np.eye(4), np.full((3, 2), np.nan)])
+def test_a_correction_travels_as_it_is(T: Array | None) -> None:
+    rng = np.random.default_rng(2)
+    seen = Observations(np.arange(3), rng.normal(size=(3, 2)), depth_m=np.ones(3))
+    vo = VoMeasurement(5, 2, T, rng.normal(size=(6, 6)).T, False, Tracking.DEGRADED, 7)
+    for observations in (seen, NOTHING_SEEN):
+        correction = Correction(6, vo, observations, True, False, None, shows_scale=False)
+        np.testing.assert_equal(asdict(through_a_pipe(correction)), asdict(correction))
 
 
 def test_too_late_and_too_early() -> None:

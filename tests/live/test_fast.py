@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
 from itertools import pairwise
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from vislam.frontend.result import lost_motion
 from vislam.geometry import se3_exp, transform
 from vislam.hw.health import Health
 from vislam.live.fast import FastPath
+from vislam.live.fast_process import Messages
 from vislam.live.messages import CameraHealth, MapMoved, ToFast
 from vislam.live.published_pose import PublishedPose
 from vislam.messages import ImuSample
@@ -197,6 +200,26 @@ def test_a_cart_that_stands_while_the_camera_is_away_does_not_drift() -> None:
     assert np.linalg.norm(poses[-1].T_odom_base[:3, 3]) < 0.1
     assert Health.AT_REST in poses[-1].health
     assert Health.INVALID not in poses[-1].health
+
+
+def test_messages_are_taken_one_at_a_time_until_their_sender_ends() -> None:
+    """A sample waits for one at most; a process that was killed in the middle of one does no harm."""
+    (hears_a, says_a), (hears_b, says_b) = Pipe(duplex=False), Pipe(duplex=False)
+    messages, taken = Messages([hears_a, hears_b]), []
+    messages.take(taken.append)
+    assert taken == []
+    for number in (1, 2):
+        says_a.send(number)
+    says_b.send(3)
+    says_b.close()
+    for expected in ([1, 3], [1, 3, 2], [1, 3, 2]):
+        messages.take(taken.append)
+        assert taken == expected
+    os.write(says_a.fileno(), b"\0\0\0\7half")
+    says_a.close()
+    messages.take(taken.append)
+    messages.take(taken.append)
+    assert taken == [1, 3, 2]
 
 
 def test_the_fast_process_loads_no_heavy_package() -> None:

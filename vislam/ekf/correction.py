@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from vislam.ekf.filter import Ekf
-from vislam.messages import Observations, VoMeasurement
+from vislam.messages import Observations, Tracking, VoMeasurement
 
 if TYPE_CHECKING:
     from vislam.ekf.filter import UpdateResult
@@ -25,19 +29,40 @@ class Correction:
     keyframe_id: int | None  # None: no keyframe
     shows_scale: bool = True  # False: one camera, and motion too uniform; of no use to a loose filter
 
+    def __reduce__(self) -> tuple[Callable[..., Correction], tuple[Any, ...]]:
+        """Travel as plain numbers: dataclasses and arrays by themselves take a third of what the filter then takes."""
+        vo = self.vo
+        T = None if vo.T_keyframe_body is None else vo.T_keyframe_body.tolist()
+        motion = (vo.t_ns, vo.keyframe_id, T, vo.covariance.tolist(), vo.has_scale, vo.tracking.value, vo.inliers)
+        seen = self.observations if len(self.observations.track_ids) else None
+        others = (self.at_rest, self.on_wheels, self.keyframe_id, self.shows_scale)
+        return _correction, (self.t_ns, motion, seen, *others)
+
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
         """Give everything to a filter; return what it said to the motion."""
-        if isinstance(ekf, Ekf):
-            answer = ekf.update_vision(self.vo, self.observations)
-        else:
-            answer = ekf.update_vision(self.vo, self.observations, self.shows_scale)
-        if self.at_rest:
-            ekf.update_zero_velocity(self.t_ns)
-        elif self.on_wheels and isinstance(ekf, Ekf):
-            ekf.update_nonholonomic(self.t_ns)
-        if self.keyframe_id is not None:
-            ekf.add_keyframe(self.keyframe_id, self.t_ns)
-        return answer
+        with ekf.replayed_once() if isinstance(ekf, Ekf) else nullcontext():
+            if isinstance(ekf, Ekf):
+                answer = ekf.update_vision(self.vo, self.observations)
+            else:
+                answer = ekf.update_vision(self.vo, self.observations, self.shows_scale)
+            if self.at_rest:
+                ekf.update_zero_velocity(self.t_ns)
+            elif self.on_wheels and isinstance(ekf, Ekf):
+                ekf.update_nonholonomic(self.t_ns)
+            if self.keyframe_id is not None:
+                ekf.add_keyframe(self.keyframe_id, self.t_ns)
+            return answer
+
+
+def _correction(t_ns: int, motion: tuple[Any, ...], seen: Observations | None, *others: Any) -> Correction:
+    """Return what `Correction.__reduce__` took apart."""
+    vo_t_ns, clone_id, T, covariance, has_scale, tracking, inliers = motion
+    T_keyframe_body = None if T is None else np.array(T, dtype=np.float64)
+    covariance = np.array(covariance, dtype=np.float64)
+    vo = VoMeasurement(vo_t_ns, clone_id, T_keyframe_body, covariance, has_scale, Tracking(tracking), inliers)
+    if seen is None:
+        seen = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+    return Correction(t_ns, vo, seen, *others)
 
 
 @dataclass(frozen=True, slots=True)

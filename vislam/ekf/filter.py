@@ -15,6 +15,8 @@ depends only on the set of measurements, not on when they came.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,6 +80,7 @@ class Ekf:
         self._t_ns = 0
         self._applied = 0
         self._ledger = Ledger()
+        self._stops_at_event = False  # see `replayed_once`
         self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *OUTCOMES), 0)
         self._nis: dict[str, tuple[int, float, int]] = {}  # of events that the history has forgotten
 
@@ -104,6 +107,13 @@ class Ekf:
     def dead_reckoning_s(self) -> float:
         """Seconds since visual odometry last corrected the state, or since `initialise`; infinite before."""
         return (self._t_ns - self._ledger.last_vo_t_ns) / _NS if self.initialised else float("inf")
+
+    @property
+    def position_variance_m2(self) -> float:
+        """Of the three axes together, as `state` has it."""
+        x, P = self._x, self._P
+        far = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+        return float(P[3, 3] + P[4, 4] + P[5, 5] + self._config.scale_sigma**2 * far)
 
     def initialise(self, state: NavState, vo: VoMeasurement | None = None) -> None:
         """Set the state, at any time, and run it through the samples that are already here. Forgets the past.
@@ -166,6 +176,16 @@ class Ekf:
         self._t_ns = sample.t_ns
         if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
             self._take_checkpoint()
+
+    @contextmanager
+    def replayed_once(self) -> Iterator[None]:
+        """Inside, go no farther than each measurement; what came after them is replayed at the end, once for all."""
+        self._stops_at_event = True
+        try:
+            yield
+        finally:
+            self._stops_at_event = False
+            self._run()
 
     def add_keyframe(self, keyframe_id: int, t_ns: int) -> UpdateResult:
         """Clone the pose at `t_ns`: visual motions at later times may refer to this keyframe."""
@@ -259,13 +279,13 @@ class Ekf:
         if event.t_ns < self._t_ns or number < self._applied:
             self._counts["rewinds"] += 1
             self._restore(history.rewind(number, event.t_ns))
-        self._run()
+        self._run(event.t_ns if self._stops_at_event else None)
         return UpdateResult(event.accepted, event.nis, event.reason)
 
-    def _run(self) -> None:
-        """Go on from the present state through every sample and event that is here."""
+    def _run(self, until_ns: int | None = None) -> None:
+        """Go on from the present state through every sample and event that is here, or until a time."""
         history = self._history
-        newest = self._series.newest_t_ns
+        newest = self._series.newest_t_ns if until_ns is None else until_ns
         if history is None:
             return
         while (event := history.event(self._applied)) is not None and event.t_ns <= max(newest or 0, self._t_ns):

@@ -14,6 +14,8 @@ from vislam.relative_motion import direction_noise, direction_residual, metric_r
 
 _FLOOR = 1e-10  # variance, rad^2 and m^2: keeps an identity motion with zero covariance from making S singular
 _OPPOSITE_SIGMAS = 3.0
+_NOT_RIGID = "the motion is not a finite rigid transform"
+_NOT_FINITE = "the covariance is not 6x6 finite numbers"
 
 
 def why_unusable(vo: VoMeasurement) -> str:
@@ -21,34 +23,33 @@ def why_unusable(vo: VoMeasurement) -> str:
     if vo.T_keyframe_body is None:
         return "no motion given"
     T, covariance = numbers(vo.T_keyframe_body), numbers(vo.covariance)
-    if T.shape != (4, 4) or not _is_rigid(T):
-        return "the motion is not a finite rigid transform"
-    if covariance.shape != (6, 6) or not _is_finite(covariance):
-        return "the covariance is not 6x6 finite numbers"
-    if not _is_semidefinite(covariance):
-        return "the covariance is not positive semidefinite"
-    return ""
+    if T.shape != (4, 4):
+        return _NOT_RIGID
+    if covariance.shape != (6, 6):
+        return _NOT_FINITE
+    is_rigid, is_finite, is_semidefinite = _check(T, covariance)
+    if not is_rigid:
+        return _NOT_RIGID
+    if not is_finite:
+        return _NOT_FINITE
+    return "" if is_semidefinite else "the covariance is not positive semidefinite"
 
 
 def numbers(values: Array) -> Array:
-    """Return an array as compiled code takes it; another layout would be compiled for, while the pose waits."""
-    return np.ascontiguousarray(values, dtype=np.float64)
+    """Return a copy as compiled code takes it; for another layout a compiler would run while the pose waits."""
+    return np.array(values, dtype=np.float64, order="C")
 
 
 @njit(cache=True, nogil=True)
-def _is_finite(A: Array) -> bool:
-    return bool(np.isfinite(A).all())
-
-
-@njit(cache=True, nogil=True)
-def _is_rigid(T: Array) -> bool:
-    """Whether T [4, 4] is finite, and its upper left part has the volume of a rotation."""
-    volume = (
+def _check(T: Array, covariance: Array) -> tuple[bool, bool, bool]:
+    """Return whether T [4, 4] is a motion, the covariance finite, and a covariance."""
+    volume = (  # a rotation has 1
         T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
         - T[0, 1] * (T[1, 0] * T[2, 2] - T[1, 2] * T[2, 0])
         + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
     )
-    return _is_finite(T) and abs(volume - 1.0) <= 1e-3
+    is_rigid = bool(np.isfinite(T).all()) and abs(volume - 1.0) <= 1e-3
+    return is_rigid, bool(np.isfinite(covariance).all()), _is_semidefinite(covariance)
 
 
 @njit(cache=True, nogil=True)

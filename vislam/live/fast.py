@@ -198,7 +198,7 @@ class FastPath:
             health |= Health.AT_REST
         if self._rejects:
             health |= Health.GATE_REJECT
-        drifted = np.trace(state.covariance[3:6, 3:6]) - self._settled_variance
+        drifted = self._ekf.position_variance_m2 - self._settled_variance
         if drifted > config.drift_sigma_m**2 or self._velocity_sigma(state) > config.velocity_sigma_m_s:
             health |= Health.INVALID
         return health
@@ -225,7 +225,7 @@ class FastPath:
     def _follow_vision(self, sees: bool, accepted: bool, rejects: bool) -> None:
         self._sees, self._rejects = sees, rejects
         if accepted and self._ekf.initialised:
-            self._settled_variance = float(np.trace(self._ekf.state().covariance[3:6, 3:6]))
+            self._settled_variance = self._ekf.position_variance_m2
 
     def _look_for_rest(self, t_ns: int) -> Hint | None:
         """Hold the drift while vision is away: by rest, or by wheels where `ekf.nonholonomic` says that there are any.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import select
 import socket
 import time
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from vislam.imu import AttitudeFilter, BiasMemory, ImuNoise
 from vislam.live.child import Life
 from vislam.live.fast import FastPath
 from vislam.live.latency import Latency
-from vislam.live.messages import Start
+from vislam.live.messages import Start, ToFast
 from vislam.live.published_pose import PublishedPose
 from vislam.live.publisher import PosePublisher
 from vislam.live.stream import SampleSender
@@ -63,7 +64,7 @@ def run(
         try:
             fast = FastPath(config, noise, T_body_camera, publisher.publish, memory)
             if life.ready():
-                _loop(life, fast, source, sender, inbox, latency)
+                _loop(life, fast, source, sender, Messages(inbox), latency)
             counters = {
                 **fast.counters,
                 **publisher.counters,
@@ -78,7 +79,7 @@ def run(
 
 
 def _loop(
-    life: Life, fast: FastPath, source: InertialSource, sender: SampleSender, inbox: list[Connection], latency: Latency
+    life: Life, fast: FastPath, source: InertialSource, sender: SampleSender, inbox: Messages, latency: Latency
 ) -> None:
     gc.collect()
     gc.freeze()
@@ -97,8 +98,7 @@ def _loop(
                 sender.send(hint)
         if not values:
             sender.flush()
-        for connection in list(inbox):
-            _take_message(connection, fast, inbox)
+        inbox.take(fast.correct)
         now_ns = time.monotonic_ns()
         if now_ns - published_ns > heartbeat_ns:
             published_ns = now_ns
@@ -109,20 +109,31 @@ def _loop(
             life.note(status=fast.status(), latency_ms=latency.summary_ms(), power_up=fast.told_of_power_up())
 
 
+class Messages:
+    """What the other processes say; looking for it costs the pose one call of the system."""
+
+    def __init__(self, connections: list[Connection]) -> None:
+        self._connections = {connection.fileno(): connection for connection in connections}
+        self._poll = select.poll()
+        for descriptor in self._connections:
+            self._poll.register(descriptor, select.POLLIN)
+
+    def take(self, correct: Callable[[ToFast], None]) -> None:
+        """Take one from each, for a sample must not wait for more than that; a process that has ended sends none."""
+        for descriptor, _ in self._poll.poll(0):
+            try:
+                message = self._connections[descriptor].recv()
+            except (EOFError, OSError):
+                self._poll.unregister(descriptor)
+                continue
+            correct(message)
+
+
 def power_up(fast: FastPath, source: InertialSource) -> None:
     """Look for the zero of a cart that stands; once it is there, the source takes the gyro's drift from it off."""
     zero = fast.power_up(source.temperature_c)
     if zero is not None and zero.temperature_c is not None:
         source.zeroed_at(zero.temperature_c, fast.bias_per_c)
-
-
-def _take_message(connection: Connection, fast: FastPath, inbox: list[Connection]) -> None:
-    """Take one, for a sample must not wait for more than that; a process that has ended sends none."""
-    try:
-        if connection.poll():
-            fast.correct(connection.recv())
-    except (EOFError, OSError):
-        inbox.remove(connection)
 
 
 def _take_priority(live: LiveConfig, life: Life) -> None:
