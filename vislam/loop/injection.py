@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vislam.errors import UsageError
 from vislam.geometry import invert, se3_exp
@@ -15,8 +16,7 @@ FIRST_ID = 1_000_000_000  # ids from here on are injected; those of the detector
 _TRIES = 50  # to find two different places
 _APART_M = 1.0  # two keyframes nearer than this, or than a tenth of what was seen of the world, may be one place
 _APART_SHARE = 0.1
-_TURN_SIGMA_RAD = 0.2  # of the pose that a false loop claims: two views that look alike
-_SHIFT_SIGMA_M = 0.3
+_SIGMAS = (0.2, 0.2, 0.2, 0.3, 0.3, 0.3)  # rad and m, of the pose that a false loop claims: two views that look alike
 
 
 class FalseLoops:
@@ -26,16 +26,17 @@ class FalseLoops:
     odometry between its members confirms it.
     """
 
-    def __init__(self, share: float, group: int, seed: int, turn_sigma_rad: float = _TURN_SIGMA_RAD) -> None:
+    def __init__(self, share: float, group: int, seed: int, sigmas: ArrayLike = _SIGMAS) -> None:
         """Make false loops `share` of all that are offered, in groups of so many; 1: each for itself.
 
+        `sigmas` [6], rotation first, in rad and m, are of the pose that a false loop claims.
         Raises UsageError for a share that is none, or a group of nothing.
         """
         if not 0.0 < share < 1.0 or group < 1:
             raise UsageError(f"loop.inject_share {share} must be below 1 and loop.inject_group {group} at least 1")
         self._per_true = share / (1.0 - share)
         self._group = group
-        self._turn_sigma_rad = turn_sigma_rad
+        self._sigmas = np.asarray(sigmas, dtype=np.float64)
         self._rng = np.random.default_rng([seed, 0xFA15E])
         self._poses: list[Array] = []
         self._open: list[tuple[int, int, Array, LoopEdge]] = []  # groups: first ends, motion between them, a model
@@ -54,8 +55,7 @@ class FalseLoops:
             place = self._other_place(newest)
             if place is None:
                 break
-            sigmas = np.repeat([self._turn_sigma_rad, _SHIFT_SIGMA_M], 3)
-            self._open.append((place, newest, se3_exp(self._rng.normal(size=6) * sigmas), true[-1]))
+            self._open.append((place, newest, se3_exp(self._rng.normal(size=6) * self._sigmas), true[-1]))
             self._owed -= self._group
         edges = [self._edge(newest, *group) for group in self._open]
         self._open = [group for group in self._open if newest - group[1] + 1 < self._group]
