@@ -10,6 +10,7 @@ import hashlib
 import io
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.errors import DataError, StorageError
-from vislam.loop.hamming import packed
+from vislam.hamming import packed
 from vislam.loop.tree import MAX_CHILDREN, descend, grow, similarity, walk_table, weigh
 
 _FORMAT = 1
@@ -180,7 +181,7 @@ def _read_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
             arrays = {key: file[key] for key in _DTYPES}
     except DataError:
         raise
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"vocabulary {name} cannot be read: {error}; train it again") from error
     for key, array in arrays.items():
         expected = np.dtype(_DTYPES[key])
