@@ -15,11 +15,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vislam.hamming import packed, popcount
 from vislam.messages import Array, ImageU8
 
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 Descriptors = NDArray[np.uint8]
+Words = NDArray[np.uint64]
 
 _BORDER_PX = 12  # corners nearer to the border lose half of their window as soon as the camera moves
 _ORB_BORDER_PX = 31  # ORB's patch; OpenCV drops keypoints nearer to the border
@@ -252,9 +254,7 @@ def match(
     """
     if len(descriptors_a) == 0 or len(descriptors_b) == 0:
         return _NO_INDICES.copy()
-    words_a = np.ascontiguousarray(descriptors_a).view(np.uint64)
-    words_b = np.ascontiguousarray(descriptors_b).view(np.uint64)
-    return np.asarray(_match(words_a, words_b, ratio, max_distance), dtype=np.int64)
+    return np.asarray(_match(packed(descriptors_a), packed(descriptors_b), ratio, max_distance), dtype=np.int64)
 
 
 def find_tags(image: ImageU8, family: str, min_side_px: float) -> tuple[Indices, Array]:
@@ -278,34 +278,34 @@ def find_tags(image: ImageU8, family: str, min_side_px: float) -> tuple[Indices,
 
 
 @njit(cache=True, nogil=True)
-def _popcount(x: np.uint64) -> int:
-    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return int((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
-
-
-@njit(cache=True, nogil=True)
-def _match(a: NDArray[np.uint64], b: NDArray[np.uint64], ratio: float, max_distance: int) -> Indices:
-    worst = 64 * a.shape[1] + 1
-    best_a = np.full(len(b), worst, dtype=np.int64)  # nearest in a of each in b
-    owner = np.full(len(b), -1, dtype=np.int64)
-    nearest = np.full(len(a), -1, dtype=np.int64)
-    passes = np.zeros(len(a), dtype=np.bool_)
+def _match(a: Words, b: Words, ratio: float, max_distance: int) -> Indices:
+    """Match packed descriptors [N, 4] and [M, 4]; loops without a branch, over columns, become vector instructions."""
+    worst = np.uint64(64 * b.shape[1] + 1)
+    b0, b1, b2, b3 = b[:, 0].copy(), b[:, 1].copy(), b[:, 2].copy(), b[:, 3].copy()
+    distances = np.empty(len(b), np.uint64)
+    nearest_b = np.full(len(b), worst, np.uint64)  # bits to the nearest in a of each in b
+    owner = np.full(len(b), -1, np.int64)
+    nearest = np.full(len(a), -1, np.int64)
+    passes = np.zeros(len(a), np.bool_)
     for i in range(len(a)):
-        first, second, j_first = worst, worst, -1
+        a0, a1, a2, a3 = a[i]
         for j in range(len(b)):
-            distance = 0
-            for k in range(a.shape[1]):
-                distance += _popcount(a[i, k] ^ b[j, k])
-            if distance < first:
-                first, second, j_first = distance, first, j
-            elif distance < second:
-                second = distance
-            if distance < best_a[j]:
-                best_a[j], owner[j] = distance, i
-        nearest[i] = j_first
-        passes[i] = first <= max_distance and first < ratio * second
+            distances[j] = (
+                popcount(a0 ^ b0[j]) + popcount(a1 ^ b1[j]) + popcount(a2 ^ b2[j]) + popcount(a3 ^ b3[j])
+            )  # fmt: skip
+        for j in range(len(b)):
+            nearer = distances[j] < nearest_b[j]
+            nearest_b[j] = distances[j] if nearer else nearest_b[j]
+            owner[j] = i if nearer else owner[j]
+        first = np.uint64(2**63)  # distance and index in one number: the least one is the first of the nearest
+        for j in range(len(b)):
+            first = min(first, (distances[j] << np.uint64(32)) | np.uint64(j))
+        nearest[i], bits = np.int64(first & np.uint64(2**32 - 1)), np.int64(first >> np.uint64(32))
+        distances[nearest[i]] = worst
+        second = worst
+        for j in range(len(b)):
+            second = min(second, distances[j])
+        passes[i] = bits <= max_distance and bits < ratio * np.int64(second)
     pairs = np.empty((len(a), 2), dtype=np.int64)
     count = 0
     for i in range(len(a)):

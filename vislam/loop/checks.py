@@ -7,9 +7,11 @@ out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from vislam.config import LoopConfig
 from vislam.geometry import invert, so3_log
@@ -55,20 +57,33 @@ def agree(one: Measured, other: Measured, poses: PoseTable, config: LoopConfig) 
     With scale, the poses must agree; without, the rotations, and the
     two rays must meet in front of both.
     """
-    ahead = invert(poses[one.from_id]) @ poses[other.from_id]
-    back = invert(poses[other.to_id]) @ poses[one.to_id]
-    predicted = ahead @ other.T_from_to @ back
-    if not _angle_rad(one.T_from_to, predicted) <= np.deg2rad(config.agreement_deg):
+    ends = poses[one.from_id], poses[one.to_id], poses[other.from_id], poses[other.to_id]
+    ahead, back, angle_rad, apart_m = _differences(one.T_from_to, other.T_from_to, *ends)
+    if not angle_rad <= math.radians(config.agreement_deg):
         return False
     if one.has_scale and other.has_scale:
-        depth = np.nanmax([_REFERENCE_DEPTH_M, one.median_depth_m, other.median_depth_m])
-        both = config.agreement_sigmas * np.hypot(one.sigma_m, other.sigma_m) + config.agreement_slack_m
-        limit = min(config.agreement_m * depth / _REFERENCE_DEPTH_M, both)
-        return bool(np.linalg.norm(one.T_from_to[:3, 3] - predicted[:3, 3]) <= limit)
+        depth = np.fmax(_REFERENCE_DEPTH_M, np.fmax(one.median_depth_m, other.median_depth_m))
+        both = config.agreement_sigmas * math.hypot(one.sigma_m, other.sigma_m) + config.agreement_slack_m
+        return bool(apart_m <= min(config.agreement_m * depth / _REFERENCE_DEPTH_M, both))
     if one.has_scale or other.has_scale:
         return False
     offset = ahead[:3, 3] + ahead[:3, :3] @ other.T_from_to[:3, :3] @ back[:3, 3]
     return _rays_meet(one.T_from_to[:3, 3], offset, ahead[:3, :3] @ other.T_from_to[:3, 3], config.agreement_deg)
+
+
+@njit(cache=True, nogil=True)
+def _differences(
+    T_one: Array, T_other: Array, T_map_from: Array, T_map_to: Array, T_map_other_from: Array, T_map_other_to: Array
+) -> tuple[Array, Array, float, float]:
+    """Return the ways between the first ends and between the last ones [4, 4], and by how many rad and m poses differ.
+
+    Compiled, because a keyframe asks some hundred times.
+    """
+    ahead = invert(T_map_from) @ T_map_other_from
+    back = invert(T_map_other_to) @ T_map_to
+    predicted = ahead @ T_other @ back
+    turn = so3_log(np.ascontiguousarray(T_one[:3, :3].T) @ np.ascontiguousarray(predicted[:3, :3]))
+    return ahead, back, float(np.linalg.norm(turn)), float(np.linalg.norm(T_one[:3, 3] - predicted[:3, 3]))
 
 
 def _rays_meet(direction: Array, origin: Array, other_direction: Array, limit_deg: float) -> bool:

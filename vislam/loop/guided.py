@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from vislam.geometry import invert
-from vislam.loop.hamming import distance, packed
+from vislam.hamming import distance, packed
 from vislam.loop.view import View
 from vislam.messages import Array
 
@@ -23,14 +23,14 @@ def _search(
     nearest = np.full(len(points), -1, np.int64)
     owner = np.full(len(xy_other), -1, np.int64)
     owner_distance = np.full(len(xy_other), 257, np.int64)
-    R, t = np.ascontiguousarray(T_other_this[:3, :3]), T_other_this[:3, 3]
+    T = T_other_this
     for i in range(len(points)):
-        if not np.isfinite(points[i, 2]):
+        px, py, pz = points[i]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if not z > 0.0:  # behind the other view, or NaN: no point
             continue
-        p = R @ points[i] + t
-        if p[2] <= 0.0:
-            continue
-        x, y = p[0] / p[2], p[1] / p[2]
+        x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / z
+        y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
         best = max_distance + 1
         for s in range(np.searchsorted(x_sorted, x - radius), len(order)):
             if x_sorted[s] > x + radius:
@@ -54,8 +54,7 @@ def _search(
 
 
 def _one_way(this: View, other: View, T_other_this: Array, radius: float, max_distance: int) -> Pairs:
-    order = np.argsort(other.xy[:, 0], kind="stable")
-    x_sorted = other.xy[order, 0].astype(np.float64)
+    order, x_sorted = other.by_x
     return np.asarray(
         _search(
             this.points_or_nan(), packed(this.descriptors), T_other_this, order, x_sorted, other.xy,
@@ -72,5 +71,6 @@ def match_guided(a: View, b: View, T_a_b: Array, radius: float, max_distance: in
     """
     forward = _one_way(a, b, invert(T_a_b), radius, max_distance)
     reverse = _one_way(b, a, T_a_b, radius, max_distance)[:, ::-1]
-    free = ~np.isin(reverse[:, 0], forward[:, 0]) & ~np.isin(reverse[:, 1], forward[:, 1])
-    return np.concatenate([forward, reverse[free]])
+    free_a, free_b = np.ones(len(a.xy), np.bool_), np.ones(len(b.xy), np.bool_)
+    free_a[forward[:, 0]], free_b[forward[:, 1]] = False, False
+    return np.concatenate([forward, reverse[free_a[reverse[:, 0]] & free_b[reverse[:, 1]]]])

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.loop.hamming import prefetch
+from vislam.hamming import prefetch
 from vislam.loop.vocabulary import BagOfWords
 
 Int32s = NDArray[np.int32]

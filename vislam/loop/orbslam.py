@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from vislam.errors import DataError
-from vislam.loop.hamming import DESCRIPTOR_BYTES
+from vislam.hamming import DESCRIPTOR_BYTES
 from vislam.loop.vocabulary import Vocabulary
 
 _MAX_FILE_BYTES = 2**30  # ORBvoc.txt has 145 MB

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.loop.hamming import distance, popcount, prefetch
+from vislam.hamming import distance, popcount, prefetch
 
 Packed = NDArray[np.uint64]
 Ints = NDArray[np.int64]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.errors import DataError
 from vislam.geometry import invert
-from vislam.loop.hamming import packed
+from vislam.hamming import packed
 from vislam.messages import Array, Keyframe
 
 
@@ -34,10 +34,16 @@ class View:
             return np.zeros(len(self.xy), dtype=np.bool_)
         return np.isfinite(self.points_cam_m[:, 2])
 
-    @property
+    @cached_property
     def has_points(self) -> bool:
         """Whether any feature has a point."""
         return bool(np.any(self.known))
+
+    @cached_property
+    def by_x(self) -> tuple[NDArray[np.int64], Array]:
+        """The features [N] from left to right, and their x, for searches."""
+        order = np.argsort(self.xy[:, 0], kind="stable")
+        return order, self.xy[order, 0].astype(np.float64)
 
     def points_or_nan(self) -> Array:
         """Return the points [N, 3] in cam0 as float64, NaN where unknown."""

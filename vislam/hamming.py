@@ -1,4 +1,4 @@
-"""Hamming distances between 256-bit descriptors, and waiting less for memory, for the compiled kernels of this room."""
+"""Hamming distances between 256-bit descriptors, and waiting less for memory."""
 
 from __future__ import annotations
 
