@@ -10,7 +10,7 @@ from vislam.config import Config
 from vislam.errors import DataError, UsageError
 from vislam.memory import SlamMemory
 from vislam.recording import Recording
-from vislam.run import imu_noise, map_of
+from vislam.run import check_fits, imu_noise, map_of
 from vislam.runfolder import MapChoice
 from vislam.session import Session, has_begun, recall
 
@@ -50,7 +50,7 @@ def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None
         memory = recall(stored)
         if memory is None:
             return None
-        map_of(stored, recording, config, imu_noise(config.imu, recording.imu_noise))
+        check_fits(stored, recording, config, imu_noise(config.imu, recording.imu_noise))
     finally:
         stored.close()
     if memory.front.t_ns >= time.monotonic_ns():

@@ -4,7 +4,7 @@
 what the viewer is shown.
 """
 
-from vislam.run.begin import begun, execute, map_of, resume
+from vislam.run.begin import begun, check_fits, execute, map_of, resume
 from vislam.run.drive import Progress, Run, imu_noise
 
-__all__ = ["Progress", "Run", "begun", "execute", "imu_noise", "map_of", "resume"]
+__all__ = ["Progress", "Run", "begun", "check_fits", "execute", "imu_noise", "map_of", "resume"]

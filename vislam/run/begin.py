@@ -19,6 +19,12 @@ from vislam.run.drive import Progress, Run, imu_noise
 from vislam.runfolder import MapChoice, storage, write_setup
 from vislam.session import Session, SessionWriter, has_begun, recall
 
+# settings (map.*) that decide what a keyframe's cloud is; what is made of clouds may be set otherwise in every run
+_SHAPING = (
+    "min_range_m", "max_range_m", "pixel_step", "edge_ratio", "edge_px", "speckle_pixels", "stereo_scale",
+    "stereo_disparity_sigma_px", "stereo_max_range_m", "stereo_max_sigma_m", "mono_depth",
+)  # fmt: skip
+
 
 def execute(
     recording: Recording,
@@ -93,7 +99,7 @@ def begun(
     try:
         memory = map_of(stored, recording, config, noise, base.localize_only)
         write_setup(out, config, source, command, base)
-        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only)
+        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only, bool(memory.scans))
     finally:
         stored.close()
     run = make(session)
@@ -112,6 +118,19 @@ def map_of(
 
     With `is_held` it is not to change.
     """
+    check_fits(stored, recording, config, noise)
+    memory = recall(stored)
+    if memory is None:
+        raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
+    memory = replace(memory, held=len(memory.graph.packets) if is_held else 0)
+    was, now = (stored.info().get("config") or {}).get("map") or {}, json.loads(json.dumps(asdict(config.map)))
+    if any(was.get(name) != now[name] for name in _SHAPING):
+        return replace(memory, scans={})
+    return memory
+
+
+def check_fits(stored: Session, recording: Recording, config: Config, noise: ImuNoise | None) -> None:
+    """Raise UsageError when a recording, with these settings, cannot go on in the map of a session."""
     info = stored.info()
     settings, sensors = info.get("config") or {}, json.loads(json.dumps(rig_data(recording.rig)))
     if settings.get("graph", {}).get("coupling") != "tight" or config.graph.coupling != "tight":
@@ -120,10 +139,3 @@ def map_of(
         raise UsageError(f"{stored.path} was made with other cameras, or another calibration, than {recording.name}")
     if (info.get("imu_noise") is None) != (noise is None):
         raise UsageError(f"{stored.path} and {recording.name} must both have an IMU, or both none")
-    memory = recall(stored)
-    if memory is None:
-        raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
-    memory = replace(memory, held=len(memory.graph.packets) if is_held else 0)
-    if settings.get("map") != json.loads(json.dumps(asdict(config.map))):
-        return replace(memory, scans={})  # of another shape
-    return memory

@@ -79,10 +79,12 @@ class SessionWriter:
 
     @classmethod
     def in_map(
-        cls, path: Path, base: Session, info: dict[str, Any], noise: ImuNoise | None, localize_only: bool
-    ) -> SessionWriter:
+        cls, path: Path, base: Session, info: dict[str, Any], noise: ImuNoise | None, localize_only: bool,
+        with_scans: bool,
+    ) -> SessionWriter:  # fmt: skip
         """Create the file of a run that begins in the map of another session, of which it holds a copy.
 
+        Without `with_scans` it holds no clouds of it: those of another shape could not be read with its own settings.
         Raises StorageError when it cannot be written.
         """
         part = path.with_name(path.name + ".part")  # the file appears whole or not at all
@@ -92,7 +94,8 @@ class SessionWriter:
             writer._db = sqlite3.connect(part, isolation_level=None)
             base.copy_to(writer._db)
             with writer._transaction():
-                for table in ("frames", "candidates", "retrieved"):  # of another recording
+                foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans",)))
+                for table in foreign:
                     writer._db.execute(f"DELETE FROM {table}")
                 writer._db.execute("DELETE FROM states WHERE whose = 'filter'")
                 writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2')")
