@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from vislam.config import EkfConfig
-from vislam.ekf import Ekf, kernels
+from vislam.ekf import Correction, Ekf, kernels
 from vislam.ekf.measurements import on_wheels
-from vislam.geometry import so3_exp, transform
-from vislam.imu import ImuNoise
-from vislam.messages import Array, ImuSample, NavState
+from vislam.geometry import invert, so3_exp, transform
+from vislam.imu import ImuNoise, SeenNoise
+from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 
 NOISE = ImuNoise(5e-4, 6e-3, 3e-5, 4e-4, 200.0)
 GRAVITY_M_S2 = 9.81
@@ -127,3 +128,50 @@ def test_late_wheels_are_the_same_as_in_time() -> None:
         states.append(ekf.state())
     assert states[0].T_world_body == pytest.approx(states[1].T_world_body, abs=1e-12)
     assert states[0].covariance == pytest.approx(states[1].covariance, abs=1e-12)
+
+
+def test_noise_that_is_told_late_counts_from_when_it_began() -> None:
+    states = []
+    for late in (False, True):
+        ekf = Ekf(CART, NOISE, GRAVITY_M_S2)
+        T, velocity, rate, force = cart(0.0)
+        ekf.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
+        for k in range(201):
+            ekf.predict(ImuSample(k * 5_000_000, rate, force))
+            if k == (160 if late else 60):
+                ekf.follow_noise(60 * 5_000_000, 3.0, 20.0)
+            if k == 180:
+                ekf.follow_noise(180 * 5_000_000, 1.0, 1.0)
+        assert ekf.counters["noise_changes"] == 2
+        states.append(ekf)
+    told, again = states[0].state(), states[1].state()
+    assert told.covariance == pytest.approx(again.covariance, rel=1e-9, abs=1e-15)
+    assert told.T_world_body == pytest.approx(again.T_world_body, abs=1e-12)
+    calm = Ekf(CART, NOISE, GRAVITY_M_S2)
+    calm.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
+    for k in range(201):
+        calm.predict(ImuSample(k * 5_000_000, rate, force))
+    at = [60 * 5_000_000, 180 * 5_000_000]
+    (before, after), (plain, calmer) = ([ekf.state_at(t) for t in at] for ekf in (states[1], calm))
+    assert before is not None and after is not None and plain is not None and calmer is not None
+    assert before.covariance == pytest.approx(plain.covariance, rel=1e-9, abs=1e-15)
+    grown = np.diag(after.covariance - before.covariance) - np.diag(calmer.covariance - plain.covariance)
+    assert grown[6] == pytest.approx(0.6 * NOISE.accel_noise_density**2 * (20.0**2 - 1.0), rel=0.05)
+    assert grown[2] == pytest.approx(0.6 * NOISE.gyro_noise_density**2 * (3.0**2 - 1.0), rel=0.05)
+
+
+def test_noise_that_is_no_number_is_refused() -> None:
+    ekf, _ = drive(CART, 1, 0.5)
+    for gyro, accel in ((np.nan, 1.0), (1.0, 0.0), (-1.0, 1.0)):
+        assert not ekf.follow_noise(ekf.state().t_ns, gyro, accel).accepted
+    assert ekf.counters["noise_invalid"] == 3 and ekf.counters["noise_changes"] == 0
+
+
+def test_a_correction_takes_the_noise_along_to_another_process() -> None:
+    vo = VoMeasurement(60 * 5_000_000, 0, invert(cart(0.0)[0]) @ cart(0.3)[0], np.eye(6) * 1e-4, True, Tracking.OK, 50)
+    nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+    told = Correction(vo.t_ns, vo, nothing, False, False, None, noise=SeenNoise(20 * 5_000_000, 1.5, 7.6))
+    ekf = drive(CART, 1, 0.5)[0]
+    ekf.add_keyframe(0, 0)
+    answer = pickle.loads(pickle.dumps(told)).apply(ekf)  # noqa: S301
+    assert answer.accepted and ekf.counters["noise_changes"] == 1

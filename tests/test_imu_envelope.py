@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from inertial_world import NS, Motion
 
-from vislam.imu import ImuNoise, NoiseEnvelope
+from vislam.imu import ImuNoise, NoiseEnvelope, SeenNoise
 from vislam.messages import ImuSample
 
 SEED = 3
@@ -96,3 +96,18 @@ def test_a_standing_drone_confirms_its_data_sheet(data_root: Path) -> None:
     assert ratios is not None
     assert 0.5 < ratios.gyro_quiet < 1.5
     assert 0.5 < ratios.accel_quiet < 1.5
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 4.0])
+def test_the_newest_window_follows_a_ride_in_steps_and_never_goes_below_the_model(factor: float) -> None:
+    seen = NoiseEnvelope(TRUE)
+    levels, begins, newest = [], [], SeenNoise(0, 1.0, 1.0)
+    for sample in ride(replace(TRUE, gyro_noise_density=factor * 2e-3, accel_noise_density=factor * 3e-2)):
+        if seen.add(sample):
+            newest = seen.newest_over(TRUE, newest)
+            levels.append((newest.gyro, newest.accel))
+            begins.append(newest.t_ns)
+    assert begins == [round(k * 0.5 * NS) for k in range(len(levels))]
+    least, most = max(1.0, factor / 1.5), max(1.0, 1.5 * factor)
+    assert all(least <= level <= most for pair in levels for level in pair)
+    assert all(len(set(channel)) <= 2 for channel in zip(*levels, strict=True))

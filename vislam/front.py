@@ -12,7 +12,7 @@ from vislam.config import Config, EkfConfig
 from vislam.ekf import Correction, Ekf, Hint
 from vislam.ekf.filtering import Filtering
 from vislam.errors import TrackingLostError, UsageError
-from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend
+from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend, mode_for
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.initialisation import Initialisation, Initialiser
 from vislam.frontend.planar import PlanarFrontEnd
@@ -120,8 +120,7 @@ class Front:
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
                 config.frontend.track_sigma_px,
             )  # fmt: skip
-            ekf_config = _ekf_config(config, self.frontend.mode, rig)
-            self._filter = Filtering(ekf_config, noise, config.imu.gravity_m_s2, rig)
+            self._filter = Filtering(filter_config(config, rig), noise, config.imu.gravity_m_s2, rig)
             self.ekf_coupling = self._filter.coupling
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
@@ -188,8 +187,8 @@ class Front:
             self._mag = value
         elif self._has_imu and self._filter is not None and self._buffer.add(value):
             self._filter.ekf.predict(value)
-            if self.envelope.add(value) and self.initialisation is None:
-                self._follow_noise()
+            if self.envelope.add(value):
+                self._follow_noise(self._filter)
 
     def add_hint(self, hint: Hint) -> None:
         """Tell the filter what holds a body while the camera sees nothing."""
@@ -325,8 +324,15 @@ class Front:
             return None
         return self._filter.motion(self._last_frame_t_ns, t_ns)
 
-    def _follow_noise(self) -> None:
-        """Raise the noise model, until the first state is found, to what the quietest half second shows."""
+    def _follow_noise(self, filtering: Filtering) -> None:
+        """Raise the noise model, until the first state is found, to what the quietest half second shows.
+
+        From then on the filter hears of the newest half second, if it wants to.
+        """
+        if self.initialisation is not None:
+            assert self.noise is not None
+            filtering.hear(self.envelope, self.noise)
+            return
         self.noise = self.envelope.at_least_seen(self._config.imu.noise_tolerance)
         self._rest.trust(self.noise)
         self._initialiser.trust(self.noise)
@@ -474,8 +480,12 @@ class Front:
         return released
 
 
-def _ekf_config(config: Config, mode: str, rig: Rig) -> EkfConfig:
-    """Return the settings of the filter with what front end and camera say for it."""
+def filter_config(config: Config, rig: Rig) -> EkfConfig:
+    """Return the settings of the filter with what front end and camera say for it.
+
+    Raises UsageError for settings that contradict each other.
+    """
+    mode, planar = mode_for(config.frontend, rig), config.frontend.planar
     coupling = config.ekf.coupling
     if coupling == "auto":
         coupling = "tight" if mode == "mono" else "loose"
@@ -484,4 +494,7 @@ def _ekf_config(config: Config, mode: str, rig: Rig) -> EkfConfig:
     readout_s = config.ekf.tight_readout_s
     readout_s = config.frontend.readout_s if readout_s is None else readout_s
     scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
-    return replace(config.ekf, coupling=coupling, tight_readout_s=readout_s, scale_sigma=scale_sigma)
+    chosen = replace(config.ekf, coupling=coupling, tight_readout_s=readout_s, scale_sigma=scale_sigma)
+    if mode != "planar":
+        return chosen
+    return replace(chosen, imu_inflation=planar.imu_inflation, vo_inflation=planar.vo_inflation, follow_noise=True)

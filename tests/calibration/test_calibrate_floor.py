@@ -11,15 +11,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vislam.calibration import floor
 from vislam.calibration.floor import calibrate_floor, fit_floor
 from vislam.calibration.options import FloorOptions
 from vislam.camera import Rig
-from vislam.config import load
+from vislam.config import PlanarConfig, load
 from vislam.errors import DataError, UsageError
+from vislam.frontend.planar_floor import make_mount
 from vislam.imu import ImuNoise
-from vislam.messages import Frame, ImuSample
+from vislam.messages import Frame, ImuSample, MagSample
+from vislam.sim import open_world
 from vislam.trajectory import Trajectory
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "frontend"))
@@ -118,3 +121,56 @@ def test_what_cannot_be_determined_is_refused() -> None:
         fit_floor(curve, options())
     without = fit_floor(curve, options(distance_m=None, height_m=0.6))  # the tilt does not mind
     assert abs(without.tilt_deg - 18.0) < 0.3
+
+
+class CartRecording:
+    """The first drive of `sim:cart-drive` as a recording whose extrinsics are off by degrees; rendered once."""
+
+    def __init__(self) -> None:
+        self._world = open_world("cart-drive", image_width_px=320, camera_hz=10.0, exposure_s=0.0, duration_s=13.0)
+        self._values = list(self._world.events(int(self._world.truth().t_ns[0]) + 3_000_000_000))
+        T = self._world.rig.T_body_cams[0].copy()
+        self.mount = make_mount(PlanarConfig(height_m=0.6), T[:3, :3].copy())
+        T[:3, :3] = Rotation.from_euler("xyz", [1.5, -2.5, 0.0], degrees=True).as_matrix() @ T[:3, :3]
+        self.rig = replace(self._world.rig, T_body_cams=(T,))
+        self.name, self.problems, self.imu_noise = "cart", dict[str, int](), self._world.imu_noise
+        self.frame_count = sum(isinstance(value, Frame) for value in self._values)
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        yield from self._values
+
+    def truth(self) -> Trajectory:
+        return self._world.truth()
+
+    def distance_m(self, end_s: float) -> float:
+        """Return how far it is from where it rests at the start, as a tape would say."""
+        first, last = self._world.spline.at(np.array([3.0, end_s])).T_world_body
+        return float(np.linalg.norm((last - first)[:2, 3]))
+
+
+@pytest.fixture(scope="module")
+def simulated_cart() -> CartRecording:
+    return CartRecording()
+
+
+@pytest.mark.parametrize("end_s", [8.45, 9.45])  # when the last frame is taken
+def test_the_simulated_cart_is_calibrated_within_what_it_says(simulated_cart: CartRecording, end_s: float) -> None:
+    """Springs, a GY-85, a camera whose clock is 30 ms late, and extrinsics that are wrong by degrees."""
+    told = FloorOptions("cart", distance_m=simulated_cart.distance_m(end_s), duration_s=end_s + 0.08)
+    found, true = fit_floor(simulated_cart, told), simulated_cart.mount
+    print(
+        f"{told.distance_m:.2f} m: tilt {found.tilt_deg:.3f} +- {found.tilt_sigma_deg:.3f} ({true.tilt_deg:.3f}), roll "
+        f"{found.roll_deg:.3f} +- {found.roll_sigma_deg:.3f} ({true.roll_deg:.3f}), height {found.height_m:.4f} +- "
+        f"{found.height_sigma_m:.4f} m"
+    )
+    assert abs(found.tilt_deg - true.tilt_deg) < 2.5 * found.tilt_sigma_deg
+    assert abs(found.roll_deg - true.roll_deg) < 2.5 * found.roll_sigma_deg
+    assert abs(found.height_m - true.height_m) < 2.5 * found.height_sigma_m
+    assert found.tilt_sigma_deg < 0.15 and found.height_sigma_m < 0.009
+
+
+def test_a_part_of_its_drive_that_does_not_tell_is_refused(simulated_cart: CartRecording) -> None:
+    with pytest.raises(DataError, match=r"the way is .* camera heights long"):  # it still rests
+        fit_floor(simulated_cart, FloorOptions("cart", distance_m=3.0, duration_s=4.5))
+    with pytest.raises(DataError, match="ends turned by"):  # a corner
+        fit_floor(simulated_cart, FloorOptions("cart", distance_m=simulated_cart.distance_m(12.9)))

@@ -20,6 +20,7 @@ class EkfConfig:
     gap_accel_m_s2: float = 2.0  # the same for specific force
     imu_inflation: float = 10.0  # on the white-noise sigmas, for vibration; flying EuRoC: innovations fit at 10, not 4
     vo_inflation: float = 1.5  # on the sigmas of visual odometry: covariances from residuals miss model errors
+    follow_noise: bool = False  # white noise rises with what samples show, by half seconds; over a floor it always does
     vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
     scale_sigma: float = 0.0  # relative, of all metres of vision together: a baseline; over a floor its height joins it
     accumulated_sigma_m: float = 0.02  # fixed R of accumulated vision; 0.005 to 0.1 err alike, below this motions fail

@@ -29,7 +29,9 @@ class PlanarConfig:
     vibration_s: float = 3.0  # so long the gyro's word on tilt counts: springs bring a cart back, bias would not
     tilt_walk_deg: float = 0.01  # per root of a second, of the mean tilt: load and tyres
     heave_m: float = 0.002  # of the camera's height between two frames
-    stamp_jitter_s: float = 0.001  # of frames: what a webcam's driver leaves; in a turn 1 ms is 0.05 deg
+    imu_inflation: float = 1.0  # in place of `ekf.imu_inflation`: over a floor the filter goes by the noise it sees
+    vo_inflation: float = 1.0  # in place of `ekf.vo_inflation`: tilt, springs and stamps are in the covariance already
+    stamp_jitter_s: float = 0.002  # of frames, by a webcam over USB; in a turn 1 ms is 0.05 deg
     sigma_px: float = 0.3  # of a corner of the floor followed from the keyframe; residuals raise it
     max_distance_heights: float = 5.0  # of floor points: a pixel is worth d^2 / H; at 8, patches come out 0.2 % short
     correlation_m: float = 10.0  # way over which an error of height or tilt adds up: the size of a room

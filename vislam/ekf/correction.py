@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vislam.ekf.filter import Ekf
+from vislam.imu import SeenNoise
 from vislam.messages import Observations, Tracking, VoMeasurement
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ class Correction:
     on_wheels: bool  # of a cart that moves: its axle goes neither sideways nor up; loose filters only
     keyframe_id: int | None  # None: no keyframe
     shows_scale: bool = True  # False: one camera, and motion too uniform; of no use to a loose filter
+    noise: SeenNoise | None = None  # since when samples are noisier or calmer; loose filters only, None: as before
 
     def __reduce__(self) -> tuple[Callable[..., Correction], tuple[Any, ...]]:
         """Travel as plain numbers: dataclasses and arrays by themselves take a third of what the filter then takes."""
@@ -35,11 +37,15 @@ class Correction:
         T = None if vo.T_keyframe_body is None else vo.T_keyframe_body.tolist()
         motion = (vo.t_ns, vo.keyframe_id, T, vo.covariance.tolist(), vo.has_scale, vo.tracking.value, vo.inliers)
         seen = self.observations if len(self.observations.track_ids) else None
-        others = (self.at_rest, self.on_wheels, self.keyframe_id, self.shows_scale)
+        others = (self.at_rest, self.on_wheels, self.keyframe_id, self.shows_scale, self.noise)
         return _correction, (self.t_ns, motion, seen, *others)
 
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
         """Give everything to a filter; return what it said to the motion."""
+        if self.noise is not None and isinstance(
+            ekf, Ekf
+        ):  # before the frame, so it has to be replayed up to that first
+            ekf.follow_noise(self.noise.t_ns, self.noise.gyro, self.noise.accel)
         with ekf.replayed_once() if isinstance(ekf, Ekf) else nullcontext():
             if isinstance(ekf, Ekf):
                 answer = ekf.update_vision(self.vo, self.observations)

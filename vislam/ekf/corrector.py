@@ -49,6 +49,9 @@ class Corrector:
         """Apply an event to x [23] and P [21, 21] in place, write its outcome into it, and return the new ledger."""
         event.was_reset, event.accepted, event.nis, event.reason = False, False, float("nan"), ""
         event.degrees = 0
+        if event.kind is Kind.NOISE:
+            event.outcome, event.accepted = "noise_changes", True
+            return replace(ledger, noise=event.noise)
         if event.kind is Kind.KEYFRAME:
             event.outcome, event.accepted = "keyframes", True
             return self._begin_keyframe(event, x, P, ledger)

@@ -68,7 +68,8 @@ class Ekf:
         self._gravity = float(gravity_m_s2)
         white = config.imu_inflation * np.array([noise.gyro_noise_density, noise.accel_noise_density])
         walks = [noise.gyro_bias_walk, noise.accel_bias_walk]
-        self._sigmas = np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
+        self._told_sigmas = np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
+        self._sigmas = self._told_sigmas  # with the noise that goes on now, see `follow_noise`
         self._corrector = Corrector(config, noise, T_body_camera)
         self._checkpoint_ns = round(config.checkpoint_s * _NS)
         self._history_ns = round(config.history_s * _NS)
@@ -144,6 +145,7 @@ class Ekf:
         self._t_ns = state.t_ns
         self._applied = 0
         self._ledger = Ledger(last_vo_t_ns=state.t_ns, floor_z_m=float(x[2]))
+        self._sigmas = self._told_sigmas
         if vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo):
             self._place_keyframe(vo)
         self._series.extra[:] = np.nan
@@ -220,6 +222,12 @@ class Ekf:
         """
         return self._insert(Event(t_ns, Kind.NONHOLONOMIC))
 
+    def follow_noise(self, t_ns: int, gyro: float, accel: float) -> UpdateResult:
+        """Take it that white noise is so many times that of the settings from `t_ns` on: a ride shakes, a rest not."""
+        if not (np.isfinite([gyro, accel]).all() and min(gyro, accel) > 0.0):
+            return self._refuse("noise_invalid", "factors on noise must be finite and positive")
+        return self._insert(Event(t_ns, Kind.NOISE, noise=(gyro, accel)))
+
     def feed_back(
         self,
         gyro_bias: Array,
@@ -249,7 +257,7 @@ class Ekf:
         if checkpoint is None:
             return None
         x, P = checkpoint.x.copy(), checkpoint.P.copy()
-        self._integrate(x, P, checkpoint.t_ns, t_ns)
+        self._integrate(x, P, checkpoint.t_ns, t_ns, self._sigmas_in(checkpoint.ledger))
         return self._nav_state(t_ns, x, P)
 
     def pose_at(self, t_ns: int) -> Array | None:
@@ -302,17 +310,21 @@ class Ekf:
             if step_ns < t_ns:  # stop on a sample: stopping between two would change the arithmetic
                 step_ns = int(self._series.t_ns[np.searchsorted(self._series.t_ns, step_ns)])
                 step_ns = min(step_ns, t_ns)
-            self._integrate(self._x, self._P, self._t_ns, step_ns, keep=True)
+            self._integrate(self._x, self._P, self._t_ns, step_ns, self._sigmas, keep=True)
             self._t_ns = step_ns
             if self._history is not None and step_ns - self._history.checkpoints[-1].t_ns >= self._checkpoint_ns:
                 self._take_checkpoint()
 
-    def _integrate(self, x: Array, P: Array, t0_ns: int, t1_ns: int, keep: bool = False) -> None:
+    def _sigmas_in(self, ledger: Ledger) -> Array:
+        gyro, accel = ledger.noise
+        return self._told_sigmas * np.array([gyro, accel, 1.0, 1.0, 1.0, 1.0])
+
+    def _integrate(self, x: Array, P: Array, t0_ns: int, t1_ns: int, sigmas: Array, keep: bool = False) -> None:
         if t1_ns <= t0_ns:
             return
         piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
         track = np.empty((len(piece.t_ns), 10))
-        kernels.predict_run(x, P, piece.t_ns, piece.samples, piece.gaps_s, track, self._sigmas, self._gravity)
+        kernels.predict_run(x, P, piece.t_ns, piece.samples, piece.gaps_s, track, sigmas, self._gravity)
         if keep:
             keep_track(self._series, piece, track)
 
@@ -322,6 +334,8 @@ class Ekf:
             self._counts[event.outcome] -= 1
             self._counts["soft_resets"] -= event.was_reset
         self._ledger = self._corrector.apply(event, self._x, self._P, self._ledger, rate)
+        if event.kind is Kind.NOISE:
+            self._sigmas = self._sigmas_in(self._ledger)
         self._counts[event.outcome] += 1
         self._counts["soft_resets"] += event.was_reset
 
@@ -365,6 +379,7 @@ class Ekf:
         self._x[:] = checkpoint.x
         self._P[:] = checkpoint.P
         self._t_ns, self._applied, self._ledger = checkpoint.t_ns, checkpoint.applied, checkpoint.ledger
+        self._sigmas = self._sigmas_in(checkpoint.ledger)
 
     def _nav_state(self, t_ns: int, x: Array, P: Array) -> NavState:
         """Return a state with the error of scale that vision cannot see: it stretches the whole way from the origin.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from vislam.ekf import Ekf, make_ekf
 from vislam.ekf.correction import Correction
 from vislam.ekf.msckf import CameraCalibration, MsckfEkf
 from vislam.geometry import invert
-from vislam.imu import ImuBuffer, ImuNoise
+from vislam.imu import ImuBuffer, ImuNoise, NoiseEnvelope, SeenNoise
 from vislam.messages import Array, GraphUpdate, ImuSample, NavState, Observations, VoMeasurement
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
@@ -39,6 +40,9 @@ class Filtering:
         self.ekf: Ekf | MsckfEkf = self._make(noise=noise)
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._told: list[Correction] = []  # since somebody asked
+        self._start_ns = 0
+        self._noise_told = SeenNoise(0, 1.0, 1.0)
+        self._noise_news: SeenNoise | None = None  # what the filter is to be told
 
     @property
     def state(self) -> NavState | None:
@@ -47,6 +51,7 @@ class Filtering:
 
     def start(self, state: NavState, vo: VoMeasurement, noise: ImuNoise, buffer: ImuBuffer) -> None:
         """Start at a state in the past; another filter where the noise is not what this one was told at first."""
+        self._start_ns = state.t_ns
         newest_t_ns = buffer.newest_t_ns
         if noise != self._noise and newest_t_ns is not None:
             self.ekf = self._make(noise=noise)
@@ -58,6 +63,7 @@ class Filtering:
 
     def resume(self, state: NavState, vo: VoMeasurement, noise: ImuNoise, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""
+        self._start_ns = state.t_ns
         self.ekf = self._make(noise=noise)
         if isinstance(self.ekf, MsckfEkf) and camera is not None:
             found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
@@ -75,13 +81,22 @@ class Filtering:
             found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
         ])  # fmt: skip
 
+    def hear(self, envelope: NoiseEnvelope, noise: ImuNoise) -> None:
+        """Take the noise that the newest samples show, to tell the filter with the next frame if it is another one."""
+        if not self._config.follow_noise:
+            return
+        seen = envelope.newest_over(noise, self._noise_told)
+        if (seen.gyro, seen.accel) != (self._noise_told.gyro, self._noise_told.accel):
+            self._noise_told = self._noise_news = replace(seen, t_ns=max(seen.t_ns, self._start_ns))
+
     def see(
         self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,
         shows_scale: bool,
     ) -> None:  # fmt: skip
         """Take what was seen in a frame, and tell the filter what it is to know by now."""
         on_wheels = self._config.nonholonomic and not at_rest
-        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale))
+        news, self._noise_news = self._noise_news, None
+        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale, news))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
         while self._seen and self._seen[0].t_ns <= newest_ns:
             correction = self._seen.popleft()

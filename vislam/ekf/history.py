@@ -27,6 +27,8 @@ OUTCOMES = (  # every counter a measurement can end in, and what they cause
     "bias_accepted",
     "bias_gated",
     "bias_invalid",
+    "noise_changes",
+    "noise_invalid",
     "before_start",
     "too_late",
     "too_early",
@@ -43,6 +45,7 @@ class Kind(StrEnum):
     ZERO_VELOCITY = "zero_velocity"
     NONHOLONOMIC = "nonholonomic"
     BIAS = "bias"
+    NOISE = "noise"
 
 
 @dataclass(slots=True, eq=False)
@@ -54,6 +57,7 @@ class Event:
     keyframe_id: int = -1
     vo: VoMeasurement | None = None
     bias: Array | None = None  # [12] gyro, accel, and their sigmas
+    noise: tuple[float, float] = (1.0, 1.0)  # of gyro and accel from here on, over what the filter was made with
     outcome: str = ""  # the counter it stands in; "" while it waits for the IMU
     was_reset: bool = False
     accepted: bool = False
@@ -77,6 +81,7 @@ class Ledger:
     T_odom_keyframe: Array | None = None  # [4, 4] where accumulated vision has the keyframe
     T_odom_vo: Array | None = None  # [4, 4] where it had the body last, and when
     vo_t_ns: int = 0
+    noise: tuple[float, float] = (1.0, 1.0)  # white noise of gyro and accel over that of the settings
     floor_z_m: float = 0.0  # height of the body in `odom` at the start, where a floor keeps it
 
 

@@ -85,7 +85,9 @@ def failure(fit: Fit, candidates: int, course: Course, config: PlanarConfig) -> 
     if is_split or not course.knows_yaw:
         return ""
     # the prior pulls: what is left of a contradiction is the smaller, the weaker the floor is
-    sigma_rad = np.hypot(np.sqrt(fit.covariance[0, 0]), _LENS_YAW_RAD + course.yaw_sigma_rad)
+    jitter_rad = np.sqrt(2.0) * config.stamp_jitter_s * course.rate[0]  # of the stamps at both ends
+    gyro_rad = _LENS_YAW_RAD + course.yaw_sigma_rad
+    sigma_rad = float(np.sqrt(fit.covariance[0, 0] + gyro_rad**2 + jitter_rad**2))
     limit = max(config.yaw_gate_sigmas * sigma_rad, np.deg2rad(config.yaw_gate_deg))
     off = abs(float(fit.motion[0]) - course.yaw_rad)
     if off > limit:

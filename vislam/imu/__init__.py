@@ -3,7 +3,7 @@
 from vislam.imu.attitude import AttitudeFilter
 from vislam.imu.bias_memory import BiasMemory
 from vislam.imu.buffer import ImuBuffer
-from vislam.imu.envelope import NoiseEnvelope, NoiseRatios
+from vislam.imu.envelope import NoiseEnvelope, NoiseRatios, SeenNoise
 from vislam.imu.noise import ImuCalibration, ImuNoise, MagCalibration
 from vislam.imu.power_up import PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, preintegrate
@@ -24,6 +24,7 @@ __all__ = [
     "Preintegrated",
     "Refusal",
     "RestDetector",
+    "SeenNoise",
     "join",
     "power_up",
     "preintegrate",

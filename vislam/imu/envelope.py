@@ -10,6 +10,7 @@ from vislam.imu.noise import ImuNoise
 from vislam.messages import Array, ImuSample
 
 _WINDOW_S = 0.5  # long enough for 5 % accuracy at 100 Hz, short enough to fall between two movements
+_SLACK, _STEP = 1.25, 1.5  # of a level over the model that is chance, and between two levels
 _MIN_SAMPLES = 20  # in a window; fewer say too little
 
 
@@ -21,6 +22,15 @@ class NoiseRatios:
     accel_quiet: float
     gyro_typical: float
     accel_typical: float
+
+
+@dataclass(frozen=True, slots=True)
+class SeenNoise:
+    """White noise since a time, as a multiple of the model's."""
+
+    t_ns: int
+    gyro: float
+    accel: float
 
 
 class NoiseEnvelope:
@@ -38,7 +48,7 @@ class NoiseEnvelope:
         self._per_window = max(_MIN_SAMPLES, round(_WINDOW_S * noise.rate_hz))
         self._longest_step_ns = round(2.5e9 / noise.rate_hz)
         self._pending: list[Array] = []  # [6] each
-        self._last_t_ns = 0
+        self._last_t_ns = self._begin_ns = 0
         self._levels: list[tuple[float, float]] = []  # (gyro, accel) sigma of one sample, per window
 
     def add(self, sample: ImuSample) -> bool:
@@ -46,6 +56,8 @@ class NoiseEnvelope:
         if sample.t_ns - self._last_t_ns > self._longest_step_ns:
             self._pending = []
         self._last_t_ns = sample.t_ns
+        if not self._pending:
+            self._begin_ns = sample.t_ns
         self._pending.append(np.concatenate([sample.gyro_rad_s, sample.accel_m_s2]))
         if len(self._pending) == self._per_window:
             rms = np.sqrt(np.mean(np.diff(np.array(self._pending), n=2, axis=0) ** 2, axis=0) / 6.0)
@@ -64,6 +76,20 @@ class NoiseEnvelope:
         seen = np.array(self._levels) / np.maximum(model, np.finfo(float).tiny)
         quiet, typical = seen.min(axis=0), np.median(seen, axis=0)
         return NoiseRatios(float(quiet[0]), float(quiet[1]), float(typical[0]), float(typical[1]))
+
+    def newest_over(self, noise: ImuNoise, told: SeenNoise) -> SeenNoise:
+        """Return the noise of the newest window since its begin, over that of a model, and never below it.
+
+        It moves in steps of half as much again, and down by two of them or all the way, so that a level that hovers is
+        no news; `told` is what it was before. Raises IndexError before the first window.
+        """
+        root_rate = np.sqrt(noise.rate_hz)
+        model = np.array([noise.gyro_noise_density, noise.accel_noise_density]) * root_rate
+        over = np.array(self._levels[-1]) / np.maximum(model, np.finfo(float).tiny)
+        steps = np.maximum(np.ceil(np.log(np.maximum(over, 1.0) / _SLACK) / np.log(_STEP)), 0.0)
+        before = np.log([told.gyro, told.accel]) / np.log(_STEP)
+        gyro, accel = (_STEP ** np.where((steps > 0.5) & (np.abs(steps - before + 0.5) < 1.0), before, steps)).tolist()
+        return SeenNoise(self._begin_ns, gyro, accel)
 
     def at_least_seen(self, tolerance: float) -> ImuNoise:
         """Return the model, its densities raised to what the quietest window shows divided by `tolerance`.

@@ -19,7 +19,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.errors import HardwareError, StorageError, UsageError, VislamError
-from vislam.frontend import lasting_scale_sigma
+from vislam.front import filter_config
 from vislam.hw.source import InertialSource
 from vislam.imu import BiasMemory
 from vislam.live import back_process, bridge, fast_process, front_process, map_process
@@ -144,10 +144,7 @@ class LiveRun:
             frames_out, frames, keyframes_out, keyframes,
         ]  # fmt: skip
         rig = source.rig
-        scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
-        fast = replace(
-            config, live=replace(config.live, send_to=send_to), ekf=replace(config.ekf, scale_sigma=scale_sigma)
-        )
+        fast = replace(config, live=replace(config.live, send_to=send_to), ekf=filter_config(config, rig))
         return {
             **source.helpers(),
             **{role: body for role, (_, body) in bridges.items()},
