@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import select
 import socket
 import time
@@ -13,7 +12,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from vislam.config import Config, LiveConfig
+from vislam.config import Config
 from vislam.ekf.correction import Correction
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
@@ -22,6 +21,7 @@ from vislam.live.child import Life
 from vislam.live.fast import FastPath
 from vislam.live.latency import Latency
 from vislam.live.messages import Start, ToFast
+from vislam.live.priority import take_priority
 from vislam.live.published_pose import PublishedPose
 from vislam.live.publisher import PosePublisher
 from vislam.live.stream import SampleSender
@@ -55,7 +55,7 @@ def run(
         memory: gyro biases that earlier power-ups found.
     """
     warm_up(config, noise, T_body_camera)
-    _take_priority(config.live, life)
+    take_priority(config.live, life)
     publisher = PosePublisher(config.live.name, config.live.send_to, config.live.allow_remote)
     sender = SampleSender(samples)
     latency = Latency()
@@ -134,17 +134,6 @@ def power_up(fast: FastPath, source: InertialSource) -> None:
     zero = fast.power_up(source.temperature_c)
     if zero is not None and zero.temperature_c is not None:
         source.zeroed_at(zero.temperature_c, fast.bias_per_c)
-
-
-def _take_priority(live: LiveConfig, life: Life) -> None:
-    if live.realtime_priority <= 0:
-        return
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(live.realtime_priority))
-    except OSError as error:
-        life.note(
-            warning=f"no real-time priority for the pose ({error}); see docs/cart.md, or --live.realtime-priority 0"
-        )
 
 
 def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
