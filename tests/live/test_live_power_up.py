@@ -41,10 +41,12 @@ def standing(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
 class Cart:
     """A board on a bus, and the fast path that reads it, on a clock of their own."""
 
-    def __init__(self, driver: Gy85, clock: SteppedClock, memory: BiasMemory | None = None) -> None:
+    def __init__(
+        self, driver: Gy85, clock: SteppedClock, memory: BiasMemory | None = None, is_mag_calibrated: bool = True
+    ) -> None:
         self.poses: list[PublishedPose] = []
         self.refusals: list[str] = []
-        self.fast = FastPath(CONFIG, NOISE, np.eye(4), self.poses.append, memory)
+        self.fast = FastPath(CONFIG, NOISE, np.eye(4), self.poses.append, memory, is_mag_calibrated)
         self._driver, self._clock = driver, clock
 
     def run(self, duration_s: float) -> PublishedPose:
@@ -83,6 +85,12 @@ def test_a_cart_that_stands_has_an_attitude_before_vision_and_says_what_it_lacks
         assert told["temperature_c"] == pytest.approx(30.0, abs=0.2)
         known = np.isfinite(np.diag(unpack(pack(pose)).pose_covariance))
         assert known.tolist() == [False, False, False, True, True, False], "x, y, z and the heading are not known"
+
+
+def test_a_magnetometer_that_nobody_calibrated_says_nothing() -> None:
+    with cart(standing) as (driver, _, clock):
+        it = Cart(driver, clock, is_mag_calibrated=False)
+        assert it.run(3.5).health == BEFORE_VISION
 
 
 def test_a_cart_that_moves_is_refused_with_the_reason_until_it_stands() -> None:

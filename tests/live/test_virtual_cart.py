@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import uuid
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +147,16 @@ def test_sensors_without_a_camera_need_no_calibration_of_one() -> None:
         assert not source.has_camera and "camera" not in source.helpers()
         camera = source.cameras()()
         assert camera.read(0.0) is None and camera.health() == Health(0)
+
+
+def test_only_a_calibration_makes_a_magnetometer_count() -> None:
+    calibration = replace(SensorsConfig().gy85.calibration, mag_bias_ut=(3.0, -2.0, 0.0))
+    told = replace(SensorsConfig(), gy85=replace(SensorsConfig().gy85, calibration=calibration))
+    for asked, sensors, counts in (
+        ("gy85+none", SensorsConfig(), False), ("gy85+none", told, True), ("serial+none", told, False),
+        ("virtual-cart", SensorsConfig(), True),
+    ):  # fmt: skip
+        assert open_live(asked, Config(), sensors)[0].is_mag_calibrated is counts
 
 
 def test_without_a_camera_attitude_is_published_until_ctrl_c_and_the_folder_is_complete(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ class FastPath:
 
     def __init__(
         self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None],
-        memory: BiasMemory | None = None,
+        memory: BiasMemory | None = None, is_mag_calibrated: bool = False,
     ) -> None:  # fmt: skip
         """Prepare an uninitialised filter.
 
@@ -44,6 +44,7 @@ class FastPath:
             T_body_camera: [4, 4] of the first camera.
             publish: takes each pose.
             memory: gyro biases that earlier power-ups found; None: none.
+            is_mag_calibrated: without, its samples say nothing: iron on the cart turns the field as it turns the cart.
         """
         self.counters = {"samples": 0, "rests_without_vision": 0, "wheels_without_vision": 0, "rebases": 0}
         self._config = config
@@ -52,6 +53,7 @@ class FastPath:
         self._publish = publish
         self._ekf = self._new_filter(noise)
         self._buffer = ImuBuffer(config.imu)
+        self._is_mag_calibrated = is_mag_calibrated
         self._alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
         self._rest = RestDetector(config.init, noise)
         self._rest_t_ns: int | None = None  # until when rest was looked for
@@ -98,7 +100,8 @@ class FastPath:
     def add(self, value: ImuSample | MagSample) -> Hint | None:
         """Take a sample; return what vision's filter has to be told of it besides."""
         if isinstance(value, MagSample):
-            self._alone.add_field(value)
+            if self._is_mag_calibrated:
+                self._alone.add_field(value)
             return None
         self.counters["samples"] += 1
         if not self._buffer.add(value):

@@ -41,6 +41,7 @@ def run(
     samples: socket.socket,
     inbox: list[Connection],
     memory: BiasMemory,
+    is_mag_calibrated: bool,
 ) -> None:
     """Read, predict, publish, until the run ends; then end the stream of samples.
 
@@ -53,6 +54,7 @@ def run(
         samples: to the front process.
         inbox: from the front and the back process.
         memory: gyro biases that earlier power-ups found.
+        is_mag_calibrated: whether what the magnetometer says may be used.
     """
     warm_up(config, noise, T_body_camera)
     take_priority(config.live, life)
@@ -62,7 +64,7 @@ def run(
     try:
         source = open_source()
         try:
-            fast = FastPath(config, noise, T_body_camera, publisher.publish, memory)
+            fast = FastPath(config, noise, T_body_camera, publisher.publish, memory, is_mag_calibrated)
             if life.ready():
                 _loop(life, fast, source, sender, Messages(inbox), latency)
             counters = {

@@ -55,7 +55,7 @@ class ReplaySource:
         )
         self.duration_s: float | None = float(self._table.t_ns[-1] - self._table.t_ns[0]) / _NS
         self._zero_ns = int(self._table.t_ns[0])
-        self.has_camera = True
+        self.has_camera, self.is_mag_calibrated = True, False  # its magnetometer is not played
         self._uri, self._seed = uri, seed
         self._outages = outages or Outages()
         self._epoch = Epoch()

@@ -41,6 +41,7 @@ class LiveSource(Recording, Protocol):
 
     duration_s: float | None  # after which there is no more; None: endless
     has_camera: bool  # without one, attitude alone is published
+    is_mag_calibrated: bool  # without, a magnetometer is not believed
 
     def inertial(self) -> Callable[[], InertialSource]:
         """Return what opens the IMU; it travels to the fast process."""
@@ -151,7 +152,7 @@ class LiveRun:
             "fast": partial(
                 fast_process.run, config=fast, noise=noise, T_body_camera=rig.T_body_cams[0],
                 open_source=source.inertial(), samples=samples_in, inbox=[fast_hears_front, fast_hears_back],
-                memory=self._memory,
+                memory=self._memory, is_mag_calibrated=source.is_mag_calibrated,
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),

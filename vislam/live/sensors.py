@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 
 from vislam.camera import Rig
-from vislam.config import Config, SensorsConfig, validated
+from vislam.config import Config, SensorCalibration, SensorsConfig, validated
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
 from vislam.errors import DataError, UsageError
-from vislam.hw.sensors import open_camera, open_inertial
+from vislam.hw.sensors import calibration_of, open_camera, open_inertial
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
 from vislam.live.child import Life
@@ -101,6 +101,8 @@ class CartSensors:
                 )
         self.name = f"live {inertial}+{camera}"
         self.has_camera = camera != "none"
+        told, ideal = calibration_of(inertial, sensors), SensorCalibration()
+        self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
         self.rig = _rig(config.calibration.camera) if self.has_camera else NO_CAMERA
         rate_hz = sensors.gy85.rate_hz
         self.imu_noise: ImuNoise | None = ImuNoise(

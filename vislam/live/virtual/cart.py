@@ -44,7 +44,7 @@ class VirtualCart:
         """Choose names for what its processes share; nothing starts yet."""
         self.name = "virtual cart"
         self.rig = virtual_rig(options)
-        self.has_camera = options.rig != "none"
+        self.has_camera, self.is_mag_calibrated = options.rig != "none", True
         self.imu_noise: ImuNoise | None = NOISE
         self.frame_count = 0
         self.problems: dict[str, int] = {}
