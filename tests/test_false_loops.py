@@ -9,6 +9,7 @@ import pytest
 from graph_world import GRAVITY_M_S2, RIG, World, rmse_m, with_vo
 
 from vislam.config import GraphConfig, WindowConfig
+from vislam.geometry import transform
 from vislam.graph import PoseGraph
 from vislam.loop.injection import FIRST_ID, FalseLoops
 from vislam.messages import GraphUpdate, LoopDecision
@@ -82,6 +83,33 @@ def test_a_false_loop_that_came_first_is_taken_out_again_and_the_map_follows() -
     assert report.decision is LoopDecision.REJECTED and report.weight == 0.0
     assert f"taken out again at keyframe {gone[0]}" in report.reason and "places say otherwise" in report.reason
     assert rmse_m(graph.poses(), world.truth) < 0.12
+
+
+@pytest.mark.parametrize("order", [("near", "far"), ("far", "near")])
+def test_of_two_that_contradict_only_each_other_the_one_nearer_to_odometry_stays(order: tuple[str, str]) -> None:
+    """Nobody can know which one is true; what is asked is that the answer does not hang on who came first."""
+    world = world_of("low")
+    packets = [world.packet(k, imu=False) for k in range(120)]
+    T_odometry = np.eye(4)
+    for packet in packets[5:104]:
+        T_odometry = T_odometry @ packet.vo.T_keyframe_body
+    right = world.loop(0, 4, 103)
+    said = {"near": np.array([0.05, 0.0, 0.0]), "far": np.array([-0.05, 0.2, -0.15])}
+    graph = PoseGraph(CONFIG, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph.initialise(None, world.truth[0])
+    for k, packet in enumerate(packets):
+        edges = []
+        if k in (103, 104):
+            T = T_odometry if k == 103 else T_odometry @ packet.vo.T_keyframe_body
+            edges = [replace(right, id=k, to_id=k, T_from_to=T @ transform(np.eye(3), said[order[k - 103]]))]
+        graph.add(packet, edges)
+    gates = {order[r.loop_id - 103]: r.chi2 for r in graph.edge_reports()}
+    graph.finish()
+    reports = {order[r.loop_id - 103]: r for r in graph.edge_reports()}
+    print({name: (report.chi2, report.reason) for name, report in reports.items()})
+    assert gates[order[0]] < 22.5 < gates[order[1]]  # the first one passes, and the second one contradicts it
+    assert reports["near"].decision is LoopDecision.ACCEPTED
+    assert reports["far"].decision is not LoopDecision.ACCEPTED
 
 
 def test_overconfident_odometry_with_aliased_groups_is_found_out() -> None:

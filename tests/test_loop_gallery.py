@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from vislam.loop.injection import FIRST_ID, as_candidate
 from vislam.loop.table import LoopRow, caption
 from vislam.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
 from vislam.run import loop_gallery
@@ -135,3 +136,22 @@ def test_what_an_accepted_loop_moved_is_told_with_it():
     assert taken.moved_rms_m == pytest.approx(np.sqrt(0.3**2 / 2))  # of the two that were there before
     assert (taken.chi2, taken.weight, taken.was_offered) == (3.0, 0.9, True)
     assert math.isnan(other.moved_max_m) and not other.was_offered
+
+
+def test_a_false_loop_made_up_between_the_ends_of_a_true_one_is_told_apart():
+    ends = (0, 2, np.eye(4), np.eye(6), True, 30, 0.5)
+    true, false = LoopEdge(7, *ends), LoopEdge(FIRST_ID, *ends)
+    told = step(2, [replace(candidate(0, 2), decision=LoopDecision.ACCEPTED), as_candidate(false)])
+    told.odometry.packet.imu, told.odometry.T_odom_body = None, np.eye(4)
+    told.update = GraphUpdate(0, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
+    told.edges, told.retrieved = [true, false], []
+    log = RunLog()
+    log.add_keyframe(told)
+    reports = {
+        7: SimpleNamespace(chi2=3.0, weight=0.9, decision=LoopDecision.ACCEPTED, reason="inside the gate"),
+        FIRST_ID: SimpleNamespace(chi2=99.0, weight=0.0, decision=LoopDecision.PARKED, reason="beyond the gate"),
+    }
+    assert [(row.source, row.decision) for row in log.loop_rows(reports)] == [
+        (candidate(0, 2).source, "accepted"),
+        ("injected", "parked"),
+    ]

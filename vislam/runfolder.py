@@ -22,10 +22,20 @@ from vislam.config import Config, ImuConfig, dump, from_data
 from vislam.errors import DataError, StorageError, UsageError
 from vislam.frames import LoggedFrames
 from vislam.loop.injection import SOURCE as INJECTED
+from vislam.loop.injection import is_injected
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
 from vislam.mapping.products import FILES as MAP_FILES
 from vislam.memory import FrameEntry, SlamMemory
-from vislam.messages import Array, GraphUpdate, ImuSpan, LoopCandidate, LoopDecision, NavState, RetrievedKeyframe
+from vislam.messages import (
+    Array,
+    GraphUpdate,
+    ImuSpan,
+    LoopCandidate,
+    LoopDecision,
+    LoopEdge,
+    NavState,
+    RetrievedKeyframe,
+)
 from vislam.session import Session
 from vislam.slam import KeyframeStep, Step
 from vislam.sources import recorded_path
@@ -228,7 +238,7 @@ class RunLog:
         self._keyframe_t_ns: dict[int, int] = {}
         self._spans: dict[int, ImuSpan] = {}  # between a keyframe and the one before
         self._candidates: list[LoopCandidate] = []
-        self._edge_ids: dict[tuple[int, int], int] = {}
+        self._edge_ids: dict[tuple[int, int, bool], int] = {}  # by ends, and whether it was made up on purpose
         self._retrieved: list[RetrievedKeyframe] = []
         self._positions: dict[int, Array] = {}  # of the keyframes in the map, in order of their ids
         self._shifts: dict[int, tuple[float, float]] = {}  # edge: rms and largest shift of the update that took it in
@@ -278,7 +288,8 @@ class RunLog:
                 self._spans[packet.keyframe.id] = packet.imu
         self._candidates, self._retrieved, self._shifts = session.candidates(), session.retrieved(), session.shifts()
         self._place(memory)
-        self._edge_ids = {(loop.edge.from_id, loop.edge.to_id): loop.edge.id for loop in memory.graph.loops}
+        for loop in memory.graph.loops:
+            self._name(loop.edge)
         self.revisions = memory.graph.revision
 
     def begin_in_map(self, memory: SlamMemory) -> None:
@@ -312,10 +323,13 @@ class RunLog:
         self._candidates += [replace(candidate, matches_px=None) for candidate in step.candidates]
         self._retrieved += step.retrieved
         for edge in step.edges:
-            self._edge_ids[edge.from_id, edge.to_id] = edge.id
+            self._name(edge)
         self._follow(step.update)
         self._positions.setdefault(keyframe.id, (step.update.T_map_odom @ step.odometry.T_odom_body)[:3, 3])
         self.revisions = step.update.revision
+
+    def _name(self, edge: LoopEdge) -> None:
+        self._edge_ids[edge.from_id, edge.to_id, is_injected(edge.id)] = edge.id
 
     def _follow(self, update: GraphUpdate) -> None:
         """Take over what an update moved, and note by how much for the loops that it took in."""
@@ -379,7 +393,7 @@ class RunLog:
     def _loop_row(self, candidate: LoopCandidate, loop_reports: dict[int, Any]) -> LoopRow:
         decision, reason, report, edge_id = candidate.decision, candidate.reason, None, -1
         if decision == LoopDecision.ACCEPTED:  # a pair that was parked before has a row for that, too
-            edge_id = self._edge_ids.get((candidate.from_id, candidate.to_id), -1)
+            edge_id = self._edge_ids.get((candidate.from_id, candidate.to_id, candidate.source == INJECTED), -1)
             report = loop_reports.get(edge_id)
         if report is not None:
             decision, reason = report.decision, f"{candidate.reason}; {report.reason}"

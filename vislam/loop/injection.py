@@ -84,6 +84,11 @@ class FalseLoops:
         )  # fmt: skip
 
 
+def is_injected(edge_id: int) -> bool:
+    """Return whether an edge was made up here."""
+    return edge_id >= FIRST_ID
+
+
 def as_candidate(edge: LoopEdge) -> LoopCandidate:
     """Return the record of a false loop, which says what it is."""
     return LoopCandidate(
