@@ -11,9 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import skew, so3_exp
+from vislam.geometry import skew, so3_exp, tangent_basis
 from vislam.messages import Array
 
 _MIN_MATCHES = 8
@@ -22,6 +23,8 @@ _CONFIDENCE = 0.999
 _ROUNDS = 8
 _CAUCHY = 2.0  # in sigmas
 _MEDIAN_CHI2_1 = 0.4549  # median of chi-square with one degree of freedom
+
+Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,53 +79,82 @@ def _plane_share(xy_a: Array, xy_b: Array, limit: float, seed: int) -> float:
     return 1.0 if mask is None else float(np.mean(mask.ravel() > 0))
 
 
-def _sampson(R: Array, t: Array, rays_a: Array, rays_b: Array) -> tuple[Array, Array]:
-    """Return the Sampson errors [N] of rays with z = 1 and their denominators [N]."""
+@njit(cache=True, nogil=True)
+def _sampson(R: Array, t: Array, xy_a: Array, xy_b: Array) -> Array:
+    """Return the Sampson errors [N] of matches on z = 1."""
     E = skew(t) @ R
-    across_a, across_b = rays_b @ E.T, rays_a @ E
-    scale = np.sqrt(np.sum(across_a[:, :2] ** 2 + across_b[:, :2] ** 2, axis=1)) + 1e-15
-    return np.sum(rays_a * across_a, axis=1) / scale, scale
+    out = np.empty(len(xy_a))
+    for i in range(len(xy_a)):
+        out[i] = _epipolar(E, xy_a[i], xy_b[i])[0]
+    return out
 
 
-def _tangent(R: Array, t: Array) -> Array:
-    """Return a basis [3, 2] of the plane across the direction, in the axes of b."""
-    basis: Array = np.linalg.svd((R.T @ t)[None])[2][1:].T
-    return basis
+@njit(cache=True, nogil=True)
+def _epipolar(E: Array, xy_a: Array, xy_b: Array) -> tuple[float, float, Point, Point]:
+    """Return the Sampson error of one match, its denominator, and both epipolar lines, in a and in b."""
+    (ax, ay), (bx, by) = xy_a, xy_b
+    in_a = (
+        E[0, 0] * bx + E[0, 1] * by + E[0, 2], E[1, 0] * bx + E[1, 1] * by + E[1, 2],
+        E[2, 0] * bx + E[2, 1] * by + E[2, 2],
+    )  # fmt: skip
+    in_b = (
+        E[0, 0] * ax + E[1, 0] * ay + E[2, 0], E[0, 1] * ax + E[1, 1] * ay + E[2, 1],
+        E[0, 2] * ax + E[1, 2] * ay + E[2, 2],
+    )  # fmt: skip
+    scale = np.sqrt(in_a[0] ** 2 + in_a[1] ** 2 + in_b[0] ** 2 + in_b[1] ** 2) + 1e-15
+    return (ax * in_a[0] + ay * in_a[1] + in_a[2]) / scale, scale, in_a, in_b
+
+
+@njit(cache=True, nogil=True)
+def _descend(R: Array, t: Array, xy_a: Array, xy_b: Array, sigma: float) -> tuple[Array, Array, Array]:
+    """Refine rotation and unit direction by Gauss-Newton with a Cauchy kernel; return them and the information [5, 5].
+
+    Its tangent: rotation about b's axes, then the direction's in the plane that `tangent_basis` spans, in b's axes.
+    """
+    H, J = np.eye(5), np.empty(5)
+    for _ in range(_ROUNDS):
+        E, across = skew(t) @ R, R @ tangent_basis(R.T @ t)
+        H, g = np.zeros((5, 5)), np.zeros(5)
+        for i in range(len(xy_a)):
+            (ax, ay), (bx, by) = xy_a[i], xy_b[i]
+            residual, scale, _, line = _epipolar(E, xy_a[i], xy_b[i])
+            J[0], J[1], J[2] = by * line[2] - line[1], line[0] - bx * line[2], bx * line[1] - by * line[0]
+            x = R[0, 0] * bx + R[0, 1] * by + R[0, 2]
+            y = R[1, 0] * bx + R[1, 1] * by + R[1, 2]
+            z = R[2, 0] * bx + R[2, 1] * by + R[2, 2]
+            nx, ny, nz = y - z * ay, z * ax - x, x * ay - y * ax
+            J[3] = nx * across[0, 0] + ny * across[1, 0] + nz * across[2, 0]
+            J[4] = nx * across[0, 1] + ny * across[1, 1] + nz * across[2, 1]
+            weight = 1.0 / (1.0 + (residual / (_CAUCHY * sigma)) ** 2) / (sigma * scale) ** 2
+            for k in range(5):
+                g[k] += weight * J[k] * residual * scale
+                for m in range(5):
+                    H[k, m] += weight * J[k] * J[m]
+        step = -np.linalg.solve(H, g)
+        t = t + across @ step[3:]
+        t = t / np.sqrt(np.sum(t * t))
+        R = R @ so3_exp(step[:3])
+    return R, t, H
 
 
 def _refined(
     R: Array, t: Array, xy_a: Array, xy_b: Array, inliers: NDArray[np.bool_], limit: float, seed: int
 ) -> Direction | None:
-    ones = np.ones((len(xy_a), 1))
-    rays_a, rays_b = np.hstack([xy_a, ones]), np.hstack([xy_b, ones])
     sigma = limit / 3.0
-    H = np.eye(5)
-    for _ in range(_ROUNDS):
-        a, b, basis = rays_a[inliers], rays_b[inliers], _tangent(R, t)
-        residual, scale = _sampson(R, t, a, b)
-        # d(a' [t] R b): rotation about b's axes, then translation R basis u
-        by_rotation = np.cross(b, (a @ skew(t) @ R))
-        by_translation = np.cross(b @ R.T, a) @ R @ basis
-        J = np.hstack([by_rotation, by_translation]) / scale[:, None]
-        weight = 1.0 / (1.0 + (residual / (_CAUCHY * sigma)) ** 2)
-        H = J.T @ (weight[:, None] * J) / sigma**2
-        try:
-            step = -np.linalg.solve(H, J.T @ (weight * residual) / sigma**2)
-        except np.linalg.LinAlgError:
-            return None
-        t = t + R @ basis @ step[3:]
-        t = t / np.linalg.norm(t)
-        R = R @ so3_exp(np.ascontiguousarray(step[:3]))
-    residual, _ = _sampson(R, t, rays_a, rays_b)
+    try:
+        R, t, H = _descend(np.ascontiguousarray(R), t, xy_a[inliers], xy_b[inliers], sigma)
+    except np.linalg.LinAlgError:
+        return None
+    residual = _sampson(R, t, xy_a, xy_b)
     inliers = inliers & (np.abs(residual) <= limit)
     if not np.all(np.isfinite(H)) or np.linalg.cond(H) > 1e14 or np.count_nonzero(inliers) < _MIN_MATCHES:
         return None
     spread = float(np.median(residual[inliers] ** 2)) / (_MEDIAN_CHI2_1 * sigma**2)
     lift = np.zeros((6, 5))
-    lift[:3, :3], lift[3:, 3:] = np.eye(3), _tangent(R, t)
+    lift[:3, :3], lift[3:, 3:] = np.eye(3), tangent_basis(R.T @ t)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
-    turned = rays_b[inliers] @ R.T
+    turned = np.column_stack([xy_b[inliers], np.ones(np.count_nonzero(inliers))]) @ R.T
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_a[inliers], axis=1)
     plane = _plane_share(xy_a[inliers], xy_b[inliers], 2.0 * limit, seed)
