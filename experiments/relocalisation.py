@@ -28,7 +28,7 @@ from vislam.front import Front
 from vislam.geometry import align_points, invert, level_rotation, so3_log, transform
 from vislam.graph import PoseGraph
 from vislam.loop.detector import LoopDetector
-from vislam.memory import PlacesMemory
+from vislam.memory import GraphMemory, PlacesMemory
 from vislam.messages import Array, Frame, Keyframe, KeyframePacket, Observations, Tracking, VoMeasurement
 from vislam.sim import open_world
 from vislam.sim.simulation import Simulation
@@ -86,13 +86,16 @@ def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGrap
     """Return a graph with the map's keyframes, held where they are."""
     graph = PoseGraph(replace(config.graph, coupling="loose"), None, 9.81, recording.rig, config.window)
     graph.initialise(None, known.T_map_body[0])
+    packets = []
     for k, T in enumerate(known.T_map_body):
         moved = np.eye(4) if k == 0 else invert(known.T_map_body[k - 1]) @ T
         t_ns = k * 1_000_000_000
         vo = VoMeasurement(t_ns, max(k - 1, 0), moved, np.diag(MAP_SIGMAS**2), True, Tracking.OK, 0)
         frame = Frame(t_ns, k, ())
         bare = Keyframe(k, t_ns, frame, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
-        graph.add(KeyframePacket(bare, vo, Observations(np.empty(0, np.int64), np.empty((0, 2))), None), [], T)
+        packets.append(KeyframePacket(bare, vo, Observations(np.empty(0, np.int64), np.empty((0, 2))), None))
+    newest = known.T_map_body[-1]
+    graph.restore(GraphMemory(packets, known.T_map_body, newest, [], {}, [], [], vo_scale=1.0, revision=0))
     graph.hold()
     return graph
 

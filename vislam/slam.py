@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from vislam import collector
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
@@ -122,6 +123,7 @@ class Back:
         loops = {} if self.loops is None else {"loop": dict(self.loops.counters)}
         return {**loops, **({} if self.map is None else self.map.counters)}
 
+    @collector.paused()
     def restore(self, memory: SlamMemory) -> GraphUpdate:
         """Take over an earlier run; return all its poses. Raises UsageError where loops are made up on purpose."""
         if self._false is not None:

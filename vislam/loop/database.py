@@ -8,7 +8,7 @@ are counted in keyframes, so a replay gives the same bytes however long a traini
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -34,11 +34,12 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-def side_by_side(work: Callable[[Sequence[A]], list[B]], items: Sequence[A]) -> list[B]:
-    """Return what `work` makes of blocks of items, in their order, in threads whose compiled parts do not wait."""
+def side_by_side(work: Callable[[Sequence[A]], list[B]], items: Sequence[A]) -> Iterator[B]:
+    """Yield what `work` makes of blocks of items, in their order, in threads whose compiled parts do not wait."""
     blocks = [items[begin : begin + _BLOCK] for begin in range(0, len(items), _BLOCK)]
     with ThreadPoolExecutor(_THREADS) as pool:
-        return [result for results in pool.map(work, blocks) for result in results]
+        for results in pool.map(work, blocks):
+            yield from results
 
 
 @dataclass(frozen=True, slots=True, eq=False)

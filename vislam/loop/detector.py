@@ -94,7 +94,7 @@ class LoopDetector:
 
         Raises DataError when features or vocabulary are damaged.
         """
-        views = side_by_side(partial(make_views, rig=self._rig), memory.keyframes)
+        views = list(side_by_side(partial(make_views, rig=self._rig), memory.keyframes))
         self._views = {view.id: view for view in views}
         for view, T_map_body in zip(views, memory.T_map_body, strict=True):
             self._poses.add(view.id, T_map_body)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from vislam import collector
 from vislam.factor_log import state_from
 from vislam.imu import ImuNoise
 from vislam.memory import (
@@ -29,6 +30,7 @@ from vislam.session.schema import maybe_numbers, numbers, readable, window_of
 _RIGID = 1e-4  # how far R R^T may be from identity
 
 
+@collector.paused()
 def recall(session: Session) -> SlamMemory | None:
     """Return what a pipeline goes on from; None when the session has nothing worth going on from.
 
