@@ -27,4 +27,4 @@ def test_short_turns_are_asked_for_and_change_nothing_else() -> None:
     release = re.match(r"(\d+)\.(\d+)", Path("/proc/sys/kernel/osrelease").read_text())
     if turn_ns is None or release is None or tuple(map(int, release.groups())) < (6, 12):
         pytest.skip("this kernel has no turns of one's own, or does not show them")
-    assert int(turn_ns[1]) == 100_000
+    assert int(turn_ns[1]) == 500_000

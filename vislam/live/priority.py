@@ -11,7 +11,7 @@ from vislam.live.child import Life
 
 _ATTRIBUTES = struct.Struct("<IIQiIQQQ")  # sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # the number of the system call; Python has no function for it
-_TURN_NS = 100_000  # the shortest that Linux gives
+_TURN_NS = 500_000  # for a sample and a late frame; in shorter ones, cut apart, it falls behind on a busy machine
 
 
 def take_priority(live: LiveConfig, life: Life) -> None:
