@@ -123,7 +123,7 @@ def fast(signals, samples, inbox, settings, epoch, table, report) -> None:
     body = partial(
         fast_process.run, config=config, noise=noise, T_body_camera=np.eye(4),
         open_source=partial(ReplayedImu, table, epoch), samples=samples, inbox=inbox,
-        memory=BiasMemory(limit=1),
+        memory=BiasMemory(limit=1), is_mag_calibrated=False,
     )  # fmt: skip
     guarded("fast", report, signals, body)
 
@@ -161,6 +161,7 @@ def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
         front = context.Process(target=correct, args=(front_says, seconds - 1.0, ready, go, epoch))
         back = context.Process(target=close_loops, args=(back_says, stop, grown, closed))
         for process in (listener, publisher, front, back):
+            process.daemon = True  # none stays behind when another fails
             process.start()
         ready.wait()
         last = {}
