@@ -37,7 +37,7 @@ def main() -> None:
     rule = LoopTruthConfig()
     answers: dict[str, dict[str, Any]] = {}
     for source in options.sources:
-        name = source.partition(":")[2].rstrip("/").rpartition("/")[2].partition(",")[0]
+        name = source.rpartition(":")[2].rstrip("/").rpartition("/")[2].partition(",")[0]
         judged, failures = [], []
         for seed in range(options.first_seed, options.first_seed + options.seeds):
             run = options.out / "runs" / f"{name}_{seed}"
