@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -42,18 +41,23 @@ class Correction:
 
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
         """Give everything to a filter; return what it said to the motion."""
-        if self.noise is not None and isinstance(
-            ekf, Ekf
-        ):  # before the frame, so it has to be replayed up to that first
+        if isinstance(ekf, Ekf):
+            return self._apply_loosely(ekf)
+        answer = ekf.update_vision(self.vo, self.observations, self.shows_scale)
+        if self.at_rest:
+            ekf.update_zero_velocity(self.t_ns)
+        if self.keyframe_id is not None:
+            ekf.add_keyframe(self.keyframe_id, self.t_ns)
+        return answer
+
+    def _apply_loosely(self, ekf: Ekf) -> UpdateResult:
+        if self.noise is not None:  # it is of before the frame, and what is replayed once only goes ahead
             ekf.follow_noise(self.noise.t_ns, self.noise.gyro, self.noise.accel)
-        with ekf.replayed_once() if isinstance(ekf, Ekf) else nullcontext():
-            if isinstance(ekf, Ekf):
-                answer = ekf.update_vision(self.vo, self.observations)
-            else:
-                answer = ekf.update_vision(self.vo, self.observations, self.shows_scale)
+        with ekf.replayed_once():
+            answer = ekf.update_vision(self.vo, self.observations)
             if self.at_rest:
                 ekf.update_zero_velocity(self.t_ns)
-            elif self.on_wheels and isinstance(ekf, Ekf):
+            elif self.on_wheels:
                 ekf.update_nonholonomic(self.t_ns)
             if self.keyframe_id is not None:
                 ekf.add_keyframe(self.keyframe_id, self.t_ns)

@@ -293,7 +293,7 @@ class LoopSet:
         for model, chi2 in verdict.put_out:
             if model.id in held:
                 estimator.spare.pop(model.id, None)
-                says = f"{verdict.places} places say otherwise, chi2 {chi2:.1f}"
+                says = f"{verdict.places} place{'s say' if verdict.places > 1 else ' says'} otherwise, chi2 {chi2:.1f}"
                 self.report(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {says}")
         if verdict.scale > 1.0 and back:  # several witnesses against the odometry say that it knows less than it says
             estimator.distrust_odometry(verdict.scale)
