@@ -18,8 +18,8 @@ class EkfConfig:
     max_gap_s: float = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
     gap_gyro_rad_s: float = 0.5  # what the rate may have been inside a hole, against its interpolation
     gap_accel_m_s2: float = 2.0  # the same for specific force
-    imu_inflation: float = 10.0  # on the white-noise sigmas, for vibration; flying EuRoC: innovations fit at 10, not 4
-    vo_inflation: float = 1.5  # on the sigmas of visual odometry: covariances from residuals miss model errors
+    imu_inflation: float = 10.0  # on white sigmas, for vibration: EuRoC fits 10, not 4; over a floor frontend.planar's
+    vo_inflation: float = 1.5  # on sigmas of vision's motion, which miss model errors; over a floor frontend.planar's
     follow_noise: bool = False  # white noise rises with what samples show, by half seconds; over a floor it always does
     vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
     scale_sigma: float = 0.0  # relative, of all metres of vision together: a baseline; over a floor its height joins it
