@@ -30,7 +30,9 @@ def main(arguments: list[str]) -> int:
     """Simulate a world and run the pipeline on it."""
     options = parse(DemoOptions, arguments, "demo")
     print(
-        f"vislam: simulating '{options.world}' and running the pipeline on it; about two minutes ...", file=sys.stderr
+        f"vislam: simulating '{options.world}' and running the pipeline on it; about two minutes, and three more the "
+        "first time, while code is compiled ...",
+        file=sys.stderr,
     )
     source = f"sim:{options.world},camera_hz={_CAMERA_HZ}"
     run = RunOptions(source, options.out, Config(seed=options.seed), overwrite=True)
