@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, SimulatedVision, to_span
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import EkfConfig
 from vislam.ekf import Correction, Ekf, kernels, visual_motion
-from vislam.ekf.measurements import chi_square_limit
 from vislam.ekf.visual_motion import relative_motion, shared_error, why_unusable
 from vislam.geometry import (
     quaternion_wxyz,

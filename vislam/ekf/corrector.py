@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import EkfConfig
 from vislam.ekf import kernels, visual_motion
 from vislam.ekf.history import Event, Kind, Ledger
@@ -14,7 +15,6 @@ from vislam.ekf.measurements import (
     LinearMeasurement,
     absolute_pose,
     biases,
-    chi_square_limit,
     on_wheels,
     where_rest_began,
     zero_velocity,

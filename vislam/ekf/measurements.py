@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.special import gammaincinv
 
 from vislam.ekf.kernels import ERRORS, pose
 from vislam.geometry import skew, so3_left_jacobian_inverse, so3_log
@@ -20,11 +19,6 @@ class LinearMeasurement(NamedTuple):
     residual: Array  # [m]
     H: Array  # [m, 21]
     noise: Array  # [m, m]
-
-
-def chi_square_limit(probability: float, dof: int) -> float:
-    """Return the value that a chi-square variable of `dof` degrees stays below with this probability."""
-    return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
 def absolute_pose(x: Array, T_odom_vo: Array, sigma_rad: float, sigma_m: float) -> LinearMeasurement:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import EkfConfig
 from vislam.ekf import msckf_features as features
 from vislam.ekf.kernels import pose
@@ -114,7 +114,7 @@ class Updater:
         # one metric observation and another fix a point and leave something over
         self._least = 2 if rig.is_stereo or rig.has_depth else config.tight_min_observations
         most = features.ROWS_MAX * (config.tight_clones + 2)
-        self._limits = 2.0 * gammaincinv(0.5 * np.maximum(np.arange(most), 1), config.gate_probability)
+        self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
         per_sample = config.tight_imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
         self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
         self._reset_sigmas = reset_sigmas(config)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import gtsam
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import GraphConfig
 from vislam.factors.journal import LoopRecord
 from vislam.factors.keys import X, nearest_rigid
@@ -24,12 +22,6 @@ from vislam.memory import Tie
 from vislam.messages import Array
 
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
-
-
-@cache
-def _chi2_limit(probability: float, freedom: int) -> float:
-    """Return what a chi-square of so many degrees of freedom exceeds with 1 - probability; scipy takes 0.3 ms."""
-    return float(chi2_distribution.ppf(probability, freedom))
 
 
 class LoopModel:
@@ -49,7 +41,7 @@ class LoopModel:
             self._direction = direction_measurement(record.T_from_to, covariance, floor)
             covariance = self._direction.covariance
         self.covariance = conditioned(covariance, config.covariance_ratio_max)
-        self.threshold = _chi2_limit(config.loop_gate_probability, len(self.covariance))
+        self.threshold = chi_square_limit(config.loop_gate_probability, len(self.covariance))
 
     @property
     def id(self) -> int:

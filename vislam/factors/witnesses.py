@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import GraphConfig
 from vislam.factors.loop import LoopModel
 from vislam.factors.travel import Chain, Travel
@@ -25,7 +25,7 @@ class Witnesses:
     def __init__(self, config: GraphConfig) -> None:
         """Start empty."""
         self._config = config
-        self._limit = float(chi2_distribution.ppf(config.loop_gate_probability, 6))
+        self._limit = chi_square_limit(config.loop_gate_probability, 6)
         self._loops: list[list[LoopModel]] = []
         self._ends: NDArray[np.int64] = np.zeros((16, 2), dtype=np.int64)  # of those that stand for each witness
 
@@ -87,7 +87,7 @@ def confirming(loops: Sequence[LoopModel], chain: Chain, evidence_min: float, lo
     """
     if len(loops) < 2:
         return []
-    limit = float(chi2_distribution.ppf(0.999, 6))
+    limit = chi_square_limit(0.999, 6)
     a, b = (np.array([getattr(m.record, end) for m in loops]) for end in ("from_id", "to_id"))
     Z = np.stack([m.record.T_from_to for m in loops])
     own = np.array([[np.trace(m.covariance[:3, :3]), np.trace(m.covariance[3:, 3:])] for m in loops]) / 3.0

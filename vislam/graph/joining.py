@@ -13,8 +13,8 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import GraphConfig
 from vislam.factors.journal import KeyframeRecord, checked_pose
 from vislam.factors.keys import nearest_rigid
@@ -42,7 +42,7 @@ class Waiting:
     def __init__(self, config: GraphConfig) -> None:
         """Start empty."""
         self._config = config
-        self._limit = float(chi2_distribution.ppf(config.loop_gate_probability, 6))
+        self._limit = chi_square_limit(config.loop_gate_probability, 6)
         self._edges: list[LoopModel] = []
 
     @property

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from vislam.chi_square import chi_square_limit
 from vislam.config import WindowConfig
 from vislam.messages import Array
 from vislam.window import gate, visual
@@ -26,7 +26,7 @@ class Doubt:
 
     def __init__(self, config: WindowConfig) -> None:
         """Start without any."""
-        self._gate = float(chi2.ppf(config.gate_probability, 2))
+        self._gate = chi_square_limit(config.gate_probability, 2)
         self._track_fraction = config.gate_track_fraction
         self._contradictions = 0  # keyframes in a row
 
