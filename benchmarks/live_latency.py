@@ -44,10 +44,9 @@ def correct(connection, seconds: float, ready, go, epoch) -> None:
     from vislam.ekf import Correction
     from vislam.imu import ImuNoise
     from vislam.live.messages import Start
-    from vislam.messages import NavState, Observations, Tracking, VoMeasurement
+    from vislam.messages import NavState, Tracking, VoMeasurement, no_observations
 
     noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
-    nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
     ready.wait()
     while not go.wait(1.0):
         continue
@@ -59,7 +58,7 @@ def correct(connection, seconds: float, ready, go, epoch) -> None:
         if k == 0:
             state = NavState(t_ns, np.eye(4), *(np.zeros(3) for _ in range(3)), np.eye(15) * 1e-4)
             connection.send(Start(state, vo, noise))
-        connection.send(Correction(t_ns, vo, nothing, False, False, k // 10 if k % 10 == 0 else None))
+        connection.send(Correction(t_ns, vo, no_observations(), False, False, k // 10 if k % 10 == 0 else None))
 
 
 def close_loops(connection, stop, grown, closed) -> None:
@@ -247,11 +246,10 @@ def late_frame_us(frames: int) -> float:
     from vislam.imu import ImuNoise
     from vislam.live.fast import FastPath
     from vislam.live.messages import Start
-    from vislam.messages import ImuSample, NavState, Observations, Tracking, VoMeasurement
+    from vislam.messages import ImuSample, NavState, Tracking, VoMeasurement, no_observations
 
     noise, dt_ns = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ), int(1e9 / RATE_HZ)
     fast = FastPath(load(None, {}), noise, np.eye(4), lambda pose: None)
-    nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
     best = np.inf
     for k in range(frames):
         for i in range(k * FRAME_EVERY, (k + 1) * FRAME_EVERY):
@@ -259,7 +257,7 @@ def late_frame_us(frames: int) -> float:
         vo = VoMeasurement(k * FRAME_EVERY * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
         if k == 0:
             fast.correct(Start(NavState(0, np.eye(4), *np.zeros((3, 3)), np.eye(15) * 1e-4), vo, noise))
-        message = pickle.dumps(Correction(vo.t_ns, vo, nothing, False, False, None))
+        message = pickle.dumps(Correction(vo.t_ns, vo, no_observations(), False, False, None))
         began = time.perf_counter()
         fast.correct(pickle.loads(message))  # noqa: S301 what was just made
         best = min(best, time.perf_counter() - began) if k > 0 else best

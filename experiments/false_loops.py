@@ -28,7 +28,7 @@ from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
 from vislam.geometry import align_points, invert, se3_adjoint, se3_exp, transform_points
 from vislam.graph import PoseGraph
-from vislam.loop.injection import FIRST_ID, FalseLoops
+from vislam.loop.injection import FalseLoops, is_injected
 from vislam.messages import (
     Array,
     Frame,
@@ -36,9 +36,9 @@ from vislam.messages import (
     KeyframePacket,
     LoopDecision,
     LoopEdge,
-    Observations,
     Tracking,
     VoMeasurement,
+    no_observations,
 )
 
 _DRIFT_SIGMAS = np.repeat([0.01, 0.05], 3)  # of a step of odometry, per unit of drift
@@ -101,7 +101,7 @@ class PoseGraphFile:
         covariance = self.covariances[k] * claimed**2
         vo = VoMeasurement(t_ns, max(k - 1, 0), self.motions[k], covariance, True, Tracking.OK, 100)
         keyframe = Keyframe(k, t_ns, Frame(t_ns, k, ()), np.zeros((0, 2)), np.zeros((0, 32), np.uint8), None)
-        return KeyframePacket(keyframe, vo, Observations(np.zeros(0, np.int64), np.zeros((0, 2))), None)
+        return KeyframePacket(keyframe, vo, no_observations(), None)
 
     def error_m(self, poses: Array) -> float:
         """Return the root mean square of position errors after alignment."""
@@ -177,7 +177,7 @@ class Outcome:
 
     def row(self, file: PoseGraphFile, group: int, clean: Outcome) -> str:
         """Return a line of the table."""
-        true, false = ([n for n in self.offered if (n >= FIRST_ID) == wrong] for wrong in (False, True))
+        true, false = ([n for n in self.offered if is_injected(n) == wrong] for wrong in (False, True))
         lost = [n for n in true if n not in self.kept]
         kept = [n for n in false if n in self.kept]
         inside = len(false) - self.outside(clean, false)

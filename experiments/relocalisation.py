@@ -29,7 +29,7 @@ from vislam.geometry import align_points, invert, level_rotation, so3_log, trans
 from vislam.graph import PoseGraph
 from vislam.loop.detector import LoopDetector
 from vislam.memory import GraphMemory, PlacesMemory
-from vislam.messages import Array, Frame, Keyframe, KeyframePacket, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, Frame, Keyframe, KeyframePacket, Tracking, VoMeasurement, no_observations
 from vislam.sim import open_world
 from vislam.sim.simulation import Simulation
 from vislam.slam import Slam
@@ -93,7 +93,7 @@ def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGrap
         vo = VoMeasurement(t_ns, max(k - 1, 0), moved, np.diag(MAP_SIGMAS**2), True, Tracking.OK, 0)
         frame = Frame(t_ns, k, ())
         bare = Keyframe(k, t_ns, frame, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
-        packets.append(KeyframePacket(bare, vo, Observations(np.empty(0, np.int64), np.empty((0, 2))), None))
+        packets.append(KeyframePacket(bare, vo, no_observations(), None))
     newest = known.T_map_body[-1]
     graph.restore(GraphMemory(packets, known.T_map_body, newest, [], {}, [], [], vo_scale=1.0, revision=0))
     graph.hold()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scipy.special import gammaincinv  # `scipy.stats` has it too, but takes 0.3 ms a call and long to load
+from scipy.special import gammaincinv  # `scipy.stats` has it too, thirty times slower, and takes 0.6 s to load
 
 
 def chi_square_limit(probability: float, degrees: int) -> float:

@@ -85,6 +85,11 @@ class Observations:
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
 
 
+def no_observations() -> Observations:
+    """Return observations of nothing."""
+    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """Images taken at one instant: a grey image per camera of the rig, with colour and registered depth if any."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from vislam.ekf.filter import Ekf
 from vislam.imu import SeenNoise
-from vislam.messages import Observations, Tracking, VoMeasurement
+from vislam.messages import Observations, Tracking, VoMeasurement, no_observations
 
 if TYPE_CHECKING:
     from vislam.ekf.filter import UpdateResult
@@ -70,9 +70,7 @@ def _correction(t_ns: int, motion: tuple[Any, ...], seen: Observations | None, *
     T_keyframe_body = None if T is None else np.array(T, dtype=np.float64)
     covariance = np.array(covariance, dtype=np.float64)
     vo = VoMeasurement(vo_t_ns, clone_id, T_keyframe_body, covariance, has_scale, Tracking(tracking), inliers)
-    if seen is None:
-        seen = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
-    return Correction(t_ns, vo, seen, *others)
+    return Correction(t_ns, vo, no_observations() if seen is None else seen, *others)
 
 
 @dataclass(frozen=True, slots=True)

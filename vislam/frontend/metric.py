@@ -16,12 +16,12 @@ from vislam.frontend.landmarks import Landmarks, fuse, move
 from vislam.frontend.locate import pnp_ransac, recognise
 from vislam.frontend.prediction import MotionPredictor, body_motion
 from vislam.frontend.refine import PoseEstimate, extra_parameter, refine_pose
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
 from vislam.frontend.shutter import Shutter
 from vislam.frontend.tracker import Tracker
 from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
 from vislam.memory import FrontNews
-from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
 
 Bools = NDArray[np.bool_]
 

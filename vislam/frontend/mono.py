@@ -20,11 +20,11 @@ from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.refine import refine_pose
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
 from vislam.frontend.tracker import Tracker
 from vislam.geometry import invert, so3_log, transform
 from vislam.memory import FrontNews
-from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
 
 _RANSAC_PX = 1.5
 _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second solution that a flat scene has

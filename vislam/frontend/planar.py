@@ -27,10 +27,10 @@ from vislam.frontend.planar_floor import Mount, Regions, Tilt, make_mount
 from vislam.frontend.planar_place import Place, by_jitter, by_tilt, failure, weakness, yaw_prior
 from vislam.frontend.planar_tracks import FloorTracks, Steps
 from vislam.frontend.prediction import body_motion
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, no_observations, too_few
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
 from vislam.geometry import se3_adjoint, so3_log
 from vislam.memory import FrontNews
-from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
 
 Bools = NDArray[np.bool_]
 

@@ -79,11 +79,6 @@ def too_few(frame: Frame, corners: int) -> str:
     return f"only {corners} corners in an image of mean grey {frame.images[0].mean():.0f}"
 
 
-def no_observations() -> Observations:
-    """Return observations of nothing."""
-    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
-
-
 def scaled_motion(vo: VoMeasurement) -> Array:
     """Return the motion [4, 4] since the keyframe as far as it is known: without scale, its rotation alone."""
     assert vo.T_keyframe_body is not None

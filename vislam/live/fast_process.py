@@ -25,7 +25,7 @@ from vislam.live.priority import take_priority
 from vislam.live.published_pose import PublishedPose
 from vislam.live.publisher import PosePublisher
 from vislam.live.stream import SampleSender
-from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement, no_observations
 
 _NS = 1_000_000_000
 _READ_S = 0.005  # most that reading waits: messages of vision are looked for in between
@@ -144,7 +144,6 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
     dt_ns = round(_NS / noise.rate_hz)
     fast = FastPath(config, noise, T_body_camera, _ignore)
     keyframe = VoMeasurement(60 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
-    nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
     state = NavState(keyframe.t_ns, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15) * 1e-4)
     AttitudeFilter(config.attitude, config.imu.gravity_m_s2, np.eye(3), np.zeros(3)).add(
         ImuSample(dt_ns, np.zeros(3), rest)
@@ -155,7 +154,7 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
             fast.correct(Start(state, keyframe, noise))
         if k in (120, 140, 160):  # a keyframe at rest, rest that goes on, wheels
             frame = replace(keyframe, t_ns=(k - 20) * dt_ns, keyframe_id=int(k > 120))
-            fast.correct(Correction(frame.t_ns, frame, nothing, k < 160, k == 160, 1 if k == 120 else None))
+            fast.correct(Correction(frame.t_ns, frame, no_observations(), k < 160, k == 160, 1 if k == 120 else None))
         fast.publish(k * dt_ns, _well)
 
 

@@ -18,7 +18,6 @@ from vislam.config import Config
 from vislam.ekf.correction import Hint
 from vislam.errors import DataError, HardwareError
 from vislam.front import Front, FrontStep
-from vislam.frontend.result import no_observations
 from vislam.hw.health import Health
 from vislam.imu import ImuNoise
 from vislam.live.beginning import Beginning
@@ -30,7 +29,7 @@ from vislam.live.messages import CameraHealth, Rebase, Start, ToFast
 from vislam.live.publisher import PoseReader
 from vislam.live.rehearsal import rehearse_front
 from vislam.live.stream import SampleReceiver, Value
-from vislam.messages import Array, Frame, Keyframe, Tracking
+from vislam.messages import Array, Frame, Keyframe, Tracking, no_observations
 from vislam.slam import makes_depth, seen_between
 
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
