@@ -27,13 +27,13 @@ sys.path.insert(0, str(ROOT))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
-from vislam.config import LoopConfig  # noqa: E402
+from vislam.config import LoopConfig, LoopTruthConfig  # noqa: E402
 from vislam.geometry import invert, so3_log  # noqa: E402
 from vislam.loop.detector import LoopDetector  # noqa: E402
 from vislam.messages import Frame, Keyframe, LoopCandidate, LoopDecision, LoopEdge  # noqa: E402
 from vislam.session.reader import Session, StoredKeyframe  # noqa: E402
 
-GROSS_M, GROSS_DEG = 0.5, 10.0
+RULE = LoopTruthConfig()
 
 
 class Pass:
@@ -76,7 +76,7 @@ def _is_gross(edge: LoopEdge, stored: list[StoredKeyframe]) -> bool:
         return False
     error = invert(edge.T_from_to) @ invert(stored[edge.from_id].T_map_body) @ stored[edge.to_id].T_map_body
     turn = np.linalg.norm(so3_log(np.ascontiguousarray(error[:3, :3])))
-    return bool(np.linalg.norm(error[:3, 3]) > GROSS_M or np.rad2deg(turn) > GROSS_DEG)
+    return bool(np.linalg.norm(error[:3, 3]) > RULE.gross_m or np.rad2deg(turn) > RULE.gross_deg)
 
 
 def _bytes(record: LoopCandidate) -> bytes:

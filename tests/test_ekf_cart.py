@@ -112,12 +112,18 @@ def test_a_cart_that_is_carried_sideways_is_gated() -> None:
     assert not answer.accepted and "innovation" in answer.reason and ekf.counters["nonholonomic_gated"] == 1
 
 
+def exactly_known() -> tuple[Ekf, Array, Array]:
+    """Return a filter at the true state, and the rate and force that a cart in its turn always has."""
+    ekf = Ekf(CART, NOISE, GRAVITY_M_S2)
+    T, velocity, rate, force = cart(0.0)
+    ekf.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
+    return ekf, rate, force
+
+
 def test_late_wheels_are_the_same_as_in_time() -> None:
     states = []
     for late in (False, True):
-        ekf = Ekf(CART, NOISE, GRAVITY_M_S2)
-        T, velocity, rate, force = cart(0.0)
-        ekf.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
+        ekf, rate, force = exactly_known()
         for k in range(101):
             t_ns = k * 5_000_000
             ekf.predict(ImuSample(t_ns, rate, force))
@@ -133,9 +139,7 @@ def test_late_wheels_are_the_same_as_in_time() -> None:
 def test_noise_that_is_told_late_counts_from_when_it_began() -> None:
     states = []
     for late in (False, True):
-        ekf = Ekf(CART, NOISE, GRAVITY_M_S2)
-        T, velocity, rate, force = cart(0.0)
-        ekf.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
+        ekf, rate, force = exactly_known()
         for k in range(201):
             ekf.predict(ImuSample(k * 5_000_000, rate, force))
             if k == (160 if late else 60):
@@ -147,8 +151,7 @@ def test_noise_that_is_told_late_counts_from_when_it_began() -> None:
     told, again = states[0].state(), states[1].state()
     assert told.covariance == pytest.approx(again.covariance, rel=1e-9, abs=1e-15)
     assert told.T_world_body == pytest.approx(again.T_world_body, abs=1e-12)
-    calm = Ekf(CART, NOISE, GRAVITY_M_S2)
-    calm.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
+    calm, rate, force = exactly_known()
     for k in range(201):
         calm.predict(ImuSample(k * 5_000_000, rate, force))
     at = [60 * 5_000_000, 180 * 5_000_000]

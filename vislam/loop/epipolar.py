@@ -90,8 +90,8 @@ def _sampson(R: Array, t: Array, xy_a: Array, xy_b: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _epipolar(E: Array, xy_a: Array, xy_b: Array) -> tuple[float, float, Point, Point]:
-    """Return the Sampson error of one match, its denominator, and both epipolar lines, in a and in b."""
+def _epipolar(E: Array, xy_a: Array, xy_b: Array) -> tuple[float, float, Point]:
+    """Return the Sampson error of one match, its denominator, and the epipolar line in b."""
     (ax, ay), (bx, by) = xy_a, xy_b
     in_a = (
         E[0, 0] * bx + E[0, 1] * by + E[0, 2], E[1, 0] * bx + E[1, 1] * by + E[1, 2],
@@ -102,7 +102,7 @@ def _epipolar(E: Array, xy_a: Array, xy_b: Array) -> tuple[float, float, Point, 
         E[0, 2] * ax + E[1, 2] * ay + E[2, 2],
     )  # fmt: skip
     scale = np.sqrt(in_a[0] ** 2 + in_a[1] ** 2 + in_b[0] ** 2 + in_b[1] ** 2) + 1e-15
-    return (ax * in_a[0] + ay * in_a[1] + in_a[2]) / scale, scale, in_a, in_b
+    return (ax * in_a[0] + ay * in_a[1] + in_a[2]) / scale, scale, in_b
 
 
 @njit(cache=True, nogil=True)
@@ -117,7 +117,7 @@ def _descend(R: Array, t: Array, xy_a: Array, xy_b: Array, sigma: float) -> tupl
         H, g = np.zeros((5, 5)), np.zeros(5)
         for i in range(len(xy_a)):
             (ax, ay), (bx, by) = xy_a[i], xy_b[i]
-            residual, scale, _, line = _epipolar(E, xy_a[i], xy_b[i])
+            residual, scale, line = _epipolar(E, xy_a[i], xy_b[i])
             J[0], J[1], J[2] = by * line[2] - line[1], line[0] - bx * line[2], bx * line[1] - by * line[0]
             x = R[0, 0] * bx + R[0, 1] * by + R[0, 2]
             y = R[1, 0] * bx + R[1, 1] * by + R[1, 2]
