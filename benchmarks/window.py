@@ -51,7 +51,7 @@ def world(seed: int, args: argparse.Namespace) -> World:
 def run_ours(packets: list[KeyframePacket], start: NavState, keyframes: int) -> tuple[Array, list[float]]:
     """Return positions [N, 3] as they were when each keyframe was the newest, and seconds of CPU for each."""
     window = SlidingWindow(
-        replace(WindowConfig(), imu_inflation=1.0, keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2
+        replace(WindowConfig(), keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2
     )
     window.initialise(start)
     positions, times = [], []
@@ -290,7 +290,7 @@ def nees(args: argparse.Namespace) -> None:
 
     names = ("rotation", "position", "velocity", "gyro bias", "accel bias")
     sums, drift = np.zeros(6), []
-    config = replace(WindowConfig(), imu_inflation=1.0, keyframes=args.keyframes)
+    config = replace(WindowConfig(), keyframes=args.keyframes)
     for seed in range(args.runs):
         packets, truths = world(seed, args).packets()
         window = SlidingWindow(config, MONO, World.noise, GRAVITY_M_S2)

@@ -269,7 +269,7 @@ class Consistency:
 
 def honest(**changes: object) -> EkfConfig:
     """Return settings that know the simulated noise exactly: no inflation."""
-    return EkfConfig(**{"imu_inflation": 1.0, "vo_inflation": 1.0, "vo_shared_fraction": SHARED, **changes})
+    return EkfConfig(**{"vo_inflation": 1.0, "vo_shared_fraction": SHARED, **changes})
 
 
 def shortened(scenario: Scenario, duration_s: float) -> Scenario:

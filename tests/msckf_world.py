@@ -137,7 +137,7 @@ class Flight:
 
     def filter(self, noise: ImuNoise = CHEAP, rig: Rig | None = None, **settings: object) -> MsckfEkf:
         """Return a filter started at the flight's first state."""
-        config = EkfConfig(**{"tight_imu_inflation": 1.0, "tight_point_inflation": 1.0, **settings})  # type: ignore[arg-type]
+        config = EkfConfig(**{"tight_point_inflation": 1.0, **settings})  # type: ignore[arg-type]
         ekf = MsckfEkf(config, noise, GRAVITY_M_S2, self.rig if rig is None else rig)
         ekf.initialise(self.start)
         return ekf

@@ -127,7 +127,7 @@ def test_prediction_is_preintegration() -> None:
     motion = Motion.random(2)
     samples = motion.samples(0.5)[0]
     T, v, *_ = motion.at(0.0)
-    ekf = Ekf(EkfConfig(imu_inflation=1.0), replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0), GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0), GRAVITY_M_S2)
     ekf.predict(samples[0])
     ekf.initialise(NavState(T0_NS, T, v, np.zeros(3), np.zeros(3), np.zeros((15, 15))))
     for s in samples[1:]:
@@ -300,7 +300,7 @@ class Scene:
         self.keyframes = range(0, len(self.stamps), self.vision.keyframe_every)
 
     def ekf(self, **config: float) -> Ekf:
-        settings = EkfConfig(**{"imu_inflation": 1.0, "vo_inflation": 1.0, **config})
+        settings = EkfConfig(**{"vo_inflation": 1.0, **config})
         ekf = Ekf(settings, EUROC_NOISE, GRAVITY_M_S2)
         ekf.initialise(self.start())
         return ekf
@@ -400,7 +400,7 @@ def test_measurement_ahead_of_the_imu_waits(scene: Scene) -> None:
 
 
 def test_start_in_the_past_runs_through_the_samples(scene: Scene) -> None:
-    first, later = scene.ekf(), Ekf(EkfConfig(imu_inflation=1.0, vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2)
+    first, later = scene.ekf(), Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2)
     for s in scene.samples[:200]:
         first.predict(s)
         later.predict(s)
@@ -755,7 +755,7 @@ CAMERA = transform(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, -0.05, 0.
 def test_directions_alone_keep_attitude_and_slow_the_drift() -> None:
     scene = Scene(seed=3, camera=CAMERA)
     free, seen = scene.ekf(), scene.ekf()
-    seen = Ekf(EkfConfig(imu_inflation=1.0, vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
+    seen = Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
     seen.initialise(scene.ekf().state())
     scene.run(seen)
     for s in scene.samples:
@@ -768,7 +768,7 @@ def test_directions_alone_keep_attitude_and_slow_the_drift() -> None:
 
 def test_direction_from_behind_is_refused_and_no_parallax_gives_rotation() -> None:
     scene = Scene(seed=3, camera=CAMERA)
-    ekf = Ekf(EkfConfig(imu_inflation=1.0, vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
+    ekf = Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
     ekf.initialise(scene.ekf().state())
     scene.run(ekf)
     last = scene.motions[-1]

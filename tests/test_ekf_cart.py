@@ -19,7 +19,7 @@ NOISE = ImuNoise(5e-4, 6e-3, 3e-5, 4e-4, 200.0)
 GRAVITY_M_S2 = 9.81
 AXLE_M = np.array([-0.3, 0.05, -0.1])
 SPEED_M_S, TURN_RAD_S = 0.8, 0.3
-CART = EkfConfig(imu_inflation=1.0, nonholonomic=True, axle_m=(-0.3, 0.05, -0.1))
+CART = EkfConfig(nonholonomic=True, axle_m=(-0.3, 0.05, -0.1))
 
 
 def perturbed(x: Array, d: Array) -> Array:
@@ -143,9 +143,9 @@ def test_noise_that_is_told_late_counts_from_when_it_began() -> None:
         for k in range(201):
             ekf.predict(ImuSample(k * 5_000_000, rate, force))
             if k == (160 if late else 60):
-                ekf.follow_noise(60 * 5_000_000, 3.0, 20.0)
+                ekf.follow_noise(60 * 5_000_000, NoiseScale(3.0, 20.0))
             if k == 180:
-                ekf.follow_noise(180 * 5_000_000, 1.0, 1.0)
+                ekf.follow_noise(180 * 5_000_000, NoiseScale(1.0, 1.0))
         assert ekf.counters["noise_changes"] == 2
         states.append(ekf)
     told, again = states[0].state(), states[1].state()
@@ -166,7 +166,7 @@ def test_noise_that_is_told_late_counts_from_when_it_began() -> None:
 def test_noise_that_is_no_number_is_refused() -> None:
     ekf, _ = drive(CART, 1, 0.5)
     for gyro, accel in ((np.nan, 1.0), (1.0, 0.0), (-1.0, 1.0)):
-        assert not ekf.follow_noise(ekf.state().t_ns, gyro, accel).accepted
+        assert not ekf.follow_noise(ekf.state().t_ns, NoiseScale(gyro, accel)).accepted
     assert ekf.counters["noise_invalid"] == 3 and ekf.counters["noise_changes"] == 0
 
 

@@ -16,7 +16,7 @@ from vislam.geometry import invert, se3_exp, so3_log, transform
 from vislam.graph import PoseGraph
 from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Tracking, VoMeasurement
 
-EXACT = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)  # the simulation tells its sigmas honestly
+EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)  # the simulation tells its sigmas honestly
 
 
 def graph_of(world: World, imu: bool = True, config: GraphConfig = EXACT) -> PoseGraph:
@@ -65,7 +65,7 @@ def error_of(state: NavState, world: World, k: int) -> np.ndarray:
 
 
 def test_an_error_of_scale_is_told_by_the_distance_from_the_start() -> None:
-    shared = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0, scale_sigma=0.01)
+    shared = GraphConfig(coupling="loose", vo_inflation=1.0, scale_sigma=0.01)
     (plain, _, _), (stretched, _, _) = run(World(4.0)), run(World(4.0), config=shared)
     np.testing.assert_array_equal(plain.poses(), stretched.poses())
     before, after = plain.states()[-1], stretched.states()[-1]

@@ -16,7 +16,7 @@ from vislam.factors import solver as solver_module
 from vislam.graph import PoseGraph
 from vislam.messages import ImuSpan, KeyframePacket, LoopDecision, LoopEdge
 
-EXACT = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)
+EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)
 POISON = RuntimeError("\nIndeterminate linear system detected while working near variable\n8646911284551352321")
 
 

@@ -24,7 +24,7 @@ TILTED = transform(so3_exp(np.array([0.4, -0.3, 1.2])), np.array([9.0, -7.0, 0.5
 
 
 def loose(world: World, imu: bool) -> PoseGraph:
-    config = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)
+    config = GraphConfig(coupling="loose", vo_inflation=1.0)
     graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
     graph.initialise(world.initial_state() if imu else None, world.truth[0])
     return graph

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from inertial_world import NS, Motion
 
-from vislam.imu import ImuNoise, NoiseEnvelope, SeenNoise
+from vislam.imu import ImuNoise, NoiseFloor, SeenNoise
 from vislam.messages import ImuSample
 
 SEED = 3
@@ -37,8 +37,8 @@ def ride(noise: ImuNoise, seconds: float = 10.0) -> list[ImuSample]:
     return samples
 
 
-def envelope(model: ImuNoise, samples: list[ImuSample]) -> NoiseEnvelope:
-    found = NoiseEnvelope(model)
+def envelope(model: ImuNoise, samples: list[ImuSample]) -> NoiseFloor:
+    found = NoiseFloor(model)
     for sample in samples:
         found.add(sample)
     return found
@@ -88,7 +88,7 @@ def test_a_standing_drone_confirms_its_data_sheet(data_root: Path) -> None:
 
     recording = open_dataset(f"euroc:{data_root / 'euroc_mh01_17s'}")
     assert recording.imu_noise is not None
-    found = NoiseEnvelope(recording.imu_noise)
+    found = NoiseFloor(recording.imu_noise)
     for value in recording.events():
         if isinstance(value, ImuSample):
             found.add(value)
@@ -100,7 +100,7 @@ def test_a_standing_drone_confirms_its_data_sheet(data_root: Path) -> None:
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 4.0])
 def test_the_newest_window_follows_a_ride_in_steps_and_never_goes_below_the_model(factor: float) -> None:
-    seen = NoiseEnvelope(TRUE)
+    seen = NoiseFloor(TRUE)
     levels, begins, newest = [], [], SeenNoise(0, 1.0, 1.0)
     for sample in ride(replace(TRUE, gyro_noise_density=factor * 2e-3, accel_noise_density=factor * 3e-2)):
         if seen.add(sample):

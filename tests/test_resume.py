@@ -30,7 +30,7 @@ from vislam.session import Session, SessionWriter, recall
 from vislam.sources import open_source
 from vislam.trajectory import read_tum
 
-LOOSE = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)
+LOOSE = GraphConfig(coupling="loose", vo_inflation=1.0)
 TIGHT = GraphConfig(coupling="tight", window_inflation=1.0)
 SOURCE = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=100"
 KILLS = 20

@@ -20,9 +20,10 @@ from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
 from vislam.frontend.uniform_motion import UniformMotion
 from vislam.geometry import invert, level_rotation, transform
-from vislam.imu import ImuBuffer, ImuNoise, NoiseEnvelope, RestDetector, subtract_bias
+from vislam.imu import ImuBuffer, ImuNoise, NoiseFloor, RestDetector, subtract_bias
 from vislam.memory import FrontMemory, FrontNews, StartFacts
 from vislam.messages import (
+    AS_MODELLED,
     Array,
     Frame,
     GraphUpdate,
@@ -32,6 +33,7 @@ from vislam.messages import (
     KeyframePacket,
     MagSample,
     NavState,
+    NoiseScale,
     Tracking,
     VoMeasurement,
 )
@@ -106,14 +108,13 @@ class Front:
         self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0, "pieces": 1}
         self._config = config
         self._clock = clock
-        self.noise = noise  # what is gone by: raised where the samples show more
+        self.noise = noise  # as told; spans and the filter hear what the samples show
         self._has_imu = noise is not None
         self.camera_clock = CameraClock(config.init)
         self.uniform = UniformMotion(config.init)
         self._filter: Filtering | None = None
         if noise is not None:
-            self._buffer = ImuBuffer(config.imu)
-            self.envelope = NoiseEnvelope(noise)
+            self._buffer = ImuBuffer(config.imu, noise)
             self._rest = RestDetector(config.init, noise)
             self._stillness = Stillness(config.init)
             self._initialiser = Initialiser(
@@ -155,9 +156,8 @@ class Front:
             start.status, start.reason, start.first_state, start.last, scale_sigma=start.scale_sigma,
             excitation_m_s2=start.excitation_m_s2,
         )  # fmt: skip
-        self.noise = start.noise
         vo = identity_motion(memory.t_ns, memory.keyframe_id, True, 0)
-        self._filter.resume(state, vo, start.noise, memory.news.filter_camera)
+        self._filter.resume(state, vo, memory.news.filter_camera)
 
     def begin_in_map(self, keyframe_id: int, next_track_id: int) -> None:
         """Number keyframes and tracks on from those of a map, before the first frame; the first begins a new piece."""
@@ -187,8 +187,6 @@ class Front:
             self._mag = value
         elif self._has_imu and self._filter is not None and self._buffer.add(value):
             self._filter.ekf.predict(value)
-            if self.envelope.add(value):
-                self._follow_noise(self._filter)
 
     def add_hint(self, hint: Hint) -> None:
         """Tell the filter what holds a body while the camera sees nothing."""
@@ -253,7 +251,7 @@ class Front:
         return FrontReport(
             self.frontend.mode, self.ekf_coupling if self.noise is not None else None, self.start, self.last_refusal,
             self.all_counters, self.nis_statistics,
-            self.envelope.warnings(self._config.imu.noise_tolerance) if self.noise is not None else [],
+            [] if self._floor is None else self._floor.warnings(self._config.imu.noise_tolerance),
             self.uniform.longest_s, self.calibration,
         )  # fmt: skip
 
@@ -285,6 +283,15 @@ class Front:
     def nis_statistics(self) -> dict[str, tuple[int, float, int]]:
         """Innovations that the filter accepted, by measurement: count, sum of NIS, sum of degrees of freedom."""
         return {} if self._filter is None else self._filter.ekf.nis_statistics
+
+    @property
+    def noise_scale(self) -> NoiseScale:
+        """White noise of the IMU over that of its model, as the newest samples show it."""
+        return AS_MODELLED if self._floor is None else self._floor.now.scale
+
+    @property
+    def _floor(self) -> NoiseFloor | None:
+        return self._buffer.noise_floor if self._has_imu else None
 
     def _linked(self, frame: Frame, track: TrackResult) -> TrackResult:
         """Return the track, tied to the keyframes of an earlier run where it begins anew."""
@@ -324,19 +331,6 @@ class Front:
             return None
         return self._filter.motion(self._last_frame_t_ns, t_ns)
 
-    def _follow_noise(self, filtering: Filtering) -> None:
-        """Raise the noise model, until the first state is found, to what the quietest half second shows.
-
-        From then on the filter hears of the newest half second, if it wants to.
-        """
-        if self.initialisation is not None:
-            assert self.noise is not None
-            filtering.hear(self.envelope, self.noise)
-            return
-        self.noise = self.envelope.at_least_seen(self._config.imu.noise_tolerance)
-        self._rest.trust(self.noise)
-        self._initialiser.trust(self.noise)
-
     def _follow_clock(self, vo: VoMeasurement) -> None:
         """Learn the camera's time offset; what waits for gravity is stamped anew, what left stays as it was."""
         if not self._has_imu:
@@ -374,7 +368,7 @@ class Front:
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
         self.initialisation = found
-        self._filter.start(found.last, track.vo, self.noise, self._buffer)
+        self._filter.start(found.last, track.vo)
         return self._release(found.T_odom_vo)
 
     def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
@@ -403,7 +397,10 @@ class Front:
         if not ekf.initialised:
             return None, None
         keyframe_id = None if track.keyframe is None else track.keyframe.id
-        self._filter.see(frame.t_ns, track.vo, track.observations, at_rest, keyframe_id, self.uniform.shows_scale)
+        assert self._floor is not None
+        self._filter.see(
+            frame.t_ns, track.vo, track.observations, at_rest, keyframe_id, self.uniform.shows_scale, self._floor.now
+        )
         T_odom_body = ekf.pose_at(frame.t_ns)
         if T_odom_body is None:
             T_odom_body = self._without_filter(track.vo)
@@ -497,4 +494,4 @@ def filter_config(config: Config, rig: Rig) -> EkfConfig:
     chosen = replace(config.ekf, coupling=coupling, tight_readout_s=readout_s, scale_sigma=scale_sigma)
     if mode != "planar":
         return chosen
-    return replace(chosen, imu_inflation=planar.imu_inflation, vo_inflation=planar.vo_inflation, follow_noise=True)
+    return replace(chosen, vo_inflation=planar.vo_inflation)

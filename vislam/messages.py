@@ -13,7 +13,7 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,16 @@ class MagSample:
     field_ut: Array  # [3]
 
 
+class NoiseScale(NamedTuple):
+    """White noise densities over those of the IMU's noise model."""
+
+    gyro: float
+    accel: float
+
+
+AS_MODELLED = NoiseScale(1.0, 1.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSpan:
     """IMU samples that cover `[t_ns[0], t_ns[-1]]` exactly: the first and last are interpolated to the asked times."""
@@ -71,6 +81,7 @@ class ImuSpan:
     t_ns: NDArray[np.int64]  # [N], strictly increasing
     gyro_rad_s: Array  # [N, 3]
     accel_m_s2: Array  # [N, 3]
+    noise: NoiseScale = AS_MODELLED  # what the samples around it show
 
 
 @dataclass(frozen=True, slots=True, eq=False)

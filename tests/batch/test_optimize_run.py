@@ -14,7 +14,7 @@ from vislam.frames import LoggedFrames
 from vislam.geometry import invert, so3_log
 from vislam.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
 
-NO_VIBRATION = BatchConfig(imu_inflation=1.0)  # the simulated IMU is as white as its model says
+NO_VIBRATION = BatchConfig()  # the simulated IMU is as white as its model says
 CONFIG = Config(batch=NO_VIBRATION)
 QUICK = Config(batch=replace(NO_VIBRATION, rounds=3, covariances=False))
 
@@ -108,7 +108,7 @@ def test_the_same_log_gives_the_same_bits():
 def test_covariances_tell_the_error():
     """Position and orientation relative to the start, three runs: normalised squared error near one per dimension."""
     honest = replace(
-        CONFIG, batch=BatchConfig(vision_inflation=1.0), graph=replace(CONFIG.graph, imu_inflation=1.0)
+        CONFIG, batch=BatchConfig(vision_inflation=1.0), graph=replace(CONFIG.graph)
     )  # noise of the world as it is
     ratios = []
     for seed in range(3):

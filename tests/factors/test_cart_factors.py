@@ -20,7 +20,7 @@ from vislam.messages import KeyframePacket
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
 
-EXACT = GraphConfig(coupling="loose", vo_inflation=1.0, imu_inflation=1.0)
+EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)
 
 
 def test_derivatives() -> None:

@@ -41,7 +41,7 @@ def test_covariance_is_honest() -> None:
     d2 = []
     world = World(150.0, keyframe_hz=1.0, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), walk=False, seed=5)
     noise = replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0)  # as in this world
-    integrator = Preintegrator(GraphConfig(imu_inflation=1.0, imu_integration_sigma=1e-6), noise, GRAVITY_M_S2)
+    integrator = Preintegrator(GraphConfig(imu_integration_sigma=1e-6), noise, GRAVITY_M_S2)
     for k in range(1, world.count):
         done = integrator.integrate(world.span(k), world.t_ns(k - 1), world.t_ns(k), NO_BIAS)
         assert done is not None

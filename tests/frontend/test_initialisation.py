@@ -24,7 +24,7 @@ from vislam.imu import ImuBuffer, ImuNoise
 from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
 
 QUIET = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
-HONEST = InitConfig(imu_inflation=1.0)
+HONEST = InitConfig()
 GYRO_BIAS, ACCEL_BIAS = np.array([0.08, -0.05, 0.03]), np.array([0.1, -0.05, 0.08])
 
 

@@ -13,7 +13,7 @@ from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.hw.timing import SampleClock
 from vislam.hw.track import SampleTrack
-from vislam.imu import NoiseEnvelope, PowerUp, Refusal, power_up
+from vislam.imu import NoiseFloor, PowerUp, Refusal, power_up
 from vislam.imu.noise import ImuNoise
 from vislam.messages import ImuSample, ImuSpan
 
@@ -101,7 +101,7 @@ def test_calibration_undoes_the_errors_of_a_raw_board() -> None:
 def test_noise_comes_through_with_the_density_of_the_data_sheets() -> None:
     model = ImuNoise(np.deg2rad(0.03), 9.80665 / 256 / np.sqrt(50.0) * 0.87, 0.0, 0.0, 400.0)
     with board(truth=still, magnetometer="none") as (driver, _, clock):
-        envelope = NoiseEnvelope(model)
+        envelope = NoiseFloor(model)
         inertial, _ = collect(driver, clock, 12.0)
         for sample in inertial:
             envelope.add(sample)

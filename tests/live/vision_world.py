@@ -14,7 +14,7 @@ from vislam.live.messages import Start
 from vislam.messages import ImuSample, NavState, Observations
 
 CART_IMU = ImuNoise(5e-4, 5e-3, 2e-5, 3e-4, 100.0)
-CONFIG = Config(imu=ImuConfig(gravity_m_s2=GRAVITY_M_S2), ekf=EkfConfig(imu_inflation=1.0, vo_inflation=1.0))
+CONFIG = Config(imu=ImuConfig(gravity_m_s2=GRAVITY_M_S2), ekf=EkfConfig(vo_inflation=1.0))
 NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
 

@@ -16,7 +16,7 @@ from vislam.geometry import invert, se3_log
 from vislam.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
 from vislam.window import SlidingWindow, WindowUpdate, gate
 
-HONEST = replace(WindowConfig(), imu_inflation=1.0, keyframes=8)  # the simulated sensor has no vibration
+HONEST = replace(WindowConfig(), keyframes=8)  # the simulated sensor has no vibration
 
 
 def run(

@@ -63,7 +63,7 @@ class _Batch:
     def __init__(self, log: FactorLog, config: Config) -> None:
         self._log = log
         self._config: BatchConfig = config.batch
-        self._chain = Chain(log, replace(config.graph, imu_inflation=config.batch.imu_inflation))
+        self._chain = Chain(log, config.graph)
         self._T_body_cam0 = log.rig.T_body_cams[0]
         self._loops = Loops(log.edges, self._chain, config.graph, self._T_body_cam0[:3, 3])
         self._tracks = collect(log, config.frontend)

@@ -15,7 +15,7 @@ from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.calibration.stillness import movement
 from vislam.calibration.tables import Table, read_inertial
 from vislam.datasets.imu_files import imu_noise_text
-from vislam.imu import ImuNoise, NoiseEnvelope, NoiseRatios
+from vislam.imu import ImuNoise, NoiseFloor, NoiseRatios
 from vislam.messages import Array, ImuSample
 
 _FILES = ("noise.yaml", "noise.png", "noise.json")
@@ -47,9 +47,9 @@ def calibrate_noise(options: NoiseOptions) -> Outcome:
     found = fit_still(read_inertial(options.source))
     written = found.model
     if options.driving is not None:
-        envelope = driving_envelope(read_inertial(options.driving), found.model)
-        found = NoiseCalibration(found.curves, found.fits, found.model, found.still_s, envelope.ratios)
-        written = envelope.at_least_seen(1.0)
+        floor = driving_floor(read_inertial(options.driving), found.model)
+        found = NoiseCalibration(found.curves, found.fits, found.model, found.still_s, floor.ratios)
+        written = floor.at_least_seen()
     report = _report(found, written)
     path = folder.write_text("noise.yaml", imu_noise_text(written, "; ".join(_statements(found))))
     folder.write_picture("noise.png", (10.0, 4.6), lambda figure, colors: draw(figure, colors, found))
@@ -88,12 +88,12 @@ def fit_still(table: Table) -> NoiseCalibration:
     return NoiseCalibration(curves, fits, _model(fits, rate_hz), span_s, None)
 
 
-def driving_envelope(table: Table, model: ImuNoise) -> NoiseEnvelope:
+def driving_floor(table: Table, model: ImuNoise) -> NoiseFloor:
     """Return the noise levels of a driving recording against a model."""
-    envelope = NoiseEnvelope(model)
+    floor = NoiseFloor(model)
     for t_ns, row in zip(table.t_ns.tolist(), table.values, strict=True):
-        envelope.add(ImuSample(t_ns, row[:3], row[3:]))
-    return envelope
+        floor.add(ImuSample(t_ns, row[:3], row[3:]))
+    return floor
 
 
 def _longest_still(table: Table) -> Table:

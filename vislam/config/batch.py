@@ -17,7 +17,6 @@ class BatchConfig:
     max_relative_sigma: float = 0.25  # of a landmark's distance by its own rays; farther ones lack parallax or depth
     max_observations: int = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
     min_seen: int = 12  # landmarks; a keyframe that sees fewer also gets the odometry of the run
-    imu_inflation: float = 6.0  # on white-noise sigmas, as in the window, for vibration: V2_01 0.040 m, 0.071 m at 2
     vision_inflation: float = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
     pixel_sigma_min_px: float = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
     pixel_sigma_max_px: float = 3.0

@@ -18,9 +18,7 @@ class EkfConfig:
     max_gap_s: float = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
     gap_gyro_rad_s: float = 0.5  # what the rate may have been inside a hole, against its interpolation
     gap_accel_m_s2: float = 2.0  # the same for specific force
-    imu_inflation: float = 10.0  # on white sigmas, for vibration: EuRoC fits 10, not 4; over a floor frontend.planar's
     vo_inflation: float = 1.5  # on sigmas of vision's motion, which miss model errors; over a floor frontend.planar's
-    follow_noise: bool = False  # white noise rises with what samples show, by half seconds; over a floor it always does
     vo_shared_fraction: float = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
     scale_sigma: float = 0.0  # relative, of all metres of vision together: a baseline; over a floor its height joins it
     accumulated_sigma_m: float = 0.02  # fixed R of accumulated vision; 0.005 to 0.1 err alike, below this motions fail
@@ -64,7 +62,6 @@ class EkfConfig:
     tight_max_range_m: float = 200.0  # beyond, nothing but rotation is seen
     tight_still_px: float = 1.0  # image motion between clones below which the older one is kept instead of the newer
     tight_min_interval_s: float = 0.03  # between clones; a fast camera would leave a window too short for parallax
-    tight_imu_inflation: float = 10.0  # on the white-noise sigmas; flying EuRoC: NEES of velocity 2.6 at 4, 0.6 here
     tight_time_offset: bool = True  # estimate what is to be added to the stamps of frames
     tight_time_offset_sigma_s: float = 0.01  # prior; USB cameras are stamped up to 30 ms late
     tight_extrinsic_rotation: bool = True  # refine the camera's rotation in the body
@@ -89,7 +86,6 @@ class WindowConfig:
     rho_sigma_1_m: float = 10.0  # prior of inverse depth: only keeps points without parallax from running away
     split_min: int = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
 
-    imu_inflation: float = 6.0  # on white-noise sigmas, for vibration; flying EuRoC: NEES of velocity 9 at 2, 1.6 here
     imu_max_gap_s: float = 0.1  # a longer hole is an outage
     imu_max_outage_s: float = 1.0  # bridged up to here with the two sigmas below; longer ones drop the factor
     outage_accel_sigma_m_s2: float = 3.0  # what nobody measured during an outage
@@ -166,7 +162,6 @@ class GraphConfig:
     tilt_every: int = 10  # keyframes between tilt factors; errors of nearer ones are the same accelerometer bias
     tilt_floor_deg: float = 0.1  # an accelerometer's scale and misalignment, which the window does not estimate
     huber_k: float = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
-    imu_inflation: float = 2.0  # on white noise sigma: data sheets know no vibration, scale error or time jitter
     imu_integration_sigma: float = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
     imu_max_gap_s: float = 0.1  # a longer hole is an outage
     imu_max_outage_s: float = 1.0  # outages up to this are bridged with the sigmas below, longer ones drop the factor

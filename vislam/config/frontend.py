@@ -29,7 +29,6 @@ class PlanarConfig:
     vibration_s: float = 3.0  # so long the gyro's word on tilt counts: springs bring a cart back, bias would not
     tilt_walk_deg: float = 0.01  # per root of a second, of the mean tilt: load and tyres
     heave_m: float = 0.002  # of the camera's height between two frames
-    imu_inflation: float = 1.0  # in place of `ekf.imu_inflation`: over a floor the filter goes by the noise it sees
     vo_inflation: float = 1.0  # in place of `ekf.vo_inflation`: tilt, springs and stamps are in the covariance already
     stamp_jitter_s: float = 0.002  # of frames, by a webcam over USB; in a turn 1 ms is 0.05 deg
     sigma_px: float = 0.3  # of a corner of the floor followed from the keyframe; residuals raise it
@@ -112,7 +111,6 @@ class InitConfig:
     mono_window_min_s: float = 1.0
     node_spacing_s: float = 0.1  # frames closer than this add noise and cost, not knowledge
     vo_inflation: float = 1.5  # on the sigmas of relative motion, which share the keyframe's landmark errors
-    imu_inflation: float = 4.0  # on the white-noise sigmas: vibration and aliasing are not in the data sheets
     accel_bias_sigma_m_s2: float = 0.2  # prior; a calibrated cheap accelerometer
     gyro_bias_sigma_rad_s: float = 0.5  # prior for the motion start; wide enough for the ITG3205's 40 deg/s
     max_tilt_sigma_deg: float = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg

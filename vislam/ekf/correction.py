@@ -28,7 +28,7 @@ class Correction:
     on_wheels: bool  # of a cart that moves: its axle goes neither sideways nor up; loose filters only
     keyframe_id: int | None  # None: no keyframe
     shows_scale: bool = True  # False: one camera, and motion too uniform; of no use to a loose filter
-    noise: SeenNoise | None = None  # since when samples are noisier or calmer; loose filters only, None: as before
+    noise: SeenNoise | None = None  # since when samples are noisier or calmer; None: as before
 
     def __reduce__(self) -> tuple[Callable[..., Correction], tuple[Any, ...]]:
         """Travel as plain numbers: dataclasses and arrays by themselves take a third of what the filter then takes."""
@@ -41,6 +41,8 @@ class Correction:
 
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
         """Give everything to a filter; return what it said to the motion."""
+        if self.noise is not None:  # it is of before the frame, and what is replayed once only goes ahead
+            ekf.follow_noise(self.noise.t_ns, self.noise.scale)
         if isinstance(ekf, Ekf):
             return self._apply_loosely(ekf)
         answer = ekf.update_vision(self.vo, self.observations, self.shows_scale)
@@ -51,8 +53,6 @@ class Correction:
         return answer
 
     def _apply_loosely(self, ekf: Ekf) -> UpdateResult:
-        if self.noise is not None:  # it is of before the frame, and what is replayed once only goes ahead
-            ekf.follow_noise(self.noise.t_ns, self.noise.gyro, self.noise.accel)
         with ekf.replayed_once():
             answer = ekf.update_vision(self.vo, self.observations)
             if self.at_rest:

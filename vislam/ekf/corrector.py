@@ -30,8 +30,7 @@ class Corrector:
     def __init__(self, config: EkfConfig, noise: ImuNoise, T_body_camera: Array | None) -> None:
         self._config = config
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
-        per_sample = config.imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
-        self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
+        self._white_rate_sigma = float(noise.gyro_noise_density * np.sqrt(noise.rate_hz))
         self._limits = np.array([0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)])
         self._axle = np.array(config.axle_m, dtype=np.float64)
         self._floor_sigma = float(config.floor_sigma_m or 0.0)
@@ -85,7 +84,8 @@ class Corrector:
         config = self._config
         goes_on = ledger.rested_t_ns is not None and event.t_ns - ledger.rested_t_ns <= REST_PAUSE_NS
         holds = ledger.clone_rests and goes_on
-        at_rest = zero_velocity(x, gyro_rad_s, float(config.zero_velocity_sigma_m_s), self._zero_rate_sigma)
+        rate_sigma = max(config.zero_rate_sigma_rad_s, self._white_rate_sigma * ledger.noise.gyro)
+        at_rest = zero_velocity(x, gyro_rad_s, float(config.zero_velocity_sigma_m_s), rate_sigma)
         if holds:
             at_rest = where_rest_began(x, at_rest, math.radians(config.rest_sigma_deg), float(config.rest_sigma_m))
         self._correct(event, at_rest, x, P, "zero_velocity")

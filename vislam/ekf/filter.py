@@ -29,7 +29,7 @@ from vislam.ekf.timeline import bias_measurement, keep_track, pose_between, stre
 from vislam.ekf.visual_motion import why_unusable
 from vislam.geometry import invert, quaternion_wxyz, skew
 from vislam.imu import ImuNoise, ImuSeries
-from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, ImuSample, NavState, NoiseScale, Observations, Tracking, VoMeasurement
 
 _NS = 1_000_000_000
 
@@ -59,14 +59,14 @@ class Ekf:
 
         Args:
             config: see `EkfConfig`.
-            noise: of the IMU; `config.imu_inflation` is applied to its white part.
+            noise: of the IMU, until `follow_noise` tells what the samples show.
             gravity_m_s2: magnitude, down in `odom`.
             T_body_camera: [4, 4]; its lever arm turns a direction seen by one camera into motion of the body.
                 None: camera and IMU coincide. Not used for metric visual odometry.
         """
         self._config = config
         self._gravity = float(gravity_m_s2)
-        white = config.imu_inflation * np.array([noise.gyro_noise_density, noise.accel_noise_density])
+        white = [noise.gyro_noise_density, noise.accel_noise_density]
         walks = [noise.gyro_bias_walk, noise.accel_bias_walk]
         self._told_sigmas = np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
         self._sigmas = self._told_sigmas  # with the noise that goes on now, see `follow_noise`
@@ -144,8 +144,7 @@ class Ekf:
             self._P[15:] = self._P[:, 15:] = 0.0  # no clone: the 16 numbers of the paper
         self._t_ns = state.t_ns
         self._applied = 0
-        self._ledger = Ledger(last_vo_t_ns=state.t_ns, floor_z_m=float(x[2]))
-        self._sigmas = self._told_sigmas
+        self._ledger = Ledger(last_vo_t_ns=state.t_ns, floor_z_m=float(x[2]), noise=self._ledger.noise)
         if vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo):
             self._place_keyframe(vo)
         self._series.extra[:] = np.nan
@@ -222,11 +221,11 @@ class Ekf:
         """
         return self._insert(Event(t_ns, Kind.NONHOLONOMIC))
 
-    def follow_noise(self, t_ns: int, gyro: float, accel: float) -> UpdateResult:
-        """Take it that white noise is so many times that of the settings from `t_ns` on: a ride shakes, a rest not."""
-        if not (np.isfinite([gyro, accel]).all() and min(gyro, accel) > 0.0):
+    def follow_noise(self, t_ns: int, scale: NoiseScale) -> UpdateResult:
+        """Take it that white noise is so many times that of the model from `t_ns` on: a ride shakes, a rest not."""
+        if not (np.isfinite(scale).all() and min(scale) > 0.0):
             return self._refuse("noise_invalid", "factors on noise must be finite and positive")
-        return self._insert(Event(t_ns, Kind.NOISE, noise=(gyro, accel)))
+        return self._insert(Event(t_ns, Kind.NOISE, noise=scale))
 
     def feed_back(
         self,
@@ -316,8 +315,7 @@ class Ekf:
                 self._take_checkpoint()
 
     def _sigmas_in(self, ledger: Ledger) -> Array:
-        gyro, accel = ledger.noise
-        return self._told_sigmas * np.array([gyro, accel, 1.0, 1.0, 1.0, 1.0])
+        return self._told_sigmas * np.array([*ledger.noise, 1.0, 1.0, 1.0, 1.0])
 
     def _integrate(self, x: Array, P: Array, t0_ns: int, t1_ns: int, sigmas: Array, keep: bool = False) -> None:
         if t1_ns <= t0_ns:

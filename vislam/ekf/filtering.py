@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +13,8 @@ from vislam.ekf import Ekf, make_ekf
 from vislam.ekf.correction import Correction
 from vislam.ekf.msckf import CameraCalibration, MsckfEkf
 from vislam.geometry import invert
-from vislam.imu import ImuBuffer, ImuNoise, NoiseEnvelope, SeenNoise
-from vislam.messages import Array, GraphUpdate, ImuSample, NavState, Observations, VoMeasurement
+from vislam.imu import ImuNoise, SeenNoise
+from vislam.messages import AS_MODELLED, Array, GraphUpdate, NavState, Observations, VoMeasurement
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.camera import Rig
@@ -27,7 +26,7 @@ class Filtering:
     """Owns the filter and what is on its way to it.
 
     Attributes:
-        ekf: the filter, another one after a start with other noise.
+        ekf: the filter.
         coupling: "loose" takes motions of visual odometry, "tight" takes tracks.
     """
 
@@ -35,36 +34,25 @@ class Filtering:
         """Make the filter that `config.coupling` asks for."""
         self.coupling = config.coupling
         self._config = config
-        self._make = partial(make_ekf, config, gravity_m_s2=gravity_m_s2, rig=rig)
-        self._noise = noise
-        self.ekf: Ekf | MsckfEkf = self._make(noise=noise)
+        self.ekf: Ekf | MsckfEkf = make_ekf(config, gravity_m_s2=gravity_m_s2, rig=rig, noise=noise)
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._told: list[Correction] = []  # since somebody asked
         self._start_ns = 0
-        self._noise_told = SeenNoise(0, 1.0, 1.0)
-        self._noise_news: SeenNoise | None = None  # what the filter is to be told
+        self._noise_told = AS_MODELLED
 
     @property
     def state(self) -> NavState | None:
         """The newest state; None before the first."""
         return self.ekf.state() if self.ekf.initialised else None
 
-    def start(self, state: NavState, vo: VoMeasurement, noise: ImuNoise, buffer: ImuBuffer) -> None:
-        """Start at a state in the past; another filter where the noise is not what this one was told at first."""
+    def start(self, state: NavState, vo: VoMeasurement) -> None:
+        """Start at a state in the past."""
         self._start_ns = state.t_ns
-        newest_t_ns = buffer.newest_t_ns
-        if noise != self._noise and newest_t_ns is not None:
-            self.ekf = self._make(noise=noise)
-            span = buffer.span(state.t_ns, newest_t_ns)
-            if span is not None:
-                for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
-                    self.ekf.predict(ImuSample(t_ns, gyro, accel))
         self.ekf.initialise(state, vo)
 
-    def resume(self, state: NavState, vo: VoMeasurement, noise: ImuNoise, camera: Array | None) -> None:
+    def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""
         self._start_ns = state.t_ns
-        self.ekf = self._make(noise=noise)
         if isinstance(self.ekf, MsckfEkf) and camera is not None:
             found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
             self.ekf.initialise(state, None, found)
@@ -81,21 +69,15 @@ class Filtering:
             found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
         ])  # fmt: skip
 
-    def hear(self, envelope: NoiseEnvelope, noise: ImuNoise) -> None:
-        """Take the noise that the newest samples show, to tell the filter with the next frame if it is another one."""
-        if not self._config.follow_noise:
-            return
-        seen = envelope.newest_over(noise, self._noise_told)
-        if (seen.gyro, seen.accel) != (self._noise_told.gyro, self._noise_told.accel):
-            self._noise_told = self._noise_news = replace(seen, t_ns=max(seen.t_ns, self._start_ns))
-
     def see(
         self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,
-        shows_scale: bool,
+        shows_scale: bool, noise: SeenNoise,
     ) -> None:  # fmt: skip
-        """Take what was seen in a frame, and tell the filter what it is to know by now."""
+        """Take what was seen in a frame and what the IMU's noise is, and tell the filter what it is to know by now."""
         on_wheels = self._config.nonholonomic and not at_rest
-        news, self._noise_news = self._noise_news, None
+        news = None
+        if noise.scale != self._noise_told:
+            self._noise_told, news = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))
         self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale, news))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
         while self._seen and self._seen[0].t_ns <= newest_ns:

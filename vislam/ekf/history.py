@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from vislam.ekf.timeline import Timeline
-from vislam.messages import Array, VoMeasurement
+from vislam.messages import AS_MODELLED, Array, NoiseScale, VoMeasurement
 
 OUTCOMES = (  # every counter a measurement can end in, and what they cause
     "keyframes",
@@ -57,7 +57,7 @@ class Event:
     keyframe_id: int = -1
     vo: VoMeasurement | None = None
     bias: Array | None = None  # [12] gyro, accel, and their sigmas
-    noise: tuple[float, float] = (1.0, 1.0)  # of gyro and accel from here on, over what the filter was made with
+    noise: NoiseScale = AS_MODELLED  # from here on, over what the filter was made with
     outcome: str = ""  # the counter it stands in; "" while it waits for the IMU
     was_reset: bool = False
     accepted: bool = False
@@ -81,7 +81,7 @@ class Ledger:
     T_odom_keyframe: Array | None = None  # [4, 4] where accumulated vision has the keyframe
     T_odom_vo: Array | None = None  # [4, 4] where it had the body last, and when
     vo_t_ns: int = 0
-    noise: tuple[float, float] = (1.0, 1.0)  # white noise of gyro and accel over that of the settings
+    noise: NoiseScale = AS_MODELLED  # white noise of the IMU over that of the model
     floor_z_m: float = 0.0  # height of the body in `odom` at the start, where a floor keeps it
 
 

@@ -26,7 +26,7 @@ from vislam.ekf.msckf_update import Outcome, Updater
 from vislam.ekf.timeline import bias_measurement, keep_track, pose_between, stretch
 from vislam.geometry import quaternion_wxyz, so3_exp, so3_log
 from vislam.imu import ImuNoise, ImuSeries
-from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, ImuSample, NavState, NoiseScale, Observations, Tracking, VoMeasurement
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.camera import Rig
@@ -58,6 +58,8 @@ _COUNTERS = (
     "bias_accepted",
     "bias_gated",
     "bias_invalid",
+    "noise_changes",
+    "noise_invalid",
     "before_start",
     "too_late",
     "rewinds",
@@ -86,16 +88,16 @@ class MsckfEkf:
 
         Args:
             config: see `EkfConfig`.
-            noise: of the IMU; `config.tight_imu_inflation` is applied to its white part.
+            noise: of the IMU, until `follow_noise` tells what the samples show.
             gravity_m_s2: magnitude, down in `odom`.
             rig: cameras; observations may also hold right pixels (two cameras) or depth.
         """
         self._config = config
         self._rig = rig
         self._gravity = float(gravity_m_s2)
-        white = config.tight_imu_inflation * np.array([noise.gyro_noise_density, noise.accel_noise_density])
+        white = [noise.gyro_noise_density, noise.accel_noise_density]
         walks = [noise.gyro_bias_walk, noise.accel_bias_walk]
-        self._sigmas = np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
+        self._told_sigmas = np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
         self._updater = Updater(config, noise, self._gravity, rig)
         self._R_configured = np.ascontiguousarray(rig.T_body_cams[0][:3, :3], dtype=np.float64)
         self._checkpoint_ns = round(config.checkpoint_s * _NS)
@@ -107,6 +109,7 @@ class MsckfEkf:
         self._Phi = np.eye(kernels.INERTIAL)
         self._Q = np.zeros((kernels.INERTIAL, kernels.INERTIAL))
         self._window = Window(np.zeros((19, 19)), 0.0, self._R_configured)
+        self._sigmas = self._told_sigmas  # with the noise that goes on now, see `follow_noise`
         self._t_ns = 0
         self._applied = 0
         self._counts = dict.fromkeys(_COUNTERS, 0)
@@ -173,7 +176,8 @@ class MsckfEkf:
             P[TIME, TIME] = camera.time_offset_sigma_s**2
             P[MOUNT, MOUNT] = np.diag(camera.rotation_sigma_rad**2)
             time_offset_s, R_body_cam = camera.time_offset_s, R_body_cam @ so3_exp(camera.rotation_rad)
-        self._window = Window(P, time_offset_s, R_body_cam, last_vision_t_ns=state.t_ns)
+        noise = self._window.noise
+        self._window = Window(P, time_offset_s, R_body_cam, last_vision_t_ns=state.t_ns, noise=noise)
         self._Phi, self._Q = np.eye(kernels.INERTIAL), np.zeros((kernels.INERTIAL, kernels.INERTIAL))
         self._t_ns, self._applied = state.t_ns, 0
         self._series.extra[:] = np.nan
@@ -231,6 +235,12 @@ class MsckfEkf:
         """Tell the filter that the body is at rest at a frame: no velocity, and the pose where rest began."""
         return self._insert(Event(t_ns, Kind.REST))
 
+    def follow_noise(self, t_ns: int, scale: NoiseScale) -> UpdateResult:
+        """Take it that white noise is so many times that of the model from `t_ns` on: a ride shakes, a rest not."""
+        if not (np.isfinite(scale).all() and min(scale) > 0.0):
+            return self._refuse("noise_invalid", "factors on noise must be finite and positive")
+        return self._insert(Event(t_ns, Kind.NOISE, noise=scale))
+
     def feed_back(
         self,
         gyro_bias: Array,
@@ -259,7 +269,7 @@ class MsckfEkf:
         if checkpoint is None:
             return None
         x, Phi, Q = checkpoint.x.copy(), checkpoint.Phi.copy(), checkpoint.Q.copy()
-        self._integrate(x, Phi, Q, checkpoint.t_ns, t_ns)
+        self._integrate(x, Phi, Q, checkpoint.t_ns, t_ns, self._sigmas_in(checkpoint.window))
         return _nav_state(t_ns, x, Phi, Q, checkpoint.window)
 
     def pose_at(self, t_ns: int) -> Array | None:
@@ -313,17 +323,22 @@ class MsckfEkf:
             if step_ns < t_ns:  # stop on a sample: stopping between two would change the arithmetic
                 step_ns = int(self._series.t_ns[np.searchsorted(self._series.t_ns, step_ns)])
                 step_ns = min(step_ns, t_ns)
-            self._integrate(self._x, self._Phi, self._Q, self._t_ns, step_ns, keep=True)
+            self._integrate(self._x, self._Phi, self._Q, self._t_ns, step_ns, self._sigmas, keep=True)
             self._t_ns = step_ns
             if self._history is not None and step_ns - self._history.checkpoints[-1].t_ns >= self._checkpoint_ns:
                 self._take_checkpoint()
 
-    def _integrate(self, x: Array, Phi: Array, Q: Array, t0_ns: int, t1_ns: int, keep: bool = False) -> None:
+    def _sigmas_in(self, window: Window) -> Array:
+        return self._told_sigmas * np.array([*window.noise, 1.0, 1.0, 1.0, 1.0])
+
+    def _integrate(
+        self, x: Array, Phi: Array, Q: Array, t0_ns: int, t1_ns: int, sigmas: Array, keep: bool = False
+    ) -> None:
         if t1_ns <= t0_ns:
             return
         piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
         track = np.empty((len(piece.t_ns), 10))
-        kernels.run(x, Phi, Q, piece.t_ns, piece.samples, piece.gaps_s, track, self._sigmas, self._gravity)
+        kernels.run(x, Phi, Q, piece.t_ns, piece.samples, piece.gaps_s, track, sigmas, self._gravity)
         if keep:
             keep_track(self._series, piece, track)
 
@@ -339,6 +354,9 @@ class MsckfEkf:
             window, outcome = self._updater.see(window, self._x, rate, ago_s, event.frame)
         elif event.kind is Kind.REST:
             window, outcome = self._updater.rest(window, self._x, rate, event.t_ns)
+        elif event.kind is Kind.NOISE:
+            window, outcome = replace(window, noise=event.noise), Outcome(True, counts={"noise_changes": 1})
+            self._sigmas = self._sigmas_in(window)
         else:
             assert event.bias is not None
             window, outcome = self._updater.known_bias(window, self._x, event.bias)
@@ -370,6 +388,7 @@ class MsckfEkf:
         self._x[:] = checkpoint.x
         self._Phi[:], self._Q[:] = checkpoint.Phi, checkpoint.Q
         self._t_ns, self._applied, self._window = checkpoint.t_ns, checkpoint.applied, checkpoint.window
+        self._sigmas = self._sigmas_in(checkpoint.window)
 
 
 def _nav_state(t_ns: int, x: Array, Phi: Array, Q: Array, window: Window) -> NavState:

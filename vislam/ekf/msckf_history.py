@@ -10,7 +10,7 @@ from vislam.ekf.msckf_state import Window
 from vislam.ekf.msckf_tracks import FrameTracks
 from vislam.ekf.msckf_update import Outcome
 from vislam.ekf.timeline import Timeline, time_of
-from vislam.messages import Array
+from vislam.messages import AS_MODELLED, Array, NoiseScale
 
 
 class Kind(StrEnum):
@@ -19,21 +19,25 @@ class Kind(StrEnum):
     FRAME = "frame"
     REST = "rest"
     BIAS = "bias"
+    NOISE = "noise"
 
 
 @dataclass(slots=True, eq=False)
 class Event:
     """A measurement, and what became of it the last time it was applied."""
 
-    t_ns: int  # of the frame by the camera's clock; of a bias by the IMU's
+    t_ns: int  # of a frame and of rest by the camera's clock; of bias and noise by the IMU's
     kind: Kind
     frame: FrameTracks | None = None
     bias: Array | None = None  # [12] gyro, accel, and their sigmas
+    noise: NoiseScale = AS_MODELLED  # from here on, over what the filter was made with
     outcome: Outcome | None = None  # None while it waits for the IMU
 
     def effective_t_ns(self, window: Window) -> int:
         """Return when it happened by the IMU's clock, as far as is known before it is used."""
-        return self.t_ns if self.kind is Kind.BIAS else self.t_ns + round(window.time_offset_s * 1e9)
+        if self.kind in (Kind.BIAS, Kind.NOISE):
+            return self.t_ns
+        return self.t_ns + round(window.time_offset_s * 1e9)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from vislam.ekf.kernels import turn
 from vislam.ekf.msckf_tracks import FrameTracks
 from vislam.geometry import skew, so3_exp, so3_left_jacobian
-from vislam.messages import Array
+from vislam.messages import AS_MODELLED, Array, NoiseScale
 
 TIME = 15
 MOUNT = slice(16, 19)
@@ -49,6 +49,7 @@ class Window:
     rejects: int = 0  # frames in a row whose tracks contradict the state
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0
+    noise: NoiseScale = AS_MODELLED  # white noise of the IMU from here on
 
     @property
     def first_point(self) -> int:

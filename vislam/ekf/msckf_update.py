@@ -115,8 +115,7 @@ class Updater:
         self._least = 2 if rig.is_stereo or rig.has_depth else config.tight_min_observations
         most = features.ROWS_MAX * (config.tight_clones + 2)
         self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
-        per_sample = config.tight_imu_inflation * noise.gyro_noise_density * np.sqrt(noise.rate_hz)
-        self._zero_rate_sigma = max(config.zero_rate_sigma_rad_s, float(per_sample))
+        self._white_rate_sigma = float(noise.gyro_noise_density * np.sqrt(noise.rate_hz))
         self._reset_sigmas = reset_sigmas(config)
 
     # -- a frame -----------------------------------------------------------------------------------------------------
@@ -327,10 +326,9 @@ class Updater:
         R = pose(x, 0, 6)[:3, :3]
         H = np.zeros((6, len(window.P)))
         H[:3, 6:9] = R.T / config.zero_velocity_sigma_m_s
-        H[3:, 9:12] = np.eye(3) / self._zero_rate_sigma
-        r = np.concatenate(
-            (-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / self._zero_rate_sigma)
-        )
+        rate_sigma = max(config.zero_rate_sigma_rad_s, self._white_rate_sigma * window.noise.gyro)
+        H[3:, 9:12] = np.eye(3) / rate_sigma
+        r = np.concatenate((-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / rate_sigma))
         if not self._passes("zero_velocity", window, H, r, out):
             return replace(window, rest_t_ns=None), out
         window = replace(corrected(window, x, H, r), rested_t_ns=t_ns)

@@ -32,11 +32,11 @@ class Preintegrator:
     """Turns IMU spans into combined factors."""
 
     def __init__(self, config: GraphConfig, noise: ImuNoise, gravity_m_s2: float) -> None:
-        """Set up the noise of the IMU, inflated and floored as `config` says."""
+        """Set up the noise of the IMU, its walks floored as `config` says; spans scale the white part."""
         self._config = config
         self._gravity_m_s2 = gravity_m_s2
-        self._gyro_density = noise.gyro_noise_density * config.imu_inflation
-        self._accel_density = noise.accel_noise_density * config.imu_inflation
+        self._gyro_density = noise.gyro_noise_density
+        self._accel_density = noise.accel_noise_density
         self.gyro_bias_walk = max(noise.gyro_bias_walk, config.gyro_bias_walk_floor)
         self.accel_bias_walk = max(noise.accel_bias_walk, config.accel_bias_walk_floor)
 
@@ -56,13 +56,15 @@ class Preintegrator:
         outage_s = float(dt[outage].sum())
         if len(dt) == 0 or outage_s > self._config.imu_max_outage_s:
             return None
-        params = self._params()
+        white = self._gyro_density * span.noise.gyro, self._accel_density * span.noise.accel
+        params = self._params(white)
         pim = gtsam.PreintegratedCombinedMeasurementsG(params, bias)
         mean_gyro = 0.5 * (gyro[1:] + gyro[:-1])
         mean_accel = 0.5 * (accel[1:] + accel[:-1])
         for i, step_s in enumerate(dt.tolist()):
             if outage[i]:
                 self._bridge(pim, params, gyro[i : i + 2], accel[i : i + 2], step_s)
+                self._set_white_noise(params, *white)
             else:
                 pim.integrateMeasurement(mean_accel[i], mean_gyro[i], step_s)
         return Preintegrated(pim, float(t_s[-1] - t_s[0]), outage_s)
@@ -76,9 +78,9 @@ class Preintegrator:
         root = np.sqrt(duration_s)
         return np.repeat([self.accel_bias_walk * root, self.gyro_bias_walk * root], 3)
 
-    def _params(self) -> gtsam.PreintegrationCombinedParams:
+    def _params(self, white: tuple[float, float]) -> gtsam.PreintegrationCombinedParams:
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(self._gravity_m_s2)
-        self._set_white_noise(params, self._gyro_density, self._accel_density)
+        self._set_white_noise(params, *white)
         params.setIntegrationCovariance(np.eye(3) * self._config.imu_integration_sigma**2)
         params.setBiasOmegaCovariance(np.eye(3) * self.gyro_bias_walk**2)
         params.setBiasAccCovariance(np.eye(3) * self.accel_bias_walk**2)
@@ -122,4 +124,3 @@ class Preintegrator:
                 (1.0 - alpha) * accel[0] + alpha * accel[1], (1.0 - alpha) * gyro[0] + alpha * gyro[1],
                 duration_s / steps,
             )  # fmt: skip
-        self._set_white_noise(params, self._gyro_density, self._accel_density)

@@ -183,6 +183,8 @@ def _checked_span(span: ImuSpan, t0_ns: int, t1_ns: int, what: str) -> ImuSpan:
         raise DataError(f"{what}: IMU span holds NaN or infinity; drop such samples before they get here")
     if np.any(np.diff(t) <= 0):
         raise DataError(f"{what}: IMU stamps must strictly increase")
+    if not (np.isfinite(span.noise).all() and min(span.noise) > 0.0):
+        raise DataError(f"{what}: the scale of the IMU's noise must be finite and positive, got {tuple(span.noise)}")
     if len(t) and (t[0] < t0_ns - _TIME_SLACK_NS or t[-1] > t1_ns + _TIME_SLACK_NS):
         raise DataError(f"{what}: IMU span [{t[0]}, {t[-1]}] ns is outside the keyframes' [{t0_ns}, {t1_ns}]")
-    return ImuSpan(t, gyro, accel)
+    return replace(span, t_ns=t, gyro_rad_s=gyro, accel_m_s2=accel)

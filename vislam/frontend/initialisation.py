@@ -101,21 +101,11 @@ class Initialiser:
         self._camera = camera
         self._track_sigma_px = track_sigma_px
         self._rest = RestDetector(config, noise)
-        self.trust(noise)
+        self._noise = noise
         self._window = FrameWindow()
         self._next_attempt_ns = 0
         self._before: Lengths | None = None  # the attempt before
         self._last = Initialisation("waiting", "no frame yet")
-
-    def trust(self, noise: ImuNoise) -> None:
-        """Go by another noise model of the IMU from now on."""
-        inflation = self._config.imu_inflation
-        self._noise = replace(
-            noise,
-            gyro_noise_density=noise.gyro_noise_density * inflation,
-            accel_noise_density=noise.accel_noise_density * inflation,
-        )
-        self._rest.trust(noise)
 
     def add(
         self,

@@ -3,8 +3,8 @@
 from vislam.imu.attitude import AttitudeFilter
 from vislam.imu.bias_memory import BiasMemory
 from vislam.imu.buffer import ImuBuffer
-from vislam.imu.envelope import NoiseEnvelope, NoiseRatios, SeenNoise
 from vislam.imu.noise import ImuCalibration, ImuNoise, MagCalibration
+from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
 from vislam.imu.power_up import PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, preintegrate
 from vislam.imu.rest import RestDetector
@@ -18,7 +18,7 @@ __all__ = [
     "ImuNoise",
     "ImuSeries",
     "MagCalibration",
-    "NoiseEnvelope",
+    "NoiseFloor",
     "NoiseRatios",
     "PowerUp",
     "Preintegrated",

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vislam.config import ImuConfig
+from vislam.imu.noise import ImuNoise
+from vislam.imu.noise_floor import NoiseFloor
 from vislam.imu.series import ImuSeries
 from vislam.messages import ImuSample, ImuSpan
 
@@ -17,10 +21,12 @@ class ImuBuffer:
     Attributes:
         counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than
             `config.max_gap_s`.
+        noise_floor: what the samples show of their noise; None without a model to compare with.
     """
 
-    def __init__(self, config: ImuConfig) -> None:
-        """Start empty."""
+    def __init__(self, config: ImuConfig, noise: ImuNoise | None = None) -> None:
+        """Start empty; with a noise model the spans tell what the samples show against it."""
+        self.noise_floor = None if noise is None else NoiseFloor(noise)
         self._series = ImuSeries()
         self._buffer_ns = round(config.buffer_s * _NS)
         self._max_gap_ns = round(config.max_gap_s * _NS)
@@ -51,6 +57,8 @@ class ImuBuffer:
         self._samples += 1
         if newest is not None and sample.t_ns - newest > self._max_gap_ns:
             self._gaps += 1
+        if self.noise_floor is not None:
+            self.noise_floor.add(sample)
         if sample.t_ns >= self._forget_at_ns:  # now and then: forgetting costs more than taking in
             self._series.forget_before(sample.t_ns - self._buffer_ns)
             self._forget_at_ns = sample.t_ns + self._buffer_ns // 16
@@ -62,7 +70,10 @@ class ImuBuffer:
         None if the samples held do not cover it, or if t1 is not after t0. A hole in the samples is interpolated
         across; ask `gap_s` whether there is one before trusting the span.
         """
-        return self._series.cut(t0_ns, t1_ns)
+        span = self._series.cut(t0_ns, t1_ns)
+        if span is None or self.noise_floor is None:
+            return span
+        return replace(span, noise=self.noise_floor.between(t0_ns, t1_ns))
 
     def gap_s(self, t0_ns: int, t1_ns: int) -> float:
         """Return the longest time between neighbouring samples among those that `[t0_ns, t1_ns]` touches.

@@ -65,7 +65,7 @@ def preintegrate(
         span: at least two samples; what lies between samples is taken as linear, also across a hole.
         gyro_bias_rad_s: in rad/s, body frame.
         accel_bias_m_s2: in m/s^2, body frame.
-        noise: gives the covariance; None leaves it zero.
+        noise: gives the covariance, scaled by what the span shows; None leaves it zero.
 
     Raises:
         ValueError: fewer than two samples.
@@ -74,7 +74,9 @@ def preintegrate(
         raise ValueError(f"preintegration needs at least 2 samples, got {len(span.t_ns)}")
     gyro_bias = np.zeros(3) if gyro_bias_rad_s is None else np.asarray(gyro_bias_rad_s, dtype=np.float64)
     accel_bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
-    densities = (0.0, 0.0) if noise is None else (noise.gyro_noise_density, noise.accel_noise_density)
+    densities = (0.0, 0.0)
+    if noise is not None:
+        densities = noise.gyro_noise_density * span.noise.gyro, noise.accel_noise_density * span.noise.accel
     dR, dv, dp, J_gyro, J_accel, covariance = _integrate(
         span.t_ns, span.gyro_rad_s, span.accel_m_s2, gyro_bias, accel_bias, *densities
     )

@@ -28,13 +28,9 @@ class RestDetector:
         self._rest_ns = round(config.rest_s * _NS)
         self._gyro_max = config.rest_gyro_max_rad_s
         self._spans: deque[ImuSpan] = deque()
-        self.trust(noise)
-
-    def trust(self, noise: ImuNoise) -> None:
-        """Go by another noise model from now on."""
         per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
-        self._gyro_std = max(self._config.rest_gyro_std_rad_s, per_sample * noise.gyro_noise_density)
-        self._accel_std = max(self._config.rest_accel_std_m_s2, per_sample * noise.accel_noise_density)
+        self._gyro_white_std = per_sample * noise.gyro_noise_density
+        self._accel_white_std = per_sample * noise.accel_noise_density
 
     def clear(self) -> None:
         """Forget what was seen, as after a hole in the data."""
@@ -61,4 +57,6 @@ class RestDetector:
         gyro_std = float(np.linalg.norm(span.gyro_rad_s.std(axis=0)))
         accel_std = float(np.linalg.norm(span.accel_m_s2.std(axis=0)))
         rate = float(np.linalg.norm(span.gyro_rad_s.mean(axis=0)))
-        return gyro_std < self._gyro_std and accel_std < self._accel_std and rate < self._gyro_max
+        gyro_limit = max(self._config.rest_gyro_std_rad_s, self._gyro_white_std * span.noise.gyro)
+        accel_limit = max(self._config.rest_accel_std_m_s2, self._accel_white_std * span.noise.accel)
+        return gyro_std < gyro_limit and accel_std < accel_limit and rate < self._gyro_max

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.messages import Array, ImuSample, ImuSpan
+from vislam.messages import Array, ImuSample, ImuSpan, NoiseScale
 
 _FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
 _MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 1e3, 1e4  # beyond every sensor: such numbers come from a broken transfer
@@ -135,9 +136,20 @@ def join(spans: Sequence[ImuSpan]) -> ImuSpan:
         np.concatenate([spans[0].t_ns, *(span.t_ns[1:] for span in spans[1:])]),
         np.concatenate([spans[0].gyro_rad_s, *(span.gyro_rad_s[1:] for span in spans[1:])]),
         np.concatenate([spans[0].accel_m_s2, *(span.accel_m_s2[1:] for span in spans[1:])]),
+        _joint_noise(spans),
     )
+
+
+def _joint_noise(spans: Sequence[ImuSpan]) -> NoiseScale:
+    if len({span.noise for span in spans}) == 1:
+        return spans[0].noise
+    durations = [int(span.t_ns[-1] - span.t_ns[0]) for span in spans]
+    gyro, accel = np.sqrt(np.average([np.square(span.noise) for span in spans], axis=0, weights=durations)).tolist()
+    return NoiseScale(gyro, accel)
 
 
 def subtract_bias(span: ImuSpan, gyro_bias_rad_s: Array, accel_bias_m_s2: Array) -> ImuSpan:
     """Return the span with its biases [3] taken off."""
-    return ImuSpan(span.t_ns, span.gyro_rad_s - gyro_bias_rad_s, span.accel_m_s2 - accel_bias_m_s2)
+    return replace(
+        span, gyro_rad_s=span.gyro_rad_s - gyro_bias_rad_s, accel_m_s2=span.accel_m_s2 - accel_bias_m_s2
+    )

@@ -40,7 +40,7 @@ class FastPath:
 
         Args:
             config: `live`, `ekf`, `init`, `imu`, `power_up` and `attitude` of it are used.
-            noise: of the IMU, until `Start` says better.
+            noise: of the IMU, until vision's side tells what the samples show.
             T_body_camera: [4, 4] of the first camera.
             publish: takes each pose.
             memory: gyro biases that earlier power-ups found; None: none.
@@ -51,7 +51,7 @@ class FastPath:
         self._noise = noise
         self._T_body_camera = T_body_camera
         self._publish = publish
-        self._ekf = self._new_filter(noise)
+        self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, T_body_camera)
         self._buffer = ImuBuffer(config.imu)
         self._is_mag_calibrated = is_mag_calibrated
         self._alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
@@ -138,6 +138,7 @@ class FastPath:
         elif isinstance(message, Rebase):
             self.counters["rebases"] += 1
             self._ekf.initialise(message.state)
+            self._ekf.follow_noise(message.state.t_ns, message.noise)
             self._follow_vision(message.is_tracking, message.is_tracking, False)
             self._at_rest = message.at_rest
         elif isinstance(message, MapMoved):
@@ -207,23 +208,12 @@ class FastPath:
         return health
 
     def _start(self, start: Start) -> None:
-        """Begin at the first state, with the noise that the samples showed, and catch up with the newest sample."""
-        newest_t_ns = self._buffer.newest_t_ns
-        self._noise = start.noise
-        self._rest.trust(start.noise)
-        self._ekf = self._new_filter(start.noise)
-        span = None if newest_t_ns is None else self._buffer.span(start.state.t_ns, newest_t_ns)
-        if span is not None:
-            for t_ns, gyro, accel in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True):
-                self._ekf.predict(ImuSample(t_ns, gyro, accel))
+        """Begin at the first state, and catch up with the newest sample."""
         self._ekf.initialise(start.state, start.vo)
         self._resets += self._started > 0 or self._alone.has_attitude
         self._started += 1
         self._alone.end()
         self._follow_vision(True, True, False)
-
-    def _new_filter(self, noise: ImuNoise) -> Ekf:
-        return Ekf(self._config.ekf, noise, self._config.imu.gravity_m_s2, self._T_body_camera)
 
     def _follow_vision(self, sees: bool, accepted: bool, rejects: bool) -> None:
         self._sees, self._rejects = sees, rejects

@@ -151,7 +151,7 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
     for k in range(1, 200):
         fast.add(ImuSample(k * dt_ns, np.zeros(3), rest))
         if k == 80:
-            fast.correct(Start(state, keyframe, noise))
+            fast.correct(Start(state, keyframe))
         if k in (120, 140, 160):  # a keyframe at rest, rest that goes on, wheels
             frame = replace(keyframe, t_ns=(k - 20) * dt_ns, keyframe_id=int(k > 120))
             fast.correct(Correction(frame.t_ns, frame, no_observations(), k < 160, k == 160, 1 if k == 120 else None))

@@ -152,14 +152,14 @@ class FrontProcess:
     def _correct(self, step: FrontStep) -> None:
         """Tell the fast process's filter what this one was told."""
         found = self.front.initialisation
-        if not self._is_started and found is not None and found.last is not None and self.front.noise is not None:
+        if not self._is_started and found is not None and found.last is not None:
             self._is_started = True
-            self._send(Start(found.last, step.track.vo, self.front.noise))
+            self._send(Start(found.last, step.track.vo))
         if self.front.ekf_coupling == "tight":
             if step.state is not None:
                 is_tracking = step.track.vo.tracking is not Tracking.LOST
                 at_rest = any(correction.at_rest for correction in step.corrections)
-                self._send(Rebase(step.state, is_tracking, at_rest))
+                self._send(Rebase(step.state, is_tracking, at_rest, self.front.noise_scale))
             return
         for correction in step.corrections:
             self._send(replace(correction, observations=no_observations()))

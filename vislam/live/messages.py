@@ -6,17 +6,15 @@ from dataclasses import dataclass
 
 from vislam.ekf.correction import Correction
 from vislam.hw.health import Health
-from vislam.imu import ImuNoise
-from vislam.messages import Array, NavState, VoMeasurement
+from vislam.messages import Array, NavState, NoiseScale, VoMeasurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """Gravity is known: the first state, the motion seen there, and the noise model that fits the samples."""
+    """Gravity is known: the first state, and the motion seen there."""
 
     state: NavState
     vo: VoMeasurement
-    noise: ImuNoise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +24,7 @@ class Rebase:
     state: NavState
     is_tracking: bool
     at_rest: bool
+    noise: NoiseScale  # of the IMU from now on
 
 
 @dataclass(frozen=True, slots=True)

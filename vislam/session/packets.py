@@ -13,6 +13,7 @@ from vislam.messages import (
     KeyframePacket,
     MagSample,
     NavState,
+    NoiseScale,
     Observations,
     Tracking,
     VoMeasurement,
@@ -22,7 +23,7 @@ from vislam.session.schema import DESCRIPTOR_BYTES, integers, maybe_bytes, maybe
 # without observations, where only the graph is to be built again
 LIGHT_COLUMNS = (
     "id, vo_t_ns, vo_keyframe_id, vo_T, vo_covariance, vo_has_scale, vo_tracking, vo_inliers, x'', x'', NULL, NULL, "
-    "imu_t_ns, imu_gyro, imu_accel, mag_t_ns, mag_field, at_rest, time_offset_s, begins_piece, NULL"
+    "imu_t_ns, imu_gyro, imu_accel, mag_t_ns, mag_field, at_rest, time_offset_s, begins_piece, NULL, imu_noise"
 )
 
 
@@ -41,6 +42,7 @@ def packet_row(packet: KeyframePacket, newest: NavState | None) -> tuple[Any, ..
         None if imu is None else to_bytes(imu.accel_m_s2, "<f8"), None if mag is None else mag.t_ns,
         None if mag is None else to_bytes(mag.field_ut, "<f8"), int(packet.at_rest), packet.time_offset_s,
         int(packet.begins_piece), maybe_bytes(state, "<f8"),
+        None if imu is None else to_bytes(np.array(imu.noise), "<f8"),
     )  # fmt: skip
 
 
@@ -57,7 +59,8 @@ def packet_of(t_ns: int, row: tuple[Any, ...]) -> KeyframePacket:
     if row[12] is not None:
         stamps = integers(row[12])
         shape = (len(stamps), 3)
-        imu = ImuSpan(stamps, numbers(row[13], "<f8", shape), numbers(row[14], "<f8", shape))
+        scale = NoiseScale(*numbers(row[21], "<f8", (2,)).tolist())
+        imu = ImuSpan(stamps, numbers(row[13], "<f8", shape), numbers(row[14], "<f8", shape), scale)
     mag = None if row[15] is None else MagSample(row[15], numbers(row[16], "<f8", (3,)))
     features = np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
     keyframe = Keyframe(row[0], t_ns, Frame(t_ns, row[0], ()), *features, None)

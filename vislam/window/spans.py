@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vislam.config import WindowConfig
@@ -22,13 +20,6 @@ class LinkStore:
         """Start empty; without `noise` there is no IMU."""
         self._config = config
         self._noise = noise
-        self._white = None
-        if noise is not None:
-            self._white = replace(
-                noise,
-                gyro_noise_density=noise.gyro_noise_density * config.imu_inflation,
-                accel_noise_density=noise.accel_noise_density * config.imu_inflation,
-            )
         self._gravity_m_s2 = gravity_m_s2
         self._spans: list[ImuSpan | None] = []
         size = config.keyframes + 2
@@ -94,7 +85,7 @@ class LinkStore:
         """Integrate link k at a bias [6]."""
         span = self._spans[k]
         assert span is not None
-        result = preintegrate(span, bias[:3], bias[3:], self._white)
+        result = preintegrate(span, bias[:3], bias[3:], self._noise)
         links = self._links
         links.dR[k], links.dv[k], links.dp[k], links.bias[k] = result.dR, result.dv_m_s, result.dp_m, bias
         links.by_bias[k] = jacobian_by_bias(result)
