@@ -50,9 +50,7 @@ def world(seed: int, args: argparse.Namespace) -> World:
 
 def run_ours(packets: list[KeyframePacket], start: NavState, keyframes: int) -> tuple[Array, list[float]]:
     """Return positions [N, 3] as they were when each keyframe was the newest, and seconds of CPU for each."""
-    window = SlidingWindow(
-        replace(WindowConfig(), keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2
-    )
+    window = SlidingWindow(replace(WindowConfig(), keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2)
     window.initialise(start)
     positions, times = [], []
     for packet in packets:

@@ -13,7 +13,7 @@ from vislam.ekf import Correction, Ekf, kernels
 from vislam.ekf.measurements import on_wheels
 from vislam.geometry import invert, so3_exp, transform
 from vislam.imu import ImuNoise, SeenNoise
-from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
+from vislam.messages import Array, ImuSample, NavState, NoiseScale, Observations, Tracking, VoMeasurement
 
 NOISE = ImuNoise(5e-4, 6e-3, 3e-5, 4e-4, 200.0)
 GRAVITY_M_S2 = 9.81
@@ -173,7 +173,7 @@ def test_noise_that_is_no_number_is_refused() -> None:
 def test_a_correction_takes_the_noise_along_to_another_process() -> None:
     vo = VoMeasurement(60 * 5_000_000, 0, invert(cart(0.0)[0]) @ cart(0.3)[0], np.eye(6) * 1e-4, True, Tracking.OK, 50)
     nothing = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
-    told = Correction(vo.t_ns, vo, nothing, False, False, None, noise=SeenNoise(20 * 5_000_000, 1.5, 7.6))
+    told = Correction(vo.t_ns, vo, nothing, False, False, None, noise=SeenNoise(20 * 5_000_000, NoiseScale(1.5, 7.6)))
     ekf = drive(CART, 1, 0.5)[0]
     ekf.add_keyframe(0, 0)
     answer = pickle.loads(pickle.dumps(told)).apply(ekf)  # noqa: S301

@@ -69,6 +69,7 @@ class FrontReport:
     counters: dict[str, dict[str, int]]
     nis: dict[str, tuple[int, float, int]]  # innovations that the filter accepted, see `Ekf.nis_statistics`
     noise_warnings: list[str]
+    imu_noise: dict[str, dict[str, float]]  # white noise of the IMU: told, and what the samples showed
     uniform_s: float  # longest stretch without motion that shows scale
     calibration: dict[str, float]  # what was learned of the camera
 
@@ -252,6 +253,7 @@ class Front:
             self.frontend.mode, self.ekf_coupling if self.noise is not None else None, self.start, self.last_refusal,
             self.all_counters, self.nis_statistics,
             [] if self._floor is None else self._floor.warnings(self._config.imu.noise_tolerance),
+            {} if self._floor is None else self._floor.summary(),
             self.uniform.longest_s, self.calibration,
         )  # fmt: skip
 

@@ -42,7 +42,7 @@ class VisionWorld:
             Correction(vo.t_ns, vo, NOTHING_SEEN, False, False, i // vision.keyframe_every if i % 8 == 0 else None)
             for i, vo in enumerate(motions)
         ]
-        return VisionWorld(motion, samples, Start(state, motions[0], CART_IMU), corrections)
+        return VisionWorld(motion, samples, Start(state, motions[0]), corrections)
 
     def lost(self, begin_s: float, end_s: float) -> VisionWorld:
         """Return the same without frames between two times since the first sample."""

@@ -14,7 +14,7 @@ class ImuConfig:
     accel_bias_walk: float | None = None  # m/s^3/sqrt(Hz)
     gravity_m_s2: float = 9.81
     buffer_s: float = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
-    noise_tolerance: float = 3.0  # a model of white noise that the quietest half second exceeds by more is raised
+    noise_tolerance: float = 3.0  # a run whose quietest second has less than a third of the white noise told is warned
     max_gap_s: float = 0.1  # a longer hole between samples is an outage, not something to interpolate across
     max_wait_s: float = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
 

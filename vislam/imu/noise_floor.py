@@ -24,6 +24,7 @@ _AVERAGED = 4  # windows; alone, the quietest band of a window is 20 % quieter t
 _LOWEST_HZ = 3.0  # below, even slow machines move
 _HIGHEST_SHARE = 0.25  # of the rate; above, the low-pass filters of sensors take noise out that is there lower down
 _CHANCE = 1.08  # how much the quietest of the averaged bands is below a flat spectrum, by simulation
+_SHAKEN = 10.0  # times the data sheet: usual in flight and on wheels
 _NEWS = 1.25  # a scale that moved by less is what was told
 _LONGEST_STEP = 2.5  # sample intervals; more is a hole
 _KEPT_S = 60.0  # of levels, for spans that are cut later; longer than any buffer
@@ -112,6 +113,19 @@ class NoiseFloor:
         quiet, typical = seen.min(axis=0), np.median(seen, axis=0)
         return NoiseRatios(float(quiet[0]), float(quiet[1]), float(typical[0]), float(typical[1]))
 
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return the white noise densities that were told and those that the run showed, by sensor; empty before."""
+        ratios = self.ratios
+        if ratios is None:
+            return {}
+        model, now = self._model, self.now.scale
+        gyro = model.gyro_noise_density, ratios.gyro_quiet, ratios.gyro_typical, now.gyro
+        accel = model.accel_noise_density, ratios.accel_quiet, ratios.accel_typical, now.accel
+        return {
+            name: {"told": told, "quietest": told * quiet, "typical": told * typical, "used_last": told * last}
+            for name, (told, quiet, typical, last) in (("gyro", gyro), ("accel", accel))
+        }
+
     def at_least_seen(self) -> ImuNoise:
         """Return the model, its densities raised to what the median window shows; never lowered."""
         ratios = self.ratios
@@ -124,7 +138,10 @@ class NoiseFloor:
         )
 
     def warnings(self, tolerance: float) -> list[str]:
-        """Return what a user should know: a model that the recording contradicts by more than `tolerance`."""
+        """Return what a user should know: a model that is `tolerance` times too large, or small beyond all vibration.
+
+        A machine that shakes has ten times the noise of a data sheet, and estimators go by it: that is no fault.
+        """
         ratios = self.ratios
         if ratios is None:
             return []
@@ -134,10 +151,10 @@ class NoiseFloor:
             ("accelerometer", ratios.accel_quiet, self._model.accel_noise_density),
         ):
             setting = "imu.gyro-noise-density" if name == "gyroscope" else "imu.accel-noise-density"
-            if quiet > tolerance:
+            if quiet > _SHAKEN * tolerance:
                 found.append(
-                    f"{name} noise: even the quietest second has {quiet:.1f} times the model's {density:.2g}; the run "
-                    f"went by what it showed; set --{setting} {density * quiet:.2g} if that is so at rest, too"
+                    f"{name} noise: even the quietest second has {quiet:.0f} times the model's {density:.2g}; check "
+                    f"the unit of the sensor and how it is mounted, or set --{setting} {density * quiet:.2g}"
                 )
             elif quiet < 1.0 / tolerance:
                 found.append(

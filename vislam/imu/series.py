@@ -150,6 +150,4 @@ def _joint_noise(spans: Sequence[ImuSpan]) -> NoiseScale:
 
 def subtract_bias(span: ImuSpan, gyro_bias_rad_s: Array, accel_bias_m_s2: Array) -> ImuSpan:
     """Return the span with its biases [3] taken off."""
-    return replace(
-        span, gyro_rad_s=span.gyro_rad_s - gyro_bias_rad_s, accel_m_s2=span.accel_m_s2 - accel_bias_m_s2
-    )
+    return replace(span, gyro_rad_s=span.gyro_rad_s - gyro_bias_rad_s, accel_m_s2=span.accel_m_s2 - accel_bias_m_s2)

@@ -110,7 +110,7 @@ class _Front:
     def report(self) -> FrontReport:
         """Return its last word, or that it died without one."""
         if self.ended is None:
-            return FrontReport("unknown", None, self.start, "the front process died", {}, {}, [], 0.0, {})
+            return FrontReport("unknown", None, self.start, "the front process died", {}, {}, [], {}, 0.0, {})
         return self.ended.report
 
 

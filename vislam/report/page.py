@@ -96,6 +96,11 @@ def _head(run: RunFiles) -> str:
             f"Over the floor: camera {values[0]} m high as given, tilted by {values[1]} ± {values[2]} deg and rolled "
             f"by {values[3]} deg as the floor shows."
         )
+    for name, sensor in (("gyro", "Gyroscope"), ("accel", "Accelerometer")):
+        noise = as_dict(m, "imu_noise", name)
+        if noise:
+            told, seen = number(noise.get("told"), 5), number(noise.get("typical"), 5)
+            parts.append(f"{sensor}: white noise of {seen} in motion, {told} told (SI units per √Hz).")
     source = run.manifest.get("source")
     if source:
         parts.append(f"Source: {source}.")

@@ -303,6 +303,7 @@ class Run:
             "map": found,
             "initialisation": initialisation(front, int(stamps[0]) if len(stamps) else None),
             "calibration": front.calibration,
+            "imu_noise": front.imu_noise,
             "accuracy": errors,
             "timing_ms": self.slam.clock.summary_ms(),
             "counters": counters,
