@@ -57,7 +57,7 @@ def correct(connection, seconds: float, ready, go, epoch) -> None:
         vo = VoMeasurement(t_ns, max(k - 1, 0) // 10, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
         if k == 0:
             state = NavState(t_ns, np.eye(4), *(np.zeros(3) for _ in range(3)), np.eye(15) * 1e-4)
-            connection.send(Start(state, vo, noise))
+            connection.send(Start(state, vo))
         connection.send(Correction(t_ns, vo, no_observations(), False, False, k // 10 if k % 10 == 0 else None))
 
 
@@ -256,7 +256,7 @@ def late_frame_us(frames: int) -> float:
             fast.add(ImuSample(i * dt_ns, np.zeros(3), np.array([0.0, 0.0, 9.81])))
         vo = VoMeasurement(k * FRAME_EVERY * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
         if k == 0:
-            fast.correct(Start(NavState(0, np.eye(4), *np.zeros((3, 3)), np.eye(15) * 1e-4), vo, noise))
+            fast.correct(Start(NavState(0, np.eye(4), *np.zeros((3, 3)), np.eye(15) * 1e-4), vo))
         message = pickle.dumps(Correction(vo.t_ns, vo, no_observations(), False, False, None))
         began = time.perf_counter()
         fast.correct(pickle.loads(message))  # noqa: S301 what was just made

@@ -122,7 +122,7 @@ class Front:
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
                 config.frontend.track_sigma_px,
             )  # fmt: skip
-            self._filter = Filtering(filter_config(config, rig), noise, config.imu.gravity_m_s2, rig)
+            self._filter = Filtering(filter_config(config, rig, noise), noise, config.imu.gravity_m_s2, rig)
             self.ekf_coupling = self._filter.coupling
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
@@ -479,7 +479,7 @@ class Front:
         return released
 
 
-def filter_config(config: Config, rig: Rig) -> EkfConfig:
+def filter_config(config: Config, rig: Rig, noise: ImuNoise | None = None) -> EkfConfig:
     """Return the settings of the filter with what front end and camera say for it.
 
     Raises UsageError for settings that contradict each other.
@@ -492,7 +492,7 @@ def filter_config(config: Config, rig: Rig) -> EkfConfig:
         raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
     readout_s = config.ekf.tight_readout_s
     readout_s = config.frontend.readout_s if readout_s is None else readout_s
-    scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
+    scale_sigma = float(np.hypot(config.ekf.scale_sigma, lasting_scale_sigma(config.frontend, rig, noise)))
     chosen = replace(config.ekf, coupling=coupling, tight_readout_s=readout_s, scale_sigma=scale_sigma)
     if mode != "planar":
         return chosen

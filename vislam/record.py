@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import Any
@@ -349,10 +349,7 @@ def _camera_notes(images: Webcam | VideoCamera | None) -> tuple[str, ...]:
 
 def _noise(files: CalibrationConfig, sensors: SensorsConfig, rate_hz: float) -> ImuNoise:
     if files.imu_noise is not None:
-        found = read_noise(Path(files.imu_noise))
-        return ImuNoise(
-            found.gyro_noise_density, found.accel_noise_density, found.gyro_bias_walk, found.accel_bias_walk, rate_hz
-        )
+        return replace(read_noise(Path(files.imu_noise)), rate_hz=rate_hz)
     s = sensors
     return ImuNoise(s.gyro_noise_density, s.accel_noise_density, s.gyro_bias_walk, s.accel_bias_walk, rate_hz)
 

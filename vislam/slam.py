@@ -99,7 +99,7 @@ class Back:
         self._has_gravity = has_gravity = first_state is not None
         readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
         window = replace(config.window, readout_s=readout_s)
-        scale_sigma = float(np.hypot(config.graph.scale_sigma, lasting_scale_sigma(config.frontend, rig)))
+        scale_sigma = float(np.hypot(config.graph.scale_sigma, lasting_scale_sigma(config.frontend, rig, noise)))
         graph = replace(config.graph, scale_sigma=scale_sigma)
         self.graph = PoseGraph(graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, window)
         self.graph.initialise(first_state, T_map_body)

@@ -12,6 +12,9 @@ class ImuConfig:
     accel_noise_density: float | None = None  # m/s^2/sqrt(Hz)
     gyro_bias_walk: float | None = None  # rad/s^2/sqrt(Hz)
     accel_bias_walk: float | None = None  # m/s^3/sqrt(Hz)
+    # scale factors and misalignment, relative, where the sensor's own file has no gyroscope_ or accelerometer_scale_sigma
+    gyro_scale_prior: float = 0.003  # of a calibrated MEMS gyroscope: data sheets give 0.2 to 1 %
+    accel_scale_prior: float = 0.01  # of a calibrated MEMS accelerometer: 0.5 to 1 % against motion capture
     gravity_m_s2: float = 9.81
     buffer_s: float = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
     noise_tolerance: float = 3.0  # a run whose quietest second has less than a third of the white noise told is warned

@@ -261,7 +261,7 @@ class MsckfEkf:
         """Return the state at the newest sample. Raises ValueError before `initialise`."""
         if self._history is None:
             raise ValueError("the filter has no state yet; call initialise first")
-        return _nav_state(self._t_ns, self._x, self._Phi, self._Q, self._window)
+        return self._nav_state(self._t_ns, self._x, self._Phi, self._Q, self._window)
 
     def state_at(self, t_ns: int) -> NavState | None:
         """Return the filtered state at a time within the history, None outside of it."""
@@ -270,7 +270,7 @@ class MsckfEkf:
             return None
         x, Phi, Q = checkpoint.x.copy(), checkpoint.Phi.copy(), checkpoint.Q.copy()
         self._integrate(x, Phi, Q, checkpoint.t_ns, t_ns, self._sigmas_in(checkpoint.window))
-        return _nav_state(t_ns, x, Phi, Q, checkpoint.window)
+        return self._nav_state(t_ns, x, Phi, Q, checkpoint.window)
 
     def pose_at(self, t_ns: int) -> Array | None:
         """Return T_odom_body [4, 4] at a time within the history, interpolated; None outside of it."""
@@ -390,15 +390,17 @@ class MsckfEkf:
         self._t_ns, self._applied, self._window = checkpoint.t_ns, checkpoint.applied, checkpoint.window
         self._sigmas = self._sigmas_in(checkpoint.window)
 
-
-def _nav_state(t_ns: int, x: Array, Phi: Array, Q: Array, window: Window) -> NavState:
-    M = kernels.to_nav_error(x)
-    P = M @ (Phi @ window.P[:15, :15] @ Phi.T + Q) @ M.T
-    return NavState(
-        t_ns=t_ns,
-        T_world_body=pose(x, 0, 6),
-        velocity_world_m_s=x[3:6].copy(),
-        gyro_bias_rad_s=x[13:16].copy(),
-        accel_bias_m_s2=x[10:13].copy(),
-        covariance=0.5 * (P + P.T),
-    )
+    def _nav_state(self, t_ns: int, x: Array, Phi: Array, Q: Array, window: Window) -> NavState:
+        """Return a state with the error of scale that it cannot know, as `Ekf` does."""
+        M = kernels.to_nav_error(x)
+        P = M @ (Phi @ window.P[:15, :15] @ Phi.T + Q) @ M.T
+        by_scale = self._config.scale_sigma * x[:6]
+        P[3:9, 3:9] += np.outer(by_scale, by_scale)
+        return NavState(
+            t_ns=t_ns,
+            T_world_body=pose(x, 0, 6),
+            velocity_world_m_s=x[3:6].copy(),
+            gyro_bias_rad_s=x[13:16].copy(),
+            accel_bias_m_s2=x[10:13].copy(),
+            covariance=0.5 * (P + P.T),
+        )

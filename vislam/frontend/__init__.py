@@ -13,6 +13,7 @@ from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import FrontEnd, TrackResult
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
+from vislam.imu import ImuNoise
 
 __all__ = ["FrontEnd", "TrackResult", "lasting_scale_sigma", "make_frontend", "mode_for"]
 
@@ -48,10 +49,15 @@ def mode_for(config: FrontEndConfig, rig: Rig) -> str:
     return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
 
 
-def lasting_scale_sigma(config: FrontEndConfig, rig: Rig) -> float:
-    """Return the relative sigma of all metres together that motions do not tell of: over a floor, the height's."""
-    planar = config.planar
-    if mode_for(config, rig) != "planar" or planar.height_m is None:
+def lasting_scale_sigma(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> float:
+    """Return the relative sigma of all metres together that motions do not tell of.
+
+    Over a floor it is that of the camera's height; for one camera with an IMU that of the accelerometer's scale.
+    """
+    mode, planar = mode_for(config, rig), config.planar
+    if mode == "mono":
+        return 0.0 if noise is None else noise.accel_scale_sigma or 0.0
+    if mode != "planar" or planar.height_m is None:
         return 0.0
     return planar.height_sigma_m / planar.height_m
 

@@ -21,6 +21,9 @@ class ImuNoise:
     gyro_bias_walk: float  # rad/s^2/sqrt(Hz)
     accel_bias_walk: float  # m/s^3/sqrt(Hz)
     rate_hz: float
+    # relative, of scale factors and misalignment that calibration left; None: not known, see `ImuConfig`
+    gyro_scale_sigma: float | None = None
+    accel_scale_sigma: float | None = None
 
 
 def _zero() -> Array:

@@ -3,7 +3,8 @@
 White noise is in every band alike, so it cannot exceed what the quietest band shows. What stands above that floor is
 motion, at low frequencies, or vibration, at high ones: neither is noise. Vibration integrates to nothing over a frame,
 and a rule that takes it for white noise (the spread of second differences, say) is an order of magnitude too large on
-a flying machine. The floor is a density as `ImuNoise` has it (Welch, "The use of fast Fourier transform for the
+a flying machine. Errors of scale factor and misalignment are no noise either, but grow with motion: what they do to
+the motion of a body, at about a hertz, is counted beside the floor. The floor is a density as `ImuNoise` has it (Welch, "The use of fast Fourier transform for the
 estimation of power spectra", IEEE Trans. Audio Electroacoust. 1967).
 """
 
@@ -23,6 +24,7 @@ _WINDOW_S, _HOP_S = 1.0, 0.5  # resolves 2 Hz; half a second is short against ho
 _AVERAGED = 4  # windows; alone, the quietest band of a window is 20 % quieter than the noise, by chance
 _LOWEST_HZ = 3.0  # below, even slow machines move
 _HIGHEST_SHARE = 0.25  # of the rate; above, the low-pass filters of sensors take noise out that is there lower down
+_MOTION_HZ = 1.0  # where bodies that people, wheels and rotors move have most of their motion
 _CHANCE = 1.08  # how much the quietest of the averaged bands is below a flat spectrum, by simulation
 _SHAKEN = 10.0  # times the data sheet: usual in flight and on wheels
 _NEWS = 1.25  # a scale that moved by less is what was told
@@ -71,6 +73,8 @@ class NoiseFloor:
         self._times: NDArray[np.int64] = np.empty(self._size, dtype=np.int64)
         self._filled = 0
         self._spectra: deque[Array] = deque(maxlen=_AVERAGED)  # [bands, 2] variance density of gyro and accel
+        self._scale_sigmas = np.array([noise.gyro_scale_sigma or 0.0, noise.accel_scale_sigma or 0.0])
+        self._motions: deque[Array] = deque(maxlen=_AVERAGED)  # [2] variance of rates and forces in a window
         self._floors: list[tuple[float, float]] = []  # density of gyro and accel over the model's, per window
         self.now = SeenNoise(0, AS_MODELLED)
         self._told: deque[SeenNoise] = deque([self.now])
@@ -80,6 +84,7 @@ class NoiseFloor:
         if self._filled and sample.t_ns - int(self._times[self._filled - 1]) > self._longest_step_ns:
             self._filled = 0
             self._spectra.clear()
+            self._motions.clear()
         row = self._rows[self._filled]
         row[:3], row[3:] = sample.gyro_rad_s, sample.accel_m_s2
         self._times[self._filled] = sample.t_ns
@@ -166,6 +171,7 @@ class NoiseFloor:
     def _take_window(self) -> None:
         """Add the spectrum of the window that is full: detrended, tapered, averaged over axes and bands."""
         rows = self._rows - self._rows.mean(axis=0)
+        self._motions.append(np.array([np.mean(self._rows[:, :3] ** 2), np.mean(rows[:, 3:] ** 2)]))
         rows -= np.outer(self._ramp, self._ramp @ rows / (self._ramp @ self._ramp))
         rate_hz = (self._size - 1) * 1e9 / float(self._times[-1] - self._times[0])
         power = np.abs(np.fft.rfft(rows * self._taper[:, None], axis=0)) ** 2 / (rate_hz * (self._taper**2).sum())
@@ -177,8 +183,10 @@ class NoiseFloor:
         model = np.maximum([self._model.gyro_noise_density, self._model.accel_noise_density], np.finfo(float).tiny)
         gyro, accel = (_CHANCE * np.sqrt(quietest) / model).tolist()
         self._floors.append((gyro, accel))
+        by_motion = self._scale_sigmas**2 * np.mean(self._motions, axis=0) / (2.0 * _MOTION_HZ) / model**2
+        gyro, accel = np.sqrt(np.maximum([gyro, accel], 1.0) ** 2 + by_motion).tolist()
         old = self.now.scale
-        scale = NoiseScale(_told(old.gyro, max(gyro, 1.0)), _told(old.accel, max(accel, 1.0)))
+        scale = NoiseScale(_told(old.gyro, gyro), _told(old.accel, accel))
         if scale == old:
             return False
         is_first = len(self._floors) == 1  # it also says what was before

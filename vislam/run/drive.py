@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,11 +42,16 @@ _INERTIAL_BEFORE_NS = 1_000_000_000  # given again before the keyframe at which 
 
 
 def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
-    """Return the recording's noise model with what the configuration overrides; None without an IMU or with it off."""
+    """Return the recording's noise model with what the configuration says of it; None without an IMU or with it off."""
     if recorded is None or not config.enabled:
         return None
     overrides = {name: value for name in asdict(recorded) if (value := getattr(config, name, None)) is not None}
-    return ImuNoise(**{**asdict(recorded), **overrides})
+    noise = ImuNoise(**{**asdict(recorded), **overrides})
+    return replace(
+        noise,
+        gyro_scale_sigma=config.gyro_scale_prior if noise.gyro_scale_sigma is None else noise.gyro_scale_sigma,
+        accel_scale_sigma=config.accel_scale_prior if noise.accel_scale_sigma is None else noise.accel_scale_sigma,
+    )
 
 
 class Run:

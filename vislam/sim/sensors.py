@@ -20,6 +20,8 @@ CONSUMER_IMU = ImuNoise(
     gyro_bias_walk=2.0e-5,
     accel_bias_walk=3.0e-4,
     rate_hz=200.0,
+    gyro_scale_sigma=0.0,  # noise and biases are all that is simulated
+    accel_scale_sigma=0.0,
 )
 GY85_IMU = ImuNoise(
     gyro_noise_density=5.2e-4,  # ITG3205: 0.03 deg/s/sqrt(Hz)
@@ -27,6 +29,8 @@ GY85_IMU = ImuNoise(
     gyro_bias_walk=3.0e-5,
     accel_bias_walk=4.0e-4,
     rate_hz=200.0,
+    gyro_scale_sigma=0.0,  # noise and biases are all that is simulated
+    accel_scale_sigma=0.0,
 )
 
 
