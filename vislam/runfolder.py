@@ -35,6 +35,7 @@ from vislam.messages import (
     LoopEdge,
     NavState,
     RetrievedKeyframe,
+    Tracking,
 )
 from vislam.session import Session
 from vislam.slam import KeyframeStep, Step
@@ -252,6 +253,11 @@ class RunLog:
     def stamps_ns(self) -> NDArray[np.int64]:
         """Times [N] of the frames so far."""
         return np.array([frame.t_ns for frame in self._frames], dtype=np.int64)
+
+    @property
+    def newest_tracking(self) -> Tracking | None:
+        """How far the front end trusted the newest frame; None before there was one."""
+        return self._frames[-1].tracking if self._frames else None
 
     @property
     def worst_position_sigma_m(self) -> float:

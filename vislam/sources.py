@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vislam.config import CalibrationConfig
+from vislam.config import CalibrationConfig, validated
 from vislam.errors import DataError, UsageError
 from vislam.recording import Recording
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from vislam.sim import MeasuredInertial
 
 _SCHEMES = re.compile(r"(?:[a-z]+:)+")
+_SHIPPED = "gtsam"  # the package that brings a table of real tracks
+_SHIPPED_TABLE = "eqvio_processed_30s.csv"
 _SENSORS = re.compile(r"virtual-cart(,|$)|gy85\+|serial:")
 
 
@@ -24,14 +27,15 @@ def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None =
 
     On disk: `euroc:PATH`, `tum:PATH`, `kitti:PATH`, `video:PATH`, or a bare path. Rendered: `sim:WORLD`. Vision
     simulated as points, on a world's motion or on the real IMU of a recording with truth: `points:WORLD` or
-    `points:PATH`. To the simulated ones options are appended as `,option=value`. Calibration files that are named take
-    the place of what a recording on disk says itself.
+    `points:PATH`. Real tracks without images: `eqvio:FILE`, or `eqvio:gtsam` for the table that GTSAM's package brings.
+    To all but those on disk options are appended as `,option=value`. Calibration files that are named take the place
+    of what a recording on disk says itself.
 
-    Raises UsageError for an unknown format, world or option, or for calibration files of a simulated source; DataError
-    when the recording cannot be used.
+    Raises UsageError for an unknown format, world or option, or for calibration files of a source that takes none;
+    DataError when the recording cannot be used.
     """
     scheme, _, rest = uri.partition(":")
-    if scheme in ("sim", "points") and calibration is not None and calibration != CalibrationConfig():
+    if scheme in ("sim", "points", "eqvio") and calibration is not None and calibration != CalibrationConfig():
         raise UsageError(f"{uri} knows its sensors exactly; leave the calibration files away")
     if scheme == "sim":
         from vislam.sim import open_world
@@ -43,6 +47,8 @@ def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None =
 
         name, options = _options(uri, rest)
         return open_points(name if name in POINT_WORLD_NAMES else measured_inertial(name), seed=seed, **options)
+    if scheme == "eqvio":
+        return _given_tracks(*_options(uri, rest))
     from vislam.datasets import open_dataset
 
     return open_dataset(uri, calibration)
@@ -51,6 +57,8 @@ def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None =
 def recorded_path(source: str) -> Path | None:
     """Return where a source, also a live one that replays it, is read from; None for worlds and sensors."""
     scheme, name, _ = split_source(source.removeprefix("replay:"))
+    if scheme == "eqvio:" and name == _SHIPPED:
+        return _shipped_tracks()
     return None if is_world(scheme, name) or _SENSORS.match(source) else Path(name)
 
 
@@ -63,10 +71,11 @@ def split_source(source: str) -> tuple[str, str, str]:
 
 
 def is_world(scheme: str, name: str) -> bool:
-    """Whether a source is simulated altogether, and its name therefore no path."""
+    """Whether a source's name is no path: it is simulated altogether, or comes with a package."""
     from vislam.sim import POINT_WORLD_NAMES
 
-    return scheme == "sim:" or (scheme == "points:" and name in POINT_WORLD_NAMES)
+    is_shipped = scheme == "eqvio:" and name == _SHIPPED
+    return scheme == "sim:" or is_shipped or (scheme == "points:" and name in POINT_WORLD_NAMES)
 
 
 def measured_inertial(uri: str) -> MeasuredInertial:
@@ -96,6 +105,33 @@ def measured_inertial(uri: str) -> MeasuredInertial:
     t_ns = np.array([row[0] for row in rows], dtype=np.int64)
     name = found.root.resolve().name
     return MeasuredInertial(name, t_ns, values[:, :3], values[:, 3:], found.imu_noise, truth, found.rig)
+
+
+def _given_tracks(name: str, options: dict[str, str]) -> Recording:
+    """Open a table of real tracks, with truth and noise model of the recording that the option `truth` names."""
+    from vislam.datasets import survey
+    from vislam.datasets.eqvio import TrackOptions, TrackRecording
+    from vislam.datasets.tables import Problems
+
+    chosen = validated(TrackOptions, options, "tracks")
+    path = _shipped_tracks() if name == _SHIPPED else Path(name)
+    if chosen.truth is None:
+        return TrackRecording(path, chosen)
+    found = survey(chosen.truth)
+    truth = None if found.truth is None else found.truth(Problems())
+    if truth is None:
+        raise DataError(f"{chosen.truth} has no true poses; leave truth= away, or give a recording that has them")
+    return TrackRecording(path, chosen, truth, found.imu_noise)
+
+
+def _shipped_tracks() -> Path:
+    """Return the table of real tracks that comes with GTSAM, which is not imported for it."""
+    spec = find_spec(_SHIPPED)
+    folders = [] if spec is None or spec.submodule_search_locations is None else spec.submodule_search_locations
+    path = next((Path(folder) / "Data" / _SHIPPED_TABLE for folder in folders), None)
+    if path is None or not path.is_file():
+        raise DataError(f"the installed gtsam brings no Data/{_SHIPPED_TABLE}; give the path of a table: eqvio:FILE")
+    return path
 
 
 def _options(uri: str, rest: str) -> tuple[str, dict[str, str]]:

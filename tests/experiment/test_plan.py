@@ -59,7 +59,7 @@ def test_a_plan_is_the_product_of_its_parts(tmp_path):
     assert plan.sequences[1].source == f"euroc:{tmp_path}/drone"
     assert [s.name for s in plan.sequences] == ["laps", "drone"]
     assert {job.source for job in jobs} == {"points:laps,duration_s=6.0", f"euroc:{tmp_path}/drone"}
-    assert variants(plan) == [(("delay", 0.0),), (("delay", 0.1),)]
+    assert variants(plan, "laps") == [(("delay", 0.0),), (("delay", 0.1),)]
     assert estimates(plan)[-2:] == [("loose", "graph"), ("tight", "graph")]
 
 

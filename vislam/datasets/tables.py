@@ -64,6 +64,49 @@ def parse_seconds(text: str) -> int:
         raise ValueError(text) from error
 
 
+def read_rows(
+    path: Path,
+    parse: Callable[[list[str]], Row[T]],
+    problems: Problems,
+    separator: str | None,
+    needs_line_end: bool,
+) -> Iterator[Row[T]]:
+    """Yield what `parse` makes of the fields of each row; it raises ValueError or ArithmeticError for unusable ones.
+
+    Where a row ends in a number, `needs_line_end` drops a last line without line end. Raises DataError as
+    `read_numbers` does.
+    """
+    good, bad, first_bad = 0, 0, ""
+    place = f"{path.parent.name}/{path.name}"
+    for number, line, ended in _lines(path, problems):
+        where = f"line {number}"
+        if needs_line_end and not ended:
+            problems.count(f"{place}: last line cut short", where)
+            break
+        try:
+            row = parse(line.split(separator))
+        except ArithmeticError:
+            kind = "rows with NaN or infinity"
+        except ValueError:
+            kind = "rows that cannot be read" if ended else "last line cut short"
+            if number == 1 and ended:
+                continue  # a header without the comment sign
+        else:
+            good += 1
+            yield row
+            continue
+        problems.count(f"{place}: {kind}", where)
+        if ended:
+            bad += 1
+            first_bad = first_bad or f"{path}:{number}: {line[:60]!r}"
+            if bad > good and bad >= _MANY_ROWS:
+                break  # no need to wade through the rest of something that is no table
+    if bad > good and (good + bad >= _ENOUGH_ROWS or good == 0):
+        raise DataError(
+            f"{first_bad} cannot be used, like {bad} of the {good + bad} rows read; repair or export it again"
+        )
+
+
 def read_numbers(
     path: Path,
     columns: int,
@@ -88,7 +131,7 @@ def read_numbers(
             raise ArithmeticError
         return t_ns, values
 
-    return _read_rows(path, parse, problems, separator, needs_line_end=True)
+    return read_rows(path, parse, problems, separator, needs_line_end=True)
 
 
 def read_names(
@@ -108,7 +151,7 @@ def read_names(
         return parse_stamp(fields[0]), name
 
     check_size(path, MAX_FILE_BYTES)
-    return _read_rows(path, parse, problems, separator, needs_line_end=False)
+    return read_rows(path, parse, problems, separator, needs_line_end=False)
 
 
 def read_frame_stamps(path: Path, problems: Problems) -> Iterator[Row[str]]:
@@ -125,7 +168,7 @@ def read_frame_stamps(path: Path, problems: Problems) -> Iterator[Row[str]]:
         return parse_ns(fields[0]), str(frame)
 
     check_size(path, MAX_FILE_BYTES)
-    return _read_rows(path, parse, problems, ",", needs_line_end=True)
+    return read_rows(path, parse, problems, ",", needs_line_end=True)
 
 
 def check_size(path: Path, limit_bytes: int) -> None:
@@ -162,44 +205,6 @@ def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str) -> Iter
             problems.count(f"{what}: backward stamp", f"{t_ns} ns")
     if held is not None:
         yield held
-
-
-def _read_rows(
-    path: Path,
-    parse: Callable[[list[str]], Row[T]],
-    problems: Problems,
-    separator: str | None,
-    needs_line_end: bool,
-) -> Iterator[Row[T]]:
-    good, bad, first_bad = 0, 0, ""
-    place = f"{path.parent.name}/{path.name}"
-    for number, line, ended in _lines(path, problems):
-        where = f"line {number}"
-        if needs_line_end and not ended:
-            problems.count(f"{place}: last line cut short", where)
-            break
-        try:
-            row = parse(line.split(separator))
-        except ArithmeticError:
-            kind = "rows with NaN or infinity"
-        except ValueError:
-            kind = "rows that cannot be read" if ended else "last line cut short"
-            if number == 1 and ended:
-                continue  # a header without the comment sign
-        else:
-            good += 1
-            yield row
-            continue
-        problems.count(f"{place}: {kind}", where)
-        if ended:
-            bad += 1
-            first_bad = first_bad or f"{path}:{number}: {line[:60]!r}"
-            if bad > good and bad >= _MANY_ROWS:
-                break  # no need to wade through the rest of something that is no table
-    if bad > good and (good + bad >= _ENOUGH_ROWS or good == 0):
-        raise DataError(
-            f"{first_bad} cannot be used, like {bad} of the {good + bad} rows read; repair or export it again"
-        )
 
 
 def _lines(path: Path, problems: Problems) -> Iterator[tuple[int, str, bool]]:

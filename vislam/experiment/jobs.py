@@ -54,7 +54,7 @@ def expand(plan: Plan) -> list[Job]:
     """Return every job of a plan, in its order. Raises UsageError when a combination is no valid configuration."""
     identities: dict[str, str] = {}
     jobs = []
-    for sequence, variant in itertools.product(plan.sequences, variants(plan)):
+    for sequence, variant in ((s, v) for s in plan.sequences for v in variants(plan, s.name)):
         source, settings = _conditions(plan, sequence, variant)
         if source not in identities:
             identities[source] = source_identity(source)
@@ -62,7 +62,8 @@ def expand(plan: Plan) -> list[Job]:
             if estimator.sequences and sequence.name not in estimator.sequences:
                 continue
             where = f"plan '{plan.name}', sequence '{sequence.name}', estimator '{estimator.name}'"
-            resolved = from_data(nested({**settings, **estimator.config, **_varied(plan, variant)}, where), where)
+            varied = _varied(plan, sequence, variant)
+            resolved = from_data(nested({**settings, **estimator.config, **varied}, where), where)
             for seed, member in itertools.product(plan.seeds, range(plan.members)):
                 config = dump(resolved) | {"seed": seed}
                 config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
@@ -78,9 +79,10 @@ def expand(plan: Plan) -> list[Job]:
     return jobs
 
 
-def variants(plan: Plan) -> list[tuple[tuple[str, Scalar], ...]]:
-    """Return every combination of the axes' values as (axis, value) pairs; one empty combination without axes."""
-    return list(itertools.product(*([(axis.name, value) for value in axis.values] for axis in plan.axes)))
+def variants(plan: Plan, sequence: str) -> list[tuple[tuple[str, Scalar], ...]]:
+    """Return every combination of what is varied for a sequence, as (axis, value) pairs; one empty one without axes."""
+    axes = plan.axes_of(sequence)
+    return list(itertools.product(*([(axis.name, value) for value in axis.values] for axis in axes)))
 
 
 def unique(jobs: list[Job]) -> Iterator[Job]:
@@ -104,10 +106,12 @@ def source_identities(jobs: Iterable[Job]) -> dict[str, str]:
 def _conditions(plan: Plan, sequence: Sequence, variant: tuple[tuple[str, Scalar], ...]) -> tuple[str, dict[str, Any]]:
     """Return the source with its options, and the settings that do not depend on the estimator."""
     options = dict(sequence.options)
-    options |= {axis.option: value for axis, (_, value) in zip(plan.axes, variant, strict=True) if axis.option}
+    axes = plan.axes_of(sequence.name)
+    options |= {axis.option: value for axis, (_, value) in zip(axes, variant, strict=True) if axis.option}
     source = ",".join([sequence.source, *(f"{name}={value}" for name, value in options.items())])
     return source, {"map.enabled": plan.map, "view.enabled": False, **plan.config, **sequence.config}
 
 
-def _varied(plan: Plan, variant: tuple[tuple[str, Scalar], ...]) -> dict[str, Scalar]:
-    return {axis.setting: value for axis, (_, value) in zip(plan.axes, variant, strict=True) if axis.setting}
+def _varied(plan: Plan, sequence: Sequence, variant: tuple[tuple[str, Scalar], ...]) -> dict[str, Scalar]:
+    axes = plan.axes_of(sequence.name)
+    return {axis.setting: value for axis, (_, value) in zip(axes, variant, strict=True) if axis.setting}

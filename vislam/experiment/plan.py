@@ -6,7 +6,7 @@ import dataclasses
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -51,6 +51,7 @@ class Axis:
     values: tuple[Scalar, ...]
     setting: str = ""  # dotted name
     option: str = ""  # name
+    sequences: tuple[str, ...] = ()  # names of those for which it is varied; empty: all
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,15 @@ class Plan:
     members: int = 6  # of each ensemble: gravity differs by 1e-9 between neighbours, which shows chaos
     timeout_s: float = 1800.0  # a job that takes longer is stopped and counts as failed
     map: bool = False  # mapping does not change trajectories and takes time
+
+    def axes_of(self, sequence: str) -> tuple[Axis, ...]:
+        """Return what is varied for a sequence."""
+        return tuple(axis for axis in self.axes if not axis.sequences or sequence in axis.sequences)
+
+    @property
+    def axis_names(self) -> list[str]:
+        """Names of what is varied, each once."""
+        return list(dict.fromkeys(axis.name for axis in self.axes))
 
 
 def load_plan(path: Path, variables: Mapping[str, str] | None = None) -> Plan:
@@ -116,15 +126,14 @@ def _check(plan: Plan, where: str) -> None:
     for what, names in (
         ("sequence", [s.name for s in plan.sequences]),
         ("estimator", [e.name for e in plan.estimators]),
-        ("axis", [a.name for a in plan.axes]),
         ("seed", [str(s) for s in plan.seeds]),
     ):
-        if what != "axis" and not names:
+        if not names:
             raise UsageError(f"{where}: a plan needs at least one {what}")
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise UsageError(f"{where}: two of kind {what} are called '{twice[0]}'; give each its own name")
-        if what != "seed" and (odd := [name for name in names if not _NAME.fullmatch(name)]):
-            raise UsageError(f"{where}: '{odd[0]}' is no name of a {what}: letters, digits, space and . , _ + - % [ ]")
+        if what != "seed":
+            _check_names(names, what, where)
     if not _NAME.fullmatch(plan.name) or "/" in plan.name:
         raise UsageError(f"{where}: '{plan.name}' is no name of a plan: letters, digits, space and . , _ + - % [ ]")
     if plan.members < 1 or plan.timeout_s <= 0.0:
@@ -134,12 +143,29 @@ def _check(plan: Plan, where: str) -> None:
         raise UsageError(
             f"{where}: seeds are a list of the plan itself, as seeds = [0, 1]; take 'seed' out of the settings"
         )
+    _check_axes(plan, where)
+    _check_estimators(plan, where)
+
+
+def _check_names(names: Iterable[str], what: str, where: str) -> None:
+    if odd := [name for name in names if not _NAME.fullmatch(name)]:
+        raise UsageError(f"{where}: '{odd[0]}' is no name of a {what}: letters, digits, space and . , _ + - % [ ]")
+
+
+def _check_axes(plan: Plan, where: str) -> None:
+    known = [sequence.name for sequence in plan.sequences]
+    _check_names(plan.axis_names, "axis", where)
     for axis in plan.axes:
+        if unknown := sorted(set(axis.sequences) - set(known)):
+            raise UsageError(f"{where}: axis '{axis.name}': no sequence '{unknown[0]}' in {', '.join(known)}")
         if bool(axis.setting) == bool(axis.option):
             raise UsageError(f"{where}: axis '{axis.name}' needs either a setting or an option to vary")
         if not axis.values or len(set(map(repr, axis.values))) != len(axis.values):
             raise UsageError(f"{where}: axis '{axis.name}' needs values, each one once")
-    _check_estimators(plan, where)
+    for sequence in known:
+        names = [axis.name for axis in plan.axes_of(sequence)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise UsageError(f"{where}: two of kind axis are called '{twice[0]}'; give each its own name")
 
 
 def _check_estimators(plan: Plan, where: str) -> None:

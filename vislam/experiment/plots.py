@@ -67,6 +67,8 @@ def over_axis(groups: Sequence[Group], axis: Axis, metric: str = "ate_m") -> str
     """Draw a metric over the numeric values of an axis, one panel per sequence and per value of the other axes."""
     panels: dict[str, list[Group]] = {}
     for group in groups:
+        if axis.sequences and group.sequence not in axis.sequences:
+            continue
         others = tuple(pair for pair in group.variant if pair[0] != axis.name)
         name = ", ".join(part for part in (group.sequence, variant_text(others)) if part)
         panels.setdefault(name, []).append(group)

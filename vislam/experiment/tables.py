@@ -42,11 +42,11 @@ def runs_csv(plan: Plan, trials: Sequence[Trial]) -> str:
     """Return every trial with every number that was measured, one row each."""
     kinds = sorted({name for trial in trials for name in trial.bounds if name not in BY_NAME})
     names = [metric.name for metric in METRICS] + kinds
-    axes = [axis.name for axis in plan.axes]
+    axes = plan.axis_names
     head = ["sequence", *axes, "estimator", "output", "seed", "member", "status", "reason", *names, "sha256", "key"]
     rows = [
         [
-            t.job.sequence, *(value for _, value in t.job.variant), t.job.estimator, t.output, t.job.seed, t.job.member,
+            t.job.sequence, *_varied(plan, t.job.variant), t.job.estimator, t.output, t.job.seed, t.job.member,
             "failed" if t.failure else "ok", t.failure,
             *(t.values.get(name, "") for name in names), t.sha256, t.job.key,
         ]
@@ -57,11 +57,11 @@ def runs_csv(plan: Plan, trials: Sequence[Trial]) -> str:
 
 def summary_csv(plan: Plan, groups: Sequence[Group]) -> str:
     """Return median, low and high of every metric of every group; "inf" where failures reach."""
-    head = ["sequence", *(axis.name for axis in plan.axes), "estimator", "output", "trials", "failures"]
+    head = ["sequence", *plan.axis_names, "estimator", "output", "trials", "failures"]
     head += [f"{metric.name}_{part}" for metric in METRICS for part in ("median", "low", "high")]
     rows: list[list[object]] = []
     for group in groups:
-        row: list[object] = [group.sequence, *(value for _, value in group.variant), group.estimator, group.output]
+        row: list[object] = [group.sequence, *_varied(plan, group.variant), group.estimator, group.output]
         row += [len(group.trials), group.failures]
         for metric in METRICS:
             found = group.spread(metric.name)
@@ -130,6 +130,12 @@ def _latex_cell(group: Group, groups: Sequence[Group], metric: Metric) -> str:
 
 def _tex(text: str) -> str:
     return "".join(_SPECIAL.get(character, character) for character in text)
+
+
+def _varied(plan: Plan, variant: Variant) -> list[object]:
+    """Return the value of everything that is varied; empty where it is not."""
+    values: dict[str, object] = dict(variant)
+    return [values.get(name, "") for name in plan.axis_names]
 
 
 def _csv(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

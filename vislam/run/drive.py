@@ -287,7 +287,8 @@ class Run:
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             counters |= back.counters
-        self.warnings += doubts(front, self.log, final, self.noise is not None)
+        doubted = doubts(front, self.log, final, self.noise is not None)
+        self.warnings += [*front.noise_warnings, *doubted]
         errors: dict[str, Any] = {}
         found = self._found_in_map()
         if truth is not None:
@@ -317,6 +318,7 @@ class Run:
             "loops": loops,
             "graph_revisions": self.log.revisions,
             "coverage_frames": len(final) / max(len(self.log), 1),
+            "doubts": doubted,
             "warnings": self.warnings,
         }
 

@@ -56,7 +56,7 @@ def initialisation(front: FrontReport, first_ns: int | None) -> dict[str, Any]:
 
 def doubts(front: FrontReport, log: RunLog, final: Trajectory, has_imu: bool) -> list[str]:
     """Return what a user must be told: where the numbers of a run hold less than they seem to."""
-    warnings = list(front.noise_warnings) if has_imu else []
+    warnings = []
     if has_imu and (sigma_m := log.worst_position_sigma_m) > _LOST_SIGMA_M:
         warnings.append(
             f"the filter's position was uncertain by {sigma_m:.1f} m (1 sigma) at its worst: too long without "

@@ -91,6 +91,23 @@ def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistenc
     return {name: chi_square_mean(float(v.sum()), len(v), 3) for name, v in finite.items() if len(v)}
 
 
+def stated_scale_sigma(states: Sequence[NavState]) -> float:
+    """Return the relative sigma of the size of a trajectory that its states claim, NaN where nothing moved.
+
+    It is the sigma of the position farthest from the first one, along the way to it, relative to the distance: what
+    else than the scale is unsure there is in it, too.
+    """
+    if not states:
+        return float("nan")
+    away = np.array([state.T_world_body[:3, 3] - states[0].T_world_body[:3, 3] for state in states])
+    distances = np.linalg.norm(away, axis=1)
+    i = int(np.argmax(distances))
+    if not distances[i] > 0.0:
+        return float("nan")
+    along = away[i] / distances[i]
+    return float(np.sqrt(along @ states[i].covariance[3:6, 3:6] @ along) / distances[i])
+
+
 def _heading_rad(R: Array) -> float:
     """Return the angle of the rotation about z that is closest to a rotation."""
     return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
