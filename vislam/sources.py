@@ -81,11 +81,13 @@ def is_world(scheme: str, name: str) -> bool:
 def measured_inertial(uri: str) -> MeasuredInertial:
     """Read the inertial data and the truth of a recording (`euroc:PATH` or a bare path); images are not needed.
 
+    What the truth's body is turned, displaced and late against the IMU is fitted and undone, where it is beyond chance.
     Raises DataError when it lacks an IMU, its noise or truth.
     """
     from vislam.datasets import survey
     from vislam.datasets.tables import Problems, in_time_order, read_numbers
     from vislam.sim import POINT_WORLD_NAMES, MeasuredInertial
+    from vislam.truth_fit import fit_truth
 
     try:
         found = survey(uri)
@@ -103,8 +105,9 @@ def measured_inertial(uri: str) -> MeasuredInertial:
     if found.imu_calibration is not None:
         values = found.imu_calibration.apply_to(values)
     t_ns = np.array([row[0] for row in rows], dtype=np.int64)
-    name = found.root.resolve().name
-    return MeasuredInertial(name, t_ns, values[:, :3], values[:, 3:], found.imu_noise, truth, found.rig)
+    name, gyro, accel = found.root.resolve().name, values[:, :3], values[:, 3:]
+    fit = fit_truth(t_ns, gyro, accel, truth)
+    return MeasuredInertial(name, t_ns, gyro, accel, found.imu_noise, fit.of_imu(truth), found.rig, fit)
 
 
 def _given_tracks(name: str, options: dict[str, str]) -> Recording:

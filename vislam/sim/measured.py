@@ -14,13 +14,13 @@ accelerometer tells how much, and the world is turned upright.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, make_interp_spline, make_lsq_spline
 from scipy.spatial.transform import Rotation
 
 from vislam.errors import DataError
-from vislam.geometry import level_rotation, so3_exp
+from vislam.geometry import level_rotation
+from vislam.imu.path import SmoothAttitude, apart, drift_knots, gaps, integrate_gyro, integrate_twice, mean_rate_ahead
 from vislam.messages import Array
 from vislam.sim.spline import Motion
 from vislam.trajectory import Trajectory
@@ -30,7 +30,6 @@ _MAX_TRUTH_GAP_S = 0.25  # over longer gaps the drift of the inertial data is no
 _MAX_IMU_GAP_S = 0.03  # over longer gaps the body may do anything
 _MIN_KNOTS = 8
 _GRAVITY_M_S2 = 9.81
-_GYRO_DRIFT_S = 20.0  # between the knots of its drift; at 40 the accelerometer of V2_01 fits worse, at 10 that of V1_01
 _PIECE_S = 0.5
 _PIECE_SIGMA_M_S = 0.02  # what is left of the change of velocity over a piece: the bias wanders
 _BIAS_SIGMA_M_S2, _TILT_SIGMA_M_S2 = 0.3, 0.1  # of a good accelerometer, and of a levelled motion capture (0.6 deg)
@@ -55,7 +54,7 @@ class MeasuredMotion:
         if len(t_ns) < 2 or len(truth) == 0:
             raise DataError(f"motion needs inertial data and true poses, got {len(t_ns)} samples, {len(truth)} poses")
         inside = (truth.t_ns >= t_ns[0]) & (truth.t_ns <= t_ns[-1])
-        chosen = _apart(truth.t_ns[inside], _KNOT_S)
+        chosen = apart(truth.t_ns[inside], _KNOT_S)
         stamps, poses = truth.t_ns[inside][chosen], truth.T_world_body[inside][chosen]
         if len(stamps) < _MIN_KNOTS:
             raise DataError(f"only {len(stamps)} true poses lie within the inertial data, {_MIN_KNOTS} are needed")
@@ -63,20 +62,20 @@ class MeasuredMotion:
         self.zero_ns = int(stamps[0])
         self.begin_s, self.end_s = 0.0, float(stamps[-1] - stamps[0]) * 1e-9
         imu_s, knots_s = _seconds(t_ns[used], self.zero_ns), _seconds(stamps, self.zero_ns)
-        self._gaps_s = np.vstack([_gaps(imu_s, _MAX_IMU_GAP_S), _gaps(knots_s, _MAX_TRUTH_GAP_S)])
+        self._gaps_s = np.vstack([gaps(imu_s, _MAX_IMU_GAP_S), gaps(knots_s, _MAX_TRUTH_GAP_S)])
         self.gyro_bias_rad_s = np.zeros(3)
         for _ in range(2):  # the second time without the bias, so that little is left to the spline
-            turned = _Attitude(imu_s, _integrate_gyro(imu_s, gyro_rad_s[used] - self.gyro_bias_rad_s))
+            turned = SmoothAttitude(imu_s, integrate_gyro(imu_s, gyro_rad_s[used] - self.gyro_bias_rad_s))
             drift = poses[:, :3, :3] @ turned.at(knots_s).transpose(0, 2, 1)
-            self.gyro_bias_rad_s = self.gyro_bias_rad_s + _mean_rate(knots_s, turned.at(knots_s), poses[:, :3, :3])
+            self.gyro_bias_rad_s = self.gyro_bias_rad_s + mean_rate_ahead(knots_s, turned.at(knots_s), poses[:, :3, :3])
         R = _smooth_drift(knots_s, drift, np.clip(imu_s, 0.0, self.end_s)) @ turned.at(imu_s)
         self.R_level_world = level_rotation(_up(imu_s, R, accel_m_s2[used], CubicSpline(knots_s, poses[:, :3, 3])))
         R = self.R_level_world @ R
         positions = poses[:, :3, 3] @ self.R_level_world.T
-        self._attitude = _Attitude(imu_s, R)
+        self._attitude = SmoothAttitude(imu_s, R)
         acceleration = np.einsum("nij,nj->ni", R, accel_m_s2[used])
         acceleration = acceleration - acceleration.mean(axis=0)
-        velocity, position = _integrate_twice(imu_s, acceleration)
+        velocity, position = integrate_twice(imu_s, acceleration)
         self._sensed = make_interp_spline(imu_s, np.hstack([acceleration, gyro_rad_s[used] - self.gyro_bias_rad_s]), 1)
         self._path = CubicHermiteSpline(imu_s, position, velocity)
         self._drift = CubicSpline(knots_s, positions - self._path(knots_s))
@@ -103,68 +102,15 @@ class MeasuredMotion:
         return np.asarray(known, dtype=np.bool_)
 
 
-class _Attitude:
-    """A smooth rotation through matrices [N, 3, 3] at times [N]: cubic in the quaternion, normalised."""
-
-    def __init__(self, t_s: Array, R: Array) -> None:
-        q = Rotation.from_matrix(R).as_quat()
-        flips = np.cumprod(np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0))
-        q[1:] *= flips[:, None]
-        self._q = CubicSpline(t_s, q)
-
-    def at(self, t_s: Array) -> Array:
-        """Return rotations [M, 3, 3] at times [M]."""
-        return np.asarray(Rotation.from_quat(self._q(t_s)).as_matrix())
-
-
 def _smooth_drift(t_s: Array, drift: Array, at_s: Array) -> Array:
     """Return rotations [M, 3, 3] at times [M] that follow those [N, 3, 3] at times [N] as slowly as a gyro drifts."""
     middle = Rotation.from_matrix(drift).mean()
     small = (middle.inv() * Rotation.from_matrix(drift)).as_rotvec()
-    inner = np.linspace(t_s[0], t_s[-1], max(round((t_s[-1] - t_s[0]) / _GYRO_DRIFT_S), 1) + 1)[1:-1]
-    knots = np.concatenate([np.repeat(t_s[0], 4), inner, np.repeat(t_s[-1], 4)])
-    return np.asarray((middle * Rotation.from_rotvec(make_lsq_spline(t_s, small, knots)(at_s))).as_matrix())
+    return np.asarray((middle * Rotation.from_rotvec(make_lsq_spline(t_s, small, drift_knots(t_s))(at_s))).as_matrix())
 
 
 def _seconds(t_ns: NDArray[np.int64], zero_ns: int) -> Array:
     return (t_ns - zero_ns).astype(np.float64) * 1e-9
-
-
-def _apart(t_ns: NDArray[np.int64], spacing_s: float) -> NDArray[np.int64]:
-    """Return indices of stamps that are at least a spacing apart (less the rounding of stamps)."""
-    chosen: list[int] = []
-    next_ns = -(1 << 62)
-    for i, stamp in enumerate(t_ns.tolist()):
-        if stamp >= next_ns:
-            chosen.append(i)
-            next_ns = stamp + round((spacing_s - 1e-4) * 1e9)
-    return np.array(chosen, dtype=np.int64)
-
-
-def _gaps(t_s: Array, longest_s: float) -> Array:
-    """Return begin and end [M, 2] of what is longer than `longest_s` between two of the times."""
-    wide = np.flatnonzero(np.diff(t_s) > longest_s)
-    return np.column_stack([t_s[wide], t_s[wide + 1]])
-
-
-@njit(cache=True, nogil=True)
-def _integrate_gyro(t_s: Array, gyro: Array) -> Array:
-    """Return rotations [N, 3, 3] from the first sample on; the mean rate of two samples turns between them."""
-    out = np.empty((len(t_s), 3, 3))
-    out[0] = np.eye(3)
-    for i in range(1, len(t_s)):
-        step = so3_exp(0.5 * (gyro[i - 1] + gyro[i]) * (t_s[i] - t_s[i - 1]))
-        out[i] = out[i - 1] @ step
-    return out
-
-
-def _integrate_twice(t_s: Array, acceleration: Array) -> tuple[Array, Array]:
-    """Return velocity and position [N, 3] of an acceleration that is linear between samples."""
-    h = np.diff(t_s)[:, None]
-    a, b = acceleration[:-1], acceleration[1:]
-    velocity = np.vstack([np.zeros(3), np.cumsum(0.5 * h * (a + b), axis=0)])
-    position = np.vstack([np.zeros(3), np.cumsum(h * velocity[:-1] + h * h * (2.0 * a + b) / 6.0, axis=0)])
-    return velocity, position
 
 
 def _up(t_s: Array, R: Array, accel: Array, path: CubicSpline) -> Array:
@@ -191,11 +137,3 @@ def _up(t_s: Array, R: Array, accel: Array, path: CubicSpline) -> Array:
     found = np.linalg.lstsq(A, b, rcond=None)[0]
     up = np.array([found[3], found[4], _GRAVITY_M_S2])
     return np.asarray(up / np.linalg.norm(up))
-
-
-def _mean_rate(t_s: Array, turned: Array, R: Array) -> Array:
-    """Return the mean rate [3] by which `turned` turns faster than `R` (both [N, 3, 3]) between the times."""
-    a = turned[:-1].transpose(0, 2, 1) @ turned[1:]
-    b = R[:-1].transpose(0, 2, 1) @ R[1:]
-    ahead = Rotation.from_matrix(b.transpose(0, 2, 1) @ a).as_rotvec()
-    return np.asarray(np.median(ahead / np.diff(t_s)[:, None], axis=0))

@@ -31,6 +31,7 @@ from vislam.sim.sensors import CONSUMER_IMU
 from vislam.sim.simulation import TrueStates
 from vislam.sim.worlds import WORLDS
 from vislam.trajectory import Trajectory
+from vislam.truth_fit import TruthFit
 
 Stamps = NDArray[np.int64]
 _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -87,6 +88,7 @@ class MeasuredInertial:
     noise: ImuNoise
     truth: Trajectory  # of the body, which is the IMU
     rig: Rig | None  # its own cameras, if it has any
+    truth_fit: TruthFit | None = None  # what was undone in `truth`; None: it is as it came
 
 
 def open_points(source: str | MeasuredInertial, seed: int = 0, **options: object) -> PointRecording:
@@ -155,6 +157,8 @@ class PointRecording:
         span_ns = (self._ns(np.array([self._begin_s, self._end_s]))).tolist()
         self._imu = RecordedImu(recorded.t_ns, recorded.gyro_rad_s, recorded.accel_m_s2, span_ns[0], span_ns[1])
         self.imu_noise = _told(recorded.noise, self.options.imu_noise_factor)
+        if recorded.truth_fit is not None and recorded.truth_fit.told:
+            self.problems[f"{recorded.truth_fit.told}: undone"] = 1
 
     def _set_span(self, begin_s: float, end_s: float) -> None:
         options = self.options

@@ -1,0 +1,160 @@
+"""Truth against the IMU: what the body of a true trajectory is turned, displaced and late is found, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tests.needs import missing
+from tests.sim.point_recordings import real
+from vislam.geometry import transform
+from vislam.messages import Array
+from vislam.sim.path import wander
+from vislam.sim.spline import BodySpline
+from vislam.sources import measured_inertial
+from vislam.trajectory import Trajectory
+from vislam.truth_fit import TruthFit, fit_truth
+
+TURN_RAD = np.deg2rad([0.2, -0.1, 0.2])  # 0.3 deg
+LEVER_M = np.array([0.006, -0.004, 0.007])  # 1 cm
+LATE_S = 0.005
+GYRO_NOISE, ACCEL_NOISE, IMU_HZ = 1.7e-4, 2e-3, 200.0  # of a good MEMS IMU
+
+
+def recorded(
+    seed: int,
+    turn_rad: Array = TURN_RAD,
+    lever_m: Array = LEVER_M,
+    late_s: float = LATE_S,
+    truth_hz: float = 100.0,
+    duration_s: float = 60.0,
+    brisk: float = 1.0,
+) -> tuple[np.ndarray, Array, Array, Trajectory]:
+    """Return stamps, gyro, accel and truth of a flight; the truth is noisy motion capture of another body frame."""
+    rng = np.random.default_rng(seed)
+
+    def design(t: Array) -> tuple[Array, Array]:
+        sway = wander(t, rng, 1.0, (0.1, 0.8), 6) * brisk
+        return sway[:, :3] * [1.0, 1.0, 0.4], sway[:, 3:] * [0.25, 0.25, 0.8]
+
+    motion = BodySpline.from_design(design, duration_s, 0.05)
+    imu_s = np.arange(0.0, duration_s, 1.0 / IMU_HZ)
+    moved = motion.at(imu_s)
+    force = moved.acceleration_world_m_s2 + [0.0, 0.0, 9.81]
+    white = rng.normal(0.0, 1.0, (len(imu_s), 6)) * np.sqrt(IMU_HZ)
+    gyro = moved.rate_body_rad_s + white[:, :3] * GYRO_NOISE + [0.02, -0.01, 0.03]
+    accel = (
+        np.einsum("nji,nj->ni", moved.T_world_body[:, :3, :3], force) + white[:, 3:] * ACCEL_NOISE + [0.1, 0.0, -0.1]
+    )
+    true_s = np.arange(0.5, duration_s - 0.5, 1.0 / truth_hz)
+    T_imu_truth = np.linalg.inv(transform(Rotation.from_rotvec(turn_rad).as_matrix(), lever_m))
+    T = motion.at(true_s).T_world_body @ T_imu_truth
+    T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0.0, 1e-3, (len(T), 3))).as_matrix()
+    T[:, :3, 3] += rng.normal(0.0, 2e-4, (len(T), 3))
+    stamps = (np.round(imu_s * 1e9) + 5e9).astype(np.int64)
+    return stamps, gyro, accel, Trajectory((np.round((true_s - late_s) * 1e9) + 5e9).astype(np.int64), T)
+
+
+def nees(fit: TruthFit, turn_rad: Array = TURN_RAD, lever_m: Array = LEVER_M, late_s: float = LATE_S) -> list[float]:
+    """Return the squared errors in sigmas: of turn and lever (3 degrees of freedom each) and of time (1)."""
+    turn, lever = fit.turn_rad - turn_rad, fit.lever_m - lever_m
+    return [
+        float(turn @ np.linalg.solve(fit.turn_covariance, turn)),
+        float(lever @ np.linalg.solve(fit.lever_covariance, lever)),
+        ((fit.time_offset_s - late_s) / fit.time_offset_sigma_s) ** 2,
+    ]
+
+
+@pytest.mark.parametrize(("seed", "truth_hz"), [(0, 100.0), (1, 20.0), (2, 200.0)])
+def test_a_turn_a_lever_and_a_clock_are_found_within_their_sigmas(seed: int, truth_hz: float) -> None:
+    fit = fit_truth(*recorded(seed, truth_hz=truth_hz))
+    print(np.rad2deg(fit.turn_rad), fit.lever_m * 1e3, fit.time_offset_s * 1e3, nees(fit), fit.told)
+    assert fit.is_turned and fit.is_displaced and fit.is_late
+    assert max(nees(fit)[:2]) < 21.1 and nees(fit)[2] < 10.8  # 99.99 and 99.9 %
+    assert np.linalg.norm(fit.turn_rad - TURN_RAD) < np.deg2rad(0.03)
+    assert np.linalg.norm(fit.lever_m - LEVER_M) < 0.002
+    assert abs(fit.time_offset_s - LATE_S) < 2e-4
+
+
+@given(
+    st.integers(0, 1000),
+    st.tuples(*[st.floats(-0.03, 0.03)] * 3),
+    st.tuples(*[st.floats(-0.04, 0.04)] * 3),
+    st.floats(-0.02, 0.02),
+)
+@settings(max_examples=8)
+def test_any_mount_is_found(seed: int, turn: tuple[float, ...], lever: tuple[float, ...], late_s: float) -> None:
+    fit = fit_truth(*recorded(seed, np.array(turn), np.array(lever), late_s, duration_s=40.0))
+    assert np.linalg.norm(fit.turn_rad - turn) < np.deg2rad(0.1)
+    assert np.linalg.norm(fit.lever_m - lever) < 0.004
+    assert abs(fit.time_offset_s - late_s) < 5e-4
+
+
+def test_a_truth_that_fits_is_left_as_it_is() -> None:
+    changed = []
+    for seed in range(8):
+        fit = fit_truth(*recorded(seed, np.zeros(3), np.zeros(3), 0.0, duration_s=40.0))
+        changed.append((fit.is_turned, fit.is_displaced, fit.is_late))
+        if not fit.told:
+            truth = recorded(seed, np.zeros(3), np.zeros(3), 0.0, duration_s=40.0)[3]
+            assert np.array_equal(fit.of_imu(truth).T_world_body, truth.T_world_body)
+            assert np.array_equal(fit.of_imu(truth).t_ns, truth.t_ns)
+    print(changed)
+    assert np.sum(changed) <= 1  # of 24
+
+
+def test_what_is_found_is_undone() -> None:
+    stamps, gyro, accel, truth = recorded(3)
+    fit = fit_truth(stamps, gyro, accel, truth)
+    again = fit_truth(stamps, gyro, accel, fit.of_imu(truth))
+    print(fit.told, "then", again.told)
+    assert "turned by 0.3" in fit.told and "mm" in fit.told and "+5.0" in fit.told
+    assert again.told == ""
+
+
+def test_gaps_in_truth_and_in_samples_do_no_harm() -> None:
+    stamps, gyro, accel, truth = recorded(4, truth_hz=200.0)
+    since_s = (truth.t_ns - truth.t_ns[0]) * 1e-9
+    kept = (since_s % 13.0 > 0.6) & ((since_s < 30.0) | (since_s > 33.0))
+    imu_kept = np.abs((stamps - stamps[0]) * 1e-9 - 20.0) > 0.05
+    holed = Trajectory(truth.t_ns[kept], truth.T_world_body[kept])
+    fit = fit_truth(stamps[imu_kept], gyro[imu_kept], accel[imu_kept], holed)
+    print(fit.told)
+    assert np.linalg.norm(fit.turn_rad - TURN_RAD) < np.deg2rad(0.05)
+    assert np.linalg.norm(fit.lever_m - LEVER_M) < 0.003
+    assert abs(fit.time_offset_s - LATE_S) < 4e-4
+
+
+def test_a_body_that_does_not_move_tells_nothing_and_nothing_is_claimed() -> None:
+    stamps, gyro, accel, truth = recorded(5, brisk=0.0)
+    fit = fit_truth(stamps, gyro, accel, truth)
+    assert fit.told == ""
+    assert np.sqrt(np.linalg.eigvalsh(fit.lever_covariance)[-1]) > 0.02 and fit.time_offset_sigma_s > 0.005
+    short = Trajectory(truth.t_ns[:30], truth.T_world_body[:30])
+    for nothing in (short, Trajectory(truth.t_ns[:0], truth.T_world_body[:0])):
+        fit = fit_truth(stamps, gyro, accel, nothing)
+        assert fit.told == "" and np.array_equal(fit.of_imu(nothing).t_ns, nothing.t_ns)
+    assert fit_truth(stamps[:0], gyro[:0], accel[:0], truth).told == ""
+
+
+def test_the_same_data_give_the_same_fit() -> None:
+    one, other = fit_truth(*recorded(6)), fit_truth(*recorded(6))
+    assert one.turn_rad.tobytes() == other.turn_rad.tobytes() and one.lever_m.tobytes() == other.lever_m.tobytes()
+
+
+@pytest.mark.data
+def test_on_a_real_flight_the_accelerometer_confirms_the_turn(data_root: Path) -> None:
+    """V2_02: the gyroscope alone finds the turn; halves of the recording agree on it."""
+    folder = data_root / "euroc_v202_imu"
+    if not folder.is_dir():
+        missing(f"{folder}")
+    data = measured_inertial(real(data_root, "v202").removeprefix("points:"))
+    print(data.truth_fit.told)
+    assert data.truth_fit.is_turned and not data.truth_fit.is_displaced
+    assert 0.4 < np.rad2deg(np.linalg.norm(data.truth_fit.turn_rad)) < 0.8
+    assert fit_truth(data.t_ns, data.gyro_rad_s, data.accel_m_s2, data.truth).told == ""
