@@ -42,11 +42,9 @@ KEYFRAMES = 1000
 def correct(connection, seconds: float, ready, go, epoch) -> None:
     """Send the corrections of a body at rest, each 50 ms late."""
     from vislam.ekf import Correction
-    from vislam.imu import ImuNoise
     from vislam.live.messages import Start
     from vislam.messages import NavState, Tracking, VoMeasurement, no_observations
 
-    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
     ready.wait()
     while not go.wait(1.0):
         continue

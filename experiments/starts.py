@@ -137,7 +137,7 @@ def judged(
     with suppress(DataError):  # without a trajectory there is nothing to compare
         errors = evaluate(final, truth, front.alignment) if truth is not None else {}
     told = doubts(front, log, final, True)
-    is_lost = bool(lost) or slam.front.counters["frames_lost"] > 0 and log.newest_tracking is Tracking.LOST
+    is_lost = bool(lost) or (slam.front.counters["frames_lost"] > 0 and log.newest_tracking is Tracking.LOST)
     begins = begun["status"] in BEGUN
     reason = "; ".join(([] if begins else [str(begun["reason"])]) + told + ([lost] if lost else []))
     scale = errors.get("scale")

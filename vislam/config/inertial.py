@@ -12,7 +12,7 @@ class ImuConfig:
     accel_noise_density: float | None = None  # m/s^2/sqrt(Hz)
     gyro_bias_walk: float | None = None  # rad/s^2/sqrt(Hz)
     accel_bias_walk: float | None = None  # m/s^3/sqrt(Hz)
-    # scale factors and misalignment, relative, where the sensor's own file has no gyroscope_ or accelerometer_scale_sigma
+    # relative errors of scale factor and alignment, where the sensor's file has no ..._scale_sigma of its own
     gyro_scale_prior: float = 0.003  # of a calibrated MEMS gyroscope: data sheets give 0.2 to 1 %
     accel_scale_prior: float = 0.01  # of a calibrated MEMS accelerometer: 0.5 to 1 % against motion capture
     gravity_m_s2: float = 9.81

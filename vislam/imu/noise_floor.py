@@ -1,11 +1,13 @@
-"""What the inertial samples themselves show of their white noise: the floor of their spectrum.
+"""What the inertial samples themselves show of their errors: the floor of their spectrum, and how much they move.
 
 White noise is in every band alike, so it cannot exceed what the quietest band shows. What stands above that floor is
 motion, at low frequencies, or vibration, at high ones: neither is noise. Vibration integrates to nothing over a frame,
 and a rule that takes it for white noise (the spread of second differences, say) is an order of magnitude too large on
-a flying machine. Errors of scale factor and misalignment are no noise either, but grow with motion: what they do to
-the motion of a body, at about a hertz, is counted beside the floor. The floor is a density as `ImuNoise` has it (Welch, "The use of fast Fourier transform for the
+a flying machine. The floor is a density as `ImuNoise` has it (Welch, "The use of fast Fourier transform for the
 estimation of power spectra", IEEE Trans. Audio Electroacoust. 1967).
+
+Errors of scale factor and misalignment are no noise either, but grow with motion: a relative error s of a signal of
+variance v, most of it near the frequency f at which bodies move, has the density s^2 v / (2 f) there.
 """
 
 from __future__ import annotations
