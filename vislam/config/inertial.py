@@ -1,6 +1,7 @@
 """Defaults of the inertial unit: its noise, power-up and attitude."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +41,41 @@ class PowerUpConfig:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeConfig:
-    """Complementary filter: attitude from gyro and accelerometer alone, the baseline without vision."""
+    """Attitude from gyro, accelerometer and magnetometer, the baseline without vision; numbers of VQF are its paper's."""
 
-    proportional_gain: float = 0.1  # 1/s: leans on the accelerometer over 10 s; half of it and ten times it are worse
+    method: Literal["vqf", "complementary"] = "vqf"  # complementary: Karpov 2026, the paper's cart
+    mag_gate: float = 0.1  # relative change of the field's norm: iron or a motor is near; of complementary also of its z
+
+    tilt_floor_deg: float = 0.4  # vqf publishes it, and what motion does on top: 0.05 m/s^2 of bias is 0.3 deg
+    tau_s: float = 3.0  # vqf: the force is averaged over it, at least
+    tau_max_s: float = 10.0  # at most, while the body keeps its tilt; and how long a tilting body is remembered
+    speed_change_m_s: float = 1.0  # a walk or a cart that starts; with the next it says what lies between the two
+    gyro_error: float = 0.05  # share of the rate: scale is +-6 % and cross-axis 2 % of an ITG3205 as it comes
+    bias_sigma_deg_s: float = 0.5  # of the gyro's bias, when nothing is known
+    bias_motion_sigma_deg_s: float = 0.1  # what motion and gravity show of it in the long run
+    bias_rest_sigma_deg_s: float = 0.03  # and rest
+    bias_vertical_variance: float = 1e4  # times, about the vertical, where gravity shows nothing
+    bias_forgetting_s: float = 100.0  # in which it may wander by 0.1 deg/s
+    bias_innovation_deg_s: float = 2.0  # no bias changes by more at once
+    rest_s: float = 1.5  # so long nothing may move
+    rest_tau_s: float = 0.5  # low-pass from which rate and force do not differ at rest
+    rest_rate_deg_s: float = 2.0  # by more than this
+    rest_force_m_s2: float = 0.5  # and this
+    rest_tilt_m_s2: float = 0.05  # nor the low-passed force from the begin of rest: a cart that rolls tilts, 0.3 deg
+    mag_tau_s: float = 9.0  # of the heading
+    mag_field_tau_s: float = 0.05  # low-pass on the field's norm and dip
+    mag_reference_tau_s: float = 20.0  # over which norm and dip of the reference follow
+    mag_dip_gate_deg: float = 10.0  # as `mag_gate`, of the dip
+    mag_undisturbed_s: float = 0.5  # the field is trusted after being like the reference for so long
+    mag_new_s: float = 20.0  # another field becomes the reference after so long of turning in it,
+    mag_first_s: float = 5.0  # the first one sooner,
+    mag_new_rate_deg_s: float = 20.0  # at least as fast as this: what the body carries along would show
+    mag_reject_s: float = 60.0  # after so long, a disturbed field is better than a gyro alone
+    mag_reject_factor: float = 2.0  # at a gain so many times lower
+
+    proportional_gain: float = 0.1  # complementary, 1/s: leans on the accelerometer over 10 s; half and ten times are worse
     integral_gain: float = 0.001  # 1/s^2: learns what bias is left after power-up within minutes
     gate_m_s2: float = 0.15  # |force| further from gravity is motion, not tilt
     level_cutoff_hz: float = 5.0  # low-pass on the force that levels, so that vibration does not close the gate
     mag_gain: float = 0.05  # 1/s, of the yaw by the magnetometer
-    mag_gate: float = 0.1  # relative change of the field's norm, and of its vertical part: iron or a motor is near
     tilt_sigma_deg: float = 1.0  # that is published; twice the error on synthetic carts, whose springs are ideal

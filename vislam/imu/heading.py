@@ -1,0 +1,125 @@
+"""Heading by the magnetometer, where its field is what it has been: section 3.6 of VQF (see `levelling`)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from vislam.config import AttitudeConfig
+from vislam.imu.low_pass import low_pass
+from vislam.messages import Array
+
+
+class Heading(NamedTuple):
+    """What is remembered of the field; norm in uT, dip (below the horizon) in rad."""
+
+    field: Array  # [2, 2] low-passed norm and dip
+    reference: Array  # [2] norm and dip of the field that is trusted; zero: none yet
+    candidate: Array  # [2] of the field that may become it
+    clocks_s: Array  # [3] for how long: the field was trusted, it was rejected, the candidate stood
+    yaw_rad: Array  # [1] of the world against the frame that levelling began with
+    azimuth_rad: Array  # [1] of the field in the world, where yaw is held
+    share: Array  # [1] of the next sample in the mean that the azimuth begins as; zero: it is over
+
+
+class Magnetic(NamedTuple):
+    """Settings of the kernel, in radians."""
+
+    tau_s: float
+    field_tau_s: float
+    reference_tau_s: float
+    norm_gate: float
+    dip_gate_rad: float
+    undisturbed_s: float
+    new_s: float
+    first_s: float
+    new_rate_rad_s: float
+    reject_s: float
+    reject_factor: float
+
+
+def magnetic(config: AttitudeConfig) -> Magnetic:
+    """Return what the kernel goes by."""
+    return Magnetic(
+        config.mag_tau_s, config.mag_field_tau_s, config.mag_reference_tau_s, config.mag_gate,
+        np.deg2rad(config.mag_dip_gate_deg), config.mag_undisturbed_s, config.mag_new_s, config.mag_first_s,
+        np.deg2rad(config.mag_new_rate_deg_s), config.mag_reject_s, config.mag_reject_factor,
+    )  # fmt: skip
+
+
+def begin_heading(reject_s: float) -> Heading:
+    """Return the state before any field came; without a reference nothing is rejected."""
+    clocks_s = np.array([0.0, reject_s, 0.0])
+    return Heading(np.zeros((2, 2)), np.zeros(2), np.zeros(2), clocks_s, np.zeros(1), np.zeros(1), np.ones(1))
+
+
+@njit(cache=True, nogil=True)
+def hold_heading(state: Heading, seen: Array, rate_rad_s: float, dt_s: float, p: Magnetic) -> None:
+    """Take a field [3], seen in the level frame that the heading is told against; the first one has no dt_s."""
+    norm = np.sqrt(np.sum(seen * seen))
+    if norm == 0.0:
+        return
+    _watch(state, norm, -np.arcsin(seen[2] / norm), rate_rad_s, dt_s, p)
+    off = np.arctan2(seen[1], seen[0]) + state.yaw_rad[0] - state.azimuth_rad[0]
+    off = np.arctan2(np.sin(off), np.cos(off))
+    gain = _gain(state, dt_s, p)
+    if state.share[0] > 0.0:  # the first samples say where the field is: one alone is as wrong as its noise
+        state.azimuth_rad[0] += state.share[0] * off
+        state.share[0] /= 1.0 + state.share[0]
+        if state.share[0] * p.tau_s < dt_s:
+            state.share[0] = 0.0
+    else:
+        state.yaw_rad[0] -= gain * off
+
+
+@njit(cache=True, nogil=True)
+def _gain(state: Heading, dt_s: float, p: Magnetic) -> float:
+    """Return the share of the sample in the heading; a disturbed field has none, for as long as a gyro can do alone."""
+    gain = 1.0 - np.exp(-dt_s / p.tau_s)
+    clocks_s = state.clocks_s
+    if clocks_s[0] >= p.undisturbed_s:
+        clocks_s[1] = max(clocks_s[1] - p.reject_factor * dt_s, 0.0)
+        return gain
+    if clocks_s[1] <= p.reject_s:
+        clocks_s[1] += dt_s
+        return 0.0
+    return gain / p.reject_factor
+
+
+@njit(cache=True, nogil=True)
+def _watch(state: Heading, norm: float, dip_rad: float, rate_rad_s: float, dt_s: float, p: Magnetic) -> None:
+    """Compare the field with the reference, and with what may become it after turning in it for long enough."""
+    now = np.array([norm, dip_rad])
+    if dt_s <= 0.0:
+        state.field[0] = now
+    else:
+        low_pass(state.field, now, dt_s, p.field_tau_s)
+    now = state.field[0]
+    share = 1.0 - np.exp(-dt_s / p.reference_tau_s)
+    reference, candidate, clocks_s = state.reference, state.candidate, state.clocks_s
+    if _is_like(now, reference, p):
+        clocks_s[0] += dt_s
+        if clocks_s[0] >= p.undisturbed_s:
+            reference += share * (now - reference)
+    else:
+        clocks_s[0] = 0.0
+    if not _is_like(now, candidate, p):
+        clocks_s[2] = 0.0
+        candidate[:] = now
+        return
+    if rate_rad_s >= p.new_rate_rad_s:
+        clocks_s[2] += dt_s
+    candidate += share * (now - candidate)
+    asked_s = p.first_s if reference[0] == 0.0 else p.new_s
+    if clocks_s[0] < p.undisturbed_s and clocks_s[2] >= asked_s:
+        reference[:] = candidate
+        clocks_s[0] = p.undisturbed_s
+
+
+@njit(cache=True, nogil=True)
+def _is_like(field: Array, reference: Array, p: Magnetic) -> bool:
+    return bool(
+        abs(field[0] - reference[0]) < p.norm_gate * reference[0] and abs(field[1] - reference[1]) < p.dip_gate_rad
+    )
