@@ -48,9 +48,10 @@ class AttitudeConfig:
 
     tilt_floor_deg: float = 0.4  # vqf publishes it, and what motion does on top: 0.05 m/s^2 of bias is 0.3 deg
     tau_s: float = 3.0  # vqf: the force is averaged over it, at least
-    tau_max_s: float = 10.0  # at most, while the body keeps its tilt; and how long a tilting body is remembered
+    tau_max_s: float = 10.0  # at most, while the body keeps its tilt
     speed_change_m_s: float = 1.0  # a walk or a cart that starts; with the next it says what lies between the two
     gyro_error: float = 0.05  # share of the rate: scale is +-6 % and cross-axis 2 % of an ITG3205 as it comes
+    sway_s: float = 60.0  # a body that tilted is remembered for so long: each change of tau lets some motion through
     bias_sigma_deg_s: float = 0.5  # of the gyro's bias, when nothing is known
     bias_motion_sigma_deg_s: float = 0.1  # what motion and gravity show of it in the long run
     bias_rest_sigma_deg_s: float = 0.03  # and rest

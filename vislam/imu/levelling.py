@@ -19,6 +19,7 @@ from vislam.imu.low_pass import low_pass
 from vislam.messages import Array
 
 _FORGOTTEN_RAD_S = np.deg2rad(0.1)  # the bias wanders by so much in `bias_forgetting_s`
+_UNSEEN = 2.5  # variance of white acceleration behind the filter, over tau^2 times that of its low-passed slope
 
 
 class Level(NamedTuple):
@@ -33,7 +34,8 @@ class Level(NamedTuple):
     rest_force: Array  # [3] that rest began with
     rest_s: Array  # [1] since when it may be rest
     sway_rad_s: Array  # [1] how fast the tilt changed, its peaks slowly forgotten
-    wander_rad2: Array  # [1] variance per axis of what motion does to the tilt
+    turning_rad_s: Array  # [3] low-passed rate of the smooth force in start, where gravity does not turn
+    wander_rad2: Array  # [1] variance per axis that it tells of
 
 
 class Levelling(NamedTuple):
@@ -44,6 +46,7 @@ class Levelling(NamedTuple):
     tau_max_s: float
     speed_change_m_s: float
     gyro_error: float
+    sway_s: float
     bias_innovation_rad_s: float
     bias_forgetting_s: float
     bias_motion_sigma_rad_s: float
@@ -60,7 +63,7 @@ class Levelling(NamedTuple):
 def levelling(config: AttitudeConfig, gravity_m_s2: float) -> Levelling:
     """Return what the kernel goes by."""
     return Levelling(
-        gravity_m_s2, config.tau_s, config.tau_max_s, config.speed_change_m_s, config.gyro_error,
+        gravity_m_s2, config.tau_s, config.tau_max_s, config.speed_change_m_s, config.gyro_error, config.sway_s,
         np.deg2rad(config.bias_innovation_deg_s), config.bias_forgetting_s, np.deg2rad(config.bias_motion_sigma_deg_s),
         np.deg2rad(config.bias_sigma_deg_s), config.bias_vertical_variance, np.deg2rad(config.bias_rest_sigma_deg_s),
         config.rest_s, config.rest_tau_s, np.deg2rad(config.rest_rate_deg_s), config.rest_force_m_s2,
@@ -76,7 +79,7 @@ def begin_level(R_world_body: Array, bias: Array, bias_sigma_rad_s: float, gravi
     smooth[0] = np.hstack([[0.0, 0.0, gravity_m_s2], R.ravel(), (R @ bias)[:2]])
     calm[0] = np.hstack([bias, up])
     covariance = np.eye(3) * bias_sigma_rad_s**2
-    return Level(R, np.eye(3), smooth, calm, bias, covariance, up, np.zeros(1), np.zeros(1), np.zeros(1))
+    return Level(R, np.eye(3), smooth, calm, bias, covariance, up, np.zeros(1), np.zeros(1), np.zeros(3), np.zeros(1))
 
 
 @njit(cache=True, nogil=True)
@@ -124,7 +127,7 @@ def _time_constant(state: Level, up_body: Array, dt_s: float, p: Levelling) -> f
     """
     rate = state.calm[0, :3] - state.bias
     sideways = rate - np.sum(rate * up_body) * up_body
-    held = state.sway_rad_s[0] * np.exp(-dt_s / p.tau_max_s)
+    held = state.sway_rad_s[0] * np.exp(-dt_s / p.sway_s)
     state.sway_rad_s[0] = max(held, np.sqrt(np.sum(sideways * sideways)))
     wrong_rad_s = p.bias_rest_sigma_rad_s + p.gyro_error * state.sway_rad_s[0]
     return min(max(np.sqrt(p.speed_change_m_s / (p.gravity_m_s2 * wrong_rad_s)), p.tau_s), p.tau_max_s)
@@ -147,9 +150,10 @@ def _correct_tilt(state: Level, dt_s: float, tau_s: float, p: Levelling) -> Arra
         correction[0] = angle
     state.R_world_start[:] = so3_exp(correction) @ state.R_world_start
     _orthonormalise(state.R_world_start)
-    turning = np.cross(force, slope) / (norm * norm)  # gravity stands still here: what turns it is what is wrong
-    share = 1.0 - np.exp(-dt_s / p.tau_max_s)
-    state.wander_rad2[0] += share * (0.5 * tau_s * tau_s * np.sum(turning * turning) - state.wander_rad2[0])
+    turning = state.turning_rad_s
+    turning += (1.0 - np.exp(-dt_s / tau_s)) * (np.cross(force, slope) / (norm * norm) - turning)
+    now_rad2 = 0.5 * _UNSEEN * tau_s * tau_s * np.sum(turning * turning)
+    state.wander_rad2[0] += (1.0 - np.exp(-dt_s / p.tau_max_s)) * (now_rad2 - state.wander_rad2[0])
     return correction
 
 
@@ -160,7 +164,8 @@ def _learn_bias(state: Level, turning: Array, dt_s: float, p: Levelling) -> None
     if state.rest_s[0] >= p.rest_s:
         H = np.eye(3)
         error = state.calm[0, :3] - bias
-        sigma = np.full(3, p.bias_rest_sigma_rad_s)
+        turned_rad_s = p.rest_tilt_m_s2 / (p.gravity_m_s2 * state.rest_s[0])  # what rest so short does not rule out
+        sigma = np.full(3, max(p.bias_rest_sigma_rad_s, turned_rad_s))
     else:
         H = smooth[3:12].copy().reshape(3, 3)
         error = -(H @ bias)
