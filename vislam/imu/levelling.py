@@ -123,12 +123,14 @@ def _time_constant(state: Level, up_body: Array, dt_s: float, p: Levelling) -> f
     """Return over how long the force is averaged.
 
     Averaged over tau, a change of speed tilts by speed / (g tau), a gyro that is wrong by e by e tau: both are least
-    where they are the same. How wrong it is grows with how fast the body tilts.
+    where they are the same. How wrong it is grows with how fast the body tilts. At rest no speed changes.
     """
     rate = state.calm[0, :3] - state.bias
     sideways = rate - np.sum(rate * up_body) * up_body
     held = state.sway_rad_s[0] * np.exp(-dt_s / p.sway_s)
     state.sway_rad_s[0] = max(held, np.sqrt(np.sum(sideways * sideways)))
+    if state.rest_s[0] >= p.rest_s:
+        return p.tau_s
     wrong_rad_s = p.bias_rest_sigma_rad_s + p.gyro_error * state.sway_rad_s[0]
     return min(max(np.sqrt(p.speed_change_m_s / (p.gravity_m_s2 * wrong_rad_s)), p.tau_s), p.tau_max_s)
 
