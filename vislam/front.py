@@ -9,6 +9,7 @@ import numpy as np
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config, EkfConfig
+from vislam.continuity import in_odom
 from vislam.ekf import Correction, Ekf, Hint
 from vislam.ekf.filtering import Filtering
 from vislam.errors import TrackingLostError, UsageError
@@ -37,11 +38,20 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state
+from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state, pose_after
 from vislam.trajectory import Alignment, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Where odometry has the body at a frame."""
+
+    T_odom_before: Array  # [4, 4] by inertial data alone, from where it was at the last frame
+    T_odom_body: Array  # [4, 4] with all that is known
+    rate_sigma_rad_s: float  # of the gyroscope's bias; 0 without an IMU
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +60,8 @@ class FrontStep:
 
     frame: Frame
     track: TrackResult
-    T_odom_body: Array | None  # None before initialisation
+    T_odom_body: Array | None  # as it is published, without jumps; None before initialisation
+    estimate: Estimate | None  # behind it; None before initialisation
     state: NavState | None  # of the filter; None before initialisation or without an IMU
     keyframe_id: int  # the newest keyframe
     T_keyframe_body: Array | None  # relative to it; None: only known by interpolation between keyframes
@@ -124,6 +135,8 @@ class Front:
             )  # fmt: skip
             self._filter = Filtering(filter_config(config, rig, noise), noise, config.imu.gravity_m_s2, rig)
             self.ekf_coupling = self._filter.coupling
+        self._published = in_odom(config)
+        self._last_state: NavState | None = None  # at the last frame
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
@@ -223,7 +236,8 @@ class Front:
             self._T_vo_body = self._T_vo_keyframe @ scaled_motion(track.vo)
         with self._clock.measure("ekf"):
             ready = self._initialise(span, track, still_image)
-            T_odom_body, state = self._correct(frame, track, at_rest)
+            estimate, state = self._correct(frame, track, at_rest, span)
+        T_odom_body = None if estimate is None else estimate.T_odom_body
         T_keyframe_body = self._since_keyframe(T_vo_keyframe_body, T_odom_body)
         if track.keyframe is not None:
             ready += self._take_keyframe(track, T_odom_body, state)
@@ -231,7 +245,8 @@ class Front:
         self._last_frame_t_ns = frame.t_ns
         self._follow_clock(track.vo)
         told = [] if self._filter is None else self._filter.take_told()
-        return FrontStep(frame, track, T_odom_body, state, self._keyframe_id, T_keyframe_body, ready, told)
+        shown = self._publish(frame.t_ns, estimate)
+        return FrontStep(frame, track, shown, estimate, state, self._keyframe_id, T_keyframe_body, ready, told)
 
     def feed_back(self, update: GraphUpdate) -> None:
         """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
@@ -391,10 +406,13 @@ class Front:
             self.first_state = first_keyframe_state(first, released[0])
         return released
 
-    def _correct(self, frame: Frame, track: TrackResult, at_rest: bool) -> tuple[Array | None, NavState | None]:
+    def _correct(
+        self, frame: Frame, track: TrackResult, at_rest: bool, span: ImuSpan | None
+    ) -> tuple[Estimate | None, NavState | None]:
         """Return the pose in `odom` and the filter's state after this frame."""
         if self._filter is None:
-            return self._T_vo_body.copy(), None
+            T_vo_body = self._T_vo_body.copy()
+            return Estimate(T_vo_body, T_vo_body, 0.0), None
         ekf = self._filter.ekf
         if not ekf.initialised:
             return None, None
@@ -403,11 +421,25 @@ class Front:
         self._filter.see(
             frame.t_ns, track.vo, track.observations, at_rest, keyframe_id, self.uniform.shows_scale, self._floor.now
         )
-        T_odom_body = ekf.pose_at(frame.t_ns)
-        if T_odom_body is None:
-            T_odom_body = self._without_filter(track.vo)
-        self._T_odom_body = T_odom_body
-        return T_odom_body, ekf.state_at(frame.t_ns)
+        after, state = ekf.pose_at(frame.t_ns), ekf.state_at(frame.t_ns)
+        if after is None:
+            after = self._without_filter(track.vo)
+        self._T_odom_body = after
+        if after is None:
+            return None, state
+        last, self._last_state = self._last_state, state
+        if state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
+            return Estimate(after, after, 0.0), state
+        # a correction may enter with a later sample only, so what the filter was told is no measure of it
+        before = pose_after(last, span, self._config.imu.gravity_m_s2)
+        return Estimate(before, after, float(np.sqrt(np.diag(state.covariance)[9:12].max()))), state
+
+    def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:
+        """Return the pose in `odom`, where it is to be continuous without the jumps of corrections."""
+        if estimate is None:
+            return None
+        before, after, sigma_rad_s = estimate.T_odom_before, estimate.T_odom_body, estimate.rate_sigma_rad_s
+        return self._published.follow(t_ns, before, after, sigma_rad_s)
 
     def _without_filter(self, vo: VoMeasurement) -> Array | None:
         """Return the pose in `odom` where inertial data stopped before the frame: vision carries the last one on."""

@@ -87,6 +87,15 @@ def pose_before(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
     return transform(R, state.T_world_body[:3, 3] - velocity * dt - 0.5 * dt * dt * gravity - R @ piece.dp_m)
 
 
+def pose_after(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
+    """Return the pose [4, 4] at the end of a span that begins at `state`, by dead reckoning."""
+    piece = preintegrate(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+    dt, gravity = piece.dt_s, np.array([0.0, 0.0, -gravity_m_s2])
+    R, velocity = state.T_world_body[:3, :3], state.velocity_world_m_s
+    moved = velocity * dt + 0.5 * dt * dt * gravity + R @ piece.dp_m
+    return transform(R @ piece.dR, state.T_world_body[:3, 3] + moved)
+
+
 def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:
     """Return the state of the first keyframe, given the state of the first frame that the initialisation used.
 

@@ -17,6 +17,7 @@ from vislam import collector
 from vislam.camera import Rig
 from vislam.clock import StageClock
 from vislam.config import Config
+from vislam.continuity import Continuity
 from vislam.errors import UsageError
 from vislam.front import Front, FrontStep
 from vislam.frontend import lasting_scale_sigma, mode_for
@@ -241,6 +242,8 @@ class Slam:
         self._frames: deque[Frame] = deque()
         self._pieces = Pieces()
         self.counters = {"frames_lost": 0, "relocalised": 0}
+        self._published = Continuity(config.publish)
+        self._T_map_odom = np.eye(4)  # at the last frame
         self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # since the newest keyframe
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
         self._begins_recording = False  # in a map, with the next keyframe
@@ -323,11 +326,18 @@ class Slam:
         keyframes = self._add(front.keyframes)
         if self.back is not None and self.back.map is not None and self.back.map.wants_frames:
             self._seen += seen_between(front)
-        T_map_body = None
-        if self.back is not None and front.T_odom_body is not None:
-            T_map_body = self.back.T_map_odom @ front.T_odom_body
+        T_map_body = self._publish(front)
         localisation = self._localisation(front.track.vo.tracking, keyframes)
         return Step(front, T_map_body, localisation, len(self._pieces.groups) - 1, keyframes)
+
+    def _publish(self, front: FrontStep) -> Array | None:
+        """Return the pose in map; what the graph corrected since the last frame is taken in as the body moves."""
+        if self.back is None or front.estimate is None:
+            return None
+        estimate, T_before = front.estimate, self._T_map_odom
+        T_map_odom = self._T_map_odom = self.back.T_map_odom
+        before, after = T_before @ estimate.T_odom_before, T_map_odom @ estimate.T_odom_body
+        return self._published.follow(front.frame.t_ns, before, after, estimate.rate_sigma_rad_s)
 
     def _localisation(self, tracking: Tracking, keyframes: list[KeyframeStep]) -> Localisation:
         """Return whether the place in the map is known after a frame."""

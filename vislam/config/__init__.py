@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from vislam.config.batch import BatchConfig, GraphWorldConfig, PoseGraphConfig
-from vislam.config.estimators import EkfConfig, GraphConfig, WindowConfig
+from vislam.config.estimators import EkfConfig, GraphConfig, PublishConfig, WindowConfig
 from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig, PlanarConfig
 from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig
 from vislam.config.live import LiveConfig, ViewConfig
@@ -59,6 +59,7 @@ __all__ = [
     "PlanarConfig",
     "PoseGraphConfig",
     "PowerUpConfig",
+    "PublishConfig",
     "RecordConfig",
     "SensorCalibration",
     "SensorsConfig",
@@ -89,6 +90,7 @@ class Config:
     ekf: EkfConfig = field(default_factory=EkfConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
+    publish: PublishConfig = field(default_factory=PublishConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     map: MapConfig = field(default_factory=MapConfig)

@@ -207,3 +207,22 @@ class GraphConfig:
     join_frames: int = 2  # new frames whose loops must agree through odometry to join two pieces: one image can deceive
     join_waiting: int = 20  # newest loops between pieces that are compared for that; bounds the work
     join_max_contradicting: float = 0.25  # of the loops between two pieces; more, and they wait for further ones
+
+
+@dataclass(frozen=True, slots=True)
+class PublishConfig:
+    """How corrections reach the pose that is published: with the motion of the body, not as jumps."""
+
+    enabled: bool = True  # off: corrections are published as they come
+    way_share: float = 0.4  # of the way that the body makes: a correction looks like odometry that errs by so much
+    way_m: float = 1.0  # the way over which a correction fades by e, where that is faster
+    reach_m: float = 0.3  # how far a turn counts as way: the length of an arm, or of a cart
+    fade_s: float = 0.1  # a correction fades no faster: news of single frames contradict each other
+    creep_m_s: float = 0.01  # most at rest: half a millimetre from frame to frame
+    creep_s: float = 10.0  # and at rest a correction fades in so long
+    turn_s: float = (
+        30.0  # a correction of orientation fades in so long, 1 deg by 0.03 deg/s: what good gyroscopes err ...
+    )
+    gyro_share: float = 0.5  # ... or by so much of what the gyroscope itself may err, where that is faster
+    at_once_m: float = 1.0  # a larger correction is another belief about the place: it comes at once
+    at_once_deg: float = 5.0

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config
+from vislam.continuity import Continuity, in_odom
 from vislam.ekf.correction import Correction, Hint
 from vislam.ekf.filter import Ekf
+from vislam.geometry import invert, transform
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
 from vislam.live.inertial_only import InertialOnly
@@ -27,6 +29,8 @@ _NS = 1_000_000_000
 _REST_STEP_NS = 100_000_000  # rest is asked for so often
 _LOOK_NS = 50_000_000  # and the sensors for their health
 _UNKNOWN = np.full((6, 6), np.inf)
+
+BaseState = tuple[Array, Array, Array, Array, Array]  # pose, velocity, rate, covariances of both, see `of_base`
 
 
 class FastPath:
@@ -66,6 +70,8 @@ class FastPath:
         self._rejects = False  # ... and contradicted the filter
         self._settled_variance = 0.0  # of position, when vision last corrected
         self._map = MapMoved(0, np.eye(4))
+        self._in_odom, self._in_map = in_odom(config), Continuity(config.publish)
+        self._T_map_odom = np.eye(4)  # that `_in_map` follows
         self._camera = Health(0)
         self._events: deque[tuple[int, Health]] = deque()
         self._looked_ns = 0
@@ -130,6 +136,12 @@ class FastPath:
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
+        before = self._ekf.state() if self._started else None
+        self._take(message)
+        if before is not None and not isinstance(message, Start):
+            self._show(before.T_world_body, self._ekf.state())
+
+    def _take(self, message: ToFast) -> None:
         if isinstance(message, Correction):
             answer = message.apply(self._ekf)
             is_seen = message.vo.tracking is not Tracking.LOST
@@ -167,7 +179,7 @@ class FastPath:
         self._publish(self._newest)
 
     def _pose(self, state: NavState | None, now_ns: int) -> PublishedPose:
-        resets = self._resets + self._ekf.counters["soft_resets"]
+        resets, T_map_odom = self._resets + self._ekf.counters["soft_resets"], self._map.T_map_odom
         if state is None:
             base = np.eye(4), np.zeros(3), np.zeros(3), _UNKNOWN, _UNKNOWN
             if self._alone.has_attitude:
@@ -176,12 +188,30 @@ class FastPath:
         else:
             variance = self._noise.gyro_noise_density**2 * self._noise.rate_hz
             base, newest_ns = of_base(state, self._gyro, variance, self._offset), state.t_ns
+            base, T_map_odom = self._shown_base(base, state)
         T, velocity, rate, pose_covariance, twist_covariance = base
         return PublishedPose(
             newest_ns, now_ns, self._sequence, self._health(state, now_ns, now_ns - newest_ns), T, velocity, rate,
-            pose_covariance, twist_covariance, self._map.T_map_odom, self._map.revision, resets,
+            pose_covariance, twist_covariance, T_map_odom, self._map.revision, resets,
             self._ekf.dead_reckoning_s,
         )  # fmt: skip
+
+    def _show(self, T_before: Array, state: NavState) -> tuple[Array, Array]:
+        """Return the body's pose [4, 4] in odom and in map as they are published: without the jumps of corrections."""
+        T_map_odom, self._T_map_odom = self._T_map_odom, self._map.T_map_odom
+        rate_sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max()))
+        shown = self._in_odom.follow(state.t_ns, T_before, state.T_world_body, rate_sigma_rad_s)
+        after = self._T_map_odom @ state.T_world_body
+        return shown, self._in_map.follow(state.t_ns, T_map_odom @ T_before, after, rate_sigma_rad_s)
+
+    def _shown_base(self, base: BaseState, state: NavState) -> tuple[BaseState, Array]:
+        """Return the base as it is published, with what it still owes in its covariance, and T_map_odom [4, 4]."""
+        _, velocity, rate, pose_covariance, twist_covariance = base
+        T_odom_body, T_map_body = self._show(state.T_world_body, state)
+        T = transform(T_odom_body[:3, :3], T_odom_body[:3, 3] + T_odom_body[:3, :3] @ self._offset)
+        owed = np.concatenate([self._in_odom.owed_m, self._in_odom.owed_rad])
+        shown = T, velocity, rate, pose_covariance + np.outer(owed, owed), twist_covariance
+        return shown, T_map_body @ invert(T_odom_body)
 
     def _health(self, state: NavState | None, now_ns: int, age_ns: int) -> Health:
         config = self._config.live
@@ -210,6 +240,8 @@ class FastPath:
     def _start(self, start: Start) -> None:
         """Begin at the first state, and catch up with the newest sample."""
         self._ekf.initialise(start.state, start.vo)
+        self._in_odom.clear()
+        self._in_map.clear()
         self._resets += self._started > 0 or self._alone.has_attitude
         self._started += 1
         self._alone.end()

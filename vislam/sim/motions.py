@@ -23,6 +23,9 @@ _TURN_RAD_S = np.deg2rad(40.0)
 _TURN_S = 9.0  # one way: a whole circle
 _LAP_HEIGHT_M = 1.4
 _START_BLEND_S = 2.0
+_ROUND_S = 12.0  # from stop to stop
+_GO_SHARE = 2.0 / 3.0  # of it is motion
+_ROUND_M = 5.0
 
 
 def still(_rng: np.random.Generator, duration_s: float) -> BodySpline:
@@ -87,6 +90,28 @@ def laps(rng: np.random.Generator, duration_s: float) -> BodySpline:
     return BodySpline.from_design(design, duration_s, _SPACING_S)
 
 
+def stop_and_go(rng: np.random.Generator, duration_s: float) -> BodySpline:
+    """Return a body carried by hand around the block of `laps`, which stands quite still for 4 s of every 12."""
+    path = rounded_path([(4.0, 0.0), (12.0, 0.0), (12.0, 7.0), (0.0, 7.0), (0.0, 0.0), (4.0, 0.0)], 1.5)
+    lap_m = path.length_m
+
+    def design(t: Array) -> tuple[Array, Array]:
+        along = np.maximum(t - _REST_S, 0.0) / _ROUND_S
+        rounds = np.floor(along)
+        there = smoothstep(along - rounds, 0.0, _GO_SHARE)  # 0 to 1 while it goes
+        arc = (rounds + there) * _ROUND_M
+        turns = np.floor(arc / lap_m)
+        xy, heading = path.at(arc - turns * lap_m)
+        # hands sway as the body goes: along the way, not in time, so that they rest with it
+        sway = wander((rounds + there) * _ROUND_S * _GO_SHARE, rng, 1.0, (0.15, 1.2), 6)
+        positions = np.column_stack([xy, np.full(len(t), _LAP_HEIGHT_M)]) + sway[:, :3] * [0.08, 0.08, 0.06]
+        angles = sway[:, 3:] * [0.06, 0.08, 0.1]
+        angles[:, 2] += heading + 2.0 * np.pi * turns
+        return positions, angles
+
+    return BodySpline.from_design(design, duration_s, _SPACING_S)
+
+
 @dataclass(frozen=True, slots=True)
 class PointWorld:
     """A motion through a cloud of landmarks."""
@@ -113,6 +138,10 @@ POINT_WORLDS: dict[str, PointWorld] = {
     ),
     "laps": PointWorld(
         "3 s of rest, then laps of 36 m, carried by hand", laps, 120.0, _HOURS_S, (0.05, 0.02, 0.03)
+    ),
+    "stop-and-go": PointWorld(
+        "3 s of rest, then 5 m by hand and 4 s of rest, again and again", stop_and_go, 60.0, _HOURS_S,
+        (0.05, 0.02, 0.03),
     ),
 }  # fmt: skip
 
