@@ -11,6 +11,7 @@ from vislam.clock import StageClock
 from vislam.config import Config, EkfConfig
 from vislam.continuity import in_odom
 from vislam.ekf import Correction, Ekf, Hint
+from vislam.ekf.backwards import EarlyFrames, known_from
 from vislam.ekf.filtering import Filtering
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend, mode_for
@@ -39,7 +40,7 @@ from vislam.messages import (
     VoMeasurement,
 )
 from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state, pose_after
-from vislam.trajectory import Alignment, gauge_alignment
+from vislam.trajectory import Alignment, Trajectory, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
@@ -83,6 +84,7 @@ class FrontReport:
     imu_noise: dict[str, dict[str, float]]  # white noise of the IMU: told, and what the samples showed
     uniform_s: float  # longest stretch without motion that shows scale
     calibration: dict[str, float]  # what was learned of the camera
+    scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
 
     @property
     def alignment(self) -> Alignment:
@@ -117,6 +119,7 @@ class Front:
         self._refused: Initialisation | None = None  # the newest answer without a state
         self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
         self.last_refusal = "no frame yet"  # why there is no first state
+        self.scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
         self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0, "pieces": 1}
         self._config = config
         self._clock = clock
@@ -133,7 +136,9 @@ class Front:
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
                 config.frontend.track_sigma_px,
             )  # fmt: skip
-            self._filter = Filtering(filter_config(config, rig, noise), noise, config.imu.gravity_m_s2, rig)
+            chosen = filter_config(config, rig, noise)
+            self._filter = Filtering(chosen, noise, config.imu.gravity_m_s2, rig)
+            self._early = EarlyFrames(chosen, rig, config.imu.gravity_m_s2)
             self.ekf_coupling = self._filter.coupling
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
@@ -231,6 +236,8 @@ class Front:
         self._count(track, at_rest)
         if self.frontend.mode == "mono":
             self.uniform.add(span, before, at_rest)
+            if self.initialisation is None:
+                self._early.see(frame.t_ns, track.observations, at_rest)
         T_vo_keyframe_body = track.vo.T_keyframe_body if track.vo.has_scale else None
         if track.vo.T_keyframe_body is not None:
             self._T_vo_body = self._T_vo_keyframe @ scaled_motion(track.vo)
@@ -269,7 +276,7 @@ class Front:
             self.all_counters, self.nis_statistics,
             [] if self._floor is None else self._floor.warnings(self._config.imu.noise_tolerance),
             {} if self._floor is None else self._floor.summary(),
-            self.uniform.longest_s, self.calibration,
+            self.uniform.longest_s, self.calibration, self.scaled_from_ns,
         )  # fmt: skip
 
     @property
@@ -367,6 +374,7 @@ class Front:
         self._keyframe_t_ns += shift_ns
         self.camera_clock.took_keyframe()
         self._waiting.restamp(shift_ns, self._buffer.span)
+        self._early.restamp(shift_ns)
 
     def _count(self, track: TrackResult, at_rest: bool) -> None:
         self.counters["frames_lost"] += track.vo.tracking == Tracking.LOST
@@ -397,14 +405,31 @@ class Front:
         first = None if found is None else found.first
         is_mono = self.frontend.mode == "mono"
         solved: dict[int, Array] = {}
+        states: dict[int, NavState] = {}
         if is_mono and found is not None and first is not None and found.T_odom_body is not None:
-            solved = self._waiting.carried_back(first, self._buffer.span, self._config.imu.gravity_m_s2)
-            solved |= dict(zip(found.t_ns, found.T_odom_body, strict=True))
+            assert self.noise is not None
+            states = self._early.states(first, self._waiting.t_ns, self._buffer.span, self.noise)
+            solved = {t_ns: state.T_world_body for t_ns, state in states.items()}
+            solved |= self._waiting.between(Trajectory(np.array(found.t_ns, dtype=np.int64), found.T_odom_body))
+            self.counters["keyframes_carried_back"] = len(states)
         released = self._waiting.release(T_odom_vo, solved)
+        if self._has_imu:
+            self._early.forget()
         self._T_odom_keyframe = solved.get(self._keyframe_t_ns) if is_mono else T_odom_vo @ self._T_vo_keyframe
         if released and first is not None:
-            self.first_state = first_keyframe_state(first, released[0])
+            t_ns = released[0].packet.keyframe.t_ns
+            self.first_state = first_keyframe_state(states.get(t_ns, first), released[0])
+            if is_mono:
+                self._leave_out(first, states, released)
         return released
+
+    def _leave_out(self, first: NavState, states: dict[int, NavState], released: list[OdometryKeyframe]) -> None:
+        """Note from when on scale is known, where that is later than the first keyframe."""
+        known_ns = known_from(first, states)
+        early = [keyframe for keyframe in released if keyframe.packet.keyframe.t_ns < known_ns]
+        self.counters["keyframes_without_scale"] = len(early)
+        if early:
+            self.scaled_from_ns = known_ns
 
     def _correct(
         self, frame: Frame, track: TrackResult, at_rest: bool, span: ImuSpan | None

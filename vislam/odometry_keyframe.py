@@ -10,6 +10,7 @@ import numpy as np
 from vislam.geometry import transform
 from vislam.imu import preintegrate
 from vislam.messages import Array, ImuSpan, KeyframePacket, NavState
+from vislam.trajectory import Trajectory
 
 _UNKNOWN_VELOCITY_M_S = 3.0  # sigma for a keyframe whose velocity the initialisation did not estimate
 
@@ -47,17 +48,14 @@ class WaitingKeyframes:
             self._keyframes[i] = replace(waiting, packet=replace(packet, imu=imu))
             before_ns = t_ns
 
-    def carried_back(
-        self, first: NavState, cut: Callable[[int, int], ImuSpan | None], gravity_m_s2: float
-    ) -> dict[int, Array]:
-        """Return the poses, by time, of those that are older than a state: by inertial data alone."""
-        poses = {}
-        for waiting in self._keyframes:
-            t_ns = waiting.packet.keyframe.t_ns
-            span = cut(t_ns, first.t_ns)  # None: not older
-            if span is not None:
-                poses[t_ns] = pose_before(first, span, gravity_m_s2)
-        return poses
+    @property
+    def t_ns(self) -> list[int]:
+        """Their times."""
+        return [waiting.packet.keyframe.t_ns for waiting in self._keyframes]
+
+    def between(self, path: Trajectory) -> dict[int, Array]:
+        """Return the poses, by time, of those within a path."""
+        return {t_ns: path.at(t_ns) for t_ns in self.t_ns if len(path) and path.t_ns[0] <= t_ns <= path.t_ns[-1]}
 
     def release(self, T_odom_vo: Array, solved: Mapping[int, Array]) -> list[OdometryKeyframe]:
         """Return all in `odom`, at the pose that was solved for their time, if any; none waits any longer."""

@@ -7,7 +7,7 @@ with scale, and with a covariance that says how well. A state found late gives m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,11 +16,14 @@ import numpy as np
 from vislam.config import EkfConfig
 from vislam.ekf.msckf import MsckfEkf
 from vislam.imu import ImuNoise
-from vislam.messages import Array, ImuSample, ImuSpan, NavState, Observations, Tracking, VoMeasurement
+from vislam.messages import ImuSample, ImuSpan, NavState, Observations, Tracking, VoMeasurement
 
 if TYPE_CHECKING:
     from vislam.camera import Rig
 
+_SPACING_NS = 90_000_000  # of frames that are used: parallax between nearer ones adds cost, not knowledge
+_KNOWN_SHARE = 0.1  # of the way: sigma of a position, above which its scale is not known
+_KNOWN_M = 0.05  # less is known well enough however short the way was
 _REVERSED = np.diag(np.repeat([1.0, 1.0, -1.0, -1.0, 1.0], 3))  # velocity and gyro bias
 
 
@@ -31,6 +34,58 @@ class Sighting:
     t_ns: int
     observations: Observations
     at_rest: bool
+
+
+class EarlyFrames:
+    """Owns what frames saw while there was no state, and tells where they were once there is one."""
+
+    def __init__(self, config: EkfConfig, rig: Rig, gravity_m_s2: float) -> None:
+        """Start empty; see `states_before`."""
+        self._config, self._rig, self._gravity_m_s2 = config, rig, gravity_m_s2
+        self._seen: list[Sighting] = []
+
+    def see(self, t_ns: int, observations: Observations, at_rest: bool) -> None:
+        """Take a frame."""
+        self._seen.append(Sighting(t_ns, replace(observations, descriptors=None), at_rest))
+
+    def forget(self) -> None:
+        """Forget all frames: nobody will ask."""
+        self._seen.clear()
+
+    def restamp(self, shift_ns: int) -> None:
+        """Bring all frames `shift_ns` later in the IMU's time."""
+        self._seen = [replace(frame, t_ns=frame.t_ns + shift_ns) for frame in self._seen]
+
+    def states(
+        self, first: NavState, wanted_ns: list[int], cut: Callable[[int, int], ImuSpan | None], noise: ImuNoise
+    ) -> dict[int, NavState]:
+        """Return the states, by time, at those of the times wanted that are older than a state.
+
+        `cut` gives the inertial data between two times.
+        """
+        wanted = sorted(t_ns for t_ns in wanted_ns if t_ns < first.t_ns)
+        span = next((span for t_ns in wanted if (span := cut(t_ns, first.t_ns)) is not None), None)
+        if span is None:
+            return {}
+        seen: list[Sighting] = []
+        for frame in self._seen:
+            if not seen or frame.t_ns in wanted or frame.t_ns - seen[-1].t_ns >= _SPACING_NS:
+                seen.append(frame)
+        states = states_before(first, span, seen, self._config, noise, self._rig, self._gravity_m_s2)
+        return {t_ns: states[t_ns] for t_ns in wanted if t_ns in states}
+
+
+def known_from(first: NavState, states: dict[int, NavState]) -> int:
+    """Return the time from which states before a first one know their scale: a tenth of the way, or 5 cm."""
+    last, way_m, from_ns = first, 0.0, first.t_ns
+    for t_ns in sorted(states, reverse=True):
+        state = states[t_ns]
+        way_m += float(np.linalg.norm(state.T_world_body[:3, 3] - last.T_world_body[:3, 3]))
+        grown_m2 = float(np.trace(state.covariance[3:6, 3:6] - first.covariance[3:6, 3:6]))
+        if np.sqrt(max(grown_m2, 0.0)) <= max(_KNOWN_M, _KNOWN_SHARE * way_m):
+            from_ns = t_ns
+        last = state
+    return from_ns
 
 
 def states_before(

@@ -261,7 +261,20 @@ class Run:
         self.log.write_states(self.out, ids, states)
         rows = self.log.loop_rows({report.loop_id: report for report in graph.edge_reports()})
         loops = self.log.write_tables(self.out, rows)
-        return self.log.final_trajectory(ids, graph.poses(), states, self.config.imu), rows, loops
+        final = self.log.final_trajectory(ids, graph.poses(), states, self.config.imu)
+        return self._with_scale(final), rows, loops
+
+    def _with_scale(self, final: Trajectory) -> Trajectory:
+        """Return what has metres: one camera may see for a while before anybody knows how large that is."""
+        from_ns = self.slam.front.report().scaled_from_ns
+        if from_ns is None:
+            return final
+        keep, length_s = final.t_ns >= from_ns, (from_ns - int(self.log.stamps_ns[0])) * 1e-9
+        self.warnings.append(
+            f"{int((~keep).sum())} frames in the first {length_s:.1f} s are not in trajectory_graph: scale was found "
+            "later and does not reach back so far; begin at rest or with more acceleration"
+        )
+        return Trajectory(final.t_ns[keep], final.T_world_body[keep])
 
     def _explain(self, rows: list[LoopRow]) -> None:
         """Write the pictures of telling loop candidates, and show all as they were decided in the end."""
