@@ -1,0 +1,151 @@
+"""The published pose: at rest it stays, in motion it follows, and what is corrected is not seen as motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vislam.config import Config, PublishConfig
+from vislam.continuity import Continuity
+from vislam.geometry import invert, se3_exp, so3_log
+from vislam.messages import Array
+from vislam.sim.points import open_points
+from vislam.slam import Slam, Step
+
+_NS = 1_000_000_000
+_FRAME_NS = 50_000_000
+_CONFIG = PublishConfig()
+
+
+def moved(m: float, rad: float = 0.0) -> Array:
+    return se3_exp(np.array([0.0, 0.0, rad, m, 0.0, 0.0]))
+
+
+def step_m(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(b[:3, 3] - a[:3, 3]))
+
+
+def turn_rad(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(so3_log(np.ascontiguousarray(a[:3, :3].T @ b[:3, :3]))))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.floats(-0.15, 0.15), min_size=6, max_size=6),
+    st.floats(0.005, 0.1),
+)
+def test_a_correction_at_rest_is_no_step_and_arrives_in_the_end(parts: list[float], dt_s: float) -> None:
+    jump = se3_exp(np.array(parts) * [0.3, 0.3, 0.3, 1.0, 1.0, 1.0])
+    publisher = Continuity(_CONFIG)
+    shown = [publisher.follow(0, np.eye(4), np.eye(4)), publisher.follow(0, np.eye(4), jump)]
+    for k in range(1, 60):
+        shown.append(publisher.follow(round(k * dt_s * _NS), jump, jump))
+    steps = [step_m(a, b) for a, b in pairwise(shown)]
+    assert max(steps) <= _CONFIG.creep_m_s * dt_s + 1e-7
+    turns = [turn_rad(a, b) for a, b in pairwise(shown)]
+    assert max(turns) <= turn_rad(np.eye(4), jump) * dt_s / _CONFIG.turn_s + 1e-7
+    last = publisher.follow(300 * _NS, jump, jump)
+    assert step_m(last, jump) < 1e-3
+    assert turn_rad(last, jump) < 1e-3
+
+
+def test_a_correction_comes_with_the_way_that_the_body_makes() -> None:
+    publisher, T = Continuity(_CONFIG), np.eye(4)
+    publisher.follow(0, T, T)
+    publisher.follow(0, T, moved(0.3) @ T)
+    T = moved(0.3) @ T
+    errors = []
+    for k in range(1, 41):
+        before, T = T, moved(0.05) @ T  # 1 m/s
+        shown = publisher.follow(k * _FRAME_NS, T, T)
+        errors.append(step_m(shown, T))
+        assert errors[-1] <= 0.3
+        assert before is not T
+    assert errors[-1] < 0.01
+    assert np.max(-np.diff(errors)) < _CONFIG.way_share * 0.05 + 0.001
+
+
+def test_a_correction_that_is_another_belief_comes_at_once() -> None:
+    publisher, far = Continuity(_CONFIG), moved(1.5)
+    publisher.follow(0, np.eye(4), np.eye(4))
+    np.testing.assert_array_equal(publisher.follow(0, np.eye(4), far)[:3, 3], far[:3, 3])
+    turned = far @ moved(0.0, np.deg2rad(8.0))
+    np.testing.assert_allclose(publisher.follow(0, far, turned), turned, atol=1e-12)
+
+
+def test_switched_off_it_shows_every_estimate_as_it_is() -> None:
+    publisher = Continuity(replace(_CONFIG, enabled=False))
+    publisher.follow(0, np.eye(4), np.eye(4))
+    np.testing.assert_allclose(publisher.follow(0, np.eye(4), moved(0.1, 0.02)), moved(0.1, 0.02), atol=1e-12)
+
+
+def test_a_turned_map_does_not_swing_the_body_at_a_lever_arm() -> None:
+    """Fifty metres from the origin, a map that turns by a degree about the body leaves it where it is."""
+    T = moved(50.0)
+    about_body = T @ moved(0.0, np.deg2rad(1.0)) @ invert(T)
+    publisher = Continuity(_CONFIG)
+    publisher.follow(0, T, T)
+    for k in range(1, 10):
+        shown = publisher.follow(k * _FRAME_NS, T if k == 1 else about_body @ T, about_body @ T)
+        assert step_m(shown, T) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def steps() -> list[tuple[Step, Array]]:
+    """One camera, a second of rest, 8 s by hand, then rest again: every step with the true pose of its frame."""
+    recording = open_points("stop-and-go", 0, rig="mono", start_s=2.0, duration_s=10.5, tracks=100)
+    config = Config()
+    slam = Slam(replace(config, map=replace(config.map, enabled=False)), recording.rig, recording.imu_noise)
+    taken = [step for value in recording.events() for step in slam.feed(value)]
+    truth = recording.true_states(np.array([step.front.frame.t_ns for step in taken])).T_world_body
+    return list(zip(taken, truth, strict=True))
+
+
+def motions(steps: list[tuple[Step, Array]], name: str) -> list[tuple[Array, Array, float]]:
+    """Return between frames the published motion, the true one, and the filter's sigma of position in metres."""
+    out = []
+    for (a, true_a), (b, true_b) in pairwise(steps):
+        shown = [step.T_map_body if name == "map" else step.front.T_odom_body for step in (a, b)]
+        if shown[0] is None or shown[1] is None or b.front.state is None:
+            continue
+        sigma_m = float(np.sqrt(np.trace(b.front.state.covariance[3:6, 3:6])))
+        out.append((invert(shown[0]) @ shown[1], invert(true_a) @ true_b, sigma_m))
+    return out
+
+
+@pytest.mark.parametrize("name", ["odom", "map"])
+def test_with_one_camera_nothing_moves_at_rest(steps: list[tuple[Step, Array]], name: str) -> None:
+    still = [shown for shown, true, _ in motions(steps, name) if np.linalg.norm(true[:3, 3]) < 1e-5]
+    assert len(still) > 20
+    assert max(np.linalg.norm(shown[:3, 3]) for shown in still) < 1e-3
+
+
+@pytest.mark.parametrize("name", ["odom", "map"])
+def test_with_one_camera_a_step_errs_less_than_the_filter_says_of_its_place(
+    steps: list[tuple[Step, Array]], name: str
+) -> None:
+    ratios = [
+        np.linalg.norm((invert(true) @ shown)[:3, 3]) / (3.0 * sigma_m) for shown, true, sigma_m in motions(steps, name)
+    ]
+    assert len(ratios) > 120
+    assert max(ratios) < 1.0
+
+
+@pytest.mark.parametrize("name", ["odom", "map"])
+def test_orientation_from_frame_to_frame_is_the_gyroscopes(steps: list[tuple[Step, Array]], name: str) -> None:
+    errors = [turn_rad(true, shown) for shown, true, _ in motions(steps, name)]
+    assert np.rad2deg(np.sqrt(np.mean(np.square(errors)))) < 0.03  # 0.01 of it is the gyroscope's own
+
+
+def test_the_published_pose_is_still_the_estimate(steps: list[tuple[Step, Array]]) -> None:
+    apart = [
+        step_m(step.front.T_odom_body, step.front.estimate.T_odom_body)
+        for step, _ in steps
+        if step.front.estimate is not None and step.front.T_odom_body is not None
+    ]
+    assert np.sqrt(np.mean(np.square(apart))) < 0.02
