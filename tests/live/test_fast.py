@@ -14,9 +14,10 @@ import pytest
 from inertial_world import GRAVITY_M_S2, T0_NS
 from vision_world import CART_IMU, CONFIG, VisionWorld
 
+from vislam.config import Config
 from vislam.ekf import Correction, Ekf, Hint
 from vislam.frontend.result import lost_motion
-from vislam.geometry import se3_exp, transform
+from vislam.geometry import invert, se3_exp, so3_log, transform
 from vislam.hw.health import Health
 from vislam.live.fast import FastPath
 from vislam.live.fast_process import Messages
@@ -29,11 +30,11 @@ _LATE_NS = 90_000_000
 
 
 def run(
-    world: VisionWorld, late_ns: int = _LATE_NS, others: list[tuple[int, ToFast]] | None = None
+    world: VisionWorld, late_ns: int = _LATE_NS, others: list[tuple[int, ToFast]] | None = None, config: Config = CONFIG
 ) -> tuple[FastPath, list[PublishedPose], list[Hint]]:
     """Feed samples at their times and messages `late_ns` after theirs; publish with each sample."""
     poses: list[PublishedPose] = []
-    fast = FastPath(CONFIG, CART_IMU, np.eye(4), poses.append)
+    fast = FastPath(config, CART_IMU, np.eye(4), poses.append)
     waiting: list[tuple[int, ToFast]] = [(world.start.state.t_ns + late_ns, world.start)]
     waiting += [(c.t_ns + late_ns, c) for c in world.corrections] + (others or [])
     waiting.sort(key=lambda entry: entry[0])
@@ -68,12 +69,13 @@ def test_it_agrees_with_a_filter_that_got_everything_in_time(world: VisionWorld)
             event.apply(twin)
         else:
             event.apply(twin)
-    _, poses, _ = run(world, late_ns=_LATE_NS)
+    bare = replace(CONFIG, publish=replace(CONFIG.publish, enabled=False))  # the estimate itself
+    _, poses, _ = run(world, late_ns=_LATE_NS, config=bare)
     settled = [pose for pose in poses if pose.t_ns > T0_NS + int(3e9)]
     fast, _, _ = run(world, late_ns=0)
     assert fast.filter_counters["vo_accepted"] > 80
     final, on_time = settled[-1], twin.state()
-    late, again = run(replace(world, samples=world.samples), late_ns=_LATE_NS)[0], fast
+    late, again = run(replace(world, samples=world.samples), late_ns=_LATE_NS, config=bare)[0], fast
     assert late.filter_counters["rewinds"] > 80
     # both of this process's filters have now seen all that is older than the last frames: bring these in, too
     for correction in world.corrections:
@@ -120,7 +122,23 @@ def test_an_older_revision_of_the_map_does_not_overtake_a_newer_one(world: Visio
     new, old = MapMoved(9, transform(np.eye(3), np.ones(3))), MapMoved(8, np.eye(4))
     _, poses, _ = run(world, others=[(T0_NS + int(2e9), new), (T0_NS + int(3e9), old)])
     assert poses[-1].map_revision == 9
-    np.testing.assert_array_equal(poses[-1].T_map_odom, new.T_map_odom)
+    np.testing.assert_allclose(poses[-1].T_map_odom, new.T_map_odom, atol=1e-3)
+
+
+def test_a_correction_by_vision_or_by_the_map_is_no_step_of_the_published_pose(world: VisionWorld) -> None:
+    """Half a metre of correction by the graph, at 200 Hz: both poses go on as the body does, and the map arrives."""
+    at_ns, moved = T0_NS + int(4e9), MapMoved(7, transform(np.eye(3), np.array([0.3, -0.4, 0.0])))
+    _, poses, _ = run(world, others=[(at_ns, moved)])
+    _, without, _ = run(world)
+    for a, b in pairwise(pose for pose in poses if pose.t_ns > T0_NS + int(2e9)):
+        steps = (invert(a.T_odom_base) @ b.T_odom_base, invert(a.T_map_base) @ b.T_map_base)
+        true = invert(world.motion.pose((a.t_ns - T0_NS) * 1e-9)) @ world.motion.pose((b.t_ns - T0_NS) * 1e-9)
+        for step in steps:
+            error = invert(true) @ step
+            assert np.linalg.norm(error[:3, 3]) < 0.005 + 0.5 * np.linalg.norm(true[:3, 3])
+            assert np.linalg.norm(so3_log(np.ascontiguousarray(error[:3, :3]))) < 1e-3
+    there = moved.T_map_odom @ without[-1].T_odom_base
+    np.testing.assert_allclose(poses[-1].T_map_base[:3, 3], there[:3, 3], atol=0.02)
 
 
 def test_an_outage_is_dead_reckoning_at_once_invalid_by_sigma_and_over_when_vision_is_back() -> None:

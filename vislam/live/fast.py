@@ -136,9 +136,10 @@ class FastPath:
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
-        before = self._ekf.state() if self._started else None
+        corrects = self._started and isinstance(message, (Correction, Rebase))
+        before = self._ekf.state() if corrects else None
         self._take(message)
-        if before is not None and not isinstance(message, Start):
+        if before is not None:
             self._show(before.T_world_body, self._ekf.state())
 
     def _take(self, message: ToFast) -> None:
