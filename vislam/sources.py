@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vislam.config import CalibrationConfig, validated
+from vislam.config import CalibrationConfig, VibrationConfig, validated
 from vislam.errors import DataError, UsageError
 from vislam.recording import Recording
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vislam.datasets.stream import Survey
     from vislam.sim import MeasuredInertial
 
 _SCHEMES = re.compile(r"(?:[a-z]+:)+")
@@ -85,7 +88,7 @@ def measured_inertial(uri: str) -> MeasuredInertial:
     Raises DataError when it lacks an IMU, its noise or truth.
     """
     from vislam.datasets import survey
-    from vislam.datasets.tables import Problems, in_time_order, read_numbers
+    from vislam.datasets.tables import Problems
     from vislam.sim import POINT_WORLD_NAMES, MeasuredInertial
     from vislam.truth_fit import fit_truth
 
@@ -100,14 +103,43 @@ def measured_inertial(uri: str) -> MeasuredInertial:
     if found.imu_file is None or found.imu_noise is None or truth is None:
         lacks = "an IMU" if found.imu_file is None or found.imu_noise is None else "truth"
         raise DataError(f"{uri} lacks {lacks}; simulated vision on a real IMU needs inertial data and true poses")
+    t_ns, values = _samples(found)
+    name, gyro, accel = found.root.resolve().name, values[:, :3], values[:, 3:]
+    fit = fit_truth(t_ns, gyro, accel, truth)
+    return MeasuredInertial(name, t_ns, gyro, accel, found.imu_noise, fit.of_imu(truth), found.rig, fit)
+
+
+def shaken(recording: Recording, vibration: VibrationConfig) -> Recording:
+    """Return a recording with the vibration of another one in its inertial samples, where the settings ask for that.
+
+    Raises UsageError when the recording has no IMU, DataError when there is no such vibration.
+    """
+    if vibration.recording is None:
+        return recording
+    from vislam.datasets import survey
+    from vislam.sim.vibration import ShakenRecording, Vibration
+
+    if recording.imu_noise is None:
+        raise UsageError(f"{recording.name} has no IMU that could vibrate; leave --imu.vibration.recording away")
+    found = survey(vibration.recording)
+    if found.imu_file is None:
+        raise DataError(f"{vibration.recording} has no inertial data to take vibration from")
+    t_ns, values = _samples(found)
+    shaking = Vibration(t_ns, values, vibration.begin_s, vibration.length_s, vibration.above_hz)
+    return ShakenRecording(recording, shaking, vibration.gain)
+
+
+def _samples(found: Survey) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps [N] and calibrated samples [N, 6] of a recording with inertial data."""
+    from vislam.datasets.tables import Problems, in_time_order, read_numbers
+
+    assert found.imu_file is not None
+    problems = Problems()
     rows = list(in_time_order(read_numbers(found.imu_file, 6, problems), problems, "imu"))
     values = np.array([row[1] for row in rows]).reshape(-1, 6)
     if found.imu_calibration is not None:
         values = found.imu_calibration.apply_to(values)
-    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
-    name, gyro, accel = found.root.resolve().name, values[:, :3], values[:, 3:]
-    fit = fit_truth(t_ns, gyro, accel, truth)
-    return MeasuredInertial(name, t_ns, gyro, accel, found.imu_noise, fit.of_imu(truth), found.rig, fit)
+    return np.array([row[0] for row in rows], dtype=np.int64), values
 
 
 def _given_tracks(name: str, options: dict[str, str]) -> Recording:

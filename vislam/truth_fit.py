@@ -1,8 +1,8 @@
 """How a true trajectory fits the IMU of its recording: what its body is turned and displaced, what its clock is off.
 
-Motion capture tells the pose of markers. Where they are on the body was calibrated once, and is off by some tenths of a
-degree; its clock is another one. The gyroscope tells the turn: a body frame that is turned against the IMU's shows as an
-error that turns with the body, while a gyroscope's drift stays in the world and is slow. The accelerometer tells the
+Motion capture tells the pose of markers. Where they are on the body was calibrated once, and is off by some tenths of
+a degree; its clock is another one. The gyroscope tells the turn: a body frame that is turned against the IMU's shows as
+an error that turns with the body, while a gyroscope's drift stays in the world and is slow. The accelerometer tells the
 rest: twice integrated over half a second on either side of a time, it must bend the path as the positions bend.
 Over seconds, not from pose to pose, since the truth of some recordings was smoothed with their own inertial data.
 
@@ -247,7 +247,7 @@ def _path(t_s: Array, acceleration: Array) -> CubicHermiteSpline:
 
 
 def _one_offset(turns: tuple[float, float], places: tuple[float, float]) -> tuple[float, float]:
-    """Return the time offset and its sigma of what turns and positions say; where they contradict each other, the latter.
+    """Return the time offset and its sigma of what turns and positions say; where they contradict, of positions alone.
 
     Simulated vision takes its turns from the gyroscope, but its path from the true positions.
     """

@@ -207,11 +207,13 @@ def test_shipped_plans_are_valid(path):
     plan = load_plan(path, {"VISLAM_DATA": "/data"})
     jobs = expand(plan)
     assert plan.name == path.stem
-    assert plan.members >= 6
+    assert plan.members >= 6 or plan.name == "starts"  # many starts of one recording are an ensemble of their own
     assert len({job.label for job in jobs}) == len(jobs) > 0
     for source in {job.source for job in jobs}:
         scheme, name, options = split_source(source)
-        if is_world(scheme, name):
+        if scheme == "eqvio:":
+            open_source(f"{scheme}{name}," + ",".join(part for part in options.split(",") if "_s=" in part))
+        elif is_world(scheme, name):
             open_source(source, 0)
         elif scheme.startswith("points:"):  # the data are absent here: its options are tried on a world
             open_source(f"points:laps{options}", 0)

@@ -85,7 +85,7 @@ def test_gyroscope_and_motion_agree_over_seconds(data_root: Path, name: str) -> 
     rms_deg = {k: np.rad2deg(np.sqrt(np.mean(angles_rad(np.array(v)) ** 2))) for k, v in apart.items()}
     print(f"{name}: over 5 s the gyroscope parts from the motion by {rms_deg['motion']:.3f} deg, the truth {rms_deg}")
     assert rms_deg["motion"] < 0.25  # the rest: its bias is taken as constant here
-    assert rms_deg["truth"] > 1.9 * rms_deg["motion"]
+    assert rms_deg["truth"] > 1.5 * rms_deg["motion"]  # also with what the truth is turned undone
 
 
 @pytest.mark.data

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from vislam.config.batch import BatchConfig, GraphWorldConfig, PoseGraphConfig
 from vislam.config.estimators import EkfConfig, GraphConfig, PublishConfig, WindowConfig
 from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig, PlanarConfig
-from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig
+from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig, VibrationConfig
 from vislam.config.live import LiveConfig, ViewConfig
 from vislam.config.loop import LoopConfig, LoopTruthConfig
 from vislam.config.mapping import DriveConfig, MapConfig, MapProduct, MonoDepthConfig
@@ -65,6 +65,7 @@ __all__ = [
     "SensorsConfig",
     "SerialConfig",
     "Vector3",
+    "VibrationConfig",
     "ViewConfig",
     "WebcamConfig",
     "WindowConfig",

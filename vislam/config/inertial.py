@@ -1,7 +1,18 @@
 """Defaults of the inertial unit: its noise, power-up and attitude."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class VibrationConfig:
+    """A fault for experiments: what the IMU of a recording shows of vibration is added to every inertial sample."""
+
+    recording: str | None = None  # as for `run`, images are not needed; None: nothing is added
+    begin_s: float = 0.0  # of the window in that recording
+    length_s: float | None = None  # of the window, played to and fro; None: to the end
+    above_hz: float = 15.0  # what moves a body on purpose is slower, rotors and wheels that shake it are faster
+    gain: float = 1.0  # times what was recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +32,7 @@ class ImuConfig:
     noise_tolerance: float = 3.0  # a run whose quietest second has less than a third of the white noise told is warned
     max_gap_s: float = 0.1  # a longer hole between samples is an outage, not something to interpolate across
     max_wait_s: float = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
+    vibration: VibrationConfig = field(default_factory=VibrationConfig)
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,9 +54,18 @@ def code_sha256(package: Path) -> str:
 def source_identity(source: str) -> str:
     """Return what a source holds, wherever it lies: format, SHA-256 of the data, options; "missing" without data."""
     scheme, name, options = split_source(source)
+    options = ",".join(_option_identity(option) for option in options.split(","))
     if is_world(scheme, name):
-        return source
+        return f"{scheme}{name}{options}"
     return f"{scheme}{fingerprint(Path(name)) or 'missing'}{options}"
+
+
+def _option_identity(option: str) -> str:
+    """Return an option of a source; what it holds where its value is a path."""
+    name, _, value = option.partition("=")
+    if "/" not in value:
+        return option
+    return f"{name}={fingerprint(Path(split_source(value)[1])) or 'missing'}"
 
 
 def sha256_of(data: Any) -> str:

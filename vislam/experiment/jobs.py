@@ -69,6 +69,8 @@ def expand(plan: Plan) -> list[Job]:
                 config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
                 batch = "batch" in estimator.outputs
                 files = [fingerprint(Path(name)) for name in config["calibration"].values() if name is not None]
+                if (shaking := config["imu"]["vibration"]["recording"]) is not None:
+                    files.append(identities.setdefault(shaking, source_identity(shaking)))
                 jobs.append(
                     Job(
                         sha256_of([identities[source], files, config, batch, environment()]),

@@ -109,16 +109,20 @@ def plan_from_data(data: dict[str, Any], where: str, folder: Path, variables: Ma
 def _resolved(sequence: Sequence, where: str, folder: Path, variables: Mapping[str, str]) -> Sequence:
     """Return a sequence with its variables replaced, its path absolute and a name."""
 
-    def value(match: re.Match[str]) -> str:
-        if match[1] not in variables:
-            raise UsageError(f"{where}: {sequence.source} needs the environment variable {match[1]}; set it")
-        return variables[match[1]]
+    def replaced(text: str) -> str:
+        def value(match: re.Match[str]) -> str:
+            if match[1] not in variables:
+                raise UsageError(f"{where}: {text} needs the environment variable {match[1]}; set it")
+            return variables[match[1]]
 
-    source = _VARIABLE.sub(value, sequence.source)
+        return _VARIABLE.sub(value, text)
+
+    source = replaced(sequence.source)
+    config = {name: replaced(value) if isinstance(value, str) else value for name, value in sequence.config.items()}
     scheme, name, options = split_source(source)
     if not is_world(scheme, name):
         source = f"{scheme}{folder / name}{options}"
-    return dataclasses.replace(sequence, source=source, name=sequence.name or Path(name).name)
+    return dataclasses.replace(sequence, source=source, config=config, name=sequence.name or Path(name).name)
 
 
 def _check(plan: Plan, where: str) -> None:

@@ -30,6 +30,7 @@ from vislam.run.view import show_map, show_paths, show_step
 from vislam.runfolder import RunLog, write_json
 from vislam.session import Session, SessionWriter, recall
 from vislam.slam import KeyframeStep, Slam, Step
+from vislam.sources import shaken
 from vislam.trajectory import Trajectory
 from vislam.viewer import NullViewer, open_viewer
 
@@ -65,7 +66,7 @@ class Run:
         Without `slam` the pipeline is made here.
         """
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
-        self.recording = recording
+        self.recording = shaken(recording, config.imu.vibration)
         self.config = config
         self.out = out
         self.noise = imu_noise(config.imu, recording.imu_noise)
