@@ -29,6 +29,8 @@ from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
 from vislam.errors import DataError
 from vislam.findings import Finding, Severity, worst
 from vislam.imu import ImuNoise
+from vislam.trajectory import Trajectory
+from vislam.truth_fit import fit_truth
 
 Stamps = NDArray[np.int64]
 
@@ -328,6 +330,19 @@ class _Inspector:
             step = "fine if the camera is mounted so; else check T_BS and that the accelerometer at rest reads +g up"
             self._add("warning", tilt, "cam0", step)
 
+    def _check_truth_fit(self, truth: Trajectory) -> None:
+        """Tell what the truth's body is turned, displaced and late against the IMU."""
+        if self._found.imu_file is None:
+            return
+        try:
+            rows = list(self._rows(Problems()))
+        except DataError:
+            return  # told by the check of the IMU
+        values = np.array([row[1] for row in rows]).reshape(-1, 6)
+        fit = fit_truth(np.array([row[0] for row in rows], dtype=np.int64), values[:, :3], values[:, 3:], truth)
+        if fit.told:
+            self._add("ok", f"{fit.told}; `points:` undoes it", "truth")
+
     def _check_truth(self, frames: FrameTable | None) -> None:
         if self._found.truth is None:
             self._add("ok", "no truth: it can be run but not scored", str(self._found.root))
@@ -341,5 +356,6 @@ class _Inspector:
             self._add("warning", "the truth holds no pose", str(self._found.root), "repair or remove it")
             return
         self._check_stream("truth", truth.t_ns, float("inf"), None)
+        self._check_truth_fit(truth)
         if frames is not None:
             self._check_overlap(frames.t_ns, truth.t_ns, "truth")

@@ -23,7 +23,7 @@ from vislam.trajectory import (
     read_states_csv,
     read_tum,
 )
-from vislam.trajectory.consistency import anees, chi_square_mean
+from vislam.trajectory.consistency import anees, chi_square_mean, stated_scale_sigma
 
 _STATES = {"ekf": "states_ekf.csv", "graph": "states_graph.csv", "batch": "states_batch.csv"}
 _CURVE_POINTS = 240  # of each trajectory that are kept for pictures
@@ -44,6 +44,7 @@ def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float], cpu_s: f
         "injected_kept": metrics["loops"].get("injected_kept"),
         "initialisation": initialisation["status"],
         "initialisation_s": initialisation["t_s"],
+        "start_scale_sigma": initialisation["scale_sigma"],
         "latency_p50_ms": _plain(p50_ms),
         "latency_p99_ms": _plain(p99_ms),
         "filter_p50_ms": timing.get("ekf", {}).get("p50"),
@@ -51,6 +52,7 @@ def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float], cpu_s: f
         "cpu_s_per_s": cpu_s / duration_s if duration_s > 0.0 else None,
         "peak_memory_mb": peak_memory_mb(),
         "nis": nis_measures(metrics.get("nis") or {}),
+        "doubts": len(metrics["doubts"]),
         "warnings": metrics["warnings"],
     }
 
@@ -73,7 +75,7 @@ def output_measures(
             continue
         states = run / _STATES.get(name, "none")
         if metrics["has_imu"] and states.is_file():
-            measures[name]["anees"] = _consistency(states, truth)
+            measures[name] |= _consistency(states, truth)
     return measures
 
 
@@ -115,9 +117,11 @@ def _curve(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dic
 
 def _consistency(states: Path, truth: Trajectory) -> dict[str, Any]:
     try:
-        return {name: asdict(value) for name, value in anees(read_states_csv(states)[1], truth).items()}
+        read = read_states_csv(states)[1]
+        found = {name: asdict(value) for name, value in anees(read, truth).items()}
+        return {"anees": found, "end_scale_sigma": stated_scale_sigma(read)}
     except VislamError as error:
-        return {"failure": str(error)}
+        return {"anees": {"failure": str(error)}}
 
 
 def nis_measures(statistics: dict[str, Any]) -> dict[str, Any]:

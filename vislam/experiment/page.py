@@ -14,10 +14,14 @@ from vislam.experiment.trials import BY_NAME, Trial
 from vislam.report.html import Cell, bullets, card, escape, folded, note, preformatted, section, table, tile
 from vislam.report.style import stylesheet
 
-_ACCURACY = ("ate_m", "scale_error", "rpe_1m_percent", "rpe_5m_percent", "rpe_10m_percent", "rpe_1m_deg_per_m",
-             "rpe_5m_deg_per_m", "rpe_10m_deg_per_m", "rotation_deg", "completeness")  # fmt: skip
-_COST = ("initialisation_s", "latency_p50_ms", "latency_p99_ms", "filter_p50_ms", "filter_p99_ms", "cpu_s_per_s",
-         "peak_memory_mb", "keyframes", "loops", "injected_kept")  # fmt: skip
+_ACCURACY = (
+    "ate_m", "scale_error", "start_scale_sigma", "end_scale_sigma", "rpe_1m_percent", "rpe_5m_percent",
+    "rpe_10m_percent", "rpe_1m_deg_per_m", "rpe_5m_deg_per_m", "rpe_10m_deg_per_m", "rotation_deg", "completeness",
+)  # fmt: skip
+_COST = (
+    "initialisation_s", "doubts", "latency_p50_ms", "latency_p99_ms", "filter_p50_ms", "filter_p99_ms", "cpu_s_per_s",
+    "peak_memory_mb", "keyframes", "loops", "injected_kept",
+)  # fmt: skip
 _STATES = ("anees_position", "anees_rotation", "anees_velocity")
 _MAX_FAILURES = 200  # shown; runs.csv holds all
 _MEASURED = (

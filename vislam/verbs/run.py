@@ -23,7 +23,7 @@ class RunOptions:
 
     source: Positional[str]
     """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, sim:WORLD[,option=value], points:WORLD or
-    points:PATH[,option=value], or a path, recognised by its contents"""
+    points:PATH[,option=value], eqvio:FILE[,option=value], or a path, recognised by its contents"""
     out: Path
     """Folder to make for everything that the run leaves"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
