@@ -143,20 +143,15 @@ def _samples(found: Survey) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _given_tracks(name: str, options: dict[str, str]) -> Recording:
-    """Open a table of real tracks, with truth and noise model of the recording that the option `truth` names."""
-    from vislam.datasets import survey
+    """Open a table of real tracks, with the noise model and the fitted truth of the recording that `truth` names."""
     from vislam.datasets.eqvio import TrackOptions, TrackRecording
-    from vislam.datasets.tables import Problems
 
     chosen = validated(TrackOptions, options, "tracks")
     path = _shipped_tracks() if name == _SHIPPED else Path(name)
     if chosen.truth is None:
         return TrackRecording(path, chosen)
-    found = survey(chosen.truth)
-    truth = None if found.truth is None else found.truth(Problems())
-    if truth is None:
-        raise DataError(f"{chosen.truth} has no true poses; leave truth= away, or give a recording that has them")
-    return TrackRecording(path, chosen, truth, found.imu_noise)
+    known = measured_inertial(chosen.truth)
+    return TrackRecording(path, chosen, known.truth, known.noise)
 
 
 def _shipped_tracks() -> Path:

@@ -130,8 +130,8 @@ def fit_truth(t_ns: NDArray[np.int64], gyro_rad_s: Array, accel_m_s2: Array, tru
     used = slice(
         max(int(np.searchsorted(t_ns, zero_ns)) - 1, 0), int(np.searchsorted(t_ns, truth.t_ns[inside[-1]])) + 1
     )
-    imu_s = (t_ns[used] - zero_ns) * 1e-9
-    true_s, poses = (truth.t_ns[inside] - zero_ns) * 1e-9, truth.T_world_body[inside]
+    imu_s = (t_ns[used] - zero_ns).astype(np.float64) * 1e-9
+    true_s, poses = (truth.t_ns[inside] - zero_ns).astype(np.float64) * 1e-9, truth.T_world_body[inside]
     turns = apart(truth.t_ns[inside], _TURN_EVERY_S)
     turn = _fit_turn(imu_s, gyro_rad_s[used], true_s[turns], poses[turns, :3, :3])
     places = apart(truth.t_ns[inside], _PLACE_EVERY_S)

@@ -71,3 +71,8 @@ def test_inertial_recordings_are_inspected(data_root: Path) -> None:
     result = inspect(str(data_root / "euroc_v101_imu"))
     assert {s.name: s.count for s in result.streams} == {"imu0": 29120, "truth": 2895}
     assert any("specific force 9.79" in f.what and f.severity == "ok" for f in result.findings)
+
+
+def test_the_doctor_tells_how_truth_fits_the_imu(data_root: Path) -> None:
+    result = inspect(str(data_root / "euroc_v202_imu"))
+    assert any("truth is turned by 0.6" in finding.what for finding in result.findings)

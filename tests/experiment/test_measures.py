@@ -17,7 +17,7 @@ from vislam.experiment.recordings import TimedRecording
 from vislam.geometry import transform
 from vislam.messages import Frame, ImuSample, NavState
 from vislam.trajectory import Trajectory, write_tum
-from vislam.trajectory.consistency import anees, chi_square_mean, nees
+from vislam.trajectory.consistency import anees, chi_square_mean, nees, stated_scale_sigma
 
 RUN = {"has_imu": True, "mode": "stereo"}
 
@@ -235,3 +235,17 @@ def test_memory_is_that_of_this_process():
     )
     grown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     assert 150.0 < float(grown) < 400.0
+
+
+def test_a_stated_scale_sigma_is_that_of_the_farthest_position_along_the_way():
+    rng = np.random.default_rng(4)
+    states = []
+    for k, x in enumerate((0.0, 1.0, 4.0, 2.0)):
+        T, P = np.eye(4), np.zeros((15, 15))
+        T[:3, 3] = 0.6 * x, 0.8 * x, 5.0
+        away = np.array([0.6, 0.8, 0.0]) * x
+        across = np.array([-0.8, 0.6, 0.0])
+        P[3:6, 3:6] = 0.03**2 * np.outer(away, away) + rng.uniform(0.1, 1.0) * np.outer(across, across)
+        states.append(NavState(k, T, np.zeros(3), np.zeros(3), np.zeros(3), P))
+    assert stated_scale_sigma(states) == pytest.approx(0.03)
+    assert np.isnan(stated_scale_sigma(states[:1])) and np.isnan(stated_scale_sigma([]))

@@ -9,9 +9,11 @@ from vislam.errors import UsageError
 from vislam.experiment.identity import code_sha256, source_identity
 from vislam.experiment.jobs import JITTER, expand, unique, variants
 from vislam.experiment.plan import load_plan, plan_from_data
-from vislam.experiment.trials import estimates
+from vislam.experiment.tables import runs_csv
+from vislam.experiment.trials import estimates, trials
 from vislam.sources import is_world, open_source, recorded_path, split_source
 
+FAILED = {"status": "failed", "reason": "lost", "run": {}, "outputs": {}}
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 GOOD = """
@@ -61,6 +63,45 @@ def test_a_plan_is_the_product_of_its_parts(tmp_path):
     assert {job.source for job in jobs} == {"points:laps,duration_s=6.0", f"euroc:{tmp_path}/drone"}
     assert variants(plan, "laps") == [(("delay", 0.0),), (("delay", 0.1),)]
     assert estimates(plan)[-2:] == [("loose", "graph"), ("tight", "graph")]
+
+
+def test_an_axis_may_be_for_some_sequences_only(tmp_path):
+    more = """
+[[axes]]
+name = "start [s]"
+option = "start_s"
+values = [0.0, 1.0, 2.0]
+sequences = ["laps"]
+"""
+    plan = load(tmp_path, GOOD + more)
+    jobs = expand(plan)
+    assert len(variants(plan, "laps")) == 6 and len(variants(plan, "drone")) == 2
+    assert len(jobs) == (6 + 2) * 2 * 2 * 2
+    assert {job.source for job in jobs if job.sequence == "drone"} == {f"euroc:{tmp_path}/drone"}
+    assert "points:laps,duration_s=6.0,start_s=2.0" in {job.source for job in jobs}
+    rows = runs_csv(plan, trials(plan, jobs, {job.key: FAILED for job in jobs})).splitlines()
+    assert rows[0].startswith("sequence,delay,start [s],estimator")
+    assert any(row.startswith("laps,0.1,2.0,loose") for row in rows)
+    assert any(row.startswith("drone,0.1,,loose") for row in rows)
+    again = more.replace("[0.0, 1.0, 2.0]", "[3.0]").replace('"laps"', '"drone"')
+    assert len(expand(load(tmp_path, GOOD + more + again))) == (6 + 2) * 2 * 2 * 2  # one name, other sequences
+    with pytest.raises(UsageError, match=r"two of kind axis are called 'start \[s\]'"):
+        load(tmp_path, GOOD + more + more)
+    with pytest.raises(UsageError, match=r"axis 'start \[s\]': no sequence 'lap' in laps, drone"):
+        load(tmp_path, GOOD + more.replace('"laps"', '"lap"'))
+
+
+def test_variables_are_replaced_in_the_settings_of_a_sequence(tmp_path):
+    text = GOOD.replace('{"frontend.mode" = "mono"}', '{"imu.vibration.recording" = "$ROOT/flight"}')
+    (tmp_path / "flight").mkdir()
+    table = tmp_path / "flight" / "imu.csv"
+    table.write_text("1,2,3\n")
+    before = {job.label: job for job in expand(load(tmp_path, text))}
+    shaken = before["drone delay=0.0 loose seed 0 member 0"]
+    assert shaken.config["imu"]["vibration"]["recording"] == f"{tmp_path}/flight"
+    table.write_text("1,2,4\n")
+    after = {job.label: job.key for job in expand(load(tmp_path, text))}
+    assert {label for label in after if before[label].key != after[label]} == {la for la in after if "drone" in la}
 
 
 def test_settings_of_estimator_win_over_sequence_over_plan(tmp_path):
@@ -123,6 +164,8 @@ def test_the_data_counts_and_not_where_they_lie(tmp_path):
     assert here.startswith("points:euroc:")
     assert here.endswith(",rig=mono")
     assert here != source_identity(f"points:euroc:{tmp_path}/here/drone,rig=stereo")
+    truths = [source_identity(f"eqvio:gtsam,truth={tmp_path}/{place}/drone,start_s=2") for place in ("here", "there")]
+    assert truths[0] == truths[1] and truths[0].endswith(",start_s=2") and str(tmp_path) not in truths[0]
     assert source_identity("sim:handheld-room,duration_s=3") == "sim:handheld-room,duration_s=3"
     assert "missing" in source_identity("euroc:/no/such/folder")
     assert split_source("/bare/path,with=option") == ("", "/bare/path", ",with=option")

@@ -44,7 +44,7 @@ _NOISE = ("input_var_gyr", "input_var_acc", "input_var_gyr_bias_walk", "input_va
 class TrackOptions:
     """What can be chosen of a recording of tracks; times in seconds from its first frame."""
 
-    truth: str | None = None  # recording (as for `vislam run`) that has the true poses, and the IMU's noise model
+    truth: str | None = None  # recording (as for `vislam run`) that has IMU, its noise model and true poses
     start_s: Annotated[float, Field(ge=0.0)] = 0.0
     duration_s: Annotated[float, Field(ge=0.5)] | None = None  # None: to the end
 
