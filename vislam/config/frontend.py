@@ -116,7 +116,9 @@ class InitConfig:
     max_tilt_sigma_deg: float = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
     max_velocity_sigma_m_s: float = 0.2
     max_gyro_bias_sigma_rad_s: float = 0.02
-    max_scale_sigma: float = 0.0225  # relative, monocular only; 38 simulated starts and 6 real ones were within 3 %
+    max_scale_sigma: float = 0.1  # relative, monocular only: a provisional start, which the window that follows refines
+    settled_scale_sigma: float = 0.03  # of a start that is final, unless the window has reached its length before
+    test_s: float = 1.0  # a start is final when a solution of so much more motion agrees with it
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state
     attempt_s: float = 0.3  # between attempts: one costs up to 0.1 s, and a window changes little in this time

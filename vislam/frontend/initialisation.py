@@ -11,32 +11,34 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vislam.camera import Camera
-from vislam.config import InitConfig
-from vislam.frontend.inertial_alignment import Alignment, VisualMotion, Window, excitation, refine, solve_linear
-from vislam.frontend.initialisation_bundle import Bundle, refine_tracks
+from vislam.camera import Camera, Rig
+from vislam.config import InitConfig, WindowConfig
+from vislam.frontend.inertial_alignment import VisualMotion, Window, excitation, refine, solve_linear
+from vislam.frontend.initialisation_bundle import refine_tracks
 from vislam.frontend.initialisation_linear import (
     InertialPath,
     Start,
     Tracks,
+    epipolar_noise,
     inertial_path,
     median_parallax,
     solve_start,
 )
 from vislam.frontend.initialisation_rest import rest_accel_bias, rest_covariance
+from vislam.frontend.initialisation_solution import Solution, from_alignment, from_bundle
 from vislam.frontend.initialisation_window import Entry, FrameWindow, gather_tracks, metric_motions
 from vislam.geometry import level_rotation, transform
 from vislam.imu import ImuNoise, RestDetector, join
 from vislam.messages import Array, ImuSpan, NavState, Observations, Tracking, VoMeasurement
+from vislam.window.bundle import BundleSolution
 
 _NS = 1_000_000_000
 _AGREE_SIGMAS = 3.0
-_MAX_BEHIND = 0.2  # of the points; more of them behind the camera, and the linear solution is no solution
 _MAX_OUTLIERS = 0.3  # of the observations
 _MAX_BIAS_SIGMAS = 3.5  # of the accelerometer's bias
-_SAME_SCALE = 0.05  # two attempts agree within this and their sigmas
+_MOST_NOISE = 3.0  # times what is told of tracks; more is disagreement
+_AMPLE = 3.0  # times the least excitation or parallax; more of it is no longer what a start lacks
 _FOREIGN_OFFSET_S = 0.002  # a time offset found in the window that is larger than this is applied before the start
 
 
@@ -71,6 +73,7 @@ class Initialisation:
     excitation_m_s2: float = 0.0  # rms change of acceleration in the window; near zero scale cannot be seen
     time_offset_s: float = 0.0  # of the camera's clock beyond what was applied, as this window has it
     time_offset_sigma_s: float = float("inf")
+    is_settled: bool = True  # False: provisional, not yet tested against the seconds after it
 
 
 class Initialiser:
@@ -79,6 +82,7 @@ class Initialiser:
     Attributes:
         phase: where the search stands.
         refusals: how often it was refused, by cause.
+        taken_back: how often a provisional start did not survive its test.
         time_offset_sigma_s: how well the camera's clock is known; the owner keeps it up to date.
     """
 
@@ -90,10 +94,22 @@ class Initialiser:
         T_body_cam0: Array,
         camera: Camera | None = None,
         track_sigma_px: float = 1.0,
+        window: WindowConfig | None = None,
     ) -> None:
-        """Start empty; `T_body_cam0` [4, 4], camera and the noise of tracks are needed only without scale."""
+        """Start empty; `T_body_cam0` [4, 4] and what follows are needed only without scale.
+
+        Args:
+            config: how the first state is found.
+            noise: of the IMU.
+            gravity_m_s2: its norm.
+            T_body_cam0: where the camera is.
+            camera: its calibration.
+            track_sigma_px: what is told of the noise of tracks; the window's own shows in what is solved.
+            window: settings of its least squares.
+        """
         self.phase = Phase.EMPTY
         self.refusals: dict[str, int] = {}
+        self.taken_back = 0
         self.time_offset_sigma_s = 0.0
         self._config = config
         self._gravity = float(gravity_m_s2)
@@ -104,7 +120,9 @@ class Initialiser:
         self._noise = noise
         self._window = FrameWindow()
         self._next_attempt_ns = 0
-        self._before: Lengths | None = None  # the attempt before
+        self._before: Solution | None = None  # the attempt before
+        self._provisional: Solution | None = None  # given out, under test
+        self._bundle_config = replace(window or WindowConfig(), sigma_px=track_sigma_px)
         self._last = Initialisation("waiting", "no frame yet")
 
     def add(
@@ -142,9 +160,9 @@ class Initialiser:
                 found = self._refuse("duration", self._needed(vo))
             case _:
                 return self._last
-        if found.first is not None:
+        if found.first is not None and found.is_settled:
             self.phase = Phase.FOUND
-        self._last = found if found.first is None else Initialisation("waiting", "already found")
+        self._last = found if found.first is None else Initialisation("waiting", "just found")
         return found
 
     def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
@@ -218,7 +236,7 @@ class Initialiser:
         try:
             return self._from_metric_motion() if metric else self._from_tracks()
         except np.linalg.LinAlgError:
-            return self._refuse("geometry", "the motion does not determine gravity and velocity yet; accelerate, turn")
+            return self._refuse("geometry", "the motion does not determine gravity and velocity yet")
 
     def _from_metric_motion(self) -> Initialisation:
         """Align metric visual odometry with inertial data."""
@@ -234,9 +252,9 @@ class Initialiser:
         refusal = self._gravity_refusal(norm, linear.gravity_norm_sigma_m_s2)
         if refusal is not None:
             return refusal
-        aligned = refine(window, linear)
-        refusal = self._quality_refusal(aligned)
-        return refusal or self._moving(chosen, aligned, metric=True, excitation_m_s2=excitation(window))
+        solution = from_alignment(tuple(entry.t_ns for entry in chosen), refine(window, linear))
+        refusal = self._quality_refusal(solution, "move with more acceleration, or turn")
+        return refusal or self._moving(chosen, solution, metric=True, excitation_m_s2=excitation(window))
 
     def _from_tracks(self) -> Initialisation:
         """Structure from motion with inertial data: scale is unknown to the camera."""
@@ -244,33 +262,54 @@ class Initialiser:
         if camera is None:
             return self._refuse("calibration", "without scale a moving start needs the camera's calibration")
         chosen = self._window.choose_nodes(config.node_spacing_s, config.mono_max_nodes)
-        tracks = gather_tracks(chosen, camera, self._T_body_cam, self._track_sigma_px, config.max_points)
+        told = gather_tracks(chosen, camera, self._T_body_cam, self._track_sigma_px, config.max_points)
         window = self._inertial_window(chosen, [])
         path = inertial_path(window)
+        sigma_xy, good = epipolar_noise(told, path.rotations)
+        tracks = replace(told, sigma_xy=min(sigma_xy, _MOST_NOISE * told.sigma_xy)).only(good)
         refusal = self._sight_refusal(tracks, path, camera.fx)
         if refusal is not None:
             return refusal
         start = solve_start(window, path, tracks)
-        if start.behind > _MAX_BEHIND:
-            reason = f"{start.behind:.0%} of the points behind the camera: too little acceleration, or wrong extrinsics"
-            return self._refuse("geometry", reason)
-        try:
-            bundle = refine_tracks(window, tracks, path, start, self.time_offset_sigma_s)
-        except np.linalg.LinAlgError:
-            return self._start_refusal(start) or self._refuse(
-                "geometry", "the motion does not settle; accelerate, turn"
-            )
-        before, self._before = self._before, Lengths([entry.t_ns for entry in chosen], bundle.aligned)
+        bundle = refine_tracks(
+            window, chosen, tracks, path, start, self._bundle_config, Rig((camera,), (self._T_body_cam,)),
+            self.time_offset_sigma_s, config.vo_inflation,
+        )  # fmt: skip
+        if not bundle.converged:
+            return self._start_refusal(start) or self._refuse("geometry", "the window's least squares does not settle")
+        solution = from_bundle(tuple(entry.t_ns for entry in chosen), bundle)
+        before, self._before = self._before, solution
         refusal = (
-            self._start_refusal(start)
-            or self._bundle_refusal(bundle)
-            or self._quality_refusal(bundle.aligned, config.vo_inflation * bundle.aligned.scale_sigma())
-            or self._repetition_refusal(before, self._before)
+            self._bundle_refusal(bundle, start)
+            or self._quality_refusal(solution, self._lacking(tracks, path, camera.fx))
+            or self._repetition_refusal(before, solution)
         )
         if refusal is not None:
             return refusal
-        found = self._moving(chosen, bundle.aligned, metric=False, excitation_m_s2=path.excitation_m_s2)
-        return replace(found, time_offset_s=bundle.offset_s, time_offset_sigma_s=bundle.offset_sigma_s)
+        found = self._moving(chosen, solution, metric=False, excitation_m_s2=path.excitation_m_s2)
+        return self._tested(
+            replace(found, time_offset_s=bundle.time_offset_s, time_offset_sigma_s=bundle.time_offset_sigma_s), solution
+        )
+
+    def _tested(self, found: Initialisation, solution: Solution) -> Initialisation:
+        """Return a first solution as provisional, and a later one as what the seconds since then made of it."""
+        config, earlier = self._config, self._provisional
+        if earlier is None:
+            self._provisional = solution
+            return replace(found, is_settled=False)
+        tested_s = (solution.t_ns[-1] - earlier.t_ns[-1]) / _NS
+        if tested_s < config.test_s:
+            return self._refuse("test", f"the start is tested for {tested_s:.1f} s of {config.test_s:.1f} s")
+        contradiction = solution.contradiction(earlier, _AGREE_SIGMAS)
+        if contradiction:
+            self._provisional = solution
+            self.taken_back += 1
+            return replace(
+                found, is_settled=False, reason=f"{found.reason}; the start before was taken back: {contradiction}"
+            )
+        if found.scale_sigma > config.settled_scale_sigma and self._window.seen_s < 0.95 * config.mono_window_s:
+            return self._refuse("test", f"scale sigma {100.0 * found.scale_sigma:.1f} % while the window grows")
+        return found
 
     def _inertial_window(self, chosen: list[Entry], motions: list[VisualMotion]) -> Window:
         return Window(
@@ -327,109 +366,97 @@ class Initialiser:
             return self._contradiction(norm)
         return None
 
-    def _bundle_refusal(self, bundle: Bundle) -> Initialisation | None:
-        bias = float(np.linalg.norm(bundle.aligned.accel_bias_m_s2))
+    def _bundle_refusal(self, bundle: BundleSolution, start: Start) -> Initialisation | None:
+        bias = float(np.linalg.norm(bundle.accel_bias_m_s2[-1]))
         limit = _MAX_BIAS_SIGMAS * self._config.accel_bias_sigma_m_s2
         if bias > limit:  # a motion that is not understood hides in it
-            reason = f"accelerometer bias {bias:.2f} m/s2 of {limit:.2f}: check its calibration, move with acceleration"
-            return self._refuse("accel bias", reason)
+            refusal = self._start_refusal(start)
+            reason = f"accelerometer bias {bias:.2f} m/s2 of {limit:.2f}: check its calibration and the extrinsics"
+            return refusal or self._refuse("accel bias", reason)
         if bundle.outliers > _MAX_OUTLIERS:
             reason = f"{bundle.outliers:.0%} of the sightings contradict the inertial data"
             return self._refuse("disagreement", reason, "failed")
-        sigma_s = bundle.offset_sigma_s
-        if abs(bundle.offset_s) > max(_FOREIGN_OFFSET_S, _AGREE_SIGMAS * sigma_s):
-            reason = f"camera clock found off by {1e3 * bundle.offset_s:.1f} +- {1e3 * sigma_s:.1f} ms"
+        if bundle.sigma_px > _MOST_NOISE * self._track_sigma_px:
+            reason = f"sightings scatter by {bundle.sigma_px:.1f} px about what the inertial data allow"
+            return self._refuse("disagreement", reason, "failed")
+        sigma_s = bundle.time_offset_sigma_s
+        if abs(bundle.time_offset_s) > max(_FOREIGN_OFFSET_S, _AGREE_SIGMAS * sigma_s):
+            reason = f"camera clock found off by {1e3 * bundle.time_offset_s:.1f} +- {1e3 * sigma_s:.1f} ms"
             refusal = self._refuse("time offset", reason)
-            return replace(refusal, time_offset_s=bundle.offset_s, time_offset_sigma_s=sigma_s)
+            return replace(refusal, time_offset_s=bundle.time_offset_s, time_offset_sigma_s=sigma_s)
         return None
 
-    def _repetition_refusal(self, before: Lengths | None, now: Lengths) -> Initialisation | None:
+    def _repetition_refusal(self, before: Solution | None, now: Solution) -> Initialisation | None:
         """Refuse what the attempt before does not confirm: a wrong minimum does not come twice at the same scale."""
+        if self._provisional is not None:
+            return None
         if before is None:
             return self._refuse("confirmation", "one more look needed to confirm the scale")
-        ratio, sigma = now.ratio(before)
-        if abs(ratio - 1.0) > _SAME_SCALE + _AGREE_SIGMAS * sigma:
-            return self._refuse("confirmation", f"scale differs from the attempt before by {abs(ratio - 1.0):.0%}")
-        return None
+        contradiction = now.contradiction(before, _AGREE_SIGMAS)
+        return self._refuse("confirmation", f"against the attempt before: {contradiction}") if contradiction else None
 
-    def _quality_refusal(self, aligned: Alignment, scale_sigma: float = 0.0) -> Initialisation | None:
+    def _lacking(self, tracks: Tracks, path: InertialPath, fx: float) -> str:
+        """Return what would make the window say more, as far as it can be told."""
         config = self._config
-        if aligned.residual_ratio > config.max_residual_ratio:
-            reason = f"vision and IMU disagree: chi2 {aligned.residual_ratio:.1f} of {config.max_residual_ratio:.1f}"
+        if path.excitation_m_s2 < _AMPLE * config.min_excitation_m_s2:
+            return f"acceleration changes by {path.excitation_m_s2:.2f} m/s2 only: speed up, brake or turn"
+        parallax_px = median_parallax(tracks, path.rotations) * fx
+        if parallax_px < _AMPLE * config.min_parallax_px:
+            return f"parallax is {parallax_px:.0f} px only: move sideways, or nearer to what is seen"
+        if self._window.seen_s < 0.95 * config.mono_window_s:
+            return f"{self._window.seen_s:.1f} s seen, more come"
+        return "the IMU's noise, with what the ride shakes, hides the scale"
+
+    def _quality_refusal(self, solution: Solution, lacking: str) -> Initialisation | None:
+        config = self._config
+        if solution.residual_ratio > config.max_residual_ratio:
+            reason = f"vision and IMU disagree: chi2 {solution.residual_ratio:.1f} of {config.max_residual_ratio:.1f}"
             advice = "per degree of freedom; check time stamps and extrinsics"
             return self._refuse("disagreement", f"{reason} {advice}", "failed")
-        P = aligned.state_covariance(-1 + len(aligned.T_world_body))
-        R = aligned.T_world_body[-1, :3, :3]
-        tilt = np.rad2deg(np.sqrt(np.linalg.eigvalsh((R @ P[:3, :3] @ R.T)[:2, :2])[-1]))
+        P = solution.last_covariance
         velocity = np.sqrt(np.linalg.eigvalsh(P[6:9, 6:9])[-1])
         gyro = np.sqrt(np.linalg.eigvalsh(P[9:12, 9:12])[-1])
         for name, value, limit, unit in (
-            ("scale", scale_sigma * 100.0, config.max_scale_sigma * 100.0, "%"),
-            ("tilt", tilt, config.max_tilt_sigma_deg, "deg"),
+            ("scale", solution.scale_sigma * 100.0, config.max_scale_sigma * 100.0, "%"),
+            ("tilt", np.rad2deg(solution.tilt_sigma_rad), config.max_tilt_sigma_deg, "deg"),
             ("velocity", velocity, config.max_velocity_sigma_m_s, "m/s"),
             ("gyro bias", gyro, config.max_gyro_bias_sigma_rad_s, "rad/s"),
         ):
             if not value <= limit:
-                reason = f"{name} sigma {value:.3g} {unit} of {limit:.3g} needed: move with more acceleration, or turn"
-                return self._refuse(name, reason)
+                return self._refuse(name, f"{name} sigma {value:.3g} {unit} of {limit:.3g} needed: {lacking}")
         return None
 
     # -- the answer --------------------------------------------------------------------------------------------------
 
-    def _moving(self, chosen: list[Entry], aligned: Alignment, metric: bool, excitation_m_s2: float) -> Initialisation:
+    def _moving(self, chosen: list[Entry], solution: Solution, metric: bool, excitation_m_s2: float) -> Initialisation:
         """Express the solution in odom."""
-        up_vo = chosen[0].T_vo_body[:3, :3] @ aligned.T_world_body[0, 2, :3]
+        up_vo = chosen[0].T_vo_body[:3, :3] @ solution.T_world_body[0, 2, :3]
         T_odom_vo = transform(level_rotation(up_vo), np.zeros(3))
         origin = T_odom_vo @ chosen[0].T_vo_body
         turn = np.eye(4)
-        turn[:3, :3] = origin[:3, :3] @ aligned.T_world_body[0, :3, :3].T
+        turn[:3, :3] = origin[:3, :3] @ solution.T_world_body[0, :3, :3].T
         turn[:3, 3] = origin[:3, 3] if metric else 0.0
-        poses = turn @ aligned.T_world_body
-        inflation = max(aligned.residual_ratio, 1.0)  # what the model does not explain makes the answer less certain
-        if not metric:  # metric motions come inflated; sightings do not, though their errors are correlated in time
-            inflation *= self._config.vo_inflation**2
+        poses = turn @ solution.T_world_body
+        inflation = max(solution.residual_ratio, 1.0)  # what the model does not explain makes the answer less certain
         first, last = (
             NavState(
-                t_ns=chosen[i].t_ns,
+                t_ns=solution.t_ns[i],
                 T_world_body=poses[i],
-                velocity_world_m_s=turn[:3, :3] @ aligned.velocities_m_s[i],
-                gyro_bias_rad_s=aligned.gyro_bias_rad_s,
-                accel_bias_m_s2=aligned.accel_bias_m_s2,
-                covariance=_turn(aligned.state_covariance(i), turn[:3, :3]) * inflation,
+                velocity_world_m_s=turn[:3, :3] @ solution.velocities_m_s[i],
+                gyro_bias_rad_s=solution.gyro_bias_rad_s,
+                accel_bias_m_s2=solution.accel_bias_m_s2,
+                covariance=_turn(covariance, turn[:3, :3]) * inflation,
             )
-            for i in (0, len(chosen) - 1)
+            for i, covariance in ((0, solution.first_covariance), (-1, solution.last_covariance))
         )
-        reason = f"{len(chosen)} frames over {(last.t_ns - first.t_ns) / _NS:.2f} s, chi2 {aligned.residual_ratio:.2f}"
-        scale_sigma = 0.0 if metric else aligned.scale_sigma() * float(np.sqrt(inflation))
+        reason = f"{len(poses)} frames over {(last.t_ns - first.t_ns) / _NS:.2f} s, chi2 {solution.residual_ratio:.2f}"
+        scale_sigma = 0.0 if metric else solution.scale_sigma * float(np.sqrt(inflation))
         if not metric:
             reason = f"{reason}, scale sigma {100.0 * scale_sigma:.1f} %"
         return Initialisation(
-            "moving", reason, first, last, T_odom_vo, tuple(entry.t_ns for entry in chosen), poses,
+            "moving", reason, first, last, T_odom_vo, solution.t_ns, poses,
             scale_sigma=scale_sigma, excitation_m_s2=excitation_m_s2,
         )  # fmt: skip
-
-
-class Lengths:
-    """Distances from the first node of a solution, to compare the scale of two solutions that overlap in time."""
-
-    def __init__(self, t_ns: list[int], aligned: Alignment) -> None:
-        """Take the times of the nodes and their solution."""
-        self._t_ns = np.array(t_ns, dtype=np.int64)
-        self._positions = aligned.T_world_body[:, :3, 3]
-        self.sigma = aligned.scale_sigma()
-
-    def ratio(self, before: Lengths) -> tuple[float, float]:
-        """Return the scale relative to that of `before`, and the sigma of that; without overlap zero."""
-        common = before._t_ns[(before._t_ns >= self._t_ns[0]) & (before._t_ns <= self._t_ns[-1])]
-        if len(common) < 2:
-            return 0.0, 0.0
-        now, then = self._from_first(common), before._from_first(common)
-        return float(now @ then / max(float(then @ then), 1e-12)), min(before.sigma, 0.3)
-
-    def _from_first(self, t_ns: NDArray[np.int64]) -> Array:
-        t_s, at_s = (self._t_ns - self._t_ns[0]) / _NS, (t_ns - self._t_ns[0]) / _NS
-        at = np.column_stack([np.interp(at_s, t_s, self._positions[:, i]) for i in range(3)])
-        return np.asarray(np.linalg.norm(at - at[0], axis=1))
 
 
 def _turn(covariance: Array, R: Array) -> Array:

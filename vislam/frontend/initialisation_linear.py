@@ -8,7 +8,7 @@ and Martinelli, "Closed-form solution of visual-inertial structure from motion",
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -20,7 +20,10 @@ from vislam.messages import Array
 
 _DEPTH_ROUNDS = 5  # a bearing's weight needs the point's distance, which the round before has found
 _CAUCHY = 3.0  # scale of the kernel in the linear rounds, in medians
+_MIN_COMMON = 10  # points in two nodes; fewer are fitted too well
+_ASTRAY = 4.0  # standard deviations
 _PLACED = 5.0  # information on a point's distance against what noise alone would show of it
+_MEDIAN_LENGTH = 1.1774  # of a normal error in a plane, in standard deviations of a coordinate
 _NEAR = 0.02  # of the median distance; nearer points are weighted as if there
 
 Ints = NDArray[np.int64]
@@ -35,6 +38,15 @@ class Tracks:
     xy: Array  # [M, 2] on the plane z = 1
     sigma_xy: float
     R_body_cam: Array  # [3, 3]
+    track_ids: Ints  # [P]
+
+    def only(self, good: NDArray[np.bool_]) -> Tracks:
+        """Return those of some points [P]."""
+        rows = good[self.point]
+        number = np.cumsum(good) - 1
+        return replace(
+            self, point=number[self.point[rows]], node=self.node[rows], xy=self.xy[rows], track_ids=self.track_ids[good]
+        )
 
     @property
     def points(self) -> int:
@@ -72,7 +84,6 @@ class Start:
     free_norm_sigma_m_s2: float
     velocity_m_s: Array  # [3] of the first node
     accel_bias_m_s2: Array  # [3]
-    points_m: Array  # [P, 3]
     behind: float  # share of the points that came out behind a camera
 
 
@@ -122,8 +133,51 @@ def _parallax(begin: Ints, node: Ints, xy: Array, R_cams: Array) -> float:
     return np.median(largest) if len(largest) else 0.0
 
 
+def epipolar_noise(tracks: Tracks, rotations: Array) -> tuple[float, NDArray[np.bool_]]:
+    """Return the noise of the bearings [rad] and which points [P] keep to the epipolar lines within four times that.
+
+    `rotations` [N, 3, 3] are those of the body. The direction of motion between two nodes, a quarter of the window
+    apart, is the one that the bearings contradict least for their noise, robustly; what is left over is noise. It is
+    infinite where too few are seen.
+    """
+    nodes = len(rotations)
+    apart = max(nodes // 4, 1)
+    rays = np.column_stack([tracks.xy, np.ones(len(tracks.xy))])
+    R_cams = rotations @ tracks.R_body_cam
+    bearings = np.einsum("mij,mj->mi", R_cams[tracks.node], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    at = np.full((nodes, tracks.points), -1)
+    at[tracks.node, tracks.point] = np.arange(len(rays))
+    errors: list[Array] = [np.empty(0)]
+    points: list[Ints] = [np.empty(0, dtype=np.int64)]
+    for i in range(nodes - apart):
+        both = np.flatnonzero((at[i] >= 0) & (at[i + apart] >= 0))
+        if len(both) >= _MIN_COMMON:
+            errors.append(_epipolar_errors(bearings[at[i, both]], bearings[at[i + apart, both]]))
+            points.append(both)
+    every = np.concatenate(errors)
+    sigma = 1.4826 * float(np.median(every)) if len(every) else float("inf")
+    good = np.ones(tracks.points, dtype=np.bool_)
+    good[np.concatenate(points)[every > _ASTRAY * sigma]] = False
+    return sigma, good
+
+
+def _epipolar_errors(a: Array, b: Array) -> Array:
+    """Return how far bearings a and b [N, 3] in common axes are from one plane with the motion, over its noise."""
+    normals = np.cross(a, b)
+    noise = 2.0 * np.eye(3) - a[:, :, None] * a[:, None, :] - b[:, :, None] * b[:, None, :]
+    robust, errors = np.ones(len(a)), np.zeros(len(a))
+    for _ in range(_DEPTH_ROUNDS):
+        A, B = (normals * robust[:, None]).T @ normals, np.einsum("n,nij->ij", robust, noise)
+        half = np.linalg.cholesky(B + 1e-9 * np.trace(B) * np.eye(3))
+        inverse = np.linalg.inv(half)
+        direction = inverse.T @ np.linalg.eigh(inverse @ A @ inverse.T)[1][:, 0]
+        errors = np.abs(normals @ direction) / np.sqrt(np.einsum("i,nij,j->n", direction, noise, direction))
+        robust = 1.0 / (1.0 + (errors / (_CAUCHY * max(float(np.median(errors)), 1e-9))) ** 2)
+    return np.asarray(errors)
+
+
 def solve_start(window: Window, path: InertialPath, tracks: Tracks) -> Start:
-    """Return gravity, first velocity, accelerometer bias and points by linear least squares.
+    """Return the state of the first node and the points, from bearings and inertial data alone.
 
     Raises:
         numpy.linalg.LinAlgError: the motion does not determine them.
@@ -137,19 +191,29 @@ def solve_start(window: Window, path: InertialPath, tracks: Tracks) -> Start:
     prior[6:, 6:] = np.eye(3) / window.accel_bias_sigma_m_s2**2
     x, A, b = np.zeros(9), np.eye(3), np.zeros(3)
     points = np.zeros((len(tracks.begin) - 1, 3))
-    along = distance
+    along, sigma = distance, tracks.sigma_xy
+    bias = 2.0 * sigma * sigma
     for _ in range(_DEPTH_ROUNDS):
-        weight = robust / (tracks.sigma_xy * distance) ** 2
-        H, g, blocks, heads, links = _eliminated(
-            tracks.begin, tracks.node, bearings, weight, centres, path.unknown, tracks.sigma_xy
-        )
-        x, A, b = _with_known_norm(H + prior, g, window.gravity_m_s2)
+        weight = robust / (sigma * distance) ** 2
+        while True:
+            try:
+                H, g, blocks, heads, links = _eliminated(
+                    tracks.begin, tracks.node, bearings, weight, centres, path.unknown, bias,
+                    _PLACED * 2.0 * sigma * sigma,
+                )
+                x, A, b = _with_known_norm(H + prior, g, window.gravity_m_s2)
+                break
+            except np.linalg.LinAlgError:
+                if bias == 0.0:
+                    raise
+                bias = 0.0  # more noise taken off than there is
         points = np.linalg.solve(blocks, (heads + links @ x)[..., None])[..., 0]
         seen = points[tracks.point] - centres[tracks.node] - path.unknown[tracks.node] @ x
         along = np.einsum("mi,mi->m", seen, bearings)
         distance = np.maximum(np.abs(along), _NEAR * float(np.median(np.abs(along))) + 1e-6)
         across = np.sqrt(np.maximum(np.einsum("mi,mi->m", seen, seen) - along**2, 0.0)) / distance
-        robust = 1.0 / (1.0 + (across / (_CAUCHY * max(float(np.median(across)), 1e-9))) ** 2)
+        typical = max(float(np.median(across)), 1e-9)
+        robust = 1.0 / (1.0 + (across / (_CAUCHY * typical)) ** 2)
     free = np.linalg.solve(A, b)
     norm = float(np.linalg.norm(free))
     down = free / max(norm, 1e-9)
@@ -161,19 +225,19 @@ def solve_start(window: Window, path: InertialPath, tracks: Tracks) -> Start:
         free_norm_sigma_m_s2=float(np.sqrt(down @ np.linalg.solve(A, down))),
         velocity_m_s=x[:3].copy(),
         accel_bias_m_s2=x[6:].copy(),
-        points_m=points,
         behind=float(behind.mean()),
     )
 
 
 @njit(cache=True, nogil=True)
 def _eliminated(
-    begin: Ints, node: Ints, bearings: Array, weight: Array, centres: Array, unknown: Array, sigma: float
+    begin: Ints, node: Ints, bearings: Array, weight: Array, centres: Array, unknown: Array, bias: float, least: float
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the normal equations over the nine unknowns, and what gives the points: blocks @ p = heads + links @ x.
 
-    A noisy bearing b makes `I - b b^T` see a little of the distance itself, 2 sigma^2 of its square, and least squares
-    would shrink the world to make that small; it is taken off. Points too far to be placed are left out.
+    A noisy bearing b makes `I - b b^T` see a little of the distance itself, `bias` of its square, which is twice the
+    variance of b, and least squares would shrink the world to make that small; it is taken off. Points of which the
+    bearings tell the distance by less than `least` of their weight are left out.
     """
     count = len(begin) - 1
     H, g = np.zeros((9, 9)), np.zeros(9)
@@ -182,7 +246,7 @@ def _eliminated(
         own, own_g = np.zeros((9, 9)), np.zeros(9)
         for m in range(begin[p], begin[p + 1]):
             b, U = bearings[m], unknown[node[m]]
-            across = weight[m] * (np.eye(3) - (1.0 + 2.0 * sigma * sigma) * np.outer(b, b))
+            across = weight[m] * (np.eye(3) - (1.0 + bias) * np.outer(b, b))
             acrossU = across @ U
             head = across @ centres[node[m]]
             blocks[p] += across
@@ -192,7 +256,7 @@ def _eliminated(
             own_g -= U.T @ head
         lowest = np.linalg.eigvalsh(blocks[p])[0]
         total = np.sum(weight[begin[p] : begin[p + 1]])
-        if lowest < _PLACED * 2.0 * sigma * sigma * total:
+        if lowest < least * total:
             blocks[p] += (total * 1e-6 - min(lowest, 0.0)) * np.eye(3)
             continue
         inverse = np.linalg.inv(blocks[p])

@@ -161,6 +161,7 @@ def gather_tracks(chosen: list[Entry], camera: Camera, T_body_cam: Array, sigma_
         point=np.searchsorted(kept, every_id[order]).astype(np.int64),
         node=every_node[order],
         xy=np.ascontiguousarray(xy[order]),
+        track_ids=kept,
         sigma_xy=sigma_px / camera.fx,
         R_body_cam=np.ascontiguousarray(T_body_cam[:3, :3]),
     )

@@ -8,24 +8,30 @@ are gravity's direction.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import WindowConfig
+from vislam.geometry import so3_exp
 from vislam.imu import ImuNoise, Preintegrated
 from vislam.messages import Array, Observations
-from vislam.window import visual
-from vislam.window.layout import CALIBRATION, STATE, Camera, Links, Prior
+from vislam.window import inertial, visual
+from vislam.window.layout import CALIBRATION, STATE, Camera, Links, Prior, Views
 from vislam.window.linear import joint_covariance
 from vislam.window.posterior import pose, scale_sigma
-from vislam.window.solver import Problem, Room, optimise
+from vislam.window.solver import Problem, Room, Solution, optimise
 from vislam.window.spans import information, jacobian_by_bias
 from vislam.window.tracks import RHO_START, TrackTable
 
-_TOLERANCE = 1e-6
+_ROUGH, _TOLERANCE = 1e-4, 1e-6  # relative decrease of the cost; the first until the pixels' noise is known
+_OUTLIER = 3.5  # standard deviations of a coordinate, by the length of the error
+_MEDIAN_LENGTH = 1.1774  # of a normal error in a plane, in standard deviations of a coordinate
+_SCALE_ROUNDS = 2  # tilt is linearised
+_FAR_OFF = 5.0  # factor of scale beyond which the shape is no good
+_SHARPEST = 0.05  # of the sigma that was told: no tracker is better, a fit to few views only looks so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +46,9 @@ class BundleProblem:
     spans: Sequence[Preintegrated]  # [M - 1]
     gyro_bias_sigma_rad_s: float
     accel_bias_sigma_m_s2: float
+    rate_rad_s: Array | None = None  # [M, 3] of the body; only a time offset needs it
+    time_offset_sigma_s: float = 0.0  # prior of what the camera's stamps lack; 0: they are exact
+    inflation: float = 1.0  # on the pixels' sigma that is measured: errors of a track are correlated in time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +62,12 @@ class BundleSolution:
     first_covariance: Array  # [15, 15] of frame 0, in the order of NavState; its position and yaw are the gauge
     last_covariance: Array  # [15, 15] of frame M - 1
     scale_sigma: float  # relative, of all displacements together
+    time_offset_s: float  # to be added to the camera's stamps
+    time_offset_sigma_s: float
     reprojection_px: float  # median error of an observation in units of sigma_px
+    sigma_px: float  # that the observations turned out to have
+    outliers: float  # share of the observations that do not fit
+    inertial_ratio: float  # chi-square of the spans and biases per row; below 1 where their noise is as modelled
     views: int
     iterations: int
     converged: bool
@@ -67,10 +81,11 @@ def solve(
     gravity_m_s2: float,
     max_iterations: int = 30,
 ) -> BundleSolution:
-    """Optimise poses, velocities, biases and landmarks of a few frames to convergence.
+    """Optimise poses, velocities, biases, landmarks and the time offset of a few frames to convergence.
 
-    The time offset and the extrinsic rotation are held. Position and yaw of frame 0 are fixed to the gauge's sigmas
-    of `config`.
+    The extrinsic rotation is held. Position and yaw of frame 0 are fixed to the gauge's sigmas of `config`. After a
+    first convergence the noise of the pixels is measured, in place of `config.sigma_px`, and what does not fit is
+    left out.
 
     Raises:
         ValueError: fewer than two frames, or lists whose lengths do not fit.
@@ -82,38 +97,127 @@ def solve(
             f"and {len(problem.spans)}"
         )
     ids = np.arange(count, dtype=np.int64)
-    X = _states(problem)
     tracks = TrackTable(config, rig)
     for k, seen in enumerate(problem.observations):
         tracks.add(k, seen)
     selection = tracks.select(ids)
-    camera = Camera(
+    total = max(len(selection.rows), 1)
+    camera = _camera(problem, config, rig)
+    X, calibration = _states(problem), np.zeros(CALIBRATION)
+    held = np.zeros(count, dtype=np.bool_)
+    links, gauge, room = _links(problem, noise), _gauge(problem, config), Room()
+    sigma, whitening, iterations = 1.0, 1.0, 0
+    for tolerance in (_ROUGH, _ROUGH, _TOLERANCE):
+        views = _whitened_by(selection.views, whitening)
+        _rescale(X, links, rig.T_body_cams[0][:3, 3], problem.accel_bias_sigma_m_s2, gravity_m_s2)
+        points = np.zeros((len(selection.slots), 3))
+        visual.start(X, calibration, views, camera, np.ones(len(points), dtype=np.bool_), RHO_START, points)
+        solution = optimise(
+            Problem(X, X.copy(), held, points, calibration, views, camera, links, gauge, gravity_m_s2, True),
+            max_iterations,
+            tolerance,
+            room,
+        )
+        iterations += solution.iterations
+        if not solution.ok or tolerance == _TOLERANCE:
+            break
+        X, calibration = solution.X.copy(), solution.calibration
+        errors = np.sqrt(solution.squares[:, 0]) * whitening
+        sigma = max(_spread(errors, len(points), count), _SHARPEST)
+        whitening = sigma * problem.inflation
+        tracks.remove_rows(selection.rows[errors > _OUTLIER * sigma])
+        selection = tracks.select(ids)
+    return replace(
+        _solution(problem, solution, links, gravity_m_s2),
+        sigma_px=sigma * config.sigma_px,
+        outliers=1.0 - len(selection.rows) / total,
+        iterations=iterations,
+        converged=solution.ok and solution.iterations < max_iterations,
+    )
+
+
+def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig) -> Camera:
+    count = len(problem.T_world_body)
+    active = np.zeros(CALIBRATION, dtype=np.bool_)
+    active[0] = problem.time_offset_sigma_s > 0.0 and problem.rate_rad_s is not None
+    return Camera(
         T_body_cam=rig.T_body_cams[0],
         T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]]),
-        rate=np.zeros((count, 3)),
+        rate=np.zeros((count, 3)) if problem.rate_rad_s is None else problem.rate_rad_s,
         applied_offset_s=np.zeros(count),
-        active=np.zeros(CALIBRATION, dtype=np.bool_),
+        active=active,
         huber_k=config.huber_k,
         rho_information=config.rho_sigma_1_m**-2,
     )
-    calibration = np.zeros(CALIBRATION)
-    points = np.zeros((len(selection.slots), 3))
-    fresh = np.ones(len(points), dtype=np.bool_)
-    visual.start(X, calibration, selection.views, camera, fresh, RHO_START, points)
-    held = np.zeros(count, dtype=np.bool_)
-    links, gauge = _links(problem, noise), _gauge(problem, config)
-    solution = optimise(
-        Problem(X, X.copy(), held, points, calibration, selection.views, camera, links, gauge, gravity_m_s2, True),
-        max_iterations,
-        _TOLERANCE,
-        Room(),
-    )
-    poses_at = 9 * count
-    index = np.concatenate([np.arange(poses_at, poses_at + 6 * count), np.arange(9), np.arange(poses_at - 9, poses_at)])
+
+
+def _rescale(X: Array, links: Links, lever_m: Array, accel_bias_sigma_m_s2: float, gravity_m_s2: float) -> None:
+    """Move the states X [M, 21] to the scale, tilt, velocities and accelerometer bias that the IMU gives their shape.
+
+    What the camera sees does not change: its path is scaled and turned as a whole. Scale lies in a valley that bends,
+    along which Gauss-Newton goes in small steps; this goes all the way, for given the shape the problem is linear.
+    """
+    count, at_bias = len(X), 3
+    walked = [np.linalg.inv(np.linalg.inv(W)[3:, 3:]) for W in links.information]
+    for _ in range(_SCALE_ROUNDS):
+        R = X[:, :9].reshape(-1, 3, 3)
+        levers = R @ lever_m
+        centres = X[:, 9:12] + levers
+        shape = centres - centres[0]
+        H, b = np.zeros((6 + 3 * count,) * 2), np.zeros(6 + 3 * count)
+        H[at_bias:6, at_bias:6] = np.eye(3) / accel_bias_sigma_m_s2**2
+        H[1:3, 1:3] = 1e-6 * np.eye(2)
+        by_tilt = gravity_m_s2 * np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
+        down = np.array([0.0, 0.0, -gravity_m_s2])
+        for k in range(count - 1):
+            dt, turn = links.dt[k], R[k].T
+            J, at = np.zeros((6, 12)), np.r_[0:6, 6 + 3 * k : 12 + 3 * k]  # scale, tilt, bias, velocities
+            J[3:, 0] = turn @ (shape[k + 1] - shape[k])
+            J[:3, 1:3], J[3:, 1:3] = turn @ by_tilt * -dt, turn @ by_tilt * (-0.5 * dt * dt)
+            J[:, 3:6] = -links.by_bias[k, 3:, 3:]
+            J[:3, 6:9], J[:3, 9:12], J[3:, 6:9] = -turn, turn, -turn * dt
+            known = np.concatenate([
+                links.dv[k] + turn @ down * dt,
+                links.dp[k] + turn @ (down * (0.5 * dt * dt) + levers[k + 1] - levers[k]),
+            ]) - links.by_bias[k, 3:, 3:] @ links.bias[k, 3:]  # fmt: skip
+            weighted = J.T @ walked[k]
+            H[np.ix_(at, at)] += weighted @ J
+            b[at] += weighted @ known
+        x = np.linalg.solve(H, b)
+        if not (np.isfinite(x).all() and 1.0 / _FAR_OFF < x[0] < _FAR_OFF):
+            return
+        tilt = so3_exp(np.array([x[1], x[2], 0.0]))
+        X[:, :9] = (tilt @ R).reshape(-1, 9)
+        X[:, 9:12] = centres[0] + (x[0] * shape) @ tilt.T - levers @ tilt.T
+        X[:, 12:15] = x[6:].reshape(-1, 3) @ tilt.T
+        X[:, 18:21] = x[3:6]
+
+
+def _whitened_by(views: Views, sigma: float) -> Views:
+    """Return the views with errors in units of `sigma` times what they were."""
+    values = views.values.copy()
+    values[:, 2:6] /= sigma
+    return views._replace(values=values)
+
+
+def _spread(errors: Array, points: int, count: int) -> float:
+    """Return the sigma of one coordinate, given the lengths [N] of errors that points and poses were fitted to."""
+    if len(errors) == 0:
+        return 1.0
+    free = max(2 * len(errors) - 3 * points - 6 * count, len(errors) // 2)
+    return float(np.median(errors)) / _MEDIAN_LENGTH * float(np.sqrt(2 * len(errors) / free))
+
+
+def _solution(problem: BundleProblem, solution: Solution, links: Links, gravity_m_s2: float) -> BundleSolution:
+    count = len(solution.X)
+    poses_at, at = 9 * count, 6 * count
+    index = np.concatenate([
+        np.arange(poses_at, poses_at + at), np.arange(9), np.arange(poses_at - 9, poses_at), [poses_at + at]
+    ])  # fmt: skip
     joint = joint_covariance(solution.U, index) if solution.ok else np.full((len(index),) * 2, np.nan)
-    at = 6 * count
     first = np.concatenate([np.arange(6), np.arange(at, at + 9)])
     last = np.concatenate([np.arange(at - 6, at), np.arange(at + 9, at + 18)])
+    views = len(solution.squares)
     return BundleSolution(
         T_world_body=np.array([pose(x) for x in solution.X]),
         velocity_world_m_s=solution.X[:, 12:15].copy(),
@@ -122,10 +226,15 @@ def solve(
         first_covariance=joint[np.ix_(first, first)],
         last_covariance=joint[np.ix_(last, last)],
         scale_sigma=scale_sigma(solution.X, joint[:at, :at]) if solution.ok else float("inf"),
-        reprojection_px=float(np.sqrt(np.median(solution.squares[:, 0]))) if len(selection.rows) > 0 else float("nan"),
-        views=len(selection.rows),
+        time_offset_s=float(solution.calibration[0]),
+        time_offset_sigma_s=float(np.sqrt(joint[-1, -1])) if problem.time_offset_sigma_s > 0.0 else 0.0,
+        reprojection_px=float(np.sqrt(np.median(solution.squares[:, 0]))) if views > 0 else float("nan"),
+        sigma_px=float("nan"),
+        outliers=float("nan"),
+        inertial_ratio=2.0 * inertial.cost(solution.X, links, gravity_m_s2) / (9.0 * (count - 1)),
+        views=views,
         iterations=solution.iterations,
-        converged=solution.ok and solution.iterations < max_iterations,
+        converged=solution.ok,
     )
 
 
@@ -164,6 +273,8 @@ def _gauge(problem: BundleProblem, config: WindowConfig) -> Prior:
     """Return the prior on frame 0: position and yaw fixed, biases loosely, tilt and velocity free."""
     up = problem.T_world_body[0, 2, :3]
     H = np.zeros((CALIBRATION + 15, CALIBRATION + 15))
+    if problem.time_offset_sigma_s > 0.0:
+        H[0, 0] = problem.time_offset_sigma_s**-2
     state = H[CALIBRATION:, CALIBRATION:]
     state[:3, :3] = np.outer(up, up) / config.gauge_sigma_rad**2 + 1e-2 * np.eye(3)  # 10 rad: only keeps it solvable
     state[3:6, 3:6] = np.eye(3) / config.gauge_sigma_m**2
