@@ -16,7 +16,7 @@ from vislam.ekf.filtering import Filtering
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend, mode_for
 from vislam.frontend.camera_clock import CameraClock
-from vislam.frontend.initialisation import Initialisation, Initialiser
+from vislam.frontend.initialisation import Initialisation, Initialiser, level_at_once, moved_to
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
@@ -43,6 +43,7 @@ from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_k
 from vislam.trajectory import Alignment, Trajectory, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
+_OTHER_WAYS = "a start from rest, a second camera or depth needs less"
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
 
 
@@ -115,7 +116,8 @@ class Front:
                 "--ekf.vision accumulated sums up motion in metres, which one camera does not see; use --frontend.mode "
                 "stereo, rgbd or planar, or --ekf.vision relative"
             )
-        self.initialisation: Initialisation | None = None
+        self.initialisation: Initialisation | None = None  # settled
+        self.newest_start: Initialisation | None = None  # that the filter goes by; provisional ones come before
         self._refused: Initialisation | None = None  # the newest answer without a state
         self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
         self.last_refusal = "no frame yet"  # why there is no first state
@@ -134,7 +136,7 @@ class Front:
             self._stillness = Stillness(config.init)
             self._initialiser = Initialiser(
                 config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
-                config.frontend.track_sigma_px,
+                config.frontend.track_sigma_px, config.window,
             )  # fmt: skip
             chosen = filter_config(config, rig, noise)
             self._filter = Filtering(chosen, noise, config.imu.gravity_m_s2, rig)
@@ -154,7 +156,8 @@ class Front:
         self._T_odom_keyframe: Array | None = None
         self._T_odom_body: Array | None = None
         self._T_vo_body = self._T_vo_keyframe.copy()
-        self._waiting = WaitingKeyframes()  # in frame `vo`, until gravity is known
+        self._waiting = WaitingKeyframes()  # in frame `vo`, until the start is settled
+        self._holds_keyframes = self._has_imu  # until the start is settled, or gravity given up
         self._resumed: FrontMemory | None = None  # until its keyframe was seen again
         self._first_id = 0  # of the keyframes of this recording
 
@@ -175,6 +178,7 @@ class Front:
             start.status, start.reason, start.first_state, start.last, scale_sigma=start.scale_sigma,
             excitation_m_s2=start.excitation_m_s2,
         )  # fmt: skip
+        self.newest_start, self._holds_keyframes = self.initialisation, False
         vo = identity_motion(memory.t_ns, memory.keyframe_id, True, 0)
         self._filter.resume(state, vo, memory.news.filter_camera)
 
@@ -261,13 +265,21 @@ class Front:
             self._filter.feed_back(update)
 
     def give_up_waiting(self) -> list[OdometryKeyframe]:
-        """Return the keyframes that still wait for gravity when the recording ends: vision alone has to do.
+        """Return the keyframes that still wait for a settled start when the recording ends.
 
-        Without scale nothing can be done with them, and the list is empty.
+        With one camera a provisional start has to do, and without any the list is empty; else vision alone does.
         """
-        if self._has_imu and self.initialisation is None and self.frontend.mode != "mono":
-            return self._release(self._T_upright)
-        return []
+        if not self._has_imu or self.initialisation is not None:
+            return []
+        return self._release_untested() if self.frontend.mode == "mono" else self._release(self._T_upright)
+
+    def _release_untested(self) -> list[OdometryKeyframe]:
+        """Return the waiting keyframes by the newest provisional start of one camera; none without one."""
+        found = self.newest_start
+        if found is None or found.T_odom_vo is None:
+            return []
+        self.initialisation = replace(found, reason=f"{found.reason}; not confirmed: {self.last_refusal}")
+        return self._release(found.T_odom_vo)
 
     def report(self) -> FrontReport:
         """Return what there is to say of the run so far."""
@@ -298,6 +310,7 @@ class Front:
         if self._has_imu:
             counters["imu"] = dict(self._buffer.counters)
             counters["initialisation refused"] = dict(self._initialiser.refusals)
+            counters["initialisation"] = {"taken_back": self._initialiser.taken_back}
             counters["camera clock"] = {"changes": self.camera_clock.changes}
         if self._filter is not None:
             counters["ekf"] = dict(self._filter.ekf.counters)
@@ -383,18 +396,45 @@ class Front:
         self._rested_since_keyframe = self._rested_since_keyframe and at_rest
 
     def _initialise(self, span: ImuSpan | None, track: TrackResult, still_image: bool) -> list[OdometryKeyframe]:
-        """Look for the first gravity-aligned state; once found, start the filter and release what waited."""
+        """Look for the first gravity-aligned state; once it is settled, release what waited.
+
+        Until then the filter goes by the newest provisional one, if any.
+        """
         if self._filter is None or self.noise is None or self.initialisation is not None:
             return []
         self._initialiser.time_offset_sigma_s = self.camera_clock.sigma_s
         found = self._initialiser.add(span, track.vo, still_image, track.observations)
         self.last_refusal = found.reason
         self._refused = found if found.first is None else None
+        if found.first is None and self.newest_start is None:
+            found = self._level(span, track.vo) or found
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
+        if self.frontend.mode == "mono":
+            before = self._filter.ekf.pose_at(found.last.t_ns) if self.newest_start is not None else None
+            found = found if before is None else moved_to(found, before[:3, 3])
+        return self._start_from(found, self._filter, track.vo)
+
+    def _start_from(self, found: Initialisation, filtering: Filtering, vo: VoMeasurement) -> list[OdometryKeyframe]:
+        """Start the filter, again if it runs; return the keyframes that waited once the start is settled."""
+        assert found.last is not None and found.T_odom_vo is not None
+        self.newest_start = found
+        filtering.start(found.last, vo)
+        if not found.is_settled:
+            return []
         self.initialisation = found
-        self._filter.start(found.last, track.vo)
         return self._release(found.T_odom_vo)
+
+    def _level(self, span: ImuSpan | None, vo: VoMeasurement) -> Initialisation | None:
+        """Return a provisional state from the newest samples alone, where vision is metric and goes on from there."""
+        if not vo.has_scale or vo.T_keyframe_body is None:
+            return None
+        if span is None and self._buffer.oldest_t_ns is not None:
+            oldest_ns = vo.t_ns - round(self._config.init.level_s * 1e9)
+            span = self._span(max(oldest_ns, self._buffer.oldest_t_ns), vo.t_ns)
+        if span is None:
+            return None
+        return level_at_once(span, vo.t_ns, self._T_vo_body, self._config.imu.gravity_m_s2, self._config.init)
 
     def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
         """Return the waiting keyframes in `odom`, and settle the state of the first.
@@ -403,13 +443,15 @@ class Front:
         """
         found = self.initialisation
         first = None if found is None else found.first
+        self._holds_keyframes = False
         is_mono = self.frontend.mode == "mono"
         solved: dict[int, Array] = {}
         states: dict[int, NavState] = {}
         if is_mono and found is not None and first is not None and found.T_odom_body is not None:
             assert self.noise is not None
             states = self._early.states(first, self._waiting.t_ns, self._buffer.span, self.noise)
-            solved = {t_ns: state.T_world_body for t_ns, state in states.items()}
+            solved = self._waiting.provisional
+            solved |= {t_ns: state.T_world_body for t_ns, state in states.items()}
             solved |= self._waiting.between(Trajectory(np.array(found.t_ns, dtype=np.int64), found.T_odom_body))
             self.counters["keyframes_carried_back"] = len(states)
         released = self._waiting.release(T_odom_vo, solved)
@@ -475,7 +517,8 @@ class Front:
     def _since_keyframe(self, T_vo_keyframe_body: Array | None, T_odom_body: Array | None) -> Array | None:
         if T_vo_keyframe_body is not None:
             return T_vo_keyframe_body
-        if self._filter is not None and T_odom_body is not None and self._T_odom_keyframe is not None:
+        is_settled = self._filter is not None and not self._holds_keyframes
+        if is_settled and T_odom_body is not None and self._T_odom_keyframe is not None:
             return invert(self._T_odom_keyframe) @ T_odom_body
         return None
 
@@ -502,9 +545,9 @@ class Front:
         self._rested_since_keyframe, self._mag = True, None
         self._T_vo_keyframe = self._T_vo_body.copy()
         self._T_odom_keyframe = T_odom_body
-        if T_odom_body is not None:
+        if T_odom_body is not None and not self._holds_keyframes:
             return [OdometryKeyframe(packet, T_odom_body)]
-        self._waiting.add(OdometryKeyframe(packet, self._T_vo_body.copy()))
+        self._waiting.add(OdometryKeyframe(packet, self._T_vo_body.copy()), T_odom_body)
         return self._give_up_if_late(keyframe.t_ns)
 
     def _bridged(self, t_ns: int, imu: ImuSpan | None, variance_m2: float) -> bool:
@@ -525,10 +568,9 @@ class Front:
         if waited_s < self._config.init.give_up_s:
             return []
         if self.frontend.mode == "mono":
-            raise TrackingLostError(
-                f"no scale after {waited_s:.0f} s: {self.last_refusal}; move the camera with more acceleration at the "
-                "start, begin at rest, or use a second camera or depth"
-            )
+            if self.newest_start is not None:
+                return self._release_untested()
+            raise TrackingLostError(f"no scale after {waited_s:.0f} s: {self.last_refusal}; {_OTHER_WAYS}")
         self.counters["imu_given_up"] = 1
         self._filter, self._has_imu = None, False
         released = self._release(self._T_upright)

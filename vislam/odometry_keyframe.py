@@ -29,10 +29,19 @@ class WaitingKeyframes:
     def __init__(self) -> None:
         """Begin with none."""
         self._keyframes: list[OdometryKeyframe] = []
+        self._provisional: list[Array | None] = []
 
-    def add(self, keyframe: OdometryKeyframe) -> None:
-        """Let a keyframe wait."""
+    def add(self, keyframe: OdometryKeyframe, T_odom_body: Array | None = None) -> None:
+        """Let a keyframe wait; `T_odom_body` [4, 4] is where a provisional start has it, if there is one."""
         self._keyframes.append(keyframe)
+        self._provisional.append(T_odom_body)
+
+    @property
+    def provisional(self) -> dict[int, Array]:
+        """Poses by time, of those that a provisional start placed."""
+        return {
+            w.packet.keyframe.t_ns: T for w, T in zip(self._keyframes, self._provisional, strict=True) if T is not None
+        }
 
     def waited_s(self, now_t_ns: int) -> float:
         """Return how long the first has waited."""
@@ -59,7 +68,7 @@ class WaitingKeyframes:
 
     def release(self, T_odom_vo: Array, solved: Mapping[int, Array]) -> list[OdometryKeyframe]:
         """Return all in `odom`, at the pose that was solved for their time, if any; none waits any longer."""
-        waiting, self._keyframes = self._keyframes, []
+        waiting, self._keyframes, self._provisional = self._keyframes, [], []
         return [
             OdometryKeyframe(w.packet, solved.get(w.packet.keyframe.t_ns, T_odom_vo @ w.T_odom_body)) for w in waiting
         ]

@@ -118,6 +118,9 @@ class InitConfig:
     max_gyro_bias_sigma_rad_s: float = 0.02
     max_scale_sigma: float = 0.1  # relative, monocular only: a provisional start, which the window that follows refines
     settled_scale_sigma: float = 0.03  # of a start that is final, unless the window has reached its length before
+    level_s: float = 0.1  # with metric vision: samples before the first frame that say at once what is level
+    level_accel_sigma_m_s2: float = 1.5  # of a body that may move: a hand or a drone; 9 deg of tilt
+    level_speed_sigma_m_s: float = 2.0  # of the same
     test_s: float = 1.0  # a start is final when a solution of so much more motion agrees with it
     max_residual_ratio: float = 3.0  # chi-square per degree of freedom; above it the model does not explain the window
     give_up_s: float = 30.0  # go on with vision alone after so long without a trustworthy first state

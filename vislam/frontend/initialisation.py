@@ -25,7 +25,7 @@ from vislam.frontend.initialisation_linear import (
     median_parallax,
     solve_start,
 )
-from vislam.frontend.initialisation_rest import rest_accel_bias, rest_covariance
+from vislam.frontend.initialisation_rest import level_covariance, rest_accel_bias, rest_covariance
 from vislam.frontend.initialisation_solution import Solution, from_alignment, from_bundle
 from vislam.frontend.initialisation_window import Entry, FrameWindow, gather_tracks, metric_motions
 from vislam.geometry import level_rotation, transform
@@ -74,6 +74,36 @@ class Initialisation:
     time_offset_s: float = 0.0  # of the camera's clock beyond what was applied, as this window has it
     time_offset_sigma_s: float = float("inf")
     is_settled: bool = True  # False: provisional, not yet tested against the seconds after it
+
+
+def moved_to(found: Initialisation, last_m: Array) -> Initialisation:
+    """Return an answer in another odom, in which its last position is `last_m` [3]; heading and vertical stay."""
+    assert found.first is not None and found.last is not None and found.T_odom_vo is not None
+    shift = transform(np.eye(3), last_m - found.last.T_world_body[:3, 3])
+    poses = None if found.T_odom_body is None else shift @ found.T_odom_body
+    first = replace(found.first, T_world_body=shift @ found.first.T_world_body)
+    last = replace(found.last, T_world_body=shift @ found.last.T_world_body)
+    return replace(found, first=first, last=last, T_odom_vo=shift @ found.T_odom_vo, T_odom_body=poses)
+
+
+def level_at_once(
+    span: ImuSpan, t_ns: int, T_vo_body: Array, gravity_m_s2: float, config: InitConfig
+) -> Initialisation:
+    """Return a provisional state at the end of a few samples: level by their mean force, at any plausible velocity.
+
+    For vision that measures metres, which finds the rest within frames. `T_vo_body` [4, 4] is where visual odometry is
+    then.
+    """
+    force = span.accel_m_s2.mean(axis=0)
+    norm = float(np.linalg.norm(force))
+    up = force if norm > 0.5 * gravity_m_s2 else np.array([0.0, 0.0, gravity_m_s2])
+    T_odom_vo = transform(level_rotation(T_vo_body[:3, :3] @ up), np.zeros(3))
+    T_odom_body = T_odom_vo @ T_vo_body
+    covariance = level_covariance(norm - gravity_m_s2, T_odom_body[:3, :3], gravity_m_s2, config)
+    state = NavState(t_ns, T_odom_body, np.zeros(3), np.zeros(3), np.zeros(3), covariance)
+    tilt_deg = np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    reason = f"level by the newest samples, to {tilt_deg:.0f} deg"
+    return Initialisation("level", reason, state, state, T_odom_vo, (t_ns,), T_odom_body[None], is_settled=False)
 
 
 class Initialiser:

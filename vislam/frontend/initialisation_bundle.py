@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import WindowConfig
@@ -10,7 +11,7 @@ from vislam.frontend.inertial_alignment import Window, up_to_z
 from vislam.frontend.initialisation_linear import InertialPath, Start, Tracks
 from vislam.frontend.initialisation_window import Entry
 from vislam.imu import preintegrate
-from vislam.messages import Array, Observations, no_observations
+from vislam.messages import Observations, no_observations
 from vislam.window.bundle import BundleProblem, BundleSolution, solve
 
 
@@ -51,7 +52,7 @@ def refine_tracks(
     return solve(problem, config, rig, window.noise, window.gravity_m_s2)
 
 
-def _only(seen: Observations | None, kept: Array) -> Observations:
+def _only(seen: Observations | None, kept: NDArray[np.int64]) -> Observations:
     """Return the observations of some tracks."""
     if seen is None:
         return no_observations()

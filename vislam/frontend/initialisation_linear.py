@@ -198,7 +198,13 @@ def solve_start(window: Window, path: InertialPath, tracks: Tracks) -> Start:
         while True:
             try:
                 H, g, blocks, heads, links = _eliminated(
-                    tracks.begin, tracks.node, bearings, weight, centres, path.unknown, bias,
+                    tracks.begin,
+                    tracks.node,
+                    bearings,
+                    weight,
+                    centres,
+                    path.unknown,
+                    bias,
                     _PLACED * 2.0 * sigma * sigma,
                 )
                 x, A, b = _with_known_norm(H + prior, g, window.gravity_m_s2)

@@ -48,3 +48,18 @@ def rest_covariance(span: ImuSpan, R: Array, gravity_m_s2: float, config: InitCo
     covariance[:3, :3], covariance[:3, 12:] = both[:3, :3], both[:3, 3:]
     covariance[12:, :3], covariance[12:, 12:] = both[3:, :3], both[3:, 3:]
     return covariance
+
+
+def level_covariance(force_error_m_s2: float, R: Array, gravity_m_s2: float, config: InitConfig) -> Array:
+    """Return the covariance [15, 15] of a body taken as level by a few samples, while it may move, with attitude R.
+
+    `force_error_m_s2` is by how much the norm of the force differs from gravity: so much acceleration is certain.
+    """
+    acceleration = max(config.level_accel_sigma_m_s2, abs(force_error_m_s2))
+    tilt = float(np.hypot(acceleration, config.accel_bias_sigma_m_s2)) / gravity_m_s2
+    covariance = np.zeros((15, 15))
+    heading = np.outer(R[2], R[2])  # about the vertical, on the body side
+    covariance[:3, :3] = tilt**2 * (np.eye(3) - heading) + _CHOSEN**2 * heading
+    sigmas = _CHOSEN, config.level_speed_sigma_m_s, config.gyro_bias_sigma_rad_s, config.accel_bias_sigma_m_s2
+    covariance[3:, 3:] = np.diag(np.repeat(np.square(sigmas), 3))
+    return covariance

@@ -14,7 +14,7 @@ from vislam.frontend.initialisation_linear import Tracks
 from vislam.frontend.result import scaled_motion
 from vislam.geometry import invert, se3_adjoint
 from vislam.imu import join
-from vislam.messages import Array, ImuSpan, Observations, VoMeasurement
+from vislam.messages import Array, ImuSpan, NoiseScale, Observations, VoMeasurement
 
 _NS = 1_000_000_000
 _MIN_SIGHTINGS = 3  # of a point; fewer hardly check one another
@@ -116,7 +116,11 @@ class FrameWindow:
         for a, b in pairwise(chosen):
             between = self.entries[a.number - first + 1 : b.number - first + 1]
             spans.append(join([entry.span for entry in between if entry.span is not None]))
-        return spans
+        newest = spans[-1].noise  # the oldest were cut before the samples showed theirs
+        return [
+            replace(span, noise=NoiseScale(max(span.noise.gyro, newest.gyro), max(span.noise.accel, newest.accel)))
+            for span in spans
+        ]
 
 
 def metric_motions(chosen: list[Entry], inflation: float) -> list[VisualMotion]:

@@ -18,6 +18,7 @@ from vislam.config import Config
 from vislam.ekf.correction import Hint
 from vislam.errors import DataError, HardwareError
 from vislam.front import Front, FrontStep
+from vislam.frontend.initialisation import Initialisation
 from vislam.hw.health import Health
 from vislam.imu import ImuNoise
 from vislam.live.beginning import Beginning
@@ -91,7 +92,7 @@ class FrontProcess:
         self._life, self._config = life, config
         self._to_fast, self._to_back, self._to_map = to_fast, to_back, to_map
         self._frames: deque[Frame] = deque()
-        self._is_started = False
+        self._told_start: Initialisation | None = None
         self._begins_back = True
         self._camera_health = Health(0)
         self._frames_taken = 0
@@ -151,9 +152,9 @@ class FrontProcess:
 
     def _correct(self, step: FrontStep) -> None:
         """Tell the fast process's filter what this one was told."""
-        found = self.front.initialisation
-        if not self._is_started and found is not None and found.last is not None:
-            self._is_started = True
+        found = self.front.newest_start
+        if found is not self._told_start and found is not None and found.last is not None:
+            self._told_start = found
             self._send(Start(found.last, step.track.vo))
         if self.front.ekf_coupling == "tight":
             if step.state is not None:
