@@ -157,6 +157,7 @@ class Front:
         self._T_odom_body: Array | None = None
         self._T_vo_body = self._T_vo_keyframe.copy()
         self._waiting = WaitingKeyframes()  # in frame `vo`, until the start is settled
+        self._begun_t_ns = 0  # when the first pose was given that was not taken back; 0: none was
         self._holds_keyframes = self._has_imu  # until the start is settled, or gravity given up
         self._resumed: FrontMemory | None = None  # until its keyframe was seen again
         self._first_id = 0  # of the keyframes of this recording
@@ -179,6 +180,7 @@ class Front:
             excitation_m_s2=start.excitation_m_s2,
         )  # fmt: skip
         self.newest_start, self._holds_keyframes = self.initialisation, False
+        self._begun_t_ns = start.begun_t_ns
         vo = identity_motion(memory.t_ns, memory.keyframe_id, True, 0)
         self._filter.resume(state, vo, memory.news.filter_camera)
 
@@ -195,7 +197,7 @@ class Front:
             return None
         return StartFacts(
             found.status, found.reason, found.last, found.scale_sigma, found.excitation_m_s2, self.noise,
-            self.first_state,
+            self.first_state, self._begun_t_ns,
         )  # fmt: skip
 
     @property
@@ -418,6 +420,8 @@ class Front:
     def _start_from(self, found: Initialisation, filtering: Filtering, vo: VoMeasurement) -> list[OdometryKeyframe]:
         """Start the filter, again if it runs; return the keyframes that waited once the start is settled."""
         assert found.last is not None and found.T_odom_vo is not None
+        if self.newest_start is None or found.takes_back:
+            self._begun_t_ns = found.last.t_ns
         self.newest_start = found
         filtering.start(found.last, vo)
         if not found.is_settled:

@@ -201,6 +201,7 @@ class StartFacts:
     excitation_m_s2: float
     noise: ImuNoise  # the model that was used from then on
     first_state: NavState  # of keyframe 0
+    begun_t_ns: int = 0  # since when there are poses: provisional ones came before `last`; 0: not told
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -74,6 +74,7 @@ class Initialisation:
     time_offset_s: float = 0.0  # of the camera's clock beyond what was applied, as this window has it
     time_offset_sigma_s: float = float("inf")
     is_settled: bool = True  # False: provisional, not yet tested against the seconds after it
+    takes_back: bool = False  # the provisional one before did not survive its test
 
 
 def moved_to(found: Initialisation, last_m: Array) -> Initialisation:
@@ -335,7 +336,10 @@ class Initialiser:
             self._provisional = solution
             self.taken_back += 1
             return replace(
-                found, is_settled=False, reason=f"{found.reason}; the start before was taken back: {contradiction}"
+                found,
+                is_settled=False,
+                takes_back=True,
+                reason=f"{found.reason}; the start before was taken back: {contradiction}",
             )
         if found.scale_sigma > config.settled_scale_sigma and self._window.seen_s < 0.95 * config.mono_window_s:
             return self._refuse("test", f"scale sigma {100.0 * found.scale_sigma:.1f} % while the window grows")

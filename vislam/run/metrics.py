@@ -43,12 +43,14 @@ def initialisation(front: FrontReport, first_ns: int | None) -> dict[str, Any]:
     start = front.start
     if start is None or first_ns is None:
         return {
-            "status": "none", "reason": front.refusal, "t_s": None, "scale_sigma": None, "excitation_m_s2": None,
+            "status": "none", "reason": front.refusal, "t_s": None, "settled_s": None, "scale_sigma": None,
+            "excitation_m_s2": None,
         }  # fmt: skip
     return {
         "status": str(start.status),
         "reason": start.reason,
-        "t_s": (start.last.t_ns - first_ns) * 1e-9,
+        "t_s": ((start.begun_t_ns or start.last.t_ns) - first_ns) * 1e-9,
+        "settled_s": (start.last.t_ns - first_ns) * 1e-9,
         "scale_sigma": start.scale_sigma,
         "excitation_m_s2": start.excitation_m_s2,
     }

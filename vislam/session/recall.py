@@ -109,6 +109,7 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
     return StartFacts(
         str(facts["status"]), str(facts["reason"]), state_from(facts["last"]), float(facts["scale_sigma"]),
         float(facts["excitation_m_s2"]), ImuNoise(**facts["noise"]), state_from(facts["first_state"]),
+        int(facts.get("begun_t_ns", 0)),
     )  # fmt: skip
 
 

@@ -263,7 +263,7 @@ def _start_data(start: StartFacts) -> dict[str, Any]:
     return {
         "status": start.status, "reason": start.reason, "last": state_data(start.last),
         "scale_sigma": start.scale_sigma, "excitation_m_s2": start.excitation_m_s2, "noise": asdict(start.noise),
-        "first_state": state_data(start.first_state),
+        "first_state": state_data(start.first_state), "begun_t_ns": start.begun_t_ns,
     }  # fmt: skip
 
 
