@@ -40,6 +40,8 @@ class Start:
     offset_s: float = 0.0  # what has to be added to the camera's stamps
     tracks: int = 120
     noise: ImuNoise = NOISE
+    told_sigma: float | None = None  # of pixels; None: the true one
+    shaken: tuple[float, float] | None = None  # until these seconds the IMU feels motion by this factor
     gyro_bias: Array = field(init=False)
     accel_bias: Array = field(init=False)
 
@@ -85,6 +87,11 @@ class Start:
         count, rate = round(self.duration_s * 200) + 1, 200.0
         white = np.repeat([self.noise.gyro_noise_density, self.noise.accel_noise_density], 3) * np.sqrt(rate)
         values = np.array([np.concatenate(self.at(k / rate)[2:]) for k in range(count)])
+        if self.shaken is not None:
+            until_s, factor = self.shaken
+            for k in range(round(until_s * rate)):
+                up = self.at(k / rate)[0][2, :3] * GRAVITY_M_S2
+                values[k, 3:] = up + factor * (values[k, 3:] - up)
         values += np.concatenate([self.gyro_bias, self.accel_bias]) + rng.normal(size=(count, 6)) * white
         return [ImuSample(T0_NS + 5_000_000 * k, v[:3].copy(), v[3:].copy()) for k, v in enumerate(values)]
 
@@ -134,14 +141,15 @@ class Start:
             self.frames.append((vo, Observations(ids[followed].astype(np.int64), seen), still))
 
     def run(self, initialiser: Initialiser) -> tuple[Initialisation, list[Initialisation]]:
-        """Feed until the first state; return the last answer and all."""
+        """Feed until a start is settled; return the newest start, or the last answer where there is none, and all."""
         answers: list[Initialisation] = []
         for i, (vo, observations, still) in enumerate(self.frames):
             span = None if i == 0 else self.buffer.span(self.stamps[i - 1], self.stamps[i])
             answers.append(initialiser.add(span, vo, still, observations))
-            if answers[-1].first is not None:
+            if answers[-1].first is not None and answers[-1].is_settled:
                 break
-        return answers[-1], answers
+        starts = [answer for answer in answers if answer.first is not None]
+        return (starts or answers)[-1], answers
 
     def tilt_error_rad(self, state: NavState) -> float:
         """Return the angle between the true and the estimated vertical, in the body."""
@@ -159,4 +167,4 @@ class Start:
 
 
 def initialiser(start: Start, config: InitConfig | None = None) -> Initialiser:
-    return Initialiser(config or InitConfig(), start.noise, GRAVITY_M_S2, T_BODY_CAM, CAMERA, start.pixel_sigma)
+    return Initialiser(config or InitConfig(), start.noise, GRAVITY_M_S2, T_BODY_CAM, CAMERA, start.told_sigma or start.pixel_sigma)

@@ -9,7 +9,7 @@ import pytest
 from inertial_world import GRAVITY_M_S2, NS, T0_NS
 from point_world import KINDS, Start, initialiser
 
-from vislam.config import ImuConfig
+from vislam.config import ImuConfig, InitConfig
 from vislam.frontend.initialisation import Initialisation, Phase
 from vislam.geometry import invert, so3_log
 from vislam.imu import ImuBuffer
@@ -40,8 +40,9 @@ def test_twenty_five_random_starts() -> None:
             if found.last is None:
                 refused.append((kind, answers[-1].cause))
                 continue
+            given = [answer for answer in answers if answer.first is not None]
             print(kind, seed, found.reason)
-            assert not is_wrong(start, found), f"{kind} {seed}: {found.reason}"
+            assert not any(is_wrong(start, answer) for answer in given), f"{kind} {seed}: {found.reason}"
             assert kind in ("static", "moving", "gentle"), f"{kind} {seed} must not be started from: {found.reason}"
             if kind == "static":
                 assert found.status == "static"
@@ -49,12 +50,15 @@ def test_twenty_five_random_starts() -> None:
             if kind == "moving":
                 scale.append(start.scale_error(found))
                 sigmas.append(found.scale_sigma)
-                seconds.append((found.last.t_ns - start.stamps[0]) * 1e-9)
+                assert given[0].last is not None
+                seconds.append((given[0].last.t_ns - start.stamps[0]) * 1e-9)
+                assert found.is_settled and given[0].scale_sigma <= 0.1
     print(f"scale {np.round(100 * np.array(scale), 2)} %, sigmas {np.round(100 * np.array(sigmas), 2)} %")
     print(f"after {seconds} s; refused {refused}")
     assert len(scale) >= 8
     assert np.median(np.abs(scale)) < 0.02
-    assert np.median(seconds) <= 3.0
+    assert np.median(seconds) <= 2.0
+    assert np.max(seconds) <= 3.0
     assert all(cause == "parallax" for kind, cause in refused if kind == "rotation")
     assert all(cause in ("excitation", "points") for kind, cause in refused if kind in ("uniform", "accelerating"))
 
@@ -82,6 +86,44 @@ def test_the_search_is_a_state_machine_that_counts_its_refusals() -> None:
     assert search.add(None, lost, False, observations).reason == "vision is lost"
     assert search.phase is Phase.EMPTY
     assert search.refusals == {"duration": 1, "vision": 1}
+
+
+@pytest.mark.parametrize("sigma", [0.15, 0.3])
+def test_tracks_that_are_better_than_told_start_as_well(sigma: float) -> None:
+    """The told noise of a pixel is a bound for a class of trackers; what counts is what this one does."""
+    for seed in range(4):
+        start = Start("moving", seed, duration_s=5.0, pixel_sigma=sigma, told_sigma=1.0)
+        found, answers = start.run(initialiser(start))
+        assert found.is_settled and found.last is not None, answers[-1].reason
+        print(f"{100 * start.scale_error(found):+.2f} % of {100 * found.scale_sigma:.2f} %, {found.reason}")
+        assert abs(start.scale_error(found)) < 3.0 * found.scale_sigma
+        assert abs(start.scale_error(found)) < 0.05
+
+
+def test_a_start_that_the_next_second_contradicts_is_taken_back() -> None:
+    """An accelerometer that felt motion half too strongly until shortly after the start: its scale does not last."""
+    search, start = None, None
+    taken_back, wrong = 0, 0
+    for seed in (1, 3, 5, 6):
+        start = Start("moving", seed, duration_s=8.0, shaken=(1.8, 1.6))
+        search = initialiser(start, InitConfig(mono_window_s=3.0))
+        found, answers = start.run(search)
+        retaken = [answer for answer in answers if answer.takes_back]
+        assert len(retaken) == search.taken_back
+        assert all("was taken back: " in answer.reason and not answer.is_settled for answer in retaken)
+        taken_back += search.taken_back
+        wrong += found.is_settled and is_wrong(start, found)
+    assert taken_back >= 2
+    assert wrong == 0
+
+
+def test_nobody_who_accelerates_is_told_to() -> None:
+    for seed in range(3):
+        start = Start("moving", seed, duration_s=4.0, pixel_sigma=2.5)
+        _, answers = start.run(initialiser(start))
+        asked = {answer.reason for answer in answers if "speed up" in answer.reason or "accelerat" in answer.reason}
+        assert all("acceleration changes by" in reason for reason in asked)
+        assert not any(answer.excitation_m_s2 > 0.45 and "speed up" in answer.reason for answer in answers)
 
 
 def test_an_accelerometer_in_g_is_never_started_from() -> None:
