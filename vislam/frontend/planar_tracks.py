@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vislam.camera import Camera
 from vislam.config import FrontEndConfig
 from vislam.features import FlowSettings, follow
+from vislam.frontend.brightness import matched
 from vislam.frontend.landmarks import UNKNOWN_RHO, Landmarks, fuse, move
 from vislam.frontend.planar_fit import FloorPair
 from vislam.frontend.planar_floor import Regions
@@ -184,7 +185,8 @@ class Steps:
         """Return where the tracks are now: [N, 2], NaN where lost."""
         if self._image is None or not frame.images:
             return np.full_like(self._pixels, np.nan)
-        self._pixels = follow(self._image, frame.images[0], self._pixels, self._pixels, self._flow)[0]
+        source = matched(self._image, frame.images[0], self._pixels, self._pixels, self._flow.window_px)
+        self._pixels = follow(source, frame.images[0], self._pixels, self._pixels, self._flow)[0]
         self._image = frame.images[0]
         return self._pixels
 

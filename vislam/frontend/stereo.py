@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.config import FrontEndConfig
 from vislam.features import FlowSettings, follow
+from vislam.frontend.brightness import matched
 from vislam.frontend.depth import DepthReading
 from vislam.frontend.tracker import given_rows
 from vislam.geometry import invert
@@ -57,7 +58,8 @@ class StereoDepth:
             best = np.full(len(pixels), np.inf)
             for start_rho in self._starts(expected_rho):
                 guess = self._right.project(rays + start_rho[:, None] * self._T_right_left[:3, 3])
-                found, difference = follow(left, right, pixels, guess, self._flow)
+                source = matched(left, right, pixels, guess, self._flow.window_px)
+                found, difference = follow(source, right, pixels, guess, self._flow)
                 candidate_rho = self._accepted(rays, found)
                 better = np.isfinite(candidate_rho) & (difference < best)
                 right_px[better], rho[better], best[better] = found[better], candidate_rho[better], difference[better]

@@ -1,7 +1,8 @@
 """Tracks: corners of the keyframe that are followed into every later frame, with ids that outlive keyframes.
 
 Every frame is matched against the keyframe's image, not against the previous frame: errors do not add up between
-keyframes, and a track that one blurred frame loses is found again in the next.
+keyframes, and a track that one blurred frame loses is found again in the next. Where the exposure has changed since,
+the keyframe's image is made as bright as the frame's.
 
 A frame may bring points that were followed elsewhere (`Frame.tracks`). Then those take the place of corners and of
 Lucas-Kanade, and keep their ids; once such a track has been dropped it is not taken up again under the same id.
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.features import FlowSettings, detect_corners, follow
+from vislam.frontend.brightness import matched
 from vislam.messages import Array, Frame, ImageU8, Observations
 
 Bools = NDArray[np.bool_]
@@ -56,7 +58,8 @@ class Tracker:
             return given_rows(frame.tracks, frame.tracks.pixels_px, self.ids)
         if self._image is None:
             return np.full((len(self), 2), np.nan)
-        return follow(self._image, frame.images[0], self.pixels, guess, self._flow)[0]
+        source = matched(self._image, frame.images[0], self.pixels, guess, self._flow.window_px)
+        return follow(source, frame.images[0], self.pixels, guess, self._flow)[0]
 
     def follow_warped(self, frame: Frame, guess: Array, on_plane: Bools, H: Array) -> Array:
         """Return the same where tracks `on_plane` [N] lie on a plane whose homography is about H [3, 3].
@@ -72,6 +75,7 @@ class Tracker:
         warped = np.asarray(cv2.warpPerspective(self._image, H, (width, height), flags=flags), dtype=np.uint8)
         at = np.column_stack([self.pixels[on_plane], np.ones(int(on_plane.sum()))]) @ H.T
         source = at[:, :2] / np.where(at[:, 2:] > 0.0, at[:, 2:], np.nan)
+        warped = matched(warped, frame.images[0], source, guess[on_plane], self._flow.window_px)
         found[on_plane] = follow(warped, frame.images[0], source, guess[on_plane], self._flow)[0]
         return found
 
