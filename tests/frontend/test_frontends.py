@@ -42,7 +42,8 @@ def motions(
         if result.vo.T_keyframe_body is not None and key:
             pairs.append((invert(key[result.vo.keyframe_id]) @ T, result.vo.T_keyframe_body, result))
         if result.keyframe is not None:
-            assert result.keyframe.frame is frame
+            whole = result.keyframe.frame
+            assert whole.index == frame.index and all(a is b for a, b in zip(whole.images, frame.images, strict=True))
             key[result.keyframe.id] = T
     return pairs
 

@@ -12,7 +12,7 @@ from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import FrontEnd, TrackResult
 from vislam.frontend.rgbd import ImageDepth
-from vislam.frontend.stereo import StereoDepth
+from vislam.frontend.view import View, stereo_views
 from vislam.imu import ImuNoise
 
 __all__ = ["FrontEnd", "TrackResult", "lasting_scale_sigma", "make_frontend", "mode_for"]
@@ -21,13 +21,13 @@ __all__ = ["FrontEnd", "TrackResult", "lasting_scale_sigma", "make_frontend", "m
 def _rgbd(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
     if not rig.has_depth:
         raise UsageError("front end 'rgbd' needs depth images, this recording has none; use --frontend.mode auto")
-    return MetricFrontEnd("rgbd", config, rig, ImageDepth(config), seed)
+    return MetricFrontEnd("rgbd", config, rig, (View(rig.cameras[0], rig.T_body_cams[0], ImageDepth(config)),), seed)
 
 
 def _stereo(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
     if not rig.is_stereo:
         raise UsageError("front end 'stereo' needs two cameras, this recording has one; use --frontend.mode auto")
-    return MetricFrontEnd("stereo", config, rig, StereoDepth(rig, config), seed)
+    return MetricFrontEnd("stereo", config, rig, stereo_views(rig, config), seed)
 
 
 FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import FrontEndConfig
-from vislam.frontend.depth import DepthReading, DepthSensor
+from vislam.frontend.depth import DepthReading
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.landmarks import Landmarks, fuse, move
@@ -19,6 +19,7 @@ from vislam.frontend.refine import PoseEstimate, extra_parameter, refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
 from vislam.frontend.shutter import Shutter
 from vislam.frontend.tracker import Tracker
+from vislam.frontend.view import View, sees
 from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
 from vislam.memory import FrontNews
 from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
@@ -32,6 +33,7 @@ _ASTRAY_PX = 6.0  # from where a filter that knows its motion expects a track: i
 _CONTRADICTS = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
 _MIN_AS_EXPECTED = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
 _FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
+_DEEP = 0.02  # of a keyframe's tracks are given depth at least, or its sensor is covered: wrong matches alone are fewer
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
 
@@ -59,14 +61,14 @@ class _Attempt:
 class MetricFrontEnd:
     """Frame-to-keyframe odometry on inverse-depth landmarks that are carried and improved from keyframe to keyframe."""
 
-    def __init__(self, mode: str, config: FrontEndConfig, rig: Rig, depth: DepthSensor, seed: int) -> None:
-        """Take the sensor that measures depth; `mode` is only the name."""
+    def __init__(self, mode: str, config: FrontEndConfig, rig: Rig, views: tuple[View, ...], seed: int) -> None:
+        """Take the cameras to look through, the usual one first; `mode` is only the name."""
         self.mode = mode
         self.keyframe_spacing = 1.0
         self._config = config
-        self._camera = rig.cameras[0]
-        self._T_body_cam = rig.T_body_cams[0]
-        self._depth = depth
+        self._views = views
+        self._view = views[0]
+        self._camera, self._T_body_cam, self._depth = views[0].camera, views[0].T_body_cam, views[0].depth
         self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
@@ -79,8 +81,11 @@ class MetricFrontEnd:
         self._keyframe_tracks = 0
         self._keyframe_twist: Array = np.zeros(6)
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
+        self._key_sees = True  # whether the usual camera sees anything in the keyframe
+        self._now_sees = True  # and in this frame; only asked while another camera is looked through
         self._t_placed_ns = -1  # of the last frame that was placed
         self._lost = False
+        self._lacks_depth = False  # hardly a track of the keyframe was given depth when it began
         self._blind = False  # the keyframe is the first and has no depth
         self._blind_px: Array = np.empty((0, 2))  # where its tracks were last seen
 
@@ -88,14 +93,19 @@ class MetricFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
     ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
-        frame, dt_s = self._intake.accept(frame)
+        whole, dt_s = self._intake.accept(frame)
         if self._keyframe is None:
-            return self._start(frame, "")
+            return self._start(whole, "")
+        self._look_back(whole, self._keyframe)
+        frame = self._view.of(whole)
         T_before = self._T_key_cam
         T_guess = T_before @ self._predictor.predict(dt_s, imu)
         if self._blind:
             return self._leave_blindness(frame, self._keyframe, T_guess)
         attempt = self._attempt(frame, T_before, T_guess, dt_s)
+        other = self._by_other_camera(whole, self._keyframe, T_guess, dt_s) if attempt.failure else None
+        if other is not None:
+            frame, T_before, attempt = self._view.of(whole), self._T_key_cam, other
         if T_last_now is not None:
             T_expected = T_before @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
             attempt = self._confirmed(attempt, frame, T_before, T_expected, dt_s)
@@ -226,6 +236,90 @@ class MetricFrontEnd:
         )
         self._shutter.learn(*change)
 
+    # -- looking through another camera ------------------------------------------------------------------------------
+
+    def _look_through(self, view: View) -> None:
+        """Let another camera of the rig be the one that is followed; what is known of the keyframe stays behind."""
+        if view is self._view:
+            return
+        T_cam_other = invert(self._T_body_cam) @ view.T_body_cam
+        back = se3_adjoint(np.asarray(invert(T_cam_other)))
+        self._T_key_cam = invert(T_cam_other) @ self._T_key_cam @ T_cam_other
+        self._keyframe_twist = back @ self._keyframe_twist
+        self._predictor.look_through(view.T_body_cam, np.asarray(T_cam_other))
+        self._shutter.look_through(view.camera)
+        self._sigma_xy = self._config.track_sigma_px / view.camera.fx
+        self._now_sees = not view.is_swapped
+        self._view, self._camera, self._T_body_cam, self._depth = view, view.camera, view.T_body_cam, view.depth
+
+    def _carry_keyframe(self, view: View, keyframe: Keyframe) -> None:
+        """Look through another camera at the same keyframe; landmarks that it does not see to the pixel get NaN."""
+        landmarks = Landmarks()
+        landmarks.mean, landmarks.covariance = self._view.carry(self._landmarks.mean, self._landmarks.covariance, view)
+        self._look_through(view)
+        vague = view.camera.fx * _spread(landmarks.covariance) > self._config.epipolar_gate_px
+        landmarks.mean[vague] = np.nan
+        # from here on the landmark is the patch at this place, and no longer the one that the other camera saw
+        rho_variance = landmarks.covariance[:, 2, 2].copy()
+        landmarks.covariance = np.zeros_like(landmarks.covariance)
+        landmarks.covariance[:, 0, 0] = landmarks.covariance[:, 1, 1] = (_CORNER_SIGMA * self._sigma_xy) ** 2
+        landmarks.covariance[:, 2, 2] = rho_variance
+        self._landmarks = landmarks
+        pixels = self._shutter.project(landmarks.mean, self._keyframe_twist)
+        pixels[~view.camera.contains(pixels)] = np.nan
+        self._tracker.look_through(view.of(keyframe.frame).images[0], pixels)
+
+    def _by_other_camera(self, whole: Frame, keyframe: Keyframe, T_guess: Array, dt_s: float) -> _Attempt | None:
+        """Place the frame by the other camera and go on looking through it; None, and nothing changed, if that fails.
+
+        Which camera is covered is not asked of its image: what counts is which one can be followed.
+        """
+        before = self._view
+        if min(len(self._views), len(whole.images), len(keyframe.frame.images)) < 2:
+            return None
+        if before.is_swapped and not self._key_sees:
+            return None
+        other = self._views[not before.is_swapped]
+        T_key_cam, landmarks, pixels = self._T_key_cam, self._landmarks, self._tracker.pixels
+        T_cam_other = invert(before.T_body_cam) @ other.T_body_cam
+        self._carry_keyframe(other, keyframe)
+        T_guess = np.asarray(invert(T_cam_other) @ T_guess @ T_cam_other)
+        attempt = self._attempt(other.of(whole), self._T_key_cam, T_guess, dt_s)
+        if not attempt.failure:
+            return attempt
+        self._look_through(before)
+        self._T_key_cam, self._landmarks = T_key_cam, landmarks
+        self._tracker.look_through(before.of(keyframe.frame).images[0], pixels)
+        return None
+
+    def _look_back(self, whole: Frame, keyframe: Keyframe) -> None:
+        """Go back to the usual camera as soon as it sees again, if the keyframe has anything in its image."""
+        if not self._view.is_swapped:
+            return
+        self._now_sees = sees(whole.images[0], self._config)
+        if self._now_sees and self._key_sees:
+            self._carry_keyframe(self._views[0], keyframe)
+
+    def _sees_again(self, frame: Frame) -> str:
+        """Return which camera was covered in the keyframe and sees again, or an empty string: a reason for another."""
+        if self._view.is_swapped:
+            return "cam0 sees again" if self._now_sees else ""
+        lost_depth = self._lacks_depth and min(len(self._views), len(frame.images)) > 1
+        return "cam1 sees again" if lost_depth and sees(frame.images[1], self._config) else ""
+
+    def _as_cam0_would(self, ids: NDArray[np.int64], xy: Array, means: Array, covariances: Array) -> Observations:
+        """Return what cam0 would see of tracks [N] that cam1 sees at `xy` [N, 2], where their depth tells it.
+
+        The depth is that of landmarks `means` [N, 3] of the same instant, with covariances [N, 3, 3].
+        """
+        covariance = np.zeros_like(covariances)
+        covariance[:, 2, 2] = covariances[:, 2, 2]
+        points, covariance = self._view.carry(np.column_stack([xy, means[:, 2]]), covariance, self._views[0])
+        usual = self._views[0].camera
+        pixels = usual.project(np.column_stack([points[:, :2], np.ones(len(points))]))
+        told = usual.contains(pixels) & (usual.fx * _spread(covariance) < self._config.epipolar_gate_px)
+        return Observations(ids[told], pixels[told])
+
     # -- what comes of it --------------------------------------------------------------------------------------------
 
     def _report(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt) -> TrackResult:
@@ -240,6 +334,7 @@ class MetricFrontEnd:
             restarted=self._since_restart < self._config.restart_keyframes,
         )
         reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
+        reason = self._sees_again(frame) or reason
         if reason:
             new, observations = self._continue_from(frame, attempt)
             return TrackResult(vo, observations, new, departure.parallax_px, reason)
@@ -247,11 +342,18 @@ class MetricFrontEnd:
         observations = Observations(
             self._tracker.ids[good].copy(), attempt.pixels[good], instant_px=self._instant_px(attempt.xy[good])
         )
+        if self._view.is_swapped:
+            seen = move(self._landmarks.mean[good], self._landmarks.covariance[good], self._T_key_cam)
+            observations = self._as_cam0_would(observations.track_ids, attempt.xy[good], *seen)
         self._landmarks.keep(self._tracker.judge(good))
         return TrackResult(vo, observations, None, departure.parallax_px, self._weakness(attempt))
 
     def _weakness(self, attempt: _Attempt) -> str:
         """Return why the tracking is degraded, or an empty string."""
+        if self._view.is_swapped:
+            return "cam0 sees nothing; cam1 is followed"
+        if self._lacks_depth:
+            return "the keyframe has no depth of its own"
         if attempt.inliers < self._config.degraded_inliers:
             return f"only {attempt.inliers} inliers"
         if attempt.inliers < self._config.degraded_inlier_ratio * attempt.followed:
@@ -327,6 +429,8 @@ class MetricFrontEnd:
         last_id = self._keyframe.id if self._keyframe is not None else -1
         self._tracker.forget()
         self._landmarks = Landmarks()
+        frame = self._view.of(frame)
+        self._look_through(self._views[0])
         count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         reading = self._add_landmarks(frame, count, np.zeros(6))
         lack = self._lack(frame, last_id)
@@ -337,6 +441,7 @@ class MetricFrontEnd:
             return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {lack}" if failure else lack)
         self._predictor.forget()
         self._lost = False
+        self._lacks_depth = False
         self._blind, self._blind_px = not self._depth.available(frame), self._tracker.pixels.copy()
         keyframe = self._install(frame, np.zeros(6))
         observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
@@ -375,7 +480,9 @@ class MetricFrontEnd:
         fresh = self._add_landmarks(frame, count, attempt.twist_per_s)
         seen_at = np.vstack([attempt.pixels[kept], self._tracker.pixels[len(self._tracker) - count :]])
         instant = np.vstack([attempt.xy[kept], landmarks.mean[len(landmarks.mean) - count :, :2]])
-        observations = self._observations(seen_at, reading.joined(fresh), instant)
+        measured = reading.joined(fresh)
+        self._lacks_depth = len(measured.rho) > np.isfinite(measured.rho).sum() / _DEEP
+        observations = self._observations(seen_at, measured, instant)
         return self._install(frame, attempt.twist_per_s), observations
 
     def _add_landmarks(self, frame: Frame, count: int, twist_per_s: Array) -> DepthReading:
@@ -394,6 +501,8 @@ class MetricFrontEnd:
     def _observations(self, pixels: Array, reading: DepthReading, xy: Array) -> Observations:
         """Return what a keyframe sees: raw pixels [N, 2] and directions [N, 2] of the middle row's time."""
         ids = self._tracker.ids.copy()
+        if self._view.is_swapped:
+            return self._as_cam0_would(ids, xy, self._landmarks.mean, self._landmarks.covariance)
         return Observations(ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self._instant_px(xy))
 
     def _instant_px(self, xy: Array) -> Array | None:
@@ -402,20 +511,29 @@ class MetricFrontEnd:
         return self._camera.project(np.column_stack([xy, np.ones(len(xy))]))
 
     def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
+        whole, usual = self._view.of(frame), self._views[0]
+
         def measure_depth(pixels: Array, ids: NDArray[np.int64] | None) -> Array:
-            xy = self._camera.normalise(pixels)
-            return self._depth.measure(frame, pixels, xy, self._landmarks.expected_rho(xy), ids).depth_m
+            xy = usual.camera.normalise(pixels)
+            expected_rho = self._landmarks.expected_rho(xy)
+            return usual.depth.measure(whole, pixels, xy, expected_rho, ids).depth_m
 
         new_id = self._keyframe.id + 1 if self._keyframe is not None else self._first_id
         features = self._config.described_features
-        keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, measure_depth)
+        keyframe = make_keyframe(new_id, whole, usual.camera, usual.T_body_cam, features, measure_depth)
         self._keyframe = keyframe
         self._since_restart += 1
         self._keyframe_tracks = len(self._tracker)
         self._keyframe_twist = twist_per_s
+        self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)
         self._t_placed_ns = frame.t_ns
         return keyframe
+
+
+def _spread(covariances: Array) -> Array:
+    """Return how far directions [N] scatter, of landmarks with covariances [N, 3, 3]."""
+    return np.asarray(np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))
 
 
 def _points(inverse_depth: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from vislam.geometry import invert, se3_exp, se3_log, so3_exp
+from vislam.geometry import invert, se3_adjoint, se3_exp, se3_log, so3_exp
 from vislam.messages import Array, ImuSpan
 
 
@@ -36,6 +36,11 @@ class MotionPredictor:
     def forget(self) -> None:
         """Assume a camera at rest, as after a loss."""
         self._twist_per_s = np.zeros(6)
+
+    def look_through(self, T_body_cam: Array, T_cam_other: Array) -> None:
+        """Go on predicting for another camera of the same body, at T_cam_other [4, 4] as the present one sees it."""
+        self._R_body_cam = T_body_cam[:3, :3].copy()
+        self._twist_per_s = se3_adjoint(np.asarray(invert(T_cam_other))) @ self._twist_per_s
 
     def observe(self, T_before_now: Array, dt_s: float) -> None:
         """Take note of the motion [4, 4] that was measured over `dt_s` seconds."""

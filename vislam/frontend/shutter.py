@@ -43,6 +43,10 @@ class Shutter:
         """Whether the readout is estimated."""
         return not self._known
 
+    def look_through(self, camera: Camera) -> None:
+        """Go on with another camera of the same make."""
+        self._camera = camera
+
     def start_at(self, readout_s: float) -> None:
         """Take the readout that an earlier run had learned, to be learned further."""
         if not self._known:

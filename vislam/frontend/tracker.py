@@ -79,6 +79,13 @@ class Tracker:
         found[on_plane] = follow(warped, frame.images[0], source, guess[on_plane], self._flow)[0]
         return found
 
+    def look_through(self, image: ImageU8, pixels: Array) -> None:
+        """Follow the same tracks in another camera from now on: its keyframe `image`, and where it sees them [N, 2].
+
+        A track that it does not see has NaN, is not found, and leaves after its misses.
+        """
+        self._image, self.pixels = image, pixels
+
     def judge(self, good: Bools) -> Bools:
         """Count misses of tracks that are not `good` [N] in this frame and drop those with too many.
 
