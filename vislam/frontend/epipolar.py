@@ -86,6 +86,19 @@ def refine_two_view(
     return TwoViewEstimate(R, t, covariance, inliers, bool(converged))
 
 
+def epipolar_distances(T_key_cam: Array, key_xy: Array, xy: Array) -> Array:
+    """Return how far points [N] seen at `xy` [N, 2] are from the epipolar lines of `key_xy` [N, 2], on z = 1.
+
+    NaN where a point was not found, and everywhere if T_key_cam [4, 4] has no translation.
+    """
+    t = np.ascontiguousarray(T_key_cam[:3, 3])
+    length = float(np.linalg.norm(t))
+    if length == 0.0:
+        return np.full(len(xy), np.nan)
+    R, t = np.ascontiguousarray(T_key_cam[:3, :3]), t / length
+    return np.asarray(_linearise(R, t, tangent_basis(t), np.ascontiguousarray(key_xy), xy, 1.0)[0])
+
+
 def essential_ransac(
     R_guess: Array, key_xy: Array, xy: Array, threshold: float, min_inliers: int
 ) -> tuple[Array, Array] | None:

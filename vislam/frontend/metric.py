@@ -10,15 +10,17 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.config import FrontEndConfig
 from vislam.frontend.depth import DepthReading
+from vislam.frontend.epipolar import epipolar_distances
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.landmarks import Landmarks, fuse, move
 from vislam.frontend.locate import pnp_ransac, recognise
+from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor, body_motion
 from vislam.frontend.refine import PoseEstimate, extra_parameter, refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
 from vislam.frontend.shutter import Shutter
-from vislam.frontend.tracker import Tracker
+from vislam.frontend.tracker import Tracker, given_rows
 from vislam.frontend.view import View, sees
 from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
 from vislam.memory import FrontNews
@@ -71,6 +73,7 @@ class MetricFrontEnd:
         self._camera, self._T_body_cam, self._depth = views[0].camera, views[0].T_body_cam, views[0].depth
         self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
+        self._noise = PixelNoise(config.track_sigma_px)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
         self._shutter = Shutter(self._camera, config.readout_s)
         self._sigma_xy = config.track_sigma_px / self._camera.fx
@@ -93,6 +96,10 @@ class MetricFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
     ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
+        result = self._track(frame, imu, T_last_now)
+        return replace(result, sigma_px=self._noise.sigma_px)
+
+    def _track(self, frame: Frame, imu: ImuSpan | None, T_last_now: Array | None) -> TrackResult:
         whole, dt_s = self._intake.accept(frame)
         if self._keyframe is None:
             return self._start(whole, "")
@@ -122,6 +129,7 @@ class MetricFrontEnd:
         self._lost = False
         self._t_placed_ns = frame.t_ns
         self._learn_shutter(attempt)
+        self._learn_noise(attempt, self._keyframe)
         return self._report(frame, self._keyframe, attempt)
 
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
@@ -221,6 +229,14 @@ class MetricFrontEnd:
         return recognise(
             keyframe, frame.images[0], self._camera, self._T_body_cam, config.described_features, config.min_inliers
         )
+
+    def _learn_noise(self, attempt: _Attempt, keyframe: Keyframe) -> None:
+        """Take note of the distances from epipolar lines."""
+        key_xy, ends = self._landmarks.mean[:, :2], 1.0
+        if keyframe.frame.tracks is not None:  # as it was seen there, not as it was improved: its noise is then known
+            given = keyframe.frame.tracks
+            key_xy, ends = self._camera.normalise(given_rows(given, given.pixels_px, self._tracker.ids)), 2.0
+        self._noise.learn(epipolar_distances(self._T_key_cam, key_xy, attempt.xy), self._camera, attempt.xy, ends)
 
     def _learn_shutter(self, attempt: _Attempt) -> None:
         """Let the shear that is left in this frame correct the readout time."""

@@ -12,12 +12,14 @@ from vislam.frontend.epipolar import (
     RotationPrior,
     TwoViewEstimate,
     direction_given_rotation,
+    epipolar_distances,
     essential_ransac,
     from_epipolar_segment,
     refine_two_view,
 )
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
+from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.refine import refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
@@ -74,6 +76,7 @@ class MonoFrontEnd:
         self._R_body_cam = np.ascontiguousarray(self._T_body_cam[:3, :3])
         self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
+        self._noise = PixelNoise(config.track_sigma_px)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
         self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
         self._min_parallax_px = config.mono_min_parallax_px
@@ -94,6 +97,12 @@ class MonoFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
     ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
+        result = self._track(frame, imu, gyro_sigma_rad_s, T_last_now)
+        return replace(result, sigma_px=self._noise.sigma_px)
+
+    def _track(
+        self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float, T_last_now: Array | None
+    ) -> TrackResult:
         frame, dt_s = self._intake.accept(frame)
         # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy there as here
         given = _BOTH_ENDS if frame.tracks is not None else 1.0
@@ -121,6 +130,7 @@ class MonoFrontEnd:
             self._predictor.observe(transform(R_before.T @ self._R_key_cam, np.zeros(3)), dt_s)
         self._lost = False
         self._t_placed_ns = frame.t_ns
+        self._learn_noise(motion, given**2)
         return self._report(frame, self._keyframe, motion)
 
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
@@ -238,6 +248,12 @@ class MonoFrontEnd:
             if found.converged >= best.converged and found.inliers.sum() > best.inliers.sum():
                 best = found
         return best
+
+    def _learn_noise(self, motion: _Motion, ends: float) -> None:
+        """Take note of the distances from epipolar lines; without a direction there are none."""
+        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(motion.pixels)
+        T_key_cam = np.asarray(transform(motion.view.R_key_cam, motion.view.direction_key))
+        self._noise.learn(epipolar_distances(T_key_cam, key_xy, xy), self._camera, xy, ends)
 
     def _parallax_px(self, R_key_cam: Array, key_xy: Array, xy: Array) -> float:
         moved = self._moved_xy(R_key_cam, key_xy, xy)

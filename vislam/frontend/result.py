@@ -23,6 +23,7 @@ class TrackResult:
     keyframe: Keyframe | None
     median_parallax_px: float  # since the keyframe that `vo` refers to, rotation taken out; 0 when nothing was followed
     reason: str  # why tracking is not ok, or why the frame became a keyframe; empty otherwise
+    sigma_px: float = float("nan")  # of a track's pixel, as this run showed it up to now; told until enough was seen
 
 
 class FrontEnd(Protocol):

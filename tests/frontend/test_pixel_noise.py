@@ -1,0 +1,69 @@
+"""The noise of tracks is measured while running: on points of known noise, and on drawn images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_frontends import recording, run
+
+from vislam.camera import Camera
+from vislam.config import FrontEndConfig
+from vislam.frontend import make_frontend
+from vislam.frontend.pixel_noise import PixelNoise
+from vislam.messages import Frame
+from vislam.sim import open_points
+
+UNIT = Camera(100, 100, 1.0, 1.0, 50.0, 50.0)  # a pixel is as long as a distance on z = 1
+NOWHERE = np.zeros((200, 2))
+
+
+def measured_px(rig: str, pixel_sigma_px: float, told_px: float = 1.0) -> float:
+    points = open_points("handheld-room", seed=1, rig=rig, duration_s=8.0, pixel_sigma_px=pixel_sigma_px)
+    front_end = make_frontend(FrontEndConfig(track_sigma_px=told_px), points.rig, 0)
+    results = [front_end.track(event, None) for event in points.events() if isinstance(event, Frame)]
+    assert results[0].sigma_px == told_px  # nothing seen yet
+    return results[-1].sigma_px
+
+
+@pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])
+@pytest.mark.parametrize("pixel_sigma_px", [0.2, 0.5, 1.0])
+def test_the_noise_of_given_tracks_is_found_whatever_was_told(rig: str, pixel_sigma_px: float) -> None:
+    assert measured_px(rig, pixel_sigma_px) == pytest.approx(pixel_sigma_px, rel=0.2)
+
+
+@pytest.mark.parametrize("kind", ["mono", "stereo", "rgbd"])
+def test_drawn_corners_scatter_little_and_more_in_noisier_images(kind: str) -> None:
+    world, frames, _ = recording(kind)
+    rng = np.random.default_rng(3)
+
+    def noisy(frame: Frame) -> Frame:
+        grey = [np.clip(i + rng.normal(0.0, 12.0, i.shape), 0, 255).astype(np.uint8) for i in frame.images]
+        return replace(frame, images=tuple(grey))
+
+    clean = run(kind, frames)[-1].sigma_px
+    assert 0.02 < clean < 0.35
+    assert run(kind, [noisy(f) for f in frames])[-1].sigma_px > 1.3 * clean
+    assert world is not None
+
+
+def test_outliers_and_single_bad_frames_hardly_move_it() -> None:
+    rng, noise = np.random.default_rng(5), PixelNoise(1.0)
+    for frame in range(150):
+        distances = rng.normal(0.0, 0.3, 200)
+        distances[:20] = rng.uniform(-20.0, 20.0, 20)
+        distances[30:40] = np.nan
+        noise.learn(distances * (5.0 if frame % 30 == 7 else 1.0), UNIT, NOWHERE)
+    assert noise.sigma_px == pytest.approx(0.3, rel=0.3)
+
+
+def test_few_tracks_or_few_frames_leave_what_was_told() -> None:
+    rng, noise = np.random.default_rng(5), PixelNoise(0.7)
+    for _ in range(9):
+        noise.learn(rng.normal(0.0, 0.2, 100), UNIT, NOWHERE[:100])
+    for _ in range(50):
+        noise.learn(rng.normal(0.0, 0.2, 20), UNIT, NOWHERE[:20])
+    assert noise.sigma_px == 0.7 and not noise.is_learnt
+    noise.learn(rng.normal(0.0, 0.2, 100), UNIT, NOWHERE[:100])
+    assert noise.is_learnt and noise.sigma_px < 0.3

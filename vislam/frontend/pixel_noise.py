@@ -1,0 +1,76 @@
+"""How much tracks scatter in this run, as the distances from their epipolar lines show it.
+
+Depth errs along the epipolar line, so across it nothing is left but the noise of the pixels themselves, whatever is
+known of the landmarks; and the same holds with one camera. Tracks that went astray are trimmed by what the others show,
+not by what was told. Frames are averaged in the logarithm, over some seconds, so that one blurred frame does not make
+the run noisy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.camera import Camera
+from vislam.messages import Array
+
+_MEDIAN_ABS = 0.6745  # of a normal distribution, in standard deviations
+_TRIM = 2.0  # standard deviations
+_TRIMMED_RMS = 0.8796  # of a standard normal distribution within the trim
+_STEPS = 4
+_MIN_TRACKS = 30  # of a frame that says something
+_MIN_FRAMES = 10  # before what was measured goes before what was told
+_MEMORY_FRAMES = 200  # over which is averaged: blur and light change within seconds
+_MIN_PX = 0.02  # of a frame: simulated pixels without any noise
+_PARAMETERS = 5  # of the motion that the same tracks were fitted with
+
+
+def _spread_px(lengths: Array) -> float:
+    """Return the standard deviation behind absolute distances [N] of which some are gross errors.
+
+    It starts from the median, which outliers of one share in ten raise by an eighth, and goes on with what lies within
+    the trim, corrected for the tails that a normal distribution loses there.
+    """
+    sigma = float(np.median(lengths)) / _MEDIAN_ABS
+    for _ in range(_STEPS):
+        within = lengths[lengths <= _TRIM * sigma]
+        if len(within) == 0:
+            break
+        sigma = float(np.sqrt(np.mean(within**2))) / _TRIMMED_RMS
+    return sigma
+
+
+class PixelNoise:
+    """Learns the standard deviation of a track's pixel, in x and in y, from frame to frame."""
+
+    def __init__(self, told_px: float) -> None:
+        """Start from the `told_px` of the configuration."""
+        self._told_px = told_px
+        self._log_px = 0.0
+        self._frames = 0
+
+    @property
+    def is_learnt(self) -> bool:
+        """Whether enough frames were measured."""
+        return self._frames >= _MIN_FRAMES
+
+    @property
+    def sigma_px(self) -> float:
+        """The standard deviation: measured, or as told while too little was seen."""
+        return float(np.exp(self._log_px)) if self.is_learnt else self._told_px
+
+    def learn(self, distances: Array, camera: Camera, xy: Array, ends: float = 1.0) -> None:
+        """Take a frame's distances [N] of tracks at `xy` [N, 2] from their epipolar lines; NaN where there is none.
+
+        Distances and places are on z = 1; the camera's lens says how many pixels that is there. `ends` are the variances of such a distance in those of one pixel: 1 where the place in the
+        keyframe is the track by definition, 2 where it is as noisy as the one in the frame.
+        """
+        seen = np.isfinite(distances)
+        if seen.sum() < _MIN_TRACKS:
+            return
+        J = camera.project_jacobian(np.column_stack([xy[seen], np.ones(int(seen.sum()))]))[:, :, :2]
+        px = np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]))
+        scaled = np.abs(distances[seen]) * px / np.sqrt(ends)
+        freedom = len(scaled) / (len(scaled) - _PARAMETERS)
+        measured_px = max(_spread_px(scaled) * np.sqrt(freedom), _MIN_PX)
+        self._frames += 1
+        self._log_px += (np.log(measured_px) - self._log_px) / min(self._frames, _MEMORY_FRAMES)
