@@ -53,10 +53,12 @@ class PowerUpConfig:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeConfig:
-    """Attitude from gyro, accelerometer and magnetometer, the baseline without vision; numbers of VQF are its paper's."""
+    """Attitude without vision; numbers of VQF are its paper's unless a reason is given."""
 
     method: Literal["vqf", "complementary"] = "vqf"  # complementary: Karpov 2026, the paper's cart
-    mag_gate: float = 0.1  # relative change of the field's norm: iron or a motor is near; of complementary also of its z
+    mag_gate: float = (
+        0.1  # relative change of the field's norm: iron or a motor is near; of complementary also of its z
+    )
 
     tilt_floor_deg: float = 0.4  # vqf publishes it, and what motion does on top: 0.05 m/s^2 of bias is 0.3 deg
     tau_s: float = 3.0  # vqf: the force is averaged over it, at least
@@ -80,13 +82,14 @@ class AttitudeConfig:
     mag_reference_tau_s: float = 20.0  # over which norm and dip of the reference follow
     mag_dip_gate_deg: float = 10.0  # as `mag_gate`, of the dip
     mag_undisturbed_s: float = 0.5  # the field is trusted after being like the reference for so long
-    mag_new_s: float = 20.0  # another field becomes the reference after so long of turning in it,
-    mag_first_s: float = 5.0  # the first one sooner,
+    mag_new_s: float = 20.0  # another field becomes the reference after so long of turning in it
     mag_new_rate_deg_s: float = 20.0  # at least as fast as this: what the body carries along would show
     mag_reject_s: float = 60.0  # after so long, a disturbed field is better than a gyro alone
     mag_reject_factor: float = 2.0  # at a gain so many times lower
 
-    proportional_gain: float = 0.1  # complementary, 1/s: leans on the accelerometer over 10 s; half and ten times are worse
+    proportional_gain: float = (
+        0.1  # complementary, 1/s: leans on the accelerometer over 10 s; half and ten times are worse
+    )
     integral_gain: float = 0.001  # 1/s^2: learns what bias is left after power-up within minutes
     gate_m_s2: float = 0.15  # |force| further from gravity is motion, not tilt
     level_cutoff_hz: float = 5.0  # low-pass on the force that levels, so that vibration does not close the gate

@@ -1,4 +1,4 @@
-"""Attitude from the IMU alone: the baseline that vision has to beat. Nothing that an estimator integrates is filtered."""
+"""Attitude without vision: the baseline that vision has to beat. What an estimator integrates is not filtered here."""
 
 from __future__ import annotations
 
@@ -23,17 +23,12 @@ class AttitudeFilter:
     """
 
     def __init__(
-        self,
-        config: AttitudeConfig,
-        gravity_m_s2: float,
-        R_world_body: Array,
-        gyro_bias_rad_s: Array,
-        gyro_bias_sigma_rad_s: float = np.inf,
+        self, config: AttitudeConfig, gravity_m_s2: float, R_world_body: Array, gyro_bias_rad_s: Array
     ) -> None:
-        """Begin with an attitude [3, 3] and a bias [3], as `PowerUp.R_level_body` and its bias; infinity: a guess."""
+        """Begin with an attitude [3, 3] and a bias [3], as `PowerUp.R_level_body` and its bias."""
         self._method: Vqf | Complementary
         if config.method == "vqf":
-            self._method = Vqf(config, gravity_m_s2, R_world_body, gyro_bias_rad_s, gyro_bias_sigma_rad_s)
+            self._method = Vqf(config, gravity_m_s2, R_world_body, gyro_bias_rad_s)
         else:
             self._method = Complementary(config, gravity_m_s2, R_world_body, gyro_bias_rad_s)
         self._t_ns: int | None = None

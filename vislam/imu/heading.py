@@ -16,7 +16,7 @@ class Heading(NamedTuple):
     """What is remembered of the field; norm in uT, dip (below the horizon) in rad."""
 
     field: Array  # [2, 2] low-passed norm and dip
-    reference: Array  # [2] norm and dip of the field that is trusted; zero: none yet
+    reference: Array  # [2] norm and dip of the field that is trusted
     candidate: Array  # [2] of the field that may become it
     clocks_s: Array  # [3] for how long: the field was trusted, it was rejected, the candidate stood
     yaw_rad: Array  # [1] of the world against the frame that levelling began with
@@ -34,7 +34,6 @@ class Magnetic(NamedTuple):
     dip_gate_rad: float
     undisturbed_s: float
     new_s: float
-    first_s: float
     new_rate_rad_s: float
     reject_s: float
     reject_factor: float
@@ -44,15 +43,14 @@ def magnetic(config: AttitudeConfig) -> Magnetic:
     """Return what the kernel goes by."""
     return Magnetic(
         config.mag_tau_s, config.mag_field_tau_s, config.mag_reference_tau_s, config.mag_gate,
-        np.deg2rad(config.mag_dip_gate_deg), config.mag_undisturbed_s, config.mag_new_s, config.mag_first_s,
+        np.deg2rad(config.mag_dip_gate_deg), config.mag_undisturbed_s, config.mag_new_s,
         np.deg2rad(config.mag_new_rate_deg_s), config.mag_reject_s, config.mag_reject_factor,
     )  # fmt: skip
 
 
-def begin_heading(reject_s: float) -> Heading:
-    """Return the state before any field came; without a reference nothing is rejected."""
-    clocks_s = np.array([0.0, reject_s, 0.0])
-    return Heading(np.zeros((2, 2)), np.zeros(2), np.zeros(2), clocks_s, np.zeros(1), np.zeros(1), np.ones(1))
+def begin_heading() -> Heading:
+    """Return the state before any field came."""
+    return Heading(np.zeros((2, 2)), np.zeros(2), np.zeros(2), np.zeros(3), np.zeros(1), np.zeros(1), np.ones(1))
 
 
 @njit(cache=True, nogil=True)
@@ -92,9 +90,12 @@ def _gain(state: Heading, dt_s: float, p: Magnetic) -> float:
 def _watch(state: Heading, norm: float, dip_rad: float, rate_rad_s: float, dt_s: float, p: Magnetic) -> None:
     """Compare the field with the reference, and with what may become it after turning in it for long enough."""
     now = np.array([norm, dip_rad])
-    if dt_s <= 0.0:
+    if (
+        state.share[0] == 1.0
+    ):  # power-up saw to it that it is the earth's; VQF's own first field must show it by turning
         state.field[0] = now
-    else:
+        state.reference[:] = now
+    elif dt_s > 0.0:
         low_pass(state.field, now, dt_s, p.field_tau_s)
     now = state.field[0]
     share = 1.0 - np.exp(-dt_s / p.reference_tau_s)
@@ -112,14 +113,13 @@ def _watch(state: Heading, norm: float, dip_rad: float, rate_rad_s: float, dt_s:
     if rate_rad_s >= p.new_rate_rad_s:
         clocks_s[2] += dt_s
     candidate += share * (now - candidate)
-    asked_s = p.first_s if reference[0] == 0.0 else p.new_s
-    if clocks_s[0] < p.undisturbed_s and clocks_s[2] >= asked_s:
+    if clocks_s[0] < p.undisturbed_s and clocks_s[2] >= p.new_s:
         reference[:] = candidate
         clocks_s[0] = p.undisturbed_s
 
 
 @njit(cache=True, nogil=True)
 def _is_like(field: Array, reference: Array, p: Magnetic) -> bool:
-    return bool(
-        abs(field[0] - reference[0]) < p.norm_gate * reference[0] and abs(field[1] - reference[1]) < p.dip_gate_rad
-    )
+    down = field[0] * np.sin(field[1]) - reference[0] * np.sin(reference[1])
+    norm = abs(field[0] - reference[0])
+    return bool(max(norm, abs(down)) < p.norm_gate * reference[0] and abs(field[1] - reference[1]) < p.dip_gate_rad)

@@ -71,14 +71,14 @@ def levelling(config: AttitudeConfig, gravity_m_s2: float) -> Levelling:
     )  # fmt: skip
 
 
-def begin_level(R_world_body: Array, bias: Array, bias_sigma_rad_s: float, gravity_m_s2: float) -> Level:
+def begin_level(R_world_body: Array, bias: Array, p: Levelling) -> Level:
     """Return the state of a body that has had this attitude and this bias for a while."""
     R, bias = np.array(R_world_body, dtype=np.float64), np.array(bias, dtype=np.float64)
-    up = gravity_m_s2 * R[2]
+    up = p.gravity_m_s2 * R[2]
     smooth, calm = np.zeros((2, 14)), np.zeros((2, 6))
-    smooth[0] = np.hstack([[0.0, 0.0, gravity_m_s2], R.ravel(), (R @ bias)[:2]])
+    smooth[0] = np.hstack([[0.0, 0.0, p.gravity_m_s2], R.ravel(), (R @ bias)[:2]])
     calm[0] = np.hstack([bias, up])
-    covariance = np.eye(3) * bias_sigma_rad_s**2
+    covariance = np.eye(3) * p.bias_sigma_rad_s**2
     return Level(R, np.eye(3), smooth, calm, bias, covariance, up, np.zeros(1), np.zeros(1), np.zeros(3), np.zeros(1))
 
 
@@ -131,7 +131,9 @@ def _time_constant(state: Level, up_body: Array, dt_s: float, p: Levelling) -> f
     state.sway_rad_s[0] = max(held, np.sqrt(np.sum(sideways * sideways)))
     if state.rest_s[0] >= p.rest_s:
         return p.tau_s
-    wrong_rad_s = p.bias_rest_sigma_rad_s + p.gyro_error * state.sway_rad_s[0]
+    P = state.covariance
+    unknown = 0.5 * (P[0, 0] + P[1, 1] + P[2, 2] - np.sum(up_body * (P @ up_body)))  # mean over the horizontal axes
+    wrong_rad_s = np.sqrt(unknown + (p.gyro_error * state.sway_rad_s[0]) ** 2)
     return min(max(np.sqrt(p.speed_change_m_s / (p.gravity_m_s2 * wrong_rad_s)), p.tau_s), p.tau_max_s)
 
 

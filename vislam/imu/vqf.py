@@ -14,15 +14,11 @@ from vislam.messages import Array
 class Vqf:
     """Owns tilt, bias and heading, each with what it remembers."""
 
-    def __init__(
-        self, config: AttitudeConfig, gravity_m_s2: float, R_world_body: Array, bias: Array, bias_sigma_rad_s: float
-    ) -> None:
-        """Begin with an attitude [3, 3] and a bias [3], as well known as `bias_sigma_rad_s` says."""
+    def __init__(self, config: AttitudeConfig, gravity_m_s2: float, R_world_body: Array, bias: Array) -> None:
+        """Begin with an attitude [3, 3] and a bias [3], known to `bias_sigma_deg_s` only."""
         self._levelling, self._magnetic = levelling(config, gravity_m_s2), magnetic(config)
-        sigma = min(bias_sigma_rad_s, self._levelling.bias_sigma_rad_s)
-        sigma = max(sigma, self._levelling.bias_rest_sigma_rad_s)
-        self._level: Level = begin_level(R_world_body, bias, sigma, gravity_m_s2)
-        self._heading: Heading = begin_heading(config.mag_reject_s)
+        self._level: Level = begin_level(R_world_body, bias, self._levelling)
+        self._heading: Heading = begin_heading()
         self._floor_rad = float(np.deg2rad(config.tilt_floor_deg))
 
     @property

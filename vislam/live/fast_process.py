@@ -25,7 +25,7 @@ from vislam.live.priority import take_priority
 from vislam.live.published_pose import PublishedPose
 from vislam.live.publisher import PosePublisher
 from vislam.live.stream import SampleSender
-from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement, no_observations
+from vislam.messages import Array, ImuSample, MagSample, NavState, Tracking, VoMeasurement, no_observations
 
 _NS = 1_000_000_000
 _READ_S = 0.005  # most that reading waits: messages of vision are looked for in between
@@ -145,9 +145,9 @@ def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
     fast = FastPath(config, noise, T_body_camera, _ignore)
     keyframe = VoMeasurement(60 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
     state = NavState(keyframe.t_ns, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15) * 1e-4)
-    AttitudeFilter(config.attitude, config.imu.gravity_m_s2, np.eye(3), np.zeros(3)).add(
-        ImuSample(dt_ns, np.zeros(3), rest)
-    )
+    attitude = AttitudeFilter(config.attitude, config.imu.gravity_m_s2, np.eye(3), np.zeros(3))
+    for k in (1, 2):
+        attitude.add(ImuSample(k * dt_ns, np.zeros(3), rest), MagSample(k * dt_ns, np.array([20.0, 0.0, -42.0])))
     for k in range(1, 200):
         fast.add(ImuSample(k * dt_ns, np.zeros(3), rest))
         if k == 80:

@@ -112,7 +112,7 @@ class InertialOnly:
         That is the position, the velocity and, as nothing holds it, the heading.
         """
         assert self._attitude is not None
-        tilt = np.deg2rad(self._config.attitude.tilt_sigma_deg) ** 2
+        tilt = self._attitude.tilt_sigma_rad**2
         unknown = [np.inf] * 3
         rate_variance = self._bias_sigma_rad_s**2 + self._noise.gyro_noise_density**2 * self._noise.rate_hz
         return (
