@@ -48,9 +48,10 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
 def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) -> dict[str, Array]:
     """Return the normalised estimation error squared of states: "rotation", "position" and "velocity", [M], 3 dof each.
 
-    Position and yaw of the first state (its attitude, without `gravity`) are a free choice that its covariance does
-    not hold, so the truth is brought into the states' world by them: the error there is zero and grows with drift, as
-    the covariance does. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
+    Position and yaw of the first state (its attitude, without `gravity`) are a free choice, so the truth is brought into
+    the states' world by them: the error there is zero and grows with drift, as the covariance does. Where that state was
+    not certain of them, what it was wrong by moves and turns the truth, and its covariance joins that of every other
+    state. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
     The true velocity is that of a fit to the true positions, and its variance joins the state's; errors of the true
     poses themselves count as the state's. NaN is what was not estimated, and the first state.
     Raises DataError with fewer than 2 matching states.
@@ -69,15 +70,17 @@ def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) ->
     true_R = R @ pairs.reference[:, :3, :3]
     true_p = (pairs.reference[:, :3, 3] - pairs.reference[0, :3, 3]) @ R.T + pairs.estimate[0, :3, 3]
     velocity, velocity_variance = _velocities(truth, pairs.t_ns)
+    velocities = np.array([s.velocity_world_m_s for s in matched])
     errors = {
         "rotation": Rotation.from_matrix(pairs.estimate[:, :3, :3].transpose(0, 2, 1) @ true_R).as_rotvec(),
         "position": true_p - pairs.estimate[:, :3, 3],
-        "velocity": velocity @ R.T - np.array([s.velocity_world_m_s for s in matched]),
+        "velocity": velocity @ R.T - velocities,
     }
     covariance = np.array([s.covariance for s in matched])
+    of_anchor = _of_anchor(pairs.estimate, velocities, covariance[0, :6, :6], gravity)
     results = {}
     for i, (name, error) in enumerate(errors.items()):
-        P = covariance[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        P = covariance[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] + of_anchor[name]
         if name == "velocity":
             P = P + velocity_variance[:, None, None] * np.eye(3)
         results[name] = _squared_mahalanobis(error, P)
@@ -106,6 +109,31 @@ def stated_scale_sigma(states: Sequence[NavState]) -> float:
         return float("nan")
     along = away[i] / distances[i]
     return float(np.sqrt(along @ states[i].covariance[3:6, 3:6] @ along) / distances[i])
+
+
+def _of_anchor(poses: Array, velocities: Array, covariance: Array, gravity: bool) -> dict[str, Array]:
+    """Return what the first state's own uncertainty adds to the errors of all states: by name, [M, 3, 3].
+
+    `poses` [M, 4, 4] and `velocities` [M, 3] are the estimate, `covariance` [6, 6] that of the first one's attitude
+    (on the body side) and position. With `gravity` only its heading turns the truth.
+    """
+    R_first = poses[0, :3, :3]
+    P_turn = R_first @ covariance[:3, :3] @ R_first.T  # world axes
+    if gravity:
+        P_turn = np.diag([0.0, 0.0, P_turn[2, 2]])
+    R, way = poses[:, :3, :3], poses[:, :3, 3] - poses[0, :3, 3]
+    by_turn = {"rotation": R.transpose(0, 2, 1), "position": _cross(way), "velocity": _cross(velocities)}
+    added = {name: J @ P_turn @ J.transpose(0, 2, 1) for name, J in by_turn.items()}
+    added["position"] += covariance[3:, 3:]
+    return added
+
+
+def _cross(vectors: Array) -> Array:
+    """Return the matrices [M, 3, 3] of the cross products with vectors [M, 3]."""
+    out = np.zeros((len(vectors), 3, 3))
+    for row, column, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 0, 2, 1), (1, 2, 0, -1), (2, 0, 1, -1), (2, 1, 0, 1)):
+        out[:, row, column] = sign * vectors[:, axis]
+    return out
 
 
 def _heading_rad(R: Array) -> float:
