@@ -179,15 +179,15 @@ def summary(starts: Sequence[Start]) -> list[str]:
 def _share_line(name: str, members: Sequence[Start]) -> str:
     ended = [s for s in members if np.isfinite(s.scale_error)]
     soon = sum(s.is_soon for s in members)
-    at_start = sum(s.sigmas(s.start_sigma) <= SIGMAS for s in ended)
-    at_end = sum(s.sigmas(s.end_sigma) <= SIGMAS for s in ended)
+    at_start = [s.sigmas(s.start_sigma) <= SIGMAS for s in ended if s.start_sigma > 0.0]  # a start at rest has none
+    at_end = [s.sigmas(s.end_sigma) <= SIGMAS for s in ended]
     gross = [s for s in ended if abs(s.scale_error) > GROSS]
     first_s = [s.first_pose_s for s in members if np.isfinite(s.first_pose_s)]
     scale = 100.0 * np.median([abs(s.scale_error) for s in ended]) if ended else np.nan
     return (
         f"{name}: {soon} of {len(members)} begin within {SOON_S:g} s (median {np.median(first_s or [np.nan]):.2f} s); "
-        f"scale off by {scale:.2f} % in the median, within {SIGMAS:g} sigmas of the start {at_start} of {len(ended)}, "
-        f"of the end {at_end}; off by over {GROSS:.0%}: {len(gross)}, "
+        f"scale off by {scale:.2f} % in the median, within {SIGMAS:g} sigmas of the start {sum(at_start)} of "
+        f"{len(at_start)}, of the end {sum(at_end)} of {len(at_end)}; off by over {GROSS:.0%}: {len(gross)}, "
         f"{sum(not s.warned for s in gross)} of them without a warning"
     )
 
