@@ -139,7 +139,7 @@ def test_the_remembered_drift_is_taken_off_as_the_board_warms_up() -> None:
     true_change = abs(bias_of(bus, 42.0) - bias_of(bus, 30.0)).max()
     print(f"the gyro changed by {true_change:.4f} rad/s; left over with and without memory: {rates}")
     assert abs(rates[0]).max() < 0.4 * true_change
-    assert abs(rates[1]).max() > 0.7 * true_change
+    assert abs(rates[0]).max() < 0.5 * abs(rates[1]).max(), "the attitude filter learns it at rest, later"
 
 
 def test_a_magnet_near_by_takes_the_bit_away_and_the_earth_gives_it_back() -> None:
