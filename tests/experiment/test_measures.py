@@ -98,20 +98,22 @@ def test_what_cannot_be_judged_says_why(tmp_path):
     assert measured(tmp_path, half, truth)["completeness"] == pytest.approx(0.5, abs=0.02)
 
 
-def states_of(truth, covariance, seed, world):
-    """States whose errors are drawn from their covariance, in a world of their own; the first one is exact."""
+def states_of(truth, covariance, seed, world, anchor_is_exact=True):
+    """States whose errors are drawn from their covariance, in a world of their own; the first one is exact, or not."""
     rng = np.random.default_rng(seed)
     t = truth.t_ns[1:-1]
     seconds = (truth.t_ns - truth.t_ns[0]) * 1e-9
     velocity = CubicSpline(seconds, truth.positions_m)(seconds[1:-1], 1)
     errors = rng.multivariate_normal(np.zeros(9), covariance[:9, :9], len(t))
-    errors[0] = 0.0
+    covariances = [covariance] * len(t)
+    if anchor_is_exact:
+        errors[0], covariances[0] = 0.0, np.zeros_like(covariance)
     states = []
-    for t_ns, T, v, e in zip(t, truth.T_world_body[1:-1], velocity, errors, strict=True):
+    for t_ns, T, v, e, P in zip(t, truth.T_world_body[1:-1], velocity, errors, covariances, strict=True):
         pose = world @ T
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(-e[:3]).as_matrix()
         pose[:3, 3] -= e[3:6]
-        states.append(NavState(int(t_ns), pose, world[:3, :3] @ v - e[6:9], np.zeros(3), np.zeros(3), covariance))
+        states.append(NavState(int(t_ns), pose, world[:3, :3] @ v - e[6:9], np.zeros(3), np.zeros(3), P))
     return states
 
 
@@ -129,12 +131,20 @@ def test_consistency_of_errors_drawn_from_their_covariance():
     tilted = transform(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix(), np.array([3.0, -2.0, 1.0]))
     values = nees(states_of(truth, covariance, 9, tilted), truth, gravity=False)
     assert all(np.nanmean(values[name]) == pytest.approx(3.0, abs=0.3) for name in ("rotation", "position"))
-    optimistic = covariance / 4.0
     states = [
-        NavState(s.t_ns, s.T_world_body, s.velocity_world_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, optimistic)
+        NavState(s.t_ns, s.T_world_body, s.velocity_world_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, s.covariance / 4.0)
         for s in states_of(truth, covariance, 9, world)
     ]
     assert all(value.mean == pytest.approx(4.0, rel=0.1) for value in anees(states, truth).values())
+
+
+def test_an_uncertain_first_state_does_not_make_the_others_inconsistent():
+    truth = walk(60)
+    P = np.diag(np.repeat([0.05, 0.1, 0.02, 0.0, 0.0], 3) ** 2)
+    world = transform(Rotation.from_euler("z", -0.4).as_matrix(), np.array([1.0, 2.0, 0.5]))
+    drawn = [nees(states_of(truth, P, seed, world, anchor_is_exact=False), truth) for seed in range(200)]
+    for name in ("rotation", "position", "velocity"):
+        assert np.nanmean([values[name] for values in drawn]) == pytest.approx(3.0, rel=0.15), name
 
 
 def test_a_noisy_truth_does_not_make_velocities_inconsistent():

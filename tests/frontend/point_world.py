@@ -167,4 +167,6 @@ class Start:
 
 
 def initialiser(start: Start, config: InitConfig | None = None) -> Initialiser:
-    return Initialiser(config or InitConfig(), start.noise, GRAVITY_M_S2, T_BODY_CAM, CAMERA, start.told_sigma or start.pixel_sigma)
+    return Initialiser(
+        config or InitConfig(), start.noise, GRAVITY_M_S2, T_BODY_CAM, CAMERA, start.told_sigma or start.pixel_sigma
+    )

@@ -131,7 +131,14 @@ def _of_anchor(poses: Array, velocities: Array, covariance: Array, gravity: bool
 def _cross(vectors: Array) -> Array:
     """Return the matrices [M, 3, 3] of the cross products with vectors [M, 3]."""
     out = np.zeros((len(vectors), 3, 3))
-    for row, column, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 0, 2, 1), (1, 2, 0, -1), (2, 0, 1, -1), (2, 1, 0, 1)):
+    for row, column, axis, sign in (
+        (0, 1, 2, -1),
+        (0, 2, 1, 1),
+        (1, 0, 2, 1),
+        (1, 2, 0, -1),
+        (2, 0, 1, -1),
+        (2, 1, 0, 1),
+    ):
         out[:, row, column] = sign * vectors[:, axis]
     return out
 
