@@ -61,7 +61,9 @@ class PixelNoise:
     def learn(self, distances: Array, camera: Camera, xy: Array, ends: float = 1.0) -> None:
         """Take a frame's distances [N] of tracks at `xy` [N, 2] from their epipolar lines; NaN where there is none.
 
-        Distances and places are on z = 1; the camera's lens says how many pixels that is there. `ends` are the variances of such a distance in those of one pixel: 1 where the place in the
+        Distances and places are on z = 1; the camera's lens says how many pixels that is there. `ends` are the
+        variances of such a distance in those of one pixel: 1 where the place in the keyframe is the track by
+        definition, 2 where it is as noisy as the one in the frame.
         keyframe is the track by definition, 2 where it is as noisy as the one in the frame.
         """
         seen = np.isfinite(distances)
