@@ -64,7 +64,6 @@ class PixelNoise:
         Distances and places are on z = 1; the camera's lens says how many pixels that is there. `ends` are the
         variances of such a distance in those of one pixel: 1 where the place in the keyframe is the track by
         definition, 2 where it is as noisy as the one in the frame.
-        keyframe is the track by definition, 2 where it is as noisy as the one in the frame.
         """
         seen = np.isfinite(distances)
         if seen.sum() < _MIN_TRACKS:
