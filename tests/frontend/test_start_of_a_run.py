@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_one_camera_has_a_pose_in_motion_soon_and_it_does_not_jump_when_the_star
     assert given[0].frame.t_ns == facts.begun_t_ns
     truth = begun.recording.truth()
     assert truth is not None
-    for before, after in zip(given[:-1], given[1:], strict=True):
+    for before, after in pairwise(given):
         assert before.T_odom_body is not None and after.T_odom_body is not None
         moved = np.linalg.norm((invert(before.T_odom_body) @ after.T_odom_body)[:3, 3])
         assert moved < 0.2  # 50 ms of a walk

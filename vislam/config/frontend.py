@@ -81,6 +81,7 @@ class FrontEndConfig:
     degraded_inlier_ratio: float = 0.5  # of the followed tracks
     patience_s: float = 0.4  # so long a lost keyframe is searched for before a new one starts
     min_start_corners: int = 40  # an image with fewer cannot start a keyframe
+    min_given: int = 8  # in place of both numbers for tracks given from elsewhere: few, but somebody chose them
 
     keyframe_parallax_px: float = 40.0  # median with rotation taken out
     keyframe_rotation_deg: float = 15.0  # patches turn with the camera and stop matching
@@ -128,7 +129,7 @@ class InitConfig:
     max_nodes: int = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
     mono_max_nodes: int = 20  # the same without scale, where every node also carries its sightings of points
     max_points: int = 60  # monocular: points solved for; more cost time and hardly sharpen scale
-    min_points: int = 20  # monocular: fewer leave too little redundancy to tell a wrong one
+    min_points: int = 10  # monocular: two numbers a sighting leave some redundancy; how much, the sigmas say
     min_parallax_px: float = 12.0  # monocular: median over the points; below, depth and so scale drown in noise
     min_excitation_m_s2: float = 0.15  # monocular: rms change of acceleration; less is also what vibration leaves
     time_offset: bool = True  # estimate what the camera's clock is off from the IMU's, and correct its stamps

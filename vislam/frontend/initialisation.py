@@ -7,6 +7,7 @@ a second.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -37,6 +38,7 @@ _NS = 1_000_000_000
 _AGREE_SIGMAS = 3.0
 _MAX_OUTLIERS = 0.3  # of the observations
 _MAX_BIAS_SIGMAS = 3.5  # of the accelerometer's bias
+_MIN_SOLVED = 6  # points in the part of a window that the closed form is tried on
 _MOST_NOISE = 3.0  # times what is told of tracks; more is disagreement
 _AMPLE = 3.0  # times the least excitation or parallax; more of it is no longer what a start lacks
 _FOREIGN_OFFSET_S = 0.002  # a time offset found in the window that is larger than this is applied before the start
@@ -173,12 +175,15 @@ class Initialiser:
         """
         still_by_imu = self._rest.add(span)
         entries = self._window.entries
-        follows = span is not None and bool(entries) and int(span.t_ns[0]) == entries[-1].t_ns
         if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None:
+            if span is not None and self._window.bridge(span, vo.has_scale):
+                return self._refuse("vision", "vision is lost")
             return self._restart("vision", "vision is lost")
+        whole = self._window.since_newest(span)
+        follows = whole is not None
         if entries and not follows:
             self._restart("inertial data", "inertial data has a hole")
-        self._window.append(span if follows else None, vo, observations, at_rest_by_image and follows)
+        self._window.append(whole, vo, observations, at_rest_by_image and follows)
         self._window.trim(self._config.window_s if vo.has_scale else self._config.mono_window_s)
         self.phase = self._next_phase(vo, still_by_imu and at_rest_by_image)
         match self.phase:
@@ -301,11 +306,7 @@ class Initialiser:
         refusal = self._sight_refusal(tracks, path, camera.fx)
         if refusal is not None:
             return refusal
-        start = solve_start(window, path, tracks)
-        bundle = refine_tracks(
-            window, chosen, tracks, path, start, self._bundle_config, Rig((camera,), (self._T_body_cam,)),
-            self.time_offset_sigma_s, config.vo_inflation,
-        )  # fmt: skip
+        start, bundle = self._solved(window, chosen, tracks, path, Rig((camera,), (self._T_body_cam,)))
         if not bundle.converged:
             return self._start_refusal(start) or self._refuse("geometry", "the window's least squares does not settle")
         solution = from_bundle(tuple(entry.t_ns for entry in chosen), bundle)
@@ -322,6 +323,32 @@ class Initialiser:
             replace(found, time_offset_s=bundle.time_offset_s, time_offset_sigma_s=bundle.time_offset_sigma_s), solution
         )
 
+    def _solved(
+        self, window: Window, chosen: list[Entry], tracks: Tracks, path: InertialPath, rig: Rig
+    ) -> tuple[Start, BundleSolution]:
+        """Return the window's least squares and the closed form that led to it.
+
+        The closed form of a long window fails where the inertial path bends away, or where few points last; that of
+        its first part tells the same unknowns.
+        """
+        found: tuple[Start, BundleSolution] | None = None
+        for nodes in (len(chosen), (len(chosen) + 1) // 2):
+            part = tracks.before(nodes)
+            if part.points < _MIN_SOLVED:
+                continue
+            with suppress(np.linalg.LinAlgError):
+                start = solve_start(window, path, part)
+                bundle = refine_tracks(
+                    window, chosen, tracks, path, start, self._bundle_config, rig, self.time_offset_sigma_s,
+                    self._config.vo_inflation,
+                )  # fmt: skip
+                if bundle.converged and self._bias_m_s2(bundle) <= self._most_bias_m_s2:
+                    return start, bundle
+                found = found or (start, bundle)
+        if found is None:
+            raise np.linalg.LinAlgError("no closed form")
+        return found
+
     def _tested(self, found: Initialisation, solution: Solution) -> Initialisation:
         """Return a first solution as provisional, and a later one as what the seconds since then made of it."""
         config, earlier = self._config, self._provisional
@@ -332,6 +359,9 @@ class Initialiser:
         if tested_s < config.test_s:
             return self._refuse("test", f"the start is tested for {tested_s:.1f} s of {config.test_s:.1f} s")
         contradiction = solution.contradiction(earlier, _AGREE_SIGMAS)
+        if contradiction is None:
+            self._provisional = solution
+            return replace(found, is_settled=False, reason=f"{found.reason}; one before could not be tested")
         if contradiction:
             self._provisional = solution
             self.taken_back += 1
@@ -393,16 +423,21 @@ class Initialiser:
 
     def _start_refusal(self, start: Start) -> Initialisation | None:
         """Refuse where the linear solution, gravity left free, is far from what gravity can be."""
-        norm, sigma = start.free_norm_m_s2, start.free_norm_sigma_m_s2
-        allowed = self._config.gravity_tolerance_m_s2
         # in a short window this norm errs by more than its sigma says: twice the room
-        if abs(norm - self._gravity) > 2.0 * (allowed + _AGREE_SIGMAS * sigma):
-            return self._contradiction(norm)
-        return None
+        allowed = 2.0 * (self._config.gravity_tolerance_m_s2 + _AGREE_SIGMAS * start.free_norm_sigma_m_s2)
+        is_foreign = abs(start.free_norm_m_s2 - self._gravity) > allowed
+        return self._contradiction(start.free_norm_m_s2) if is_foreign else None
+
+    @property
+    def _most_bias_m_s2(self) -> float:
+        return _MAX_BIAS_SIGMAS * self._config.accel_bias_sigma_m_s2
+
+    @staticmethod
+    def _bias_m_s2(bundle: BundleSolution) -> float:
+        return float(np.linalg.norm(bundle.accel_bias_m_s2[-1]))
 
     def _bundle_refusal(self, bundle: BundleSolution, start: Start) -> Initialisation | None:
-        bias = float(np.linalg.norm(bundle.accel_bias_m_s2[-1]))
-        limit = _MAX_BIAS_SIGMAS * self._config.accel_bias_sigma_m_s2
+        bias, limit = self._bias_m_s2(bundle), self._most_bias_m_s2
         if bias > limit:  # a motion that is not understood hides in it
             refusal = self._start_refusal(start)
             reason = f"accelerometer bias {bias:.2f} m/s2 of {limit:.2f}: check its calibration and the extrinsics"
@@ -427,6 +462,8 @@ class Initialiser:
         if before is None:
             return self._refuse("confirmation", "one more look needed to confirm the scale")
         contradiction = now.contradiction(before, _AGREE_SIGMAS)
+        if contradiction is None:
+            contradiction = "no frame in common"
         return self._refuse("confirmation", f"against the attempt before: {contradiction}") if contradiction else None
 
     def _lacking(self, tracks: Tracks, path: InertialPath, fx: float) -> str:

@@ -20,7 +20,8 @@ from vislam.messages import Array
 
 _DEPTH_ROUNDS = 5  # a bearing's weight needs the point's distance, which the round before has found
 _CAUCHY = 3.0  # scale of the kernel in the linear rounds, in medians
-_MIN_COMMON = 10  # points in two nodes; fewer are fitted too well
+_MIN_SIGHTINGS = 3  # of a point; fewer hardly check one another
+_MIN_COMMON = 8  # points in two nodes; fewer are fitted too well
 _ASTRAY = 4.0  # standard deviations
 _PLACED = 5.0  # information on a point's distance against what noise alone would show of it
 _MEDIAN_LENGTH = 1.1774  # of a normal error in a plane, in standard deviations of a coordinate
@@ -43,6 +44,16 @@ class Tracks:
     def only(self, good: NDArray[np.bool_]) -> Tracks:
         """Return those of some points [P]."""
         rows = good[self.point]
+        number = np.cumsum(good) - 1
+        return replace(
+            self, point=number[self.point[rows]], node=self.node[rows], xy=self.xy[rows], track_ids=self.track_ids[good]
+        )
+
+    def before(self, node: int) -> Tracks:
+        """Return the sightings in the nodes before one, of points that are seen often enough there."""
+        early = self.node < node
+        good = np.bincount(self.point[early], minlength=self.points) >= _MIN_SIGHTINGS
+        rows = early & good[self.point]
         number = np.cumsum(good) - 1
         return replace(
             self, point=number[self.point[rows]], node=self.node[rows], xy=self.xy[rows], track_ids=self.track_ids[good]

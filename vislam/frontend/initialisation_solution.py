@@ -34,8 +34,10 @@ class Solution:
         R = self.T_world_body[-1, :3, :3]
         return float(np.sqrt(np.linalg.eigvalsh((R @ self.last_covariance[:3, :3] @ R.T)[:2, :2])[-1]))
 
-    def contradiction(self, before: Solution, sigmas: float) -> str:
+    def contradiction(self, before: Solution, sigmas: float) -> str | None:
         """Return in which way this differs from an earlier solution by more than `sigmas` of both; empty: it does not.
+
+        None where they have nothing in common.
 
         Compared are scale, vertical and velocity where both overlap in time, the last two at its newest common node.
         Both saw the same, so that the sigmas together are more than their difference should have.
@@ -43,7 +45,7 @@ class Solution:
         t_ns, at = np.array(self.t_ns, dtype=np.int64), np.array(before.t_ns, dtype=np.int64)
         common = at[(at >= t_ns[0]) & (at <= t_ns[-1])]
         if len(common) < 2:
-            return "no frame in common"
+            return None
         now, then = self._lengths(common), before._lengths(common)
         change = float(now @ then / max(float(then @ then), 1e-12)) - 1.0
         limit = sigmas * float(np.hypot(self.scale_sigma * (1.0 + change), before.scale_sigma))

@@ -12,12 +12,13 @@ from vislam.camera import Camera
 from vislam.frontend.inertial_alignment import VisualMotion
 from vislam.frontend.initialisation_linear import Tracks
 from vislam.frontend.result import scaled_motion
-from vislam.geometry import invert, se3_adjoint
-from vislam.imu import join
+from vislam.geometry import invert, se3_adjoint, transform
+from vislam.imu import join, preintegrate
 from vislam.messages import Array, ImuSpan, NoiseScale, Observations, VoMeasurement
 
 _NS = 1_000_000_000
 _MIN_SIGHTINGS = 3  # of a point; fewer hardly check one another
+_MAX_BLIND_S = 1.0  # a gyroscope of unknown bias is off by degrees after more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +50,7 @@ class FrameWindow:
         self._keyframe_id: int | None = None
         self._keyframe_number = 0
         self._T_vo_body = np.eye(4)
+        self._blind: ImuSpan | None = None  # since the newest entry, while vision is lost
 
     @property
     def seen_s(self) -> float:
@@ -66,10 +68,33 @@ class FrameWindow:
         T = self._T_vo_body.copy()
         self.entries.append(Entry(span, vo, observations, T, self._keyframe_number, number, still))
         self._count += 1
+        self._blind = None
+
+    def bridge(self, span: ImuSpan, has_scale: bool) -> bool:
+        """Take a frame without vision: without scale the gyroscope carries the rotation on, for a while.
+
+        False, and nothing is taken, where there is nothing to go on from or it is too long ago.
+        """
+        spans = [span] if self._blind is None else [self._blind, span]
+        if has_scale or not self.entries or int(spans[0].t_ns[0]) != self.entries[-1].t_ns:
+            return False
+        blind = join(spans)
+        if int(blind.t_ns[-1]) - int(blind.t_ns[0]) > _MAX_BLIND_S * _NS:
+            return False
+        self._blind = blind
+        self._T_vo_body = self._T_vo_body @ transform(preintegrate(span).dR, np.zeros(3))
+        return True
+
+    def since_newest(self, span: ImuSpan | None) -> ImuSpan | None:
+        """Return the inertial data since the newest entry, given those since the frame before; None across a hole."""
+        if span is None or not self.entries:
+            return None
+        whole = span if self._blind is None else join([self._blind, span])
+        return whole if int(whole.t_ns[0]) == self.entries[-1].t_ns else None
 
     def clear(self) -> None:
         """Drop all entries; the chain of poses goes on."""
-        self.entries = []
+        self.entries, self._blind = [], None
 
     def trim(self, window_s: float) -> None:
         """Drop entries older than the window."""
@@ -81,6 +106,7 @@ class FrameWindow:
 
     def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> bool:
         """Shift all times and cut the spans anew; False, and empty, where inertial data do not cover them."""
+        self._blind = None
         moved: list[Entry] = []
         for entry in self.entries:
             vo = replace(entry.vo, t_ns=entry.t_ns + shift_ns)

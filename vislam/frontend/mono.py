@@ -78,6 +78,7 @@ class MonoFrontEnd:
         self._tracker = Tracker(config)
         self._noise = PixelNoise(config.track_sigma_px)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
+        self._min_inliers = config.min_inliers
         self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
         self._min_parallax_px = config.mono_min_parallax_px
         self._keyframe: Keyframe | None = None
@@ -106,6 +107,7 @@ class MonoFrontEnd:
         frame, dt_s = self._intake.accept(frame)
         # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy there as here
         given = _BOTH_ENDS if frame.tracks is not None else 1.0
+        self._min_inliers = self._config.min_inliers if frame.tracks is None else self._config.min_given
         self._sigma_xy = given * self._config.track_sigma_px / self._camera.fx
         self._min_parallax_px = given * self._config.mono_min_parallax_px
         if self._keyframe is None:
@@ -192,11 +194,11 @@ class MonoFrontEnd:
 
     def _failure(self, view: TwoViewEstimate, followed: int) -> str:
         agree = int(view.inliers.sum())
-        if followed < self._config.min_inliers:
+        if followed < self._min_inliers:
             return f"only {followed} of {len(self._tracker)} tracks found"
         if not view.converged:
             return "the motion does not converge"
-        if agree < max(self._config.min_inliers, self._config.min_inlier_ratio * followed):
+        if agree < max(self._min_inliers, self._config.min_inlier_ratio * followed):
             return f"only {agree} of {followed} tracks agree on a motion"
         return ""
 
@@ -226,7 +228,7 @@ class MonoFrontEnd:
         if self._direction_key.any():
             best = refine_two_view(R_guess, self._direction_key, key_xy, xy, self._sigma_xy, config.cauchy)
         if best is None or not best.converged or best.inliers.sum() < _RANSAC_BELOW * np.isfinite(xy[:, 0]).sum():
-            start = essential_ransac(R_guess, key_xy, xy, _RANSAC_PX / self._camera.fx, config.min_inliers)
+            start = essential_ransac(R_guess, key_xy, xy, _RANSAC_PX / self._camera.fx, self._min_inliers)
             if start is not None:
                 other = refine_two_view(*start, key_xy, xy, self._sigma_xy, config.cauchy)
                 if best is None or other.inliers.sum() > best.inliers.sum():
@@ -331,7 +333,8 @@ class MonoFrontEnd:
         self._tracker.forget()
         count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         self._last_px = self._tracker.pixels.copy()
-        if count < self._config.min_start_corners:
+        least = self._config.min_start_corners if frame.tracks is None else self._config.min_given
+        if count < least:
             self._tracker.forget()
             self._last_px = np.empty((0, 2))
             reason = too_few(frame, count)
