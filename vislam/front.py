@@ -412,9 +412,8 @@ class Front:
             found = self._level(span, track.vo) or found
         if found.last is None or found.first is None or found.T_odom_vo is None:
             return []
-        if self.frontend.mode == "mono":
-            before = self._filter.ekf.pose_at(found.last.t_ns) if self.newest_start is not None else None
-            found = found if before is None else moved_to(found, before[:3, 3])
+        before = self._filter.ekf.pose_at(found.last.t_ns) if self.newest_start is not None else None
+        found = found if before is None else moved_to(found, before)
         return self._start_from(found, self._filter, track.vo)
 
     def _start_from(self, found: Initialisation, filtering: Filtering, vo: VoMeasurement) -> list[OdometryKeyframe]:

@@ -29,7 +29,7 @@ from vislam.frontend.initialisation_linear import (
 from vislam.frontend.initialisation_rest import level_covariance, rest_accel_bias, rest_covariance
 from vislam.frontend.initialisation_solution import Solution, from_alignment, from_bundle
 from vislam.frontend.initialisation_window import Entry, FrameWindow, gather_tracks, metric_motions
-from vislam.geometry import level_rotation, transform
+from vislam.geometry import level_rotation, so3_exp, transform
 from vislam.imu import ImuNoise, RestDetector, join
 from vislam.messages import Array, ImuSpan, NavState, Observations, Tracking, VoMeasurement
 from vislam.window.bundle import BundleSolution
@@ -79,14 +79,31 @@ class Initialisation:
     takes_back: bool = False  # the provisional one before did not survive its test
 
 
-def moved_to(found: Initialisation, last_m: Array) -> Initialisation:
-    """Return an answer in another odom, in which its last position is `last_m` [3]; heading and vertical stay."""
+def moved_to(found: Initialisation, T_odom_body: Array) -> Initialisation:
+    """Return an answer in another odom, in which its last position and heading are those of `T_odom_body` [4, 4].
+
+    The vertical stays as it was found. An `odom` that a provisional start began goes on that way without a jump.
+    """
     assert found.first is not None and found.last is not None and found.T_odom_vo is not None
-    shift = transform(np.eye(3), last_m - found.last.T_world_body[:3, 3])
+    T_last = found.last.T_world_body
+    R = T_odom_body[:3, :3] @ T_last[:3, :3].T
+    heading_rad = float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+    R_turn = so3_exp(np.array([0.0, 0.0, heading_rad]))
+    shift = transform(R_turn, T_odom_body[:3, 3] - R_turn @ T_last[:3, 3])
     poses = None if found.T_odom_body is None else shift @ found.T_odom_body
-    first = replace(found.first, T_world_body=shift @ found.first.T_world_body)
-    last = replace(found.last, T_world_body=shift @ found.last.T_world_body)
+    first, last = _moved(found.first, shift), _moved(found.last, shift)
     return replace(found, first=first, last=last, T_odom_vo=shift @ found.T_odom_vo, T_odom_body=poses)
+
+
+def _moved(state: NavState, T: Array) -> NavState:
+    """Return a state in a world moved and turned by T [4, 4]."""
+    R = T[:3, :3]
+    turn = np.eye(15)
+    turn[3:6, 3:6] = turn[6:9, 6:9] = R
+    return replace(
+        state, T_world_body=T @ state.T_world_body, velocity_world_m_s=R @ state.velocity_world_m_s,
+        covariance=turn @ state.covariance @ turn.T,
+    )  # fmt: skip
 
 
 def level_at_once(
