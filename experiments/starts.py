@@ -36,10 +36,12 @@ from vislam.experiment.plan import load_plan
 from vislam.messages import Tracking
 from vislam.recording import Recording
 from vislam.run import imu_noise
-from vislam.run.metrics import doubts, initialisation
+from vislam.run.evidence import front_evidence, whole_evidence
+from vislam.run.metrics import initialisation
 from vislam.runfolder import RunLog
 from vislam.sim import MeasuredInertial, open_points
 from vislam.slam import Slam
+from vislam.verdict import judge as verdict_of
 from vislam.sources import measured_inertial, open_source, shaken, split_source
 from vislam.trajectory import Trajectory, evaluate
 from vislam.trajectory.consistency import stated_scale_sigma
@@ -137,7 +139,8 @@ def judged(
     errors: dict[str, float | None] = {}
     with suppress(DataError):  # without a trajectory there is nothing to compare
         errors = evaluate(final, truth, front.alignment) if truth is not None else {}
-    told = doubts(front, log, final, True)
+    evidence = whole_evidence(front_evidence(front, config.imu), log, final, [], {}, 0, {})
+    told = list(verdict_of(evidence, config.verdict).reasons)
     is_lost = bool(lost) or log.newest_tracking is Tracking.LOST
     begins = begun["status"] in BEGUN
     reason = "; ".join(([] if begins else [str(begun["reason"])]) + told + ([lost] if lost else []))

@@ -16,13 +16,23 @@ from vislam.ekf.filtering import Filtering
 from vislam.errors import TrackingLostError, UsageError
 from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend, mode_for
 from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.feed import CameraFeed
 from vislam.frontend.initialisation import Initialisation, Initialiser, level_at_once, moved_to
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
 from vislam.frontend.uniform_motion import UniformMotion
 from vislam.geometry import invert, level_rotation, transform
-from vislam.imu import ImuBuffer, ImuNoise, NoiseFloor, RestDetector, subtract_bias
+from vislam.imu import (
+    ConditionWatch,
+    ImuBuffer,
+    ImuNoise,
+    InertialCondition,
+    NoiseFloor,
+    NoiseRatios,
+    RestDetector,
+    subtract_bias,
+)
 from vislam.memory import FrontMemory, FrontNews, StartFacts
 from vislam.messages import (
     AS_MODELLED,
@@ -86,6 +96,9 @@ class FrontReport:
     uniform_s: float  # longest stretch without motion that shows scale
     calibration: dict[str, float]  # what was learned of the camera
     scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
+    noise_ratios: NoiseRatios | None = None  # white noise seen over that of the model; None without an IMU
+    condition: InertialCondition | None = None  # of the IMU; None without one
+    told_rate_hz: float | None = None  # of inertial samples
 
     @property
     def alignment(self) -> Alignment:
@@ -129,9 +142,11 @@ class Front:
         self._has_imu = noise is not None
         self.camera_clock = CameraClock(config.init)
         self.uniform = UniformMotion(config.init)
+        self.feed = CameraFeed()
         self._filter: Filtering | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu, noise)
+            self.condition = ConditionWatch()
             self._rest = RestDetector(config.init, noise)
             self._stillness = Stillness(config.init)
             self._initialiser = Initialiser(
@@ -212,6 +227,7 @@ class Front:
             self._mag = value
         elif self._has_imu and self._filter is not None and self._buffer.add(value):
             self._filter.ekf.predict(value)
+            self.condition.add(value)
 
     def add_hint(self, hint: Hint) -> None:
         """Tell the filter what holds a body while the camera sees nothing."""
@@ -230,6 +246,7 @@ class Front:
 
     def process(self, frame: Frame) -> FrontStep:
         """Track one frame, update the filter with it, and hand over keyframes that are ready."""
+        self.feed.add(frame)
         frame = self.camera_clock.in_imu_time(frame)
         span = self._span(self._last_frame_t_ns, frame.t_ns)
         before = None if self._filter is None else self._filter.state
@@ -239,6 +256,7 @@ class Front:
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, before))
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and self._stillness.resting
+        self.feed.moved(at_rest)
         self._count(track, at_rest)
         if self.frontend.mode == "mono":
             self.uniform.add(span, before, at_rest)
@@ -291,6 +309,9 @@ class Front:
             [] if self._floor is None else self._floor.warnings(self._config.imu.noise_tolerance),
             {} if self._floor is None else self._floor.summary(),
             self.uniform.longest_s, self.calibration, self.scaled_from_ns,
+            None if self._floor is None else self._floor.ratios,
+            self.condition.condition() if self.noise is not None else None,
+            self.noise.rate_hz if self.noise is not None else None,
         )  # fmt: skip
 
     @property
@@ -301,7 +322,21 @@ class Front:
         if told.drift_sigma > 0.0:
             clock |= {"camera_drift": told.drift, "camera_drift_sigma": told.drift_sigma}
         mount = self.frontend.calibration if isinstance(self.frontend, PlanarFrontEnd) else {}
-        return {**(clock if self._has_imu else {}), **mount}
+        return {**({**clock, **self._turned} if self._has_imu else {}), **mount}
+
+    @property
+    def _turned(self) -> dict[str, float]:
+        """By how much the camera stands turned on the body against what was told, in degrees, as rotations tell it."""
+        found, camera = self.camera_clock.estimate, self.news.filter_camera
+        turn, sigmas = found.R_correction, found.R_correction_sigma
+        if camera is not None and camera[5:8].all():
+            turn, sigmas = camera[2:5], camera[5:8]
+        elif not found.frames:
+            return {}
+        angle = float(np.linalg.norm(turn))
+        along = turn / max(angle, 1e-12)
+        sigma = float(np.sqrt(np.sum((along * sigmas) ** 2)))
+        return {"camera_turn_deg": float(np.rad2deg(angle)), "camera_turn_sigma_deg": float(np.rad2deg(sigma))}
 
     @property
     def all_counters(self) -> dict[str, dict[str, int]]:
@@ -309,6 +344,8 @@ class Front:
         counters = {"front": dict(self.counters)}
         if self.frontend.mode == "mono":
             counters["front"]["frames_without_excitation"] = self.uniform.frames
+        feed = self.feed
+        counters["camera feed"] = {"frames": feed.frames, "missing": feed.missing, "repeated": feed.repeated}
         if self._has_imu:
             counters["imu"] = dict(self._buffer.counters)
             counters["initialisation refused"] = dict(self._initialiser.refusals)

@@ -32,6 +32,7 @@ from vislam.config.sensors import (
     Vector3,
     WebcamConfig,
 )
+from vislam.config.verdict import VerdictConfig
 from vislam.errors import UsageError
 
 __all__ = [
@@ -65,6 +66,7 @@ __all__ = [
     "SensorsConfig",
     "SerialConfig",
     "Vector3",
+    "VerdictConfig",
     "VibrationConfig",
     "ViewConfig",
     "WebcamConfig",
@@ -98,6 +100,7 @@ class Config:
     live: LiveConfig = field(default_factory=LiveConfig)
     power_up: PowerUpConfig = field(default_factory=PowerUpConfig)
     attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
+    verdict: VerdictConfig = field(default_factory=VerdictConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
 
 

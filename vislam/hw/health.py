@@ -15,6 +15,7 @@ class Health(IntFlag):
     AT_REST = 1 << 4
     MAG_OK = 1 << 5
     GATE_REJECT = 1 << 6  # vision contradicts the filter now
+    DOUBTFUL = 1 << 7  # the run so far contradicts itself: see the verdict's reasons (status line, metrics.json)
     IMU_MISSING = 1 << 16  # no sample within the time that the source allows
     IMU_GAP = 1 << 17  # samples were lost since the last word
     ACCEL_SATURATED = 1 << 18

@@ -3,6 +3,7 @@
 from vislam.imu.attitude import AttitudeFilter
 from vislam.imu.bias_memory import BiasMemory
 from vislam.imu.buffer import ImuBuffer
+from vislam.imu.condition import ConditionWatch, InertialCondition
 from vislam.imu.noise import ImuCalibration, ImuNoise, MagCalibration
 from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
 from vislam.imu.power_up import PowerUp, Refusal, power_up
@@ -13,10 +14,12 @@ from vislam.imu.series import ImuSeries, join, subtract_bias
 __all__ = [
     "AttitudeFilter",
     "BiasMemory",
+    "ConditionWatch",
     "ImuBuffer",
     "ImuCalibration",
     "ImuNoise",
     "ImuSeries",
+    "InertialCondition",
     "MagCalibration",
     "NoiseFloor",
     "NoiseRatios",

@@ -21,7 +21,7 @@ from vislam.geometry import invert, transform
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
 from vislam.live.inertial_only import InertialOnly
-from vislam.live.messages import CameraHealth, MapMoved, Rebase, Start, ToFast
+from vislam.live.messages import CameraHealth, Doubted, MapMoved, Rebase, Start, ToFast
 from vislam.live.published_pose import PublishedPose, of_base
 from vislam.messages import Array, ImuSample, MagSample, NavState, Tracking
 
@@ -73,6 +73,7 @@ class FastPath:
         self._in_odom, self._in_map = in_odom(config), Continuity(config.publish)
         self._T_map_odom = np.eye(4)  # that `_in_map` follows
         self._camera = Health(0)
+        self._doubt = Health(0)
         self._events: deque[tuple[int, Health]] = deque()
         self._looked_ns = 0
         self._sequence = 0
@@ -159,6 +160,8 @@ class FastPath:
                 self._map = message
         elif isinstance(message, CameraHealth):
             self._camera = message.health
+        elif isinstance(message, Doubted):
+            self._doubt = Health.DOUBTFUL if message.is_doubtful else Health(0)
         else:
             self._start(message)
 
@@ -216,7 +219,7 @@ class FastPath:
 
     def _health(self, state: NavState | None, now_ns: int, age_ns: int) -> Health:
         config = self._config.live
-        health = self._camera
+        health = self._camera | self._doubt
         for _, event in self._events:
             health |= event
         if age_ns > config.imu_timeout_s * _NS:

@@ -26,15 +26,18 @@ from vislam.live.child import Life
 from vislam.live.frames import FrameSource
 from vislam.live.handover import FrontEnded, KeyframeOut, Seen
 from vislam.live.mail import Outbox
-from vislam.live.messages import CameraHealth, Rebase, Start, ToFast
+from vislam.live.messages import CameraHealth, Doubted, Rebase, Start, ToFast
 from vislam.live.publisher import PoseReader
 from vislam.live.rehearsal import rehearse_front
 from vislam.live.stream import SampleReceiver, Value
 from vislam.messages import Array, Frame, Keyframe, Tracking, no_observations
+from vislam.run.evidence import front_evidence
 from vislam.slam import makes_depth, seen_between
+from vislam.verdict import Trust, Verdict, judge
 
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
 _PUT_S = 0.1
+_JUDGE_NS = 1_000_000_000  # of frames between verdicts: one costs a millisecond
 _STEPS = 4096  # frames that may wait for the map process: minutes; then it is stuck
 
 
@@ -95,6 +98,8 @@ class FrontProcess:
         self._told_start: Initialisation | None = None
         self._begins_back = True
         self._camera_health = Health(0)
+        self._verdict = Verdict(Trust.TRUSTED)
+        self._judged_t_ns = 0
         self._frames_taken = 0
         self._feeds_depth = makes_depth(config, rig)
         self._poses: PoseReader | None = None
@@ -140,6 +145,7 @@ class FrontProcess:
         self._counters["crowded_frames"] += is_crowded
         step = self.front.process(frame)
         self._correct(step)
+        self._judge(frame.t_ns)
         for odometry in step.keyframes:
             self._put_keyframe(KeyframeOut(odometry, *self._first()))
         shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
@@ -164,6 +170,18 @@ class FrontProcess:
             return
         for correction in step.corrections:
             self._send(replace(correction, observations=no_observations()))
+
+    def _judge(self, t_ns: int) -> None:
+        """Tell the pose whether the run so far is to be doubted, and people why; nothing while it begins."""
+        if self.front.initialisation is None or t_ns - self._judged_t_ns < _JUDGE_NS:
+            return
+        self._judged_t_ns = t_ns
+        verdict = judge(front_evidence(self.front.report(), self._config.imu), self._config.verdict)
+        if verdict.state != self._verdict.state:
+            self._send(Doubted(verdict.state is not Trust.TRUSTED))
+        if verdict != self._verdict:
+            self._life.note(verdict={"state": str(verdict.state), "reasons": list(verdict.reasons)})
+        self._verdict = verdict
 
     def _follow_camera(self, health: Health) -> None:
         if health != self._camera_health:

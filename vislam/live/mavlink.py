@@ -22,7 +22,7 @@ _FLIP_6 = np.tile(_FLIP, 2)
 _UPPER = np.triu_indices(6)
 _SYSTEM = 1  # the vehicle that the autopilot steers
 _HEARTBEAT_NS = 1_000_000_000
-_SEEN, _BLIND, _FAILED = 100, 25, -1
+_SEEN, _DOUBTED, _BLIND, _FAILED = 100, 50, 25, -1
 
 
 class Mavlink:
@@ -89,11 +89,13 @@ def odometry(pose: PublishedPose) -> common.MAVLink_odometry_message:
 
 
 def quality(health: Health) -> int:
-    """Return MAVLink's quality: 100 with vision, 25 without it or against it, -1 for a pose not to steer by."""
+    """Return MAVLink's quality: 100 with vision, 50 of a doubtful run, 25 blind, -1 for a pose not to steer by."""
     if Health.INVALID in health or Health.LEVELLED not in health:
         return _FAILED
     blind = Health.DEAD_RECKONING | Health.GATE_REJECT
-    return _SEEN if Health.VISION_OK in health and not health & blind else _BLIND
+    if Health.VISION_OK not in health or health & blind:
+        return _BLIND
+    return _DOUBTED if Health.DOUBTFUL in health else _SEEN
 
 
 def _upper(covariance: Array) -> list[float]:

@@ -34,6 +34,13 @@ class CameraHealth:
     health: Health
 
 
+@dataclass(frozen=True, slots=True)
+class Doubted:
+    """Whether the verdict on the run so far is anything but trusted, when it changes."""
+
+    is_doubtful: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MapMoved:
     """Where `odom` is in `map` since a revision of the graph."""
@@ -42,4 +49,4 @@ class MapMoved:
     T_map_odom: Array  # [4, 4]
 
 
-ToFast = Start | Correction | Rebase | CameraHealth | MapMoved
+ToFast = Start | Correction | Rebase | CameraHealth | Doubted | MapMoved

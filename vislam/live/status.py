@@ -20,6 +20,8 @@ def status_line(run: LiveRun) -> str:
     names = " ".join((flag.name or "").lower() for flag in health) or "not levelled"
     refused = told.get("power_up", {}).get("refused")
     names += "  found in the map" if run.notes.get("map", {}).get("found_in_map") else ""
+    reasons = run.notes.get("front", {}).get("verdict", {}).get("reasons")
+    names += f"  because {reasons[0]}" if reasons else ""
     names += f"  no zero yet: {refused}" if refused else ""
     late = f"{latency['p50']:.2f}/{latency['p99']:.2f} ms" if "p50" in latency else "-"
     return (

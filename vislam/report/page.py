@@ -32,6 +32,7 @@ from vislam.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_
 from vislam.report.scene import Scene, build_scene
 from vislam.report.style import stylesheet
 from vislam.trajectory import write_text
+from vislam.verdict import verdict_sentence
 
 
 def write_report(run: Path) -> Path:
@@ -76,7 +77,8 @@ def _name(run: RunFiles) -> str:
 
 def _head(run: RunFiles) -> str:
     m = run.metrics
-    parts = []
+    verdict = as_dict(m, "verdict")
+    parts = [f"{verdict_sentence(verdict)}."] if verdict else []
     if m:
         parts.append(
             f"{number(m.get('frames'), 0)} frames and {number(m.get('keyframes'), 0)} keyframes, "
@@ -143,7 +145,8 @@ def _lost_frames(run: RunFiles) -> tuple[int, int]:
 
 
 def _problems(run: RunFiles, scene: Scene) -> str:
-    lines = [str(warning) for warning in as_list(run.metrics.get("warnings"))]
+    lines = [str(moved) for moved in as_list(as_dict(run.metrics, "verdict").get("moved"))]
+    lines += [str(warning) for warning in as_list(run.metrics.get("warnings"))]
     lines += scene.notes
     lines += [f"{name} left out: {reason}" for name, reason in run.unread.items()]
     return card(bullets(lines), kind="warnings", title="Worth knowing") if lines else ""

@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 
 from vislam.config import Config, ImuConfig
 from vislam.errors import DataError, UsageError, VislamError
+from vislam.front import FrontReport
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
 from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
-from vislam.messages import Frame, ImuSample, LoopDecision, MagSample
+from vislam.messages import Frame, ImuSample, LoopDecision, MagSample, Pieces
 from vislam.recording import Recording
+from vislam.run.evidence import KeyframeWitness, front_evidence, whole_evidence
 from vislam.run.loop_gallery import LoopGallery
-from vislam.run.metrics import accuracy, doubts, initialisation, judge
+from vislam.run.metrics import accuracy, initialisation, refuse, verdict_entry
 from vislam.run.pipeline import Pipeline
 from vislam.run.view import show_map, show_paths, show_step
 from vislam.runfolder import RunLog, write_json
@@ -32,6 +34,7 @@ from vislam.session import Session, SessionWriter, recall
 from vislam.slam import KeyframeStep, Slam, Step
 from vislam.sources import shaken
 from vislam.trajectory import Trajectory
+from vislam.verdict import Evidence, judge
 from vislam.viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:
@@ -73,6 +76,8 @@ class Run:
         self.slam: Pipeline = Slam(config, recording.rig, self.noise) if slam is None else slam
         self.log = RunLog()
         self.gallery = LoopGallery()
+        self.witness = KeyframeWitness(config)
+        self._pieces = Pieces()
         self.session = session
         self.resumed: list[dict[str, Any]] = []
         self._first_frame = 0  # that was not remembered from an earlier process
@@ -149,7 +154,7 @@ class Run:
         if failure is not None:
             raise failure
         if self.wants_frames:
-            judge(metrics, self.out)
+            refuse(metrics, self.out)
         return metrics
 
     @property
@@ -218,6 +223,8 @@ class Run:
             )  # fmt: skip
             self.session.add(entry)
             self.gallery.add(step)
+            self.witness.add(packet, step.update)
+            self._pieces = step.update.pieces
         if self.base is not None and self.joined_t_ns is None and step.update.pieces.group(packet.keyframe.id) == 0:
             self.joined_t_ns = packet.keyframe.t_ns
 
@@ -301,8 +308,9 @@ class Run:
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             counters |= back.counters
-        doubted = doubts(front, self.log, final, self.noise is not None)
-        self.warnings += [*front.noise_warnings, *doubted]
+        evidence = self._evidence(front, final)
+        verdict = judge(evidence, self.config.verdict)
+        self.warnings += front.noise_warnings
         errors: dict[str, Any] = {}
         found = self._found_in_map()
         if truth is not None:
@@ -310,6 +318,7 @@ class Run:
             self.warnings += not_compared
         return {
             "name": self.recording.name,
+            "verdict": verdict_entry(evidence, verdict),
             "mode": front.mode,
             "has_imu": self.noise is not None,
             "coupling": {"ekf": front.coupling, "graph": self.config.graph.coupling},
@@ -332,9 +341,21 @@ class Run:
             "loops": loops,
             "graph_revisions": self.log.revisions,
             "coverage_frames": len(final) / max(len(self.log), 1),
-            "doubts": doubted,
+            "doubts": list(verdict.reasons),
             "warnings": self.warnings,
         }
+
+    def _evidence(self, report: FrontReport, final: Trajectory) -> Evidence:
+        """Gather what speaks for and against the run."""
+        front = front_evidence(report, self.config.imu)
+        graph = None if self.slam.back is None else self.slam.back.graph
+        if graph is None:
+            return whole_evidence(front, self.log, final, [], {}, 0, {})
+        ids, states = graph.ids.tolist(), graph.states()
+        by_keyframe = dict(zip(ids, states, strict=True)) if states else {}
+        apart = len({*self._pieces.groups}) - 1
+        keyframes = self.witness.evidence(ids, graph.poses(), states)
+        return whole_evidence(front, self.log, final, graph.edge_reports(), by_keyframe, apart, keyframes)
 
     def _found_in_map(self) -> dict[str, Any] | None:
         """Return in which map the run began, and when it was found there."""

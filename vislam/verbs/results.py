@@ -12,6 +12,7 @@ from rich.console import Console
 
 from vislam.errors import VislamError
 from vislam.verbs.terminal import number, print_table
+from vislam.verdict import verdict_sentence
 
 
 @contextmanager
@@ -36,9 +37,10 @@ def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps(plain(metrics)))
         return
+    console, loops = Console(), metrics["loops"]
+    _print_verdict(console, metrics.get("verdict", {}))
     if metrics["accuracy"]:
         _print_accuracy(metrics)
-    console, loops = Console(), metrics["loops"]
     console.print(
         f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {loops['accepted']} loops of "
         f"{loops['candidates']} candidates, {number(metrics['realtime_factor'], 1)} x real time"
@@ -61,6 +63,15 @@ def print_evaluation(results: dict[str, dict[str, Any]]) -> None:
         numbers = [number(entry[key], 4) for key in columns.values()]
         rows.append((name, *numbers, f"{entry['matched']}/{entry['total']}", f"{entry['coverage']:.0%}"))
     print_table(("trajectory", *columns, "matched", "covered"), rows)
+
+
+def _print_verdict(console: Console, verdict: dict[str, Any]) -> None:
+    """Print what the run is worth, and under it what its calibration found."""
+    if verdict:
+        style = "green" if verdict["state"] == "trusted" else "red"
+        console.print(f"{verdict_sentence(verdict)}.", style=style, soft_wrap=True)
+    for moved in verdict.get("moved", []):
+        console.print(f"found out: {moved}", soft_wrap=True)
 
 
 def _print_accuracy(metrics: dict[str, Any]) -> None:

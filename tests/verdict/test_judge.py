@@ -1,0 +1,121 @@
+"""From evidence to a verdict: each reason alone, nothing by chance, and words that say what to do next."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vislam.config import VerdictConfig
+from vislam.verdict import (
+    Apart,
+    Evidence,
+    ForceAgreement,
+    Moved,
+    Trust,
+    TurnAgreement,
+    judge,
+    verdict_sentence,
+)
+
+CONFIG = VerdictConfig()
+SOUND = Evidence(
+    mode="mono", frames=400, frames_lost=1, frames_degraded=5, frames_missing=2, coverage=0.99, has_imu=True,
+    innovations={"tracks": (4000, 2400.0, 12000)}, keyframes=60, refused=12, offered=4000, sigma_m=0.1, uniform_s=3.0,
+    apart=Apart(0.02, 0.8, 20.0), loops_accepted=30, loops_contradicting=2, clock=Moved(0.0004, 0.0005),
+    rotation=Moved(0.4, 0.1), turns=TurnAgreement(50, 0.002, 0.0015, 1e-3),
+    forces=ForceAgreement(50, 1.001, 0.002, 9.79, 0.02, 0.2), gyro_noise=0.9, accel_noise=1.1, rate_hz=200.0,
+    rate_told_hz=200.0, force_m_s2=9.85,
+)  # fmt: skip
+
+
+def verdict(**changes):
+    return judge(replace(SOUND, **changes), CONFIG)
+
+
+def test_a_sound_run_is_trusted_without_reasons():
+    assert verdict().state is Trust.TRUSTED
+    assert verdict().reasons == ()
+    assert verdict().moved == ()
+
+
+def test_a_run_of_which_nothing_is_known_is_not_doubted():
+    assert judge(Evidence(), CONFIG).state is Trust.TRUSTED
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"frames_lost": 20}, "vision lost 20 of 400 frames"),
+        ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),
+        ({"frames_missing": 100}, "100 of 500 frames never arrived"),
+        ({"frames_repeated": 40}, "40 images repeat the one before"),
+        ({"pieces_apart": 2}, "2 pieces of the trajectory"),
+        ({"is_started": False, "start_reason": "gravity norm 1.00"}, "gravity was not found"),
+        ({"start_failures": 5}, "contradicted each other in 5 attempts"),
+        ({"soft_resets": 2}, "gave up its certainty 2 times"),
+        ({"refused": 900}, "refused 900 of 4000"),
+        ({"innovations": {"vo": (300, 2700.0, 1800)}}, "innovations of vo are 1.5 times"),
+        ({"sigma_m": 3.0}, "uncertain by 3.0 m"),
+        ({"uniform_s": 40.0}, "uniform motion for 40 s"),
+        ({"apart": Apart(1.5, 12.0, 20.0)}, "filter and graph are 1.50 m apart"),
+        ({"loops_contradicting": 25}, "25 of 55 verified loops"),
+        ({"clock": Moved(0.08, 0.0005)}, "80.0 ± 0.5 ms early"),
+        ({"rotation": Moved(3.0, 0.1)}, "the camera is turned by 3.0 degrees against its file: calibrate"),
+        ({"turns": TurnAgreement(50, -0.03, 0.002, 1e-3)}, "vision sees turns 3.0 % smaller"),
+        ({"forces": ForceAgreement(50, 1.05, 0.002, 9.8, 0.02, 0.2)}, "metres are 5.0 % larger"),
+        ({"forces": ForceAgreement(50, 1.0, 0.002, 10.3, 0.02, 0.2)}, "gravity along the way is 10.30"),
+        ({"gyro_noise": 8.0}, "the gyroscope is 8.0 times as noisy as told"),
+        ({"accel_noise": 5.0}, "the accelerometer is 5.0 times as noisy as told"),
+        ({"rate_hz": 50.0}, "come at 50 Hz, told were 200"),
+        ({"longest_gap_s": 1.5}, "no inertial sample for 1.50 s"),
+        ({"saturated": ("gyro z",)}, "saturated: gyro z"),
+        ({"force_m_s2": 1.0}, "reads 1.00 m/s2 where gravity is 9.81"),
+    ],
+)
+def test_each_contradiction_alone_is_a_doubt_that_names_it(changes, words):
+    found = verdict(**changes)
+    assert found.state is Trust.DOUBTFUL
+    assert len(found.reasons) == 1
+    assert words in found.reasons[0]
+
+
+def test_a_run_with_few_poses_is_lost_and_says_why():
+    found = verdict(coverage=0.2, is_started=False, start_reason="parallax 3 px of 12 needed")
+    assert found.state is Trust.LOST
+    assert "20%" in found.reasons[0]
+    assert "parallax 3 px" in found.reasons[0]
+
+
+def test_what_calibration_corrected_is_told_without_a_doubt():
+    found = verdict(clock=Moved(-0.02, 0.0005), rotation=Moved(1.2, 0.1))
+    assert found.state is Trust.TRUSTED
+    assert any("20.0 ± 0.5 ms late" in words and "corrected" in words for words in found.moved)
+    assert any("turned by 1.20 ± 0.10 degrees" in words for words in found.moved)
+
+
+def test_what_is_found_far_off_but_badly_known_is_no_doubt():
+    sigma = 0.4
+    assert verdict(turns=TurnAgreement(15, 0.5, sigma, 0.01)).state is Trust.TRUSTED
+    assert verdict(forces=ForceAgreement(15, 1.5, sigma, 8.0, 2.0, 3.0)).state is Trust.TRUSTED
+    assert verdict(clock=Moved(float("nan"), float("inf"))).state is Trust.TRUSTED
+
+
+def test_filter_and_graph_may_differ_by_what_both_admit_or_by_a_trifle():
+    assert verdict(apart=Apart(3.0, 1.2, 20.0)).state is Trust.TRUSTED
+    assert verdict(apart=Apart(0.01, 9.0, 20.0)).state is Trust.TRUSTED
+
+
+def test_innovations_that_noise_explains_are_rarely_doubted():
+    rng = np.random.default_rng(5)
+    doubted = 0
+    for _ in range(300):
+        nis = float(np.sum(rng.normal(size=(60, 6)) ** 2)) * 5.0  # five frames that share the error of each keyframe
+        doubted += judge(replace(SOUND, innovations={"vo": (300, nis, 1800)}), CONFIG).state is not Trust.TRUSTED
+    assert doubted <= 3
+
+
+def test_the_sentence_is_the_same_from_a_verdict_that_was_stored():
+    found = verdict(rate_hz=50.0)
+    stored = {"state": str(found.state), "reasons": list(found.reasons)}
+    assert verdict_sentence(stored).startswith("Doubtful: inertial samples come at 50 Hz")
+    assert verdict_sentence({"state": "trusted", "reasons": []}) == "Trusted: nothing in the run contradicts itself"

@@ -1,0 +1,28 @@
+"""Defaults of the verdict on a run: what its evidence may be by chance, and how good what was told of sensors is."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictConfig:
+    """When a run is doubted. Sigmas are those of classes of sensors, not of a recording."""
+
+    probability: float = 0.999  # of each test to pass where nothing is wrong: some 15 tests, 1 doubt in 60 sound runs
+    rotation_sigma_deg: float = 0.5  # of the camera on the body as told: Kalibr is good to 0.1, a printed mount to 1
+    clock_sigma_s: float = 0.015  # of the camera's clock as told: drivers that stamp on arrival are off by up to 30 ms
+    turn_scale_sigma: float = 0.005  # relative, of focal length and gyro together: Kalibr 0.2 %, a calibrated gyro 0.5
+    force_scale_sigma: float = 0.01  # relative, of accelerometer and of baseline or depth, all calibrated
+    accel_bias_sigma_m_s2: float = 0.2  # as `init.accel_bias_sigma_m_s2`: of a calibrated cheap accelerometer
+    noise_ratio: float = 3.0  # white noise over that told, in the quietest half second; estimators cover so much
+    rate_error: float = 0.2  # relative, of the inertial rate against that told: clocks are good to 3 %
+    lost_share: float = 0.02  # of the frames that vision may lose: a blink, no outage
+    degraded_share: float = 0.2  # of the frames on which vision may lean weakly
+    missing_share: float = 0.1  # of the frames that may never arrive: patches are followed over twice the interval then
+    repeated_frames: int = 3  # images equal to the last bit in motion: one may be a hiccup, a stuck driver sends many
+    refused_share: float = 0.1  # of visual measurements that the filter may refuse: more than outliers explain
+    contradicting_share: float = 0.25  # of verified loops that the graph may refuse, as `graph.join_max_contradicting`
+    uniform_s: float = 20.0  # one camera without motion that shows scale: biases have walked away by then
+    sigma_m: float = 1.0  # of the filter's position at its worst: no controller can use it
+    apart_sigmas: float = 3.0  # rms between filter and graph over what both admit: independent models would differ by 1
+    apart_share: float = 0.005  # of the way: closer together than this they tell the same story, whatever they admit
+    min_coverage: float = 0.5  # of the frames that must have a pose; below, the run is lost

@@ -1,0 +1,90 @@
+"""How an inertial unit is doing, beside its noise: its rate, holes, a range that ends too early, the force it feels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.messages import Array, ImuSample
+
+_NS = 1_000_000_000
+_WINDOW = 64  # samples looked at together
+_HOLE = 2.5  # usual intervals; a longer one is a hole
+_BY_CHANCE = 1e-3  # plateaus at the end of the range that chance would make in the whole recording
+
+
+@dataclass(frozen=True, slots=True)
+class InertialCondition:
+    """What the samples of a recording show."""
+
+    samples: int
+    rate_hz: float  # NaN before there are two
+    longest_gap_s: float
+    saturated_axes: tuple[str, ...]  # "gyro x", ...: the range ends where the motion does not
+    force_m_s2: float  # median norm of the mean force over short windows: gravity, where motion goes to and fro
+
+
+class ConditionWatch:
+    """Owns counts over all samples; memory grows by a number per window."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._pending: list[Array] = []  # [6] each
+        self._last_t_ns: int | None = None
+        self._intervals_ns: list[int] = []  # one per window: its median
+        self._window_ns: list[int] = []
+        self._longest_ns = 0
+        self._samples = 0
+        self._forces: list[float] = []
+        self._ends = np.stack([np.full(6, np.inf), np.full(6, -np.inf)])  # lowest and highest value per axis ...
+        self._runs = np.zeros((2, 6), dtype=np.int64)  # ... and the longest run of samples that have exactly it
+        self._equal = np.zeros(6, dtype=np.int64)  # pairs of neighbours that are exactly equal
+
+    def add(self, sample: ImuSample) -> None:
+        """Take a sample, in time order."""
+        if self._last_t_ns is not None:
+            step_ns = sample.t_ns - self._last_t_ns
+            self._window_ns.append(step_ns)
+            self._longest_ns = max(self._longest_ns, step_ns)
+        self._last_t_ns = sample.t_ns
+        self._samples += 1
+        self._pending.append(np.concatenate([sample.gyro_rad_s, sample.accel_m_s2]))
+        if len(self._pending) == _WINDOW:
+            self._look(np.array(self._pending))
+            self._pending, self._window_ns = self._pending[-1:], []
+
+    def condition(self) -> InertialCondition:
+        """Return what there is to say so far."""
+        interval_ns = float(np.median(self._intervals_ns)) if self._intervals_ns else float("nan")
+        longest_ns = self._longest_ns if self._longest_ns > _HOLE * interval_ns else 0
+        force = float(np.median(self._forces)) if self._forces else float("nan")
+        return InertialCondition(self._samples, _NS / interval_ns, longest_ns / _NS, self._saturated(), force)
+
+    def _look(self, values: Array) -> None:
+        """Take a window [N, 6]; its first sample is the last one of the window before."""
+        self._intervals_ns.append(int(np.median(self._window_ns)))
+        self._forces.append(float(np.linalg.norm(values[1:, 3:].mean(axis=0))))
+        self._equal += np.sum(values[1:] == values[:-1], axis=0)
+        for side, ends in enumerate((values.min(axis=0), values.max(axis=0))):
+            beyond = ends < self._ends[0] if side == 0 else ends > self._ends[1]
+            runs = np.where(ends == self._ends[side], self._runs[side], 0)
+            for axis in np.flatnonzero(beyond | (ends == self._ends[side])):
+                runs[axis] = max(int(runs[axis]), _longest_run(values[:, axis] == ends[axis]))
+            self._runs[side] = np.where(beyond, runs, np.maximum(runs, self._runs[side]))
+            self._ends[side] = np.where(beyond, ends, self._ends[side])
+
+    def _saturated(self) -> tuple[str, ...]:
+        """Return the axes whose range ends in a plateau that equal neighbours elsewhere do not explain."""
+        if self._samples <= _WINDOW:
+            return ()
+        share = (self._equal + 1.0) / self._samples
+        expected = self._samples * share ** np.maximum(self._runs.max(axis=0) - 1, 0)
+        names = [f"{unit} {axis}" for unit in ("gyro", "accelerometer") for axis in "xyz"]
+        return tuple(name for name, chance in zip(names, expected, strict=True) if chance < _BY_CHANCE)
+
+
+def _longest_run(is_there: np.ndarray) -> int:
+    """Return the length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_there, [False]]).astype(np.int8)))
+    return int(np.max(edges[1::2] - edges[::2], initial=0))

@@ -1,0 +1,183 @@
+"""Gathers the evidence of a run for its verdict: from the front half, live or not, and from the whole at the end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from vislam.config import Config, ImuConfig
+from vislam.errors import VislamError
+from vislam.factors.gate import EdgeReport
+from vislam.front import FrontReport
+from vislam.imu import Preintegrated, preintegrate
+from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
+from vislam.runfolder import RunLog
+from vislam.trajectory import Trajectory, align, associate
+from vislam.verdict import Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
+
+_MIN_COMPARED = 10  # poses
+_SAMPLES = 4  # of a span, at least, that says something
+_REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
+_VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
+
+
+def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
+    """Return what the front half has to say, at any time of a run."""
+    counters = report.counters
+    front, feed, ekf = (counters.get(name, {}) for name in ("front", "camera feed", "ekf"))
+    has_imu = report.condition is not None
+    refusals = counters.get("initialisation refused", {})
+    offered = [(ekf.get(first, 0), sum(ekf.get(name, 0) for name in others)) for first, *others in _VISION]
+    evidence = Evidence(
+        mode=report.mode,
+        frames=feed.get("frames", 0),
+        frames_lost=front.get("frames_lost", 0),
+        frames_degraded=front.get("frames_degraded", 0),
+        frames_missing=feed.get("missing", 0),
+        frames_repeated=feed.get("repeated", 0),
+        has_imu=has_imu,
+        is_started=not has_imu or report.start is not None,
+        start_reason=report.refusal,
+        start_failures=sum(refusals.get(name, 0) for name in _REFUSALS),
+        innovations=report.nis,
+        keyframes=ekf.get("keyframes", 0),
+        refused=sum(refused for _, refused in offered),
+        offered=sum(taken + refused for taken, refused in offered),
+        soft_resets=ekf.get("soft_resets", 0),
+        uniform_s=report.uniform_s,
+        gravity_m_s2=imu.gravity_m_s2,
+        max_gap_s=imu.max_gap_s,
+        **_calibration(report.calibration),
+    )
+    condition, noise = report.condition, report.noise_ratios
+    if condition is None:
+        return evidence
+    return replace(
+        evidence,
+        gyro_noise=None if noise is None else noise.gyro_quiet,
+        accel_noise=None if noise is None else noise.accel_quiet,
+        rate_hz=condition.rate_hz if np.isfinite(condition.rate_hz) else None,
+        rate_told_hz=report.told_rate_hz,
+        longest_gap_s=condition.longest_gap_s,
+        saturated=condition.saturated_axes,
+        force_m_s2=condition.force_m_s2 if np.isfinite(condition.force_m_s2) else None,
+    )
+
+
+def _calibration(learned: dict[str, float]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if "camera_offset_s" in learned:
+        found["clock"] = Moved(learned["camera_offset_s"], learned["camera_offset_sigma_s"])
+    if "camera_turn_deg" in learned:
+        found["rotation"] = Moved(learned["camera_turn_deg"], learned["camera_turn_sigma_deg"])
+    return found
+
+
+class KeyframeWitness:
+    """Owns what keyframes bring that only a comparison of sensors asks for: turns by vision, inertial steps."""
+
+    def __init__(self, config: Config) -> None:
+        """Start empty."""
+        self._config = config
+        self._turns: list[TurnStep] = []
+        self._inertial: dict[int, Preintegrated] = {}  # by the keyframe at their end
+        self._rotation: Moved | None = None
+
+    def add(self, packet: KeyframePacket, update: GraphUpdate) -> None:
+        """Take a keyframe and what the graph made of it."""
+        span, vo = packet.imu, packet.vo
+        if update.details is not None and update.newest is not None:
+            self._rotation = _window_turn(update.details.get("calibration")) or self._rotation
+        if span is None or packet.begins_piece or len(span.t_ns) < _SAMPLES:
+            return
+        if float(np.diff(span.t_ns).max()) * 1e-9 > self._config.imu.max_gap_s:
+            return
+        inertial = preintegrate(span)
+        self._inertial[packet.keyframe.id] = inertial
+        is_seen = vo.tracking is Tracking.OK and vo.T_keyframe_body is not None and not packet.at_rest
+        if is_seen and vo.keyframe_id == packet.keyframe.id - 1 and vo.T_keyframe_body is not None:
+            self._turns.append(TurnStep(inertial, np.ascontiguousarray(vo.T_keyframe_body[:3, :3])))
+
+    def evidence(self, ids: list[int], T_map_body: Array, states: Sequence[NavState]) -> dict[str, Any]:
+        """Return the fields of `Evidence` that come of it, for the final poses [M, 4, 4] of the keyframes."""
+        found: dict[str, Any] = {"turns": turn_agreement(self._turns)}
+        if self._rotation is not None:
+            found["rotation"] = self._rotation
+        if len(states) != len(ids):
+            return found
+        bias = {i: state.gyro_bias_rad_s for i, state in zip(ids, states, strict=True)}
+        steps = [self._without_bias(k, bias.get(k)) for k in ids[1:]]
+        imu = self._config.imu
+        sigma = self._config.verdict.accel_bias_sigma_m_s2
+        found["forces"] = force_agreement(T_map_body, steps, imu.gravity_m_s2, sigma)
+        return found
+
+    def _without_bias(self, keyframe_id: int, gyro_bias: Array | None) -> Preintegrated | None:
+        inertial = self._inertial.get(keyframe_id)
+        if inertial is None or gyro_bias is None:
+            return None
+        dR, dv, dp = inertial.corrected(gyro_bias, np.zeros(3))
+        return replace(inertial, dR=dR, dv_m_s=dv, dp_m=dp)
+
+
+def _window_turn(calibration: Any) -> Moved | None:
+    """Return by how much a window turned the camera, in degrees; None where it does not estimate that."""
+    if calibration is None or not np.all(calibration.R_cam_sigma > 0.0):
+        return None
+    turn = calibration.R_cam_correction
+    angle = float(np.linalg.norm(turn))
+    sigma = float(np.sqrt(np.sum((turn / max(angle, 1e-12) * calibration.R_cam_sigma) ** 2)))
+    return Moved(float(np.rad2deg(angle)), float(np.rad2deg(sigma)))
+
+
+def whole_evidence(
+    front: Evidence, log: RunLog, final: Trajectory, reports: Sequence[EdgeReport], states: dict[int, NavState],
+    pieces_apart: int, keyframes: dict[str, Any],
+) -> Evidence:  # fmt: skip
+    """Return the evidence of a whole run.
+
+    Args:
+        front: that of the front half.
+        log: of the run.
+        final: the final trajectory.
+        reports: what became of the loops that were offered to the graph.
+        states: of the graph, by keyframe.
+        pieces_apart: pieces of the trajectory that are joined with nothing.
+        keyframes: see `KeyframeWitness.evidence`.
+    """
+    decided = Counter(report.decision for report in reports)
+    return replace(
+        front,
+        coverage=len(final) / max(len(log), 1),
+        pieces_apart=pieces_apart,
+        sigma_m=log.worst_position_sigma_m,
+        apart=_apart(log, final, states) if front.has_imu and front.is_started else None,
+        loops_accepted=decided[LoopDecision.ACCEPTED],
+        loops_contradicting=sum(decided.values()) - decided[LoopDecision.ACCEPTED],
+        **keyframes,
+    )
+
+
+def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart | None:
+    """Compare filter and graph at the keyframes, each with the sigmas that it admits."""
+    odometry = log.odometry_trajectory()
+    if len(odometry) < _MIN_COMPARED or len(final) < _MIN_COMPARED:
+        return None
+    with suppress(VislamError):  # nothing in common to compare
+        pairs = associate(odometry, final)
+        errors = pairs.aligned(align(pairs, "yaw")).position_errors_m()
+        rms_m = float(np.sqrt(np.mean(errors**2)))
+        path_m = float(np.linalg.norm(np.diff(final.positions_m, axis=0), axis=1).sum())
+        admitted = [
+            np.trace(state.covariance[3:6, 3:6]) + np.trace(log.filter_state(k).covariance[3:6, 3:6])  # type: ignore[union-attr]
+            for k, state in states.items()
+            if log.filter_state(k) is not None
+        ]
+        if admitted:
+            return Apart(rms_m, rms_m / max(float(np.sqrt(np.mean(admitted))), 1e-9), path_m)
+    return None
