@@ -21,6 +21,7 @@ from vislam.frontend.initialisation import Initialisation, Initialiser, level_at
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
+from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.frontend.uniform_motion import UniformMotion
 from vislam.geometry import invert, level_rotation, transform
 from vislam.imu import (
@@ -98,7 +99,7 @@ class FrontReport:
     scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
     noise_ratios: NoiseRatios | None = None  # white noise seen over that of the model; None without an IMU
     condition: InertialCondition | None = None  # of the IMU; None without one
-    told_rate_hz: float | None = None  # of inertial samples
+    told_noise: ImuNoise | None = None  # of the IMU
 
     @property
     def alignment(self) -> Alignment:
@@ -311,7 +312,7 @@ class Front:
             self.uniform.longest_s, self.calibration, self.scaled_from_ns,
             None if self._floor is None else self._floor.ratios,
             self.condition.condition() if self.noise is not None else None,
-            self.noise.rate_hz if self.noise is not None else None,
+            self.noise,
         )  # fmt: skip
 
     @property
@@ -328,15 +329,19 @@ class Front:
     def _turned(self) -> dict[str, float]:
         """By how much the camera stands turned on the body against what was told, in degrees, as rotations tell it."""
         found, camera = self.camera_clock.estimate, self.news.filter_camera
-        turn, sigmas = found.R_correction, found.R_correction_sigma
+        turn, sigmas, prior_deg = found.R_correction, found.R_correction_sigma, float(np.rad2deg(TURN_SIGMA))
         if camera is not None and camera[5:8].all():
-            turn, sigmas = camera[2:5], camera[5:8]
+            turn, sigmas, prior_deg = camera[2:5], camera[5:8], self._config.ekf.tight_extrinsic_sigma_deg
         elif not found.frames:
             return {}
         angle = float(np.linalg.norm(turn))
         along = turn / max(angle, 1e-12)
         sigma = float(np.sqrt(np.sum((along * sigmas) ** 2)))
-        return {"camera_turn_deg": float(np.rad2deg(angle)), "camera_turn_sigma_deg": float(np.rad2deg(sigma))}
+        return {
+            "camera_turn_deg": float(np.rad2deg(angle)),
+            "camera_turn_sigma_deg": float(np.rad2deg(sigma)),
+            "camera_turn_prior_deg": prior_deg,
+        }
 
     @property
     def all_counters(self) -> dict[str, dict[str, int]]:

@@ -23,7 +23,7 @@ SOUND = Evidence(
     innovations={"tracks": (4000, 2400.0, 12000)}, keyframes=60, refused=12, offered=4000, sigma_m=0.1, uniform_s=3.0,
     apart=Apart(0.02, 0.8, 20.0), loops_accepted=30, loops_contradicting=2, clock=Moved(0.0004, 0.0005),
     rotation=Moved(0.4, 0.1), turns=TurnAgreement(50, 0.002, 0.0015, 1e-3),
-    forces=ForceAgreement(50, 1.001, 0.002, 9.79, 0.02, 0.2), gyro_noise=0.9, accel_noise=1.1, rate_hz=200.0,
+    forces=ForceAgreement(50, 1.001, 0.002, 9.79, 0.02, 0.2), gyro_noise=2e-3, accel_noise=0.05, rate_hz=200.0,
     rate_told_hz=200.0, force_m_s2=9.85,
 )  # fmt: skip
 
@@ -64,8 +64,8 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"turns": TurnAgreement(50, -0.03, 0.002, 1e-3)}, "vision sees turns 3.0 % smaller"),
         ({"forces": ForceAgreement(50, 1.05, 0.002, 9.8, 0.02, 0.2)}, "metres are 5.0 % larger"),
         ({"forces": ForceAgreement(50, 1.0, 0.002, 10.3, 0.02, 0.2)}, "gravity along the way is 10.30"),
-        ({"gyro_noise": 8.0}, "the gyroscope is 8.0 times as noisy as told"),
-        ({"accel_noise": 5.0}, "the accelerometer is 5.0 times as noisy as told"),
+        ({"gyro_noise": 0.05}, "gyroscope noise is 2.9 deg after a second"),
+        ({"accel_noise": 0.6}, "accelerometer noise is 0.60 m/s"),
         ({"rate_hz": 50.0}, "come at 50 Hz, told were 200"),
         ({"longest_gap_s": 1.5}, "no inertial sample for 1.50 s"),
         ({"saturated": ("gyro z",)}, "saturated: gyro z"),

@@ -29,7 +29,7 @@ _SIGMA_RAD = 1e-3  # nominal, of a visual rotation; residuals tell the real one
 _MIN_RATIO = 0.05  # of real to nominal variance: better than 0.2 mrad nobody is
 _GYRO_BIAS_SIGMA = 0.5  # rad/s, prior: wide enough for any
 _TOLD_SIGMA_S = 1e-3  # what others find is believed no further: their models have errors in common with ours
-_TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
+TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
 _CAUCHY = 3.0  # standard deviations
 _ROUNDS = 5
 _UNKNOWNS = 8  # offset, gyro bias, misalignment, drift
@@ -71,7 +71,7 @@ class TimeOffset:
         self._config = config
         none, drift_sigma = np.zeros(3), config.clock_drift_sigma if config.clock_drift else _NO_DRIFT
         self.estimate = TimeOffsetEstimate(
-            config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, _TURN_SIGMA), 0,
+            config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, TURN_SIGMA), 0,
             drift_sigma=drift_sigma,
         )  # fmt: skip
         self._prior = self.estimate  # what else is known of offset and drift
@@ -169,7 +169,7 @@ class TimeOffset:
     def _prior_at(self, now_ns: int) -> tuple[Array, Array]:
         """Return information [8, 8] and mean [8] of what is known before the frames, with the offset of a time."""
         prior = self._prior
-        sigmas = np.repeat([_GYRO_BIAS_SIGMA, _TURN_SIGMA], 3)
+        sigmas = np.repeat([_GYRO_BIAS_SIGMA, TURN_SIGMA], 3)
         information = np.diag([0.0, *(1.0 / sigmas**2), 1.0 / prior.drift_sigma**2])
         then = np.zeros(_UNKNOWNS)  # the offset at the prior's time, by the unknowns
         then[0], then[7] = 1.0, -(now_ns - prior.t_ns) / _NS

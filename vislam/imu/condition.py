@@ -9,8 +9,9 @@ import numpy as np
 from vislam.messages import Array, ImuSample
 
 _NS = 1_000_000_000
-_WINDOW = 64  # samples looked at together
+_WINDOW, _AGAIN = 256, 96  # samples looked at together, and how many of them again in the next window
 _HOLE = 2.5  # usual intervals; a longer one is a hole
+_COARSE_STEPS = 8.0  # of the sensor's resolution
 _BY_CHANCE = 1e-3  # plateaus at the end of the range that chance would make in the whole recording
 
 
@@ -38,7 +39,8 @@ class ConditionWatch:
         self._samples = 0
         self._forces: list[float] = []
         self._ends = np.stack([np.full(6, np.inf), np.full(6, -np.inf)])  # lowest and highest value per axis ...
-        self._runs = np.zeros((2, 6), dtype=np.int64)  # ... and the longest run of samples that have exactly it
+        self._runs = np.zeros((2, 6), dtype=np.int64)  # ... and the longest run of it that a motion was cut off by
+        self._steps = np.full(6, np.inf)  # smallest change: what the sensor resolves
         self._equal = np.zeros(6, dtype=np.int64)  # pairs of neighbours that are exactly equal
 
     def add(self, sample: ImuSample) -> None:
@@ -52,7 +54,7 @@ class ConditionWatch:
         self._pending.append(np.concatenate([sample.gyro_rad_s, sample.accel_m_s2]))
         if len(self._pending) == _WINDOW:
             self._look(np.array(self._pending))
-            self._pending, self._window_ns = self._pending[-1:], []
+            self._pending, self._window_ns = self._pending[-_AGAIN:], []
 
     def condition(self) -> InertialCondition:
         """Return what there is to say so far."""
@@ -62,15 +64,17 @@ class ConditionWatch:
         return InertialCondition(self._samples, _NS / interval_ns, longest_ns / _NS, self._saturated(), force)
 
     def _look(self, values: Array) -> None:
-        """Take a window [N, 6]; its first sample is the last one of the window before."""
+        """Take a window [N, 6] that begins within the one before."""
         self._intervals_ns.append(int(np.median(self._window_ns)))
-        self._forces.append(float(np.linalg.norm(values[1:, 3:].mean(axis=0))))
-        self._equal += np.sum(values[1:] == values[:-1], axis=0)
+        self._forces.append(float(np.linalg.norm(values[:, 3:].mean(axis=0))))
+        changes = np.abs(np.diff(values, axis=0))
+        self._equal += np.sum(changes == 0.0, axis=0)
+        self._steps = np.minimum(self._steps, np.where(changes > 0.0, changes, np.inf).min(axis=0))
         for side, ends in enumerate((values.min(axis=0), values.max(axis=0))):
             beyond = ends < self._ends[0] if side == 0 else ends > self._ends[1]
             runs = np.where(ends == self._ends[side], self._runs[side], 0)
             for axis in np.flatnonzero(beyond | (ends == self._ends[side])):
-                runs[axis] = max(int(runs[axis]), _longest_run(values[:, axis] == ends[axis]))
+                runs[axis] = max(int(runs[axis]), _cut_off(values[:, axis], ends[axis], self._steps[axis]))
             self._runs[side] = np.where(beyond, runs, np.maximum(runs, self._runs[side]))
             self._ends[side] = np.where(beyond, ends, self._ends[side])
 
@@ -84,7 +88,17 @@ class ConditionWatch:
         return tuple(name for name, chance in zip(names, expected, strict=True) if chance < _BY_CHANCE)
 
 
-def _longest_run(is_there: np.ndarray) -> int:
-    """Return the length of the longest run of True."""
+def _cut_off(values: Array, end: float, step: float) -> int:
+    """Return the longest run of `end` in [N] that a motion was cut off by; 0: none.
+
+    A smooth peak in a sensor's coarse steps stays at its highest for a while, too; but half that long before, it was
+    three steps lower, and a motion that is cut off was much farther away.
+    """
+    is_there = values == end
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_there, [False]]).astype(np.int8)))
-    return int(np.max(edges[1::2] - edges[::2], initial=0))
+    longest = 0
+    for begin, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        before = begin - max((stop - begin) // 2, 1)
+        if before >= 0 and abs(values[before] - end) > _COARSE_STEPS * step:
+            longest = max(longest, stop - begin)
+    return longest

@@ -54,15 +54,15 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         max_gap_s=imu.max_gap_s,
         **_calibration(report.calibration),
     )
-    condition, noise = report.condition, report.noise_ratios
-    if condition is None:
+    condition, noise, told = report.condition, report.noise_ratios, report.told_noise
+    if condition is None or told is None:
         return evidence
     return replace(
         evidence,
-        gyro_noise=None if noise is None else noise.gyro_quiet,
-        accel_noise=None if noise is None else noise.accel_quiet,
+        gyro_noise=None if noise is None else noise.gyro_quiet * told.gyro_noise_density,
+        accel_noise=None if noise is None else noise.accel_quiet * told.accel_noise_density,
         rate_hz=condition.rate_hz if np.isfinite(condition.rate_hz) else None,
-        rate_told_hz=report.told_rate_hz,
+        rate_told_hz=told.rate_hz,
         longest_gap_s=condition.longest_gap_s,
         saturated=condition.saturated_axes,
         force_m_s2=condition.force_m_s2 if np.isfinite(condition.force_m_s2) else None,
@@ -74,7 +74,8 @@ def _calibration(learned: dict[str, float]) -> dict[str, Any]:
     if "camera_offset_s" in learned:
         found["clock"] = Moved(learned["camera_offset_s"], learned["camera_offset_sigma_s"])
     if "camera_turn_deg" in learned:
-        found["rotation"] = Moved(learned["camera_turn_deg"], learned["camera_turn_sigma_deg"])
+        names = ("camera_turn_deg", "camera_turn_sigma_deg", "camera_turn_prior_deg")
+        found["rotation"] = Moved.measured(*(learned[name] for name in names))
     return found
 
 
@@ -92,7 +93,7 @@ class KeyframeWitness:
         """Take a keyframe and what the graph made of it."""
         span, vo = packet.imu, packet.vo
         if update.details is not None and update.newest is not None:
-            self._rotation = _window_turn(update.details.get("calibration")) or self._rotation
+            self._rotation = _window_turn(update.details.get("calibration"), self._config.window.rotation_sigma_deg)
         if span is None or packet.begins_piece or len(span.t_ns) < _SAMPLES:
             return
         if float(np.diff(span.t_ns).max()) * 1e-9 > self._config.imu.max_gap_s:
@@ -125,14 +126,14 @@ class KeyframeWitness:
         return replace(inertial, dR=dR, dv_m_s=dv, dp_m=dp)
 
 
-def _window_turn(calibration: Any) -> Moved | None:
+def _window_turn(calibration: Any, prior_deg: float) -> Moved | None:
     """Return by how much a window turned the camera, in degrees; None where it does not estimate that."""
     if calibration is None or not np.all(calibration.R_cam_sigma > 0.0):
         return None
     turn = calibration.R_cam_correction
     angle = float(np.linalg.norm(turn))
     sigma = float(np.sqrt(np.sum((turn / max(angle, 1e-12) * calibration.R_cam_sigma) ** 2)))
-    return Moved(float(np.rad2deg(angle)), float(np.rad2deg(sigma)))
+    return Moved.measured(float(np.rad2deg(angle)), float(np.rad2deg(sigma)), prior_deg)
 
 
 def whole_evidence(

@@ -7,15 +7,27 @@ from dataclasses import dataclass, field
 
 from vislam.verdict.agreement import ForceAgreement, TurnAgreement
 
+_LEAST_KNOWN = 0.2  # of the variance of the prior that a measurement took away
+
 Innovations = Mapping[str, tuple[int, float, int]]  # by kind: how many, the sum of their NIS, of their degrees
 
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """A number of the calibration that the run estimated."""
+    """A number of the calibration as the run measured it."""
 
     by: float  # since what was told
     sigma: float  # of that
+
+    @staticmethod
+    def measured(by: float, sigma: float, prior_sigma: float) -> Moved | None:
+        """Return what was measured, for an estimate [by, sigma] that a prior around zero has drawn towards zero.
+
+        The prior says the same as what the verdict holds against the measurement; counted twice, it would hide it.
+        None where hardly anything was measured.
+        """
+        known = 1.0 - (sigma / prior_sigma) ** 2
+        return None if known < _LEAST_KNOWN else Moved(by / known, sigma / known**0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +75,8 @@ class Evidence:
     turns: TurnAgreement | None = None
     forces: ForceAgreement | None = None
     # inertial data
-    gyro_noise: float | None = None  # white noise over that of the model, in the quietest half second
-    accel_noise: float | None = None
+    gyro_noise: float | None = None  # rad/s/sqrt(Hz), white noise in the quietest half second
+    accel_noise: float | None = None  # m/s^2/sqrt(Hz)
     rate_hz: float | None = None
     rate_told_hz: float | None = None
     longest_gap_s: float = 0.0

@@ -141,17 +141,21 @@ def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             f"the accelerometer's metres are {_percent(forces.scale - 1.0)} than those of vision: check baseline or "
             "depth scale, and calibrate the accelerometer"
         )
-    if _beyond(Moved(forces.gravity_m_s2 - e.gravity_m_s2, forces.gravity_sigma_m_s2), c.force_scale_sigma * e.gravity_m_s2, 1, c):
+    if _beyond(
+        Moved(forces.gravity_m_s2 - e.gravity_m_s2, forces.gravity_sigma_m_s2),
+        c.force_scale_sigma * e.gravity_m_s2,
+        1,
+        c,
+    ):
         yield f"gravity along the way is {forces.gravity_m_s2:.2f} m/s2: calibrate the accelerometer"
 
 
 def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
-    for name, ratio in (("gyroscope", e.gyro_noise), ("accelerometer", e.accel_noise)):
-        if ratio is not None and ratio > c.noise_ratio:
-            yield (
-                f"the {name} is {ratio:.1f} times as noisy as told, even at its quietest: it shakes, or its noise is "
-                "another (`vislam calibrate noise`)"
-            )
+    turn_deg = math.degrees(e.gyro_noise or 0.0)  # in a second, as densities are per root of it
+    if turn_deg > c.gyro_noise_deg:
+        yield f"gyroscope noise is {turn_deg:.1f} deg after a second, even at its quietest: mount it on something soft"
+    if (speed := e.accel_noise or 0.0) > c.accel_noise_m_s:
+        yield f"accelerometer noise is {speed:.2f} m/s after a second, even at its quietest: mount it on something soft"
     if e.rate_hz is not None and e.rate_told_hz and abs(e.rate_hz / e.rate_told_hz - 1.0) > c.rate_error:
         yield f"inertial samples come at {e.rate_hz:.0f} Hz, told were {e.rate_told_hz:.0f}: look for what loses them"
     if e.longest_gap_s > e.max_gap_s:

@@ -1,0 +1,89 @@
+"""What camera and IMU deliver, told from samples and frames alone: holes, rates, ranges that end, stuck images."""
+
+import numpy as np
+import pytest
+
+from vislam.frontend.feed import CameraFeed
+from vislam.imu import ConditionWatch
+from vislam.messages import Frame, ImuSample
+
+_NS = 1_000_000_000
+
+
+def samples(seconds=10.0, rate_hz=200.0, clip_rad_s=np.inf, lsb=0.0):
+    rng = np.random.default_rng(2)
+    for k in range(round(seconds * rate_hz)):
+        t_s = k / rate_hz
+        gyro = 2.0 * np.sin([1.1 * t_s, 0.9 * t_s, 1.7 * t_s]) + rng.normal(size=3) * 0.002
+        if lsb:
+            gyro = np.round(gyro / lsb) * lsb
+        accel = np.array([np.sin(2.0 * t_s), 0.0, 9.81]) + rng.normal(size=3) * 0.03
+        yield ImuSample(round(t_s * _NS), np.clip(gyro, -clip_rad_s, clip_rad_s), accel)
+
+
+def condition(values):
+    watch = ConditionWatch()
+    for value in values:
+        watch.add(value)
+    return watch.condition()
+
+
+def test_a_sound_unit_shows_its_rate_its_gravity_and_nothing_else():
+    found = condition(samples())
+    assert found.rate_hz == pytest.approx(200.0, rel=1e-6)
+    assert found.longest_gap_s == 0.0
+    assert found.saturated_axes == ()
+    assert found.force_m_s2 == pytest.approx(9.83, abs=0.05)
+
+
+@pytest.mark.parametrize("lsb", [0.0, 0.001, 0.02])
+def test_a_range_that_ends_too_early_is_found_by_its_plateaus_and_coarse_steps_are_not(lsb):
+    assert condition(samples(lsb=lsb)).saturated_axes == ()
+    assert condition(samples(lsb=lsb, clip_rad_s=1.5)).saturated_axes == ("gyro x", "gyro y", "gyro z")
+
+
+def test_samples_that_never_change_are_no_saturation():
+    still = [ImuSample(k * 5_000_000, np.zeros(3), np.array([0.0, 0.0, 9.81])) for k in range(2000)]
+    assert condition(still).saturated_axes == ()
+
+
+def test_a_hole_counts_with_its_length_and_jitter_does_not():
+    jitter = np.random.default_rng(0)
+    late = [ImuSample(s.t_ns + int(jitter.integers(0, 2_000_000)), s.gyro_rad_s, s.accel_m_s2) for s in samples()]
+    assert condition(late).longest_gap_s == 0.0
+    holed = [s for s in samples() if not 3.0 <= s.t_ns / _NS < 4.5]
+    assert condition(holed).longest_gap_s == pytest.approx(1.505, abs=0.001)
+
+
+def test_nothing_is_said_of_nothing():
+    found = condition([])
+    assert found.samples == 0
+    assert np.isnan(found.rate_hz)
+    assert np.isnan(found.force_m_s2)
+
+
+def images(count, seed=1):
+    rng = np.random.default_rng(seed)
+    return [rng.integers(0, 255, (48, 64), dtype=np.uint8) for _ in range(count)]
+
+
+def feed(frames, at_rest=False):
+    watch = CameraFeed()
+    for t_ns, image in frames:
+        watch.add(Frame(t_ns, 0, () if image is None else (image,)))
+        watch.moved(at_rest)
+    return watch
+
+
+def test_frames_that_never_arrived_are_counted_by_the_usual_interval():
+    kept = [k for k in range(100) if k not in (20, 21, 50)]
+    watch = feed([(k * 50_000_000, None) for k in kept])
+    assert (watch.frames, watch.missing, watch.repeated) == (97, 3, 0)
+
+
+def test_images_that_repeat_while_the_body_moves_are_counted():
+    seen = images(10)
+    stuck = [*seen[:5], *[seen[4]] * 20, *seen[5:]]
+    assert feed([(k * 50_000_000, im) for k, im in enumerate(stuck)]).repeated == 20
+    assert feed([(k * 50_000_000, im) for k, im in enumerate(stuck)], at_rest=True).repeated == 0
+    assert feed([(k * 50_000_000, im) for k, im in enumerate(seen)]).repeated == 0
