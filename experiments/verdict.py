@@ -123,8 +123,8 @@ class Campaign:
             return math.nan
         if entry["coverage"] < 0.5:
             return math.inf
-        names = [name for name in ("ekf", "graph") if name in clean["ate_m"]]
-        return max((entry["ate_m"].get(n, math.inf) / clean["ate_m"][n] for n in names), default=math.nan)
+        both = [name for name in ("ekf", "graph") if name in clean["ate_m"] and name in entry["ate_m"]]
+        return max((entry["ate_m"][name] / clean["ate_m"][name] for name in both), default=math.inf)
 
     def table(self) -> str:
         """Return all runs as a table, and under it what the verdict is worth."""

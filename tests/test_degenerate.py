@@ -95,15 +95,15 @@ def test_a_lost_filter_is_told(tmp_path):
     uri = f"points:turn-in-place,rig=mono,duration_s=25,{CAMERA}"
     metrics, errors, _ = run(tmp_path, uri, ekf__coupling="loose", graph__coupling="loose")
     assert errors["ekf"]["ate_max_m"] > 1.0, "no longer degenerate; take a harder case"
-    assert any("uncertain" in warning for warning in metrics["warnings"])
-    assert any("visual motions as impossible" in warning for warning in metrics["warnings"])
+    assert any("uncertain" in reason for reason in metrics["verdict"]["reasons"])
+    assert any("visual measurements as impossible" in reason for reason in metrics["verdict"]["reasons"])
 
 
 @pytest.mark.parametrize(("world", "uniform"), [("straight", True), ("laps", False)])
 def test_uniform_motion_of_one_camera_is_told(tmp_path, world, uniform):
     """Without a change of acceleration nothing shows scale any more, and noise must not pass for it in the filter."""
     metrics, errors, _ = run(tmp_path, f"points:{world},rig=mono,duration_s=28,{CAMERA}", graph__coupling="loose")
-    assert any("uniform motion for" in warning for warning in metrics["warnings"]) == uniform
+    assert any("uniform motion for" in reason for reason in metrics["verdict"]["reasons"]) == uniform
     assert (metrics["counters"]["front"]["frames_without_excitation"] > 150) == uniform
     assert errors["ekf"]["ate_max_m"] < (2.0 if uniform else 0.2)
 

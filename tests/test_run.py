@@ -171,7 +171,9 @@ def test_an_accelerometer_in_the_wrong_unit_is_told_and_done_without(small_room,
 
     metrics = run(Edited(small_room, halved), tmp_path / "run", map__enabled=False, init__give_up_s=give_up_s)
     assert metrics["initialisation"]["status"] == "none"
-    assert any("gravity was never found" in warning and "expected 9.81" in warning for warning in metrics["warnings"])
+    assert any(
+        "gravity was not found" in reason and "expected 9.81" in reason for reason in metrics["verdict"]["reasons"]
+    )
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
     assert metrics["coverage_frames"] == 1.0
 

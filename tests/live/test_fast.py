@@ -21,7 +21,7 @@ from vislam.geometry import invert, se3_exp, so3_log, transform
 from vislam.hw.health import Health
 from vislam.live.fast import FastPath
 from vislam.live.fast_process import Messages
-from vislam.live.messages import CameraHealth, MapMoved, ToFast
+from vislam.live.messages import CameraHealth, Doubted, MapMoved, ToFast
 from vislam.live.published_pose import PublishedPose
 from vislam.messages import ImuSample
 
@@ -116,6 +116,14 @@ def test_odom_does_not_jump_when_a_large_loop_closes(world: VisionWorld) -> None
         moved = np.linalg.norm(after.T_odom_base[:3, 3] - before.T_odom_base[:3, 3])
         assert moved < fastest * dt + 0.03  # a correction by vision, late by 90 ms, is a step of millimetres
         np.testing.assert_array_equal(after.T_odom_base, same.T_odom_base)
+
+
+def test_a_doubt_travels_with_every_pose_until_it_is_over(world: VisionWorld) -> None:
+    begin_ns, end_ns = T0_NS + int(4e9), T0_NS + int(6e9)
+    _, poses, _ = run(world, others=[(begin_ns, Doubted(True)), (end_ns, Doubted(False))])
+    doubted = [pose.t_ns for pose in poses if Health.DOUBTFUL in pose.health]
+    assert doubted == [pose.t_ns for pose in poses if begin_ns <= pose.t_ns < end_ns]
+    assert not any(Health.INVALID in pose.health for pose in poses if pose.t_ns in set(doubted))
 
 
 def test_an_older_revision_of_the_map_does_not_overtake_a_newer_one(world: VisionWorld) -> None:

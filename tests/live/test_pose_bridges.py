@@ -194,6 +194,25 @@ def test_ros_hears_nothing_of_a_pose_not_to_steer_by(changes: dict) -> None:
         wire.close()
 
 
+@needs_dds
+def test_ros_hears_the_health_word_of_every_pose() -> None:
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from vislam.live import ros2
+
+    wire = ros2.Ros2(_DOMAIN + 31)
+    words = [Health.LEVELLED | Health.INVALID, Health.LEVELLED | Health.VISION_OK | Health.DOUBTFUL]
+    try:
+        topic = Topic(wire._participant, "rt/vislam/health", ros2.UInt32, qos=ros2.QOS)
+        reader = DataReader(wire._participant, topic, qos=ros2.QOS)
+        for word in words:
+            wire.send(known_pose(health=word))
+        assert [Health(message.data) for message in reader.take(N=10)] == words
+    finally:
+        wire.close()
+
+
 @needs_mavlink
 def test_mavlink_odometry_is_in_forward_right_down() -> None:
     from pymavlink.dialects.v20 import common
@@ -244,6 +263,7 @@ def test_what_is_unknown_is_nan_and_quality_follows_the_health() -> None:
     assert np.isnan(message.velocity_covariance[0])
     assert message.quality == quality(Health(0)) == quality(Health.LEVELLED | Health.VISION_OK | Health.INVALID) == -1
     assert quality(Health.LEVELLED | Health.VISION_OK) == 100
+    assert quality(Health.LEVELLED | Health.VISION_OK | Health.DOUBTFUL) == 50
     assert quality(Health.LEVELLED | Health.DEAD_RECKONING) == 25
     assert quality(Health.LEVELLED | Health.VISION_OK | Health.GATE_REJECT) == 25
 

@@ -1,4 +1,6 @@
-"""The published pose for ROS 2: nav_msgs/Odometry and tf over DDS, without ROS. Only its own process imports this.
+"""The published pose for ROS 2: nav_msgs/Odometry, tf and the health word over DDS, without ROS.
+
+Only its own process imports this.
 
 Needs cyclonedds. The structs below are those of ROS's message packages, field by field; names, topics and the encoding
 are those of https://design.ros2.org/articles/topic_and_service_names.html and of rmw_cyclonedds.
@@ -159,8 +161,16 @@ class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
     transforms: sequence[TransformStamped]
 
 
+@dataclass
+@annotate.final
+class UInt32(IdlStruct, typename="std_msgs::msg::dds_::UInt32_"):
+    """std_msgs/UInt32: the health word, of which an Odometry has no field."""
+
+    data: uint32
+
+
 class Ros2:
-    """Owns the DDS entities that write /odom and /tf."""
+    """Owns the DDS entities that write /odom, /tf and /vislam/health."""
 
     def __init__(self, domain: int, allow_remote: bool = False) -> None:
         """Join a domain.
@@ -174,9 +184,11 @@ class Ros2:
         publisher = Publisher(self._participant)
         self._odom = DataWriter(publisher, Topic(self._participant, "rt/odom", Odometry, qos=QOS), qos=QOS)
         self._tf = DataWriter(publisher, Topic(self._participant, "rt/tf", TFMessage, qos=QOS), qos=QOS)
+        self._health = DataWriter(publisher, Topic(self._participant, "rt/vislam/health", UInt32, qos=QOS), qos=QOS)
 
     def send(self, pose: PublishedPose) -> None:
-        """Write both; nothing for a pose not to steer by, as an Odometry cannot say so."""
+        """Write all; of a pose not to steer by the health word alone, as an Odometry cannot say so."""
+        self._health.write(UInt32(int(pose.health)))
         if Health.INVALID in pose.health or not np.isfinite(pose.pose_covariance).all():
             return
         stamp_ns = pose.t_ns + max(time.time_ns() - time.monotonic_ns() for _ in range(3))  # less when interrupted
