@@ -136,7 +136,11 @@ class Front:
         self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
         self.last_refusal = "no frame yet"  # why there is no first state
         self.scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
-        self.counters = {"frames_lost": 0, "frames_degraded": 0, "imu_outages": 0, "frames_at_rest": 0, "pieces": 1}
+        self.counters = {
+            "frames_lost": 0, "frames_degraded": 0, "longest_loss_ms": 0, "imu_outages": 0, "frames_at_rest": 0,
+            "pieces": 1,
+        }  # fmt: skip
+        self._lost_since_ns: int | None = None
         self._config = config
         self._clock = clock
         self.noise = noise  # as told; spans and the filter hear what the samples show
@@ -434,7 +438,12 @@ class Front:
         self._early.restamp(shift_ns)
 
     def _count(self, track: TrackResult, at_rest: bool) -> None:
-        self.counters["frames_lost"] += track.vo.tracking == Tracking.LOST
+        is_lost = track.vo.tracking == Tracking.LOST
+        self.counters["frames_lost"] += is_lost
+        self._lost_since_ns = (self._lost_since_ns or track.vo.t_ns) if is_lost else None
+        if self._lost_since_ns is not None:
+            lasted_ms = (track.vo.t_ns - self._lost_since_ns) // 1_000_000
+            self.counters["longest_loss_ms"] = max(self.counters["longest_loss_ms"], lasted_ms)
         self.counters["frames_degraded"] += track.vo.tracking == Tracking.DEGRADED
         self.counters["frames_at_rest"] += at_rest
         self._rested_since_keyframe = self._rested_since_keyframe and at_rest

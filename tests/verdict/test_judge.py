@@ -45,7 +45,8 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"frames_lost": 20}, "vision lost 20 of 400 frames"),
+        ({"frames_lost": 60}, "vision lost 60 of 400 frames"),
+        ({"frames_lost": 30, "longest_loss_s": 1.5}, "30 of 400 frames, 1.5 s at once"),
         ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),
         ({"frames_missing": 100}, "100 of 500 frames never arrived"),
         ({"frames_repeated": 40}, "40 images repeat the one before"),

@@ -18,7 +18,8 @@ class VerdictConfig:
     gyro_noise_deg: float = 1.0  # after a second
     accel_noise_m_s: float = 0.3  # after a second
     rate_error: float = 0.2  # relative, of the inertial rate against that told: clocks are good to 3 %
-    lost_share: float = 0.02  # of the frames that vision may lose: a blink, no outage
+    lost_share: float = 0.1  # of the frames that vision may lose: it finds its keyframe again, and nothing drifted ...
+    lost_s: float = 1.0  # ... but not after so long: a cheap IMU alone is off by a centimetre to a decimetre then
     degraded_share: float = 0.2  # of the frames on which vision may lean weakly
     missing_share: float = 0.1  # of the frames that may never arrive: patches are followed over twice the interval then
     repeated_frames: int = 3  # images equal to the last bit in motion: one may be a hiccup, a stuck driver sends many

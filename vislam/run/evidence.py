@@ -37,6 +37,7 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         mode=report.mode,
         frames=feed.get("frames", 0),
         frames_lost=front.get("frames_lost", 0),
+        longest_loss_s=1e-3 * front.get("longest_loss_ms", 0),
         frames_degraded=front.get("frames_degraded", 0),
         frames_missing=feed.get("missing", 0),
         frames_repeated=feed.get("repeated", 0),

@@ -47,6 +47,7 @@ class Evidence:
     mode: str = ""
     frames: int = 0
     frames_lost: int = 0
+    longest_loss_s: float = 0.0
     frames_degraded: int = 0
     frames_missing: int = 0  # that an even rate would have brought
     frames_repeated: int = 0  # equal to the one before in motion

@@ -60,8 +60,11 @@ def _lost(e: Evidence, c: VerdictConfig) -> Iterator[str]:
 def _vision(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     if e.frames < _MIN_FRAMES:
         return
-    if e.frames_lost > c.lost_share * e.frames:
-        yield f"vision lost {e.frames_lost} of {e.frames} frames: look at tracking.csv for when and why"
+    if e.frames_lost > c.lost_share * e.frames or e.longest_loss_s > c.lost_s:
+        yield (
+            f"vision lost {e.frames_lost} of {e.frames} frames, {e.longest_loss_s:.1f} s at once: look at tracking.csv "
+            "for when and why"
+        )
     if e.frames_degraded > c.degraded_share * e.frames:
         yield f"vision was weak in {e.frames_degraded} of {e.frames} frames: more light, texture or a sharper lens"
     if e.frames_missing > c.missing_share * (e.frames + e.frames_missing):
