@@ -41,10 +41,10 @@ from vislam.run.metrics import initialisation
 from vislam.runfolder import RunLog
 from vislam.sim import MeasuredInertial, open_points
 from vislam.slam import Slam
-from vislam.verdict import judge as verdict_of
 from vislam.sources import measured_inertial, open_source, shaken, split_source
 from vislam.trajectory import Trajectory, evaluate
 from vislam.trajectory.consistency import stated_scale_sigma
+from vislam.verdict import judge as verdict_of
 
 PLAN = Path(__file__).with_name("starts.toml")
 SOON_S = 3.0  # a controller waits no longer
@@ -127,11 +127,18 @@ def run(job: Job, overrides: Callable[[dict], dict]) -> Start:
         states = graph.states()
         final = log.final_trajectory([int(i) for i in graph.ids], graph.poses(), states, config.imu)
         end_sigma = stated_scale_sigma(states)
-    return judged(job, slam, log, final, recording.truth(), end_sigma, lost)
+    return judged(job, config, slam, log, final, recording.truth(), end_sigma, lost)
 
 
 def judged(
-    job: Job, slam: Slam, log: RunLog, final: Trajectory, truth: Trajectory | None, end_sigma: float, lost: str
+    job: Job,
+    config: Config,
+    slam: Slam,
+    log: RunLog,
+    final: Trajectory,
+    truth: Trajectory | None,
+    end_sigma: float,
+    lost: str,
 ) -> Start:
     """Compare what a start led to with the truth."""
     front = slam.front.report()

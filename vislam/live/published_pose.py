@@ -78,7 +78,7 @@ class PublishedPose:
 
     @property
     def T_map_base(self) -> Array:
-        """The pose [4, 4] in `map`, which jumps when a loop closes: for planning, not for control."""
+        """The pose [4, 4] in `map`; it moves by what loops correct, at once where that is much: for planning."""
         return self.T_map_odom @ self.T_odom_base
 
     def predict(

@@ -48,10 +48,10 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
 def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) -> dict[str, Array]:
     """Return the normalised estimation error squared of states: "rotation", "position" and "velocity", [M], 3 dof each.
 
-    Position and yaw of the first state (its attitude, without `gravity`) are a free choice, so the truth is brought into
-    the states' world by them: the error there is zero and grows with drift, as the covariance does. Where that state was
-    not certain of them, what it was wrong by moves and turns the truth, and its covariance joins that of every other
-    state. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
+    Position and yaw of the first state (its attitude, without `gravity`) are a free choice, so the truth is brought
+    into the states' world by them: the error there is zero and grows with drift, as the covariance does. Where that
+    state was not certain of them, what it was wrong by moves and turns the truth, and its covariance joins that of
+    every other state. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
     The true velocity is that of a fit to the true positions, and its variance joins the state's; errors of the true
     poses themselves count as the state's. NaN is what was not estimated, and the first state.
     Raises DataError with fewer than 2 matching states.
