@@ -24,6 +24,7 @@ from vislam.frontend.initialisation_linear import (
     epipolar_noise,
     inertial_path,
     median_parallax,
+    solve_shape,
     solve_start,
 )
 from vislam.frontend.initialisation_rest import level_covariance, rest_accel_bias, rest_covariance
@@ -38,7 +39,6 @@ _NS = 1_000_000_000
 _AGREE_SIGMAS = 3.0
 _MAX_OUTLIERS = 0.3  # of the observations
 _MAX_BIAS_SIGMAS = 3.5  # of the accelerometer's bias
-_MIN_SOLVED = 6  # points in the part of a window that the closed form is tried on
 _MOST_NOISE = 3.0  # times what is told of tracks; more is disagreement
 _AMPLE = 3.0  # times the least excitation or parallax; more of it is no longer what a start lacks
 _FOREIGN_OFFSET_S = 0.002  # a time offset found in the window that is larger than this is applied before the start
@@ -171,6 +171,7 @@ class Initialiser:
         self._window = FrameWindow()
         self._next_attempt_ns = 0
         self._before: Solution | None = None  # the attempt before
+        self._offset_s: float | None = None  # of the camera's clock, by the last attempt that could be believed
         self._provisional: Solution | None = None  # given out, under test
         self._bundle_config = replace(window or WindowConfig(), sigma_px=track_sigma_px)
         self._last = Initialisation("waiting", "no frame yet")
@@ -224,7 +225,7 @@ class Initialiser:
         `cut` gives the inertial data between two times, as `ImuBuffer.span`.
         """
         self._rest.clear()
-        self._before = None
+        self._before = self._offset_s = None
         if not self._window.restamp(shift_ns, cut):
             self._restart("inertial data", "inertial data does not reach back to the first frames")
         self._next_attempt_ns += shift_ns if self._next_attempt_ns else 0
@@ -243,7 +244,7 @@ class Initialiser:
         self._window.clear()
         self._rest.clear()
         self._next_attempt_ns = 0
-        self._before = None
+        self._before = self._offset_s = None
         self.phase = Phase.EMPTY
         self._last = self._refuse(cause, reason)
         return self._last
@@ -331,6 +332,7 @@ class Initialiser:
         refusal = (
             self._bundle_refusal(bundle, start)
             or self._quality_refusal(solution, self._lacking(tracks, path, camera.fx))
+            or self._clock_refusal(bundle)
             or self._repetition_refusal(before, solution)
         )
         if refusal is not None:
@@ -345,26 +347,24 @@ class Initialiser:
     ) -> tuple[Start, BundleSolution]:
         """Return the window's least squares and the closed form that led to it.
 
-        The closed form of a long window fails where the inertial path bends away, or where few points last; that of
-        its first part tells the same unknowns.
+        The closed form over points fails where few points last; the shape that epipolar constraints tell is then the
+        start.
         """
-        found: tuple[Start, BundleSolution] | None = None
-        for nodes in (len(chosen), (len(chosen) + 1) // 2):
-            part = tracks.before(nodes)
-            if part.points < _MIN_SOLVED:
-                continue
+        start = solve_start(window, path, tracks)
+        y = np.concatenate([start.velocity_m_s, start.gravity_m_s2, start.accel_bias_m_s2, [1.0]])
+        found: BundleSolution | None = None
+        for first in (lambda: y, lambda: solve_shape(window, path, tracks)):
             with suppress(np.linalg.LinAlgError):
-                start = solve_start(window, path, part)
                 bundle = refine_tracks(
-                    window, chosen, tracks, path, start, self._bundle_config, rig, self.time_offset_sigma_s,
+                    window, chosen, tracks, path, first(), self._bundle_config, rig, self.time_offset_sigma_s,
                     self._config.vo_inflation,
                 )  # fmt: skip
                 if bundle.converged and self._bias_m_s2(bundle) <= self._most_bias_m_s2:
                     return start, bundle
-                found = found or (start, bundle)
+                found = found or bundle
         if found is None:
-            raise np.linalg.LinAlgError("no closed form")
-        return found
+            raise np.linalg.LinAlgError("neither start leads anywhere")
+        return start, found
 
     def _tested(self, found: Initialisation, solution: Solution) -> Initialisation:
         """Return a first solution as provisional, and a later one as what the seconds since then made of it."""
@@ -465,12 +465,20 @@ class Initialiser:
         if bundle.sigma_px > _MOST_NOISE * self._track_sigma_px:
             reason = f"sightings scatter by {bundle.sigma_px:.1f} px about what the inertial data allow"
             return self._refuse("disagreement", reason, "failed")
-        sigma_s = bundle.time_offset_sigma_s
-        if abs(bundle.time_offset_s) > max(_FOREIGN_OFFSET_S, _AGREE_SIGMAS * sigma_s):
-            reason = f"camera clock found off by {1e3 * bundle.time_offset_s:.1f} +- {1e3 * sigma_s:.1f} ms"
-            refusal = self._refuse("time offset", reason)
-            return replace(refusal, time_offset_s=bundle.time_offset_s, time_offset_sigma_s=sigma_s)
         return None
+
+    def _clock_refusal(self, bundle: BundleSolution) -> Initialisation | None:
+        """Refuse, and tell the offset of the camera's clock, where it shows and the attempt before showed it, too."""
+        offset_s, sigma_s = bundle.time_offset_s, bundle.time_offset_sigma_s
+        before_s, self._offset_s = self._offset_s, offset_s
+        if abs(offset_s) <= max(_FOREIGN_OFFSET_S, _AGREE_SIGMAS * sigma_s):
+            return None
+        refusal = self._refuse(
+            "time offset", f"camera clock found off by {1e3 * offset_s:.1f} +- {1e3 * sigma_s:.1f} ms"
+        )
+        if before_s is None or abs(offset_s - before_s) > max(_FOREIGN_OFFSET_S, _AGREE_SIGMAS * sigma_s):
+            return refusal
+        return replace(refusal, time_offset_s=offset_s, time_offset_sigma_s=sigma_s)
 
     def _repetition_refusal(self, before: Solution | None, now: Solution) -> Initialisation | None:
         """Refuse what the attempt before does not confirm: a wrong minimum does not come twice at the same scale."""

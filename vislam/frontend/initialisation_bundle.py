@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from vislam.camera import Rig
 from vislam.config import WindowConfig
 from vislam.frontend.inertial_alignment import Window, up_to_z
-from vislam.frontend.initialisation_linear import InertialPath, Start, Tracks
+from vislam.frontend.initialisation_linear import InertialPath, Tracks
 from vislam.frontend.initialisation_window import Entry
 from vislam.imu import preintegrate
-from vislam.messages import Observations, no_observations
+from vislam.messages import Array, Observations, no_observations
 from vislam.window.bundle import BundleProblem, BundleSolution, solve
 
 
@@ -20,7 +20,7 @@ def refine_tracks(
     chosen: list[Entry],
     tracks: Tracks,
     path: InertialPath,
-    start: Start,
+    y: Array,
     config: WindowConfig,
     rig: Rig,
     offset_sigma_s: float,
@@ -28,17 +28,18 @@ def refine_tracks(
 ) -> BundleSolution:
     """Return the maximum a posteriori over poses, velocities, biases, time offset and points, from the closed form.
 
-    `inflation` is that of the pixels' sigma, which is measured. Look at `converged`.
+    `y` [10] are first velocity, gravity, accelerometer bias and the factor of what the path knows, of which only the
+    shape counts; `inflation` is that of the pixels' sigma, which is measured. Look at `converged`.
     """
-    x = np.concatenate([start.velocity_m_s, start.gravity_m_s2, start.accel_bias_m_s2])
-    R_world = up_to_z(start.gravity_m_s2, np.eye(3))
+    x, known = y[:9], y[9]
+    R_world = up_to_z(x[3:6], np.eye(3))
     T = np.tile(np.eye(4), (len(path.rotations), 1, 1))
     T[:, :3, :3] = R_world @ path.rotations
-    T[:, :3, 3] = (path.known_m + path.unknown @ x) @ R_world.T
+    T[:, :3, 3] = (known * path.known_m + path.unknown @ x) @ R_world.T
     rates = np.array([*(span.gyro_rad_s[0] for span in window.spans), window.spans[-1].gyro_rad_s[-1]])
     problem = BundleProblem(
         T_world_body=T,
-        velocity_world_m_s=(path.known_m_s + path.unknown_m_s @ x) @ R_world.T,
+        velocity_world_m_s=(known * path.known_m_s + path.unknown_m_s @ x) @ R_world.T,
         gyro_bias_rad_s=path.gyro_bias_rad_s,
         accel_bias_m_s2=np.zeros(3),
         observations=[_only(entry.observations, tracks.track_ids) for entry in chosen],

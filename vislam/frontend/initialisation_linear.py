@@ -20,7 +20,7 @@ from vislam.messages import Array
 
 _DEPTH_ROUNDS = 5  # a bearing's weight needs the point's distance, which the round before has found
 _CAUCHY = 3.0  # scale of the kernel in the linear rounds, in medians
-_MIN_SIGHTINGS = 3  # of a point; fewer hardly check one another
+
 _MIN_COMMON = 8  # points in two nodes; fewer are fitted too well
 _ASTRAY = 4.0  # standard deviations
 _PLACED = 5.0  # information on a point's distance against what noise alone would show of it
@@ -44,16 +44,6 @@ class Tracks:
     def only(self, good: NDArray[np.bool_]) -> Tracks:
         """Return those of some points [P]."""
         rows = good[self.point]
-        number = np.cumsum(good) - 1
-        return replace(
-            self, point=number[self.point[rows]], node=self.node[rows], xy=self.xy[rows], track_ids=self.track_ids[good]
-        )
-
-    def before(self, node: int) -> Tracks:
-        """Return the sightings in the nodes before one, of points that are seen often enough there."""
-        early = self.node < node
-        good = np.bincount(self.point[early], minlength=self.points) >= _MIN_SIGHTINGS
-        rows = early & good[self.point]
         number = np.cumsum(good) - 1
         return replace(
             self, point=number[self.point[rows]], node=self.node[rows], xy=self.xy[rows], track_ids=self.track_ids[good]
@@ -172,6 +162,46 @@ def epipolar_noise(tracks: Tracks, rotations: Array) -> tuple[float, NDArray[np.
     return sigma, good
 
 
+def solve_shape(window: Window, path: InertialPath, tracks: Tracks) -> Array:
+    """Return first velocity, gravity, accelerometer bias and the factor of what is known [10], up to a common scale.
+
+    From epipolar constraints alone: those that the bearings contradict least for their noise, a generalised eigenvector
+    (total least squares), which noise does not shrink and which needs no point. Its scale is that of gravity.
+
+    Raises:
+        numpy.linalg.LinAlgError: the motion does not determine them.
+    """
+    R_cams = path.rotations @ tracks.R_body_cam
+    rays = np.column_stack([tracks.xy, np.ones(len(tracks.xy))])
+    bearings = np.einsum("mij,mj->mi", R_cams[tracks.node], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    apart = max(len(path.rotations) // 4, 1)
+    rows, columns = np.triu_indices(len(rays), 1)
+    near = (tracks.point[rows] == tracks.point[columns]) & (tracks.node[columns] - tracks.node[rows] >= apart)
+    a, b = rows[near], columns[near]
+    centres = np.concatenate([path.unknown, (path.known_m + path.rotations @ window.lever_m)[:, :, None]], axis=2)
+    moved = centres[tracks.node[b]] - centres[tracks.node[a]]  # [K, 3, 10]
+    J = np.einsum("ki,kij->kj", np.cross(bearings[a], bearings[b]), moved)
+    across = [moved - v[:, :, None] * np.einsum("ki,kij->kj", v, moved)[:, None, :] for v in (bearings[a], bearings[b])]
+    noise = np.concatenate(across, axis=1)  # [K, 6, 10]: its square is the variance of J in units of the bearings'
+    weight = np.ones(len(a))
+    y = np.zeros(10)
+    for _ in range(_DEPTH_ROUNDS):
+        A = (J * weight[:, None]).T @ J
+        B = np.einsum("k,kij,kil->jl", weight, noise, noise)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(B), 1e-300))
+        half = np.linalg.cholesky(B * np.outer(scale, scale) + 1e-9 * np.eye(10))
+        inverse = np.linalg.inv(half)
+        y = scale * (inverse.T @ np.linalg.eigh(inverse @ (A * np.outer(scale, scale)) @ inverse.T)[1][:, 0])
+        spread = np.maximum(np.sum((noise @ y) ** 2, axis=1), 1e-300)
+        errors = np.abs(J @ y) / np.sqrt(spread)
+        weight = 1.0 / (1.0 + (errors / (_CAUCHY * max(float(np.median(errors)), 1e-12))) ** 2)
+        weight *= float(np.median(spread)) / np.maximum(spread, 0.01 * float(np.median(spread)))
+    y *= window.gravity_m_s2 / max(float(np.linalg.norm(y[3:6])), 1e-12)
+    if not np.isfinite(y).all():
+        raise np.linalg.LinAlgError("no shape")
+    return np.asarray(y if y[9] > 0.0 else -y)
+
+
 def _epipolar_errors(a: Array, b: Array) -> Array:
     """Return how far bearings a and b [N, 3] in common axes are from one plane with the motion, over its noise."""
     normals = np.cross(a, b)
@@ -286,7 +316,7 @@ def _with_known_norm(H: Array, g: Array, norm: float) -> tuple[Array, Array, Arr
     """Minimise `x H x / 2 - g x` with |x[3:6]| = norm; also return the system [3, 3], [3] of x[3:6] alone."""
     others = [0, 1, 2, 6, 7, 8]
     H_oo, H_og = H[np.ix_(others, others)], H[np.ix_(others, [3, 4, 5])]
-    scale = np.sqrt(np.diag(H_oo))
+    scale = np.sqrt(np.maximum(np.diag(H_oo), 0.0))
     if not np.all(scale > 0.0):
         raise np.linalg.LinAlgError("no observation of the velocity")
     factor = np.linalg.cholesky(H_oo / np.outer(scale, scale) + 1e-12 * np.eye(6))
