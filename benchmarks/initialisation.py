@@ -39,7 +39,8 @@ def run_kind(kind: str, count: int) -> int:
         if found.last is None:
             causes[answers[-1].cause] = causes.get(answers[-1].cause, 0) + 1
             continue
-        seconds.append((found.last.t_ns - start.stamps[0]) * 1e-9)
+        given = [answer.last for answer in answers if answer.last is not None]
+        seconds.append((given[0].t_ns - start.stamps[0]) * 1e-9)
         tilt.append(start.tilt_error_rad(found.last))
         error = 0.0
         if found.status == "moving":
