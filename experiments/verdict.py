@@ -56,6 +56,15 @@ SOURCES = {
     "V2_01 stereo": Source(
         "points:euroc:$DATA/euroc_v201_imu,rig=stereo,start_s=5,duration_s=15,tracks=100,camera_hz=10", 15.0
     ),
+    "V1_01 stereo": Source(
+        "points:euroc:$DATA/euroc_v101_imu,rig=stereo,duration_s=40,tracks=100,camera_hz=10", 40.0
+    ),
+    "V2_02 stereo": Source(
+        "points:euroc:$DATA/euroc_v202_imu,rig=stereo,duration_s=40,tracks=100,camera_hz=10", 40.0
+    ),
+    "room1 stereo": Source(
+        "points:euroc:$DATA/tumvi_room1_imu,rig=stereo,duration_s=40,tracks=100,camera_hz=10", 40.0
+    ),
     "V1_01 mono": Source("points:euroc:$DATA/euroc_v101_imu,rig=mono,duration_s=40", 40.0),
     "V2_01 mono": Source("points:euroc:$DATA/euroc_v201_imu,rig=mono,duration_s=40", 40.0),
     "room1 mono": Source("points:euroc:$DATA/tumvi_room1_imu,rig=mono,duration_s=40", 40.0),
@@ -115,6 +124,7 @@ class Campaign:
             if entry["evidence"]:
                 verdict = judge(validated(Evidence, entry["evidence"], "stored evidence"), config)
                 entry["state"], entry["reasons"] = str(verdict.state), list(verdict.reasons)
+        self._path.write_text(json.dumps(self.results, indent=1), encoding="utf-8")
 
     def ratio(self, entry: dict[str, Any]) -> float:
         """Return how many times the clean error a run has, by the worse of filter and graph; infinite without poses."""

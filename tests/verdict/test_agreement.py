@@ -82,6 +82,15 @@ def test_a_turned_camera_is_not_taken_for_a_wrong_focal_length(steps):
     assert abs(found.scale_error) < 3.5 * found.scale_sigma
 
 
+def test_a_body_that_does_not_turn_says_nothing_of_focal_length(steps):
+    _, spans = steps()
+    rng = np.random.default_rng(8)
+    still = [replace(span, gyro_rad_s=0.01 + rng.normal(size=span.gyro_rad_s.shape) * 0.05) for span in spans]
+    turns = [TurnStep(preintegrate(span), so3_exp(rng.normal(size=3) * 1e-4)) for span in still]
+    found = turn_agreement(turns)
+    assert found.scale_sigma > 0.2
+
+
 def test_outlying_turns_do_not_decide(steps):
     turns = list(seen_turns(*steps()))
     turns[::9] = [replace(turn, R_seen=turn.R_seen @ so3_exp(np.array([0.2, 0.1, 0.0]))) for turn in turns[::9]]

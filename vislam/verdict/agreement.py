@@ -62,16 +62,17 @@ def turn_agreement(steps: Sequence[TurnStep]) -> TurnAgreement | None:
     """
     if len(steps) < _MIN_STEPS:
         return None
-    rows, errors = np.zeros((len(steps), 3, 7)), np.zeros((len(steps), 3))
+    rows, errors, seen = np.zeros((len(steps), 3, 7)), np.zeros((len(steps), 3)), np.zeros((len(steps), 3))
     for i, step in enumerate(steps):
         R = np.ascontiguousarray(step.inertial.dR)
         errors[i] = so3_log(np.ascontiguousarray(R.T @ step.R_seen))
         rows[i, :, :3] = step.inertial.dR_dgyro
         rows[i, :, 3:6] = R.T - np.eye(3)
-        rows[i, :, 6] = so3_log(R)
+        rows[i, :, 6], seen[i] = so3_log(R), so3_log(step.R_seen)
     sigmas = np.array([*[_BIAS_RAD_S] * 3, *[_TURN_RAD] * 3, _SCALE])
     x, covariance, residual = _robust(rows, errors, sigmas, np.zeros(7), _LEAST_TURN_RAD)
-    return TurnAgreement(len(steps), float(x[6]), float(np.sqrt(covariance[6, 6])), residual)
+    sigma = np.hypot(np.sqrt(covariance[6, 6]), _dilution(rows[:, :, 6] + rows[:, :, :6] @ x[:6], seen))
+    return TurnAgreement(len(steps), float(x[6]), float(sigma), residual)
 
 
 def force_agreement(
@@ -90,28 +91,43 @@ def force_agreement(
     """
     rows, errors = [], []
     for i in range(1, len(T_map_body) - 1):
-        a, b = inertial[i - 1], inertial[i]
-        if a is None or b is None:
+        before, after = inertial[i - 1], inertial[i]
+        if before is None or after is None:
             continue
         R_a, R_b = T_map_body[i - 1, :3, :3], T_map_body[i, :3, :3]
         p = T_map_body[i - 1 : i + 2, :3, 3]
-        seen = (p[2] - p[1]) / b.dt_s - (p[1] - p[0]) / a.dt_s
+        seen = (p[2] - p[1]) / after.dt_s - (p[1] - p[0]) / before.dt_s
         row = np.zeros((3, 7))
         row[:, 0] = seen
-        row[:, 1:4] = -0.5 * (a.dt_s + b.dt_s) * np.eye(3)
-        row[:, 4:] = R_a @ (a.dp_daccel / a.dt_s - a.dv_daccel) - R_b @ b.dp_daccel / b.dt_s
+        row[:, 1:4] = -0.5 * (before.dt_s + after.dt_s) * np.eye(3)
+        row[:, 4:] = R_a @ (before.dp_daccel / before.dt_s - before.dv_daccel) - R_b @ after.dp_daccel / after.dt_s
         rows.append(row)
-        errors.append(R_b @ b.dp_m / b.dt_s - R_a @ (a.dp_m / a.dt_s - a.dv_m_s))
+        errors.append(R_b @ after.dp_m / after.dt_s - R_a @ (before.dp_m / before.dt_s - before.dv_m_s))
     if len(rows) < _MIN_STEPS:
         return None
     sigmas = np.array([_SCALE, *[_GRAVITY_SIGMA_M_S2] * 3, *[bias_sigma_m_s2] * 3])
     mean = np.array([1.0, 0.0, 0.0, -gravity_m_s2, 0.0, 0.0, 0.0])
-    x, covariance, _ = _robust(np.array(rows), np.array(errors), sigmas, mean, _LEAST_SPEED_M_S)
+    A, b = np.array(rows), np.array(errors)
+    x, covariance, _ = _robust(A, b, sigmas, mean, _LEAST_SPEED_M_S)
+    scale_sigma = np.hypot(np.sqrt(covariance[0, 0]), _dilution(A[:, :, 0], b - A[:, :, 1:] @ x[1:]))
     norm = float(np.linalg.norm(x[1:4]))
     along = x[1:4] / max(norm, 1e-9)
     tilt = float(np.rad2deg(np.arccos(np.clip(-along[2], -1.0, 1.0))))
     sigma = float(np.sqrt(along @ covariance[1:4, 1:4] @ along))
-    return ForceAgreement(len(rows), float(x[0]), float(np.sqrt(covariance[0, 0])), norm, sigma, tilt)
+    return ForceAgreement(len(rows), float(x[0]), float(scale_sigma), norm, sigma, tilt)
+
+
+def _dilution(one: Array, other: Array) -> float:
+    """Return how far the factor between two noisy measurements [N, 3] of the same may be off for their noise.
+
+    Noise in what is multiplied draws a factor towards zero; multiplying the other one instead draws it the other way.
+    The truth is between the two (Frisch 1934), which are 1 / r^2 apart, r the correlation: where nothing turns, or
+    nothing speeds up, only noise is left, and a factor says nothing.
+    """
+    a, b = one - one.mean(axis=0), other - other.mean(axis=0)
+    together = float(np.sum(a * b)) ** 2
+    apart = float(np.sum(a * a)) * float(np.sum(b * b))
+    return 0.5 * (apart / together - 1.0) if together > 0.0 else float("inf")
 
 
 def _robust(rows: Array, errors: Array, sigmas: Array, mean: Array, least: float) -> tuple[Array, Array, float]:
