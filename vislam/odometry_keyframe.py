@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vislam.geometry import transform
-from vislam.imu import preintegrate
+from vislam.imu import preintegrate, shifted
 from vislam.messages import Array, ImuSpan, KeyframePacket, NavState
 from vislam.trajectory import Trajectory
 
@@ -48,12 +48,14 @@ class WaitingKeyframes:
         return (now_t_ns - self._keyframes[0].packet.keyframe.t_ns) * 1e-9
 
     def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
-        """Bring all `shift_ns` later in the IMU's time; `cut` gives the inertial data between two times."""
+        """Bring all `shift_ns` later in the IMU's time; `cut` gives the inertial data between two times, where it has them."""
         before_ns: int | None = None
         for i, waiting in enumerate(self._keyframes):
             packet = _restamped(waiting.packet, shift_ns)
             t_ns = packet.keyframe.t_ns
-            imu = None if before_ns is None or waiting.packet.imu is None else cut(before_ns, t_ns)
+            imu = waiting.packet.imu
+            if before_ns is not None and imu is not None:
+                imu = cut(before_ns, t_ns) or shifted(imu, shift_ns)  # at the ends of the data
             self._keyframes[i] = replace(waiting, packet=replace(packet, imu=imu))
             before_ns = t_ns
 

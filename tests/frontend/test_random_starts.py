@@ -173,3 +173,27 @@ def test_what_came_before_the_window_is_reckoned_backwards() -> None:
     error = invert(pose_before(state, span, GRAVITY_M_S2)) @ start.pose(begin_ns)
     assert np.linalg.norm(error[:3, 3]) < 0.02  # white noise of two seconds
     assert np.linalg.norm(so3_log(error[:3, :3])) < 2e-3
+
+
+@pytest.mark.parametrize("shift_ns", [-20_000_000, 20_000_000])
+def test_a_clock_that_is_corrected_costs_no_frame_of_the_window(shift_ns: int) -> None:
+    """At both ends of it there are no inertial data for the new times yet, or any more."""
+    start = Start("moving", 2)
+    search = initialiser(start)
+    buffer = ImuBuffer(ImuConfig())
+    samples = iter(start.samples)
+    for i, (vo, observations, still) in enumerate(start.frames[:25]):
+        while buffer.newest_t_ns is None or buffer.newest_t_ns <= start.stamps[i]:
+            sample = next(samples)
+            if sample.t_ns >= start.stamps[0] - 5_000_000:
+                buffer.add(sample)
+        span = None if i == 0 else buffer.span(start.stamps[i - 1], start.stamps[i])
+        search.add(span, vo, still, observations)
+    search.restamp(shift_ns, buffer.span)
+    for sample in samples:
+        buffer.add(sample)
+    vo, observations, still = start.frames[25]
+    span = buffer.span(start.stamps[24] + shift_ns, start.stamps[25] + shift_ns)
+    answer = search.add(span, replace(vo, t_ns=vo.t_ns + shift_ns), still, observations)
+    assert search.phase in (Phase.MOVING, Phase.FOUND) and answer.cause != "duration"
+    assert "inertial data" not in search.refusals

@@ -226,8 +226,7 @@ class Initialiser:
         """
         self._rest.clear()
         self._before = self._offset_s = None
-        if not self._window.restamp(shift_ns, cut):
-            self._restart("inertial data", "inertial data does not reach back to the first frames")
+        self._window.restamp(shift_ns, cut)
         self._next_attempt_ns += shift_ns if self._next_attempt_ns else 0
 
     def _next_phase(self, vo: VoMeasurement, still: bool) -> Phase:

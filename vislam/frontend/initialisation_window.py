@@ -13,7 +13,7 @@ from vislam.frontend.inertial_alignment import VisualMotion
 from vislam.frontend.initialisation_linear import Tracks
 from vislam.frontend.result import scaled_motion
 from vislam.geometry import invert, se3_adjoint, transform
-from vislam.imu import join, preintegrate
+from vislam.imu import join, preintegrate, shifted
 from vislam.messages import Array, ImuSpan, NoiseScale, Observations, VoMeasurement
 
 _NS = 1_000_000_000
@@ -104,19 +104,16 @@ class FrameWindow:
             keep += 1
         del self.entries[:keep]
 
-    def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> bool:
-        """Shift all times and cut the spans anew; False, and empty, where inertial data do not cover them."""
-        self._blind = None
+    def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
+        """Shift all times and cut the spans anew; at the ends, where inertial data do not reach, they are moved."""
         moved: list[Entry] = []
         for entry in self.entries:
-            vo = replace(entry.vo, t_ns=entry.t_ns + shift_ns)
-            span = cut(moved[-1].t_ns, vo.t_ns) if moved else None
-            if moved and span is None:
-                self.entries = []
-                return False
-            moved.append(replace(entry, vo=vo, span=span))
+            vo, span = replace(entry.vo, t_ns=entry.t_ns + shift_ns), entry.span
+            if span is not None and moved:
+                span = cut(moved[-1].t_ns, vo.t_ns) or shifted(span, shift_ns)
+            moved.append(replace(entry, vo=vo, span=span if moved else None))
         self.entries = moved
-        return True
+        self._blind = None if self._blind is None else shifted(self._blind, shift_ns)
 
     def is_keyframe(self, i: int) -> bool:
         """Whether entry i is the keyframe of the next one."""

@@ -9,7 +9,7 @@ from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
 from vislam.imu.power_up import PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, preintegrate
 from vislam.imu.rest import RestDetector
-from vislam.imu.series import ImuSeries, join, subtract_bias
+from vislam.imu.series import ImuSeries, join, shifted, subtract_bias
 
 __all__ = [
     "AttitudeFilter",
@@ -31,5 +31,6 @@ __all__ = [
     "join",
     "power_up",
     "preintegrate",
+    "shifted",
     "subtract_bias",
 ]

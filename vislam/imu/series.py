@@ -140,6 +140,11 @@ def join(spans: Sequence[ImuSpan]) -> ImuSpan:
     )
 
 
+def shifted(span: ImuSpan, shift_ns: int) -> ImuSpan:
+    """Return a span as if it had been measured `shift_ns` later."""
+    return replace(span, t_ns=span.t_ns + shift_ns)
+
+
 def _joint_noise(spans: Sequence[ImuSpan]) -> NoiseScale:
     if len({span.noise for span in spans}) == 1:
         return spans[0].noise
