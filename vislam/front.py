@@ -480,8 +480,11 @@ class Front:
         return self._release(found.T_odom_vo)
 
     def _level(self, span: ImuSpan | None, vo: VoMeasurement) -> Initialisation | None:
-        """Return a provisional state from the newest samples alone, where vision is metric and goes on from there."""
-        if not vo.has_scale or vo.T_keyframe_body is None:
+        """Return a provisional state from the newest samples alone, where vision is metric and goes on from there.
+
+        The tight filter has tracks, not metres: it does not find the velocity at once.
+        """
+        if not vo.has_scale or vo.T_keyframe_body is None or self.ekf_coupling != "loose":
             return None
         if span is None and self._buffer.oldest_t_ns is not None:
             oldest_ns = vo.t_ns - round(self._config.init.level_s * 1e9)

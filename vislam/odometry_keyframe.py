@@ -48,7 +48,7 @@ class WaitingKeyframes:
         return (now_t_ns - self._keyframes[0].packet.keyframe.t_ns) * 1e-9
 
     def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
-        """Bring all `shift_ns` later in the IMU's time; `cut` gives the inertial data between two times, where it has them."""
+        """Bring all `shift_ns` later in the IMU's time; `cut` gives the inertial data between two times, if any."""
         before_ns: int | None = None
         for i, waiting in enumerate(self._keyframes):
             packet = _restamped(waiting.packet, shift_ns)
