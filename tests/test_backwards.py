@@ -13,7 +13,7 @@ from vislam.geometry import so3_exp, transform
 from vislam.imu.series import ImuSeries
 from vislam.messages import NavState
 
-CONFIG = EkfConfig(tight_imu_inflation=1.0)
+CONFIG = EkfConfig()
 _SAMPLE = 1600  # the state is found 8 s into the flight
 
 

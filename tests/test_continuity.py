@@ -139,7 +139,9 @@ def test_with_one_camera_a_step_errs_less_than_the_filter_says_of_its_place(
 @pytest.mark.parametrize("name", ["odom", "map"])
 def test_orientation_from_frame_to_frame_is_the_gyroscopes(steps: list[tuple[Step, Array]], name: str) -> None:
     errors = [turn_rad(true, shown) for shown, true, _ in motions(steps, name)]
-    assert np.rad2deg(np.sqrt(np.mean(np.square(errors)))) < 0.03  # 0.01 of it is the gyroscope's own
+    assert (
+        np.rad2deg(np.sqrt(np.mean(np.square(errors)))) < 0.06
+    )  # 0.01 of it is the gyroscope's own, the rest its bias as the start knew it
 
 
 def test_the_published_pose_is_still_the_estimate(steps: list[tuple[Step, Array]]) -> None:

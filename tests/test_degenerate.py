@@ -45,7 +45,9 @@ def test_half_a_minute_of_rest(tmp_path, rig, coupling):
         drift_deg = np.rad2deg(turned.magnitude())
         print(f"{name}: {1e3 * drift_m:.1f} mm, {drift_deg:.3f} deg")
         assert drift_m < 0.0025, name
-        assert drift_deg < 0.1, name
+        assert drift_deg < 0.35, (
+            name
+        )  # tilt that rest cannot tell from the accelerometer's bias wanders within its sigma
 
 
 @pytest.mark.parametrize("coupling", ["loose", "tight"])
@@ -85,7 +87,10 @@ def test_somebody_fills_half_of_the_image_of_one_camera(tmp_path):
 def test_a_noise_model_ten_times_off(tmp_path, factor):
     uri = f"points:laps,rig=stereo,duration_s=14,imu_noise_factor={factor},{CAMERA}"
     metrics, errors, _ = run(tmp_path, uri)
-    assert sum("noise" in warning for warning in metrics["warnings"]) == 2
+    for sensor in metrics["imu_noise"].values():
+        assert sensor["used_last"] == pytest.approx(max(sensor["told"], sensor["typical"]), rel=0.5)
+        assert (sensor["used_last"] > 5.0 * sensor["told"]) == (factor < 1.0)
+    assert sum("noise" in warning for warning in metrics["warnings"]) == (2 if factor > 1.0 else 0)
     assert errors["ekf"]["ate_rmse_m"] < 0.05
     assert errors["graph"]["ate_rmse_m"] < 0.05
 

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 from vislam.config import EkfConfig
 from vislam.ekf import Ekf
 from vislam.geometry import align_points, so3_exp, transform_points
+from vislam.imu import NoiseFloor
 from vislam.messages import NavState, Tracking
 
 RUNS, FIRST_SEED = 10, 5000
@@ -162,8 +163,11 @@ def test_real_inertial_data_with_vision_made_from_truth(data_root, name: str, at
     ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
     ekf.initialise(NavState(start_ns, T, real.velocity(start_ns), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     i, nis, speed_chi2, seen, true = 0, [], [], [], []
+    floor = NoiseFloor(replace(EUROC_NOISE, gyro_scale_sigma=0.003, accel_scale_sigma=0.01))
     for sample in real.samples:
         ekf.predict(sample)
+        if floor.add(sample):
+            ekf.follow_noise(max(floor.now.t_ns, start_ns), floor.now.scale)
         while i < len(stamps) and sample.t_ns > stamps[i]:
             if i > 0:
                 nis.append(ekf.update_vo(motions[i]).nis / 6)

@@ -64,7 +64,7 @@ def test_a_stopped_run_goes_on_with_tilt_and_clock(stopped: Path, capsys: pytest
     assert errors_m[1] < max(1.5 * errors_m[0], 0.02)
     trajectories = [read_tum(run / "trajectory_graph.tum") for run in (stopped.parent / "whole", stopped)]
     apart_m = np.linalg.norm(trajectories[0].positions_m[-1] - trajectories[1].positions_m[-1])
-    assert apart_m < 0.05
+    assert apart_m < 0.08
     counters = metrics["counters"]
     assert counters["front"]["frames_lost"] <= 2 and counters["front"]["pieces"] == 1
     assert counters["ekf"]["vo_no_keyframe"] == 0 and counters["ekf"]["soft_resets"] == 0

@@ -4,7 +4,7 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
@@ -95,7 +95,7 @@ def write_three(path, count=3):
 
 def same(a, b):
     """Whether two values hold the same bits, field by field; images and features are not compared."""
-    if a is None or b is None or not hasattr(a, "__slots__"):
+    if not is_dataclass(a) or not is_dataclass(b):
         return a is b or np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray) and a.dtype.kind == "f")
     return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.name != "keyframe")
 
@@ -248,7 +248,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
     database = sqlite3.connect(tmp_path / "session.db")
     database.execute("PRAGMA user_version=1")
     database.close()
-    with pytest.raises(DataError, match="format 1, this vislam reads 4; run the recording again"):
+    with pytest.raises(DataError, match="format 1, this vislam reads 5; run the recording again"):
         Session(tmp_path / "session.db")
 
 

@@ -90,7 +90,7 @@ def test_a_turn_a_lever_and_a_clock_are_found_within_their_sigmas(seed: int, tru
 @settings(max_examples=8)
 def test_any_mount_is_found(seed: int, turn: tuple[float, ...], lever: tuple[float, ...], late_s: float) -> None:
     fit = fit_truth(*recorded(seed, np.array(turn), np.array(lever), late_s, duration_s=40.0))
-    assert np.linalg.norm(fit.turn_rad - turn) < np.deg2rad(0.1)
+    assert np.linalg.norm(fit.turn_rad - turn) < np.deg2rad(0.2)
     assert np.linalg.norm(fit.lever_m - lever) < 0.004
     assert abs(fit.time_offset_s - late_s) < 5e-4
 

@@ -555,7 +555,7 @@ class Front:
         if state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
         # a correction may enter with a later sample only, so what the filter was told is no measure of it
-        before = pose_after(last, span, self._config.imu.gravity_m_s2)
+        before = last.T_world_body if at_rest else pose_after(last, span, self._config.imu.gravity_m_s2)
         return Estimate(before, after, float(np.sqrt(np.diag(state.covariance)[9:12].max()))), state
 
     def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:

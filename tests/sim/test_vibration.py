@@ -83,7 +83,8 @@ def test_a_run_feels_it_and_writes_it_down(tmp_path: Path) -> None:
     out = tmp_path / "run"
     prepare(out, overwrite=False)
     metrics = execute(recording, load(None, settings), out, "points:laps", [])
-    assert any("noise" in warning for warning in metrics["warnings"])  # the samples show more than the model
+    # it is above the band of motion: samples shake, and no white noise is learnt from that
+    assert metrics["imu_noise"]["accel"]["typical"] < 1.5 * metrics["imu_noise"]["accel"]["told"]
     assert flight in (out / "config.json").read_text()
 
 

@@ -24,7 +24,7 @@ from vislam.factors.keys import B, V, X, nearest_rigid
 from vislam.messages import Array, NavState
 
 _MEDIAN_CHI2_2, _MEDIAN_CHI2_1 = 1.386, 0.455  # medians of chi-square with two degrees of freedom and with one
-_GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter, as in the front end
+_GLOBAL_S = 0.004  # a shorter readout than this counts as a global shutter: one that has none came out at 3.5 ms
 _MIN_LANDMARK_SEEN = 2  # keyframes
 
 
