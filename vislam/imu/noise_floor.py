@@ -23,6 +23,7 @@ from vislam.imu.noise import ImuNoise
 from vislam.messages import AS_MODELLED, Array, ImuSample, NoiseScale
 
 _WINDOW_S, _HOP_S = 1.0, 0.5  # resolves 2 Hz; half a second is short against how long a ride or a rest lasts
+_MOST_SAMPLES = 8192  # in a window, whatever rate is told: no IMU is faster
 _AVERAGED = 4  # windows; alone, the quietest band of a window is 20 % quieter than the noise, by chance
 _LOWEST_HZ = 3.0  # below, even slow machines move
 _HIGHEST_SHARE = 0.25  # of the rate; above, the low-pass filters of sensors take noise out that is there lower down
@@ -65,8 +66,8 @@ class NoiseFloor:
     def __init__(self, noise: ImuNoise) -> None:
         """Take the model to compare with."""
         self._model = noise
-        self._size = max(round(_WINDOW_S * noise.rate_hz), 8)
-        self._hop = max(round(_HOP_S * noise.rate_hz), 4)
+        self._size = min(max(round(_WINDOW_S * noise.rate_hz), 8), _MOST_SAMPLES)
+        self._hop = max(self._size // 2, 4)
         self._taper = np.hanning(self._size + 2)[1:-1]
         self._ramp = np.arange(self._size) - 0.5 * (self._size - 1)
         self._bands = _bands(self._size, noise.rate_hz)
