@@ -34,3 +34,20 @@ class Recording(Protocol):
     def truth(self) -> Trajectory | None:
         """Return the true body trajectory in a world frame, or None."""
         ...
+
+
+class WrappedRecording:
+    """A recording that has what another one has; who wraps one yields its values otherwise."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Take over everything but the values."""
+        self._recording = recording
+        self.name = recording.name
+        self.rig = recording.rig
+        self.imu_noise: ImuNoise | None = recording.imu_noise
+        self.frame_count = recording.frame_count
+        self.problems: dict[str, int] = recording.problems
+
+    def truth(self) -> Trajectory | None:
+        """Return the recording's truth."""
+        return self._recording.truth()

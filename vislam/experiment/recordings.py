@@ -15,9 +15,8 @@ from vislam.datasets.recorder import record
 from vislam.errors import StorageError
 from vislam.experiment.identity import code_sha256, sha256_of
 from vislam.messages import Frame, ImuSample, MagSample
-from vislam.recording import Recording
+from vislam.recording import Recording, WrappedRecording
 from vislam.sources import open_source
-from vislam.trajectory import Trajectory
 
 _SIMULATOR = Path(__file__).resolve().parent.parent / "sim"
 
@@ -46,7 +45,7 @@ def open_cached(source: str, seed: int, cache: Path, calibration: CalibrationCon
     return open_dataset(f"euroc:{folder}")
 
 
-class TimedRecording:
+class TimedRecording(WrappedRecording):
     """A recording that notes how long its consumer was busy with each frame.
 
     A frame is finished by the inertial sample after it, so `frame_done` tells when, and the whole time since the
@@ -59,19 +58,10 @@ class TimedRecording:
 
     def __init__(self, recording: Recording) -> None:
         """Wrap a recording (see `vislam.recording.Recording`)."""
-        self._recording = recording
-        self.name = recording.name
-        self.rig = recording.rig
-        self.imu_noise = recording.imu_noise
-        self.frame_count = recording.frame_count
-        self.problems = recording.problems
+        super().__init__(recording)
         self.latencies_s: list[float] = []
         self.span_ns: tuple[int, int] | None = None
         self._finished = 0
-
-    def truth(self) -> Trajectory | None:
-        """Return the recording's truth."""
-        return self._recording.truth()
 
     def frame_done(self, _done: int, _total: int, _note: str) -> None:
         """Note that the value that was taken last finished a frame; fits `vislam.run.Progress`."""

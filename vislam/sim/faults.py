@@ -17,11 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from vislam.camera import Camera, Rig
 from vislam.errors import UsageError
-from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImageU8, ImuSample, MagSample
-from vislam.recording import Recording
+from vislam.recording import Recording, WrappedRecording
 from vislam.sim.disturbance import PERSON_M, in_window, person_box
-from vislam.trajectory import Trajectory
 
 Event = ImuSample | MagSample | Frame
 Stream = Callable[[Iterator[Event], Rig, np.random.Generator], Iterator[Event]]
@@ -54,7 +52,7 @@ class Fault:
         return all(has[need] for need in self.needs)
 
 
-class FaultyRecording:
+class FaultyRecording(WrappedRecording):
     """A recording with a fault (see `vislam.recording.Recording`), from its first frame on, or only a piece of it.
 
     The same arguments give the same values.
@@ -74,13 +72,11 @@ class FaultyRecording:
         """
         if fault and fault not in FAULTS:
             raise UsageError(f"no fault '{fault}'; there are: {', '.join(FAULTS)}")
-        self._recording, self._seed, self._length_s = recording, seed, length_s
+        super().__init__(recording)
+        self._seed, self._length_s = seed, length_s
         self._fault = FAULTS[fault] if fault else Fault("nothing", frozenset())
         self.name = f"{recording.name} {fault}".strip()
         self.rig = recording.rig if self._fault.rig is None else self._fault.rig(recording.rig)
-        self.imu_noise: ImuNoise | None = recording.imu_noise
-        self.frame_count = recording.frame_count
-        self.problems: dict[str, int] = recording.problems
 
     def events(self, from_ns: int | None = None) -> Iterator[Event]:
         """Yield the values with their fault, all of them: what `from_ns` leaves out would change what is random."""
@@ -90,10 +86,6 @@ class FaultyRecording:
         if self._fault.stream is not None:
             events = self._fault.stream(events, self._recording.rig, np.random.default_rng(self._seed))
         yield from events
-
-    def truth(self) -> Trajectory | None:
-        """Return the truth, which no fault touches."""
-        return self._recording.truth()
 
 
 def _cut(events: Iterable[Event], length_s: float) -> Iterator[Event]:

@@ -15,8 +15,7 @@ from scipy.signal import butter, filtfilt, resample_poly
 
 from vislam.errors import DataError
 from vislam.messages import Array, Frame, ImuSample, MagSample
-from vislam.recording import Recording
-from vislam.trajectory import Trajectory
+from vislam.recording import Recording, WrappedRecording
 
 _ORDER = 4  # of the Butterworth filter, run to and fro: no phase
 _MARGIN_S = 1.0  # that is filtered with the window, so that its ends are not those of the filter
@@ -61,24 +60,15 @@ class Vibration:
         return np.asarray(resample_poly(self._values, ratio.numerator, ratio.denominator, axis=0))
 
 
-class ShakenRecording:
+class ShakenRecording(WrappedRecording):
     """A recording (see `vislam.recording.Recording`) whose inertial samples also hold a vibration, to and fro."""
 
     def __init__(self, recording: Recording, vibration: Vibration, gain: float) -> None:
         """Wrap a recording; its nth sample gets the nth reading, times the gain."""
-        self._recording = recording
-        self.name = recording.name
-        self.rig = recording.rig
-        self.imu_noise = recording.imu_noise
-        self.frame_count = recording.frame_count
-        self.problems = recording.problems
+        super().__init__(recording)
         rate_hz = 0.0 if recording.imu_noise is None else recording.imu_noise.rate_hz
         readings = gain * vibration.at_rate(rate_hz or vibration.rate_hz)
         self._readings = np.concatenate([readings, readings[-2:0:-1]])  # and back: no jump where it begins anew
-
-    def truth(self) -> Trajectory | None:
-        """Return the recording's truth."""
-        return self._recording.truth()
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
         """Yield the recording's values."""
