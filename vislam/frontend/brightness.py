@@ -13,7 +13,7 @@ from numba import njit
 
 from vislam.messages import Array, ImageU8
 
-_NEGLIGIBLE = 1.1  # ratio of brightness; less, and patches are compared as they are: a wrong guess does as much
+_NEGLIGIBLE = 1.3  # ratio of brightness; less, and Lucas-Kanade stands it better than a gain known to some percent
 _MIN_PATCHES = 10  # that tell the same; fewer are no evidence
 _MAX_PATCHES = 120  # looked at; the middle one of so many is known to a few percent
 _SAMPLES = 7  # a patch is seen through 7 x 7 pixels spread over it
