@@ -294,7 +294,9 @@ class MonoFrontEnd:
         return TrackResult(vo, observations, None, motion.parallax_px, weakness)
 
     def _weakness(self, motion: _Motion) -> str:
-        if motion.inliers < self._config.degraded_inliers:
+        # of tracks that somebody chose, as many times the least as of our own
+        enough = self._config.degraded_inliers * self._min_inliers // self._config.min_inliers
+        if motion.inliers < enough:
             return f"only {motion.inliers} inliers"
         if motion.inliers < self._config.degraded_inlier_ratio * motion.followed:
             return f"only {motion.inliers} of {motion.followed} tracks agree"
