@@ -55,6 +55,7 @@ from vislam.trajectory import Alignment, Trajectory, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
 _OTHER_WAYS = "a start from rest, a second camera or depth needs less"
+_SWAY_M_S = 0.03  # that a filter at rest may take for speed; a body that sets off is soon faster
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
 
 
@@ -555,7 +556,10 @@ class Front:
         if state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
         # a correction may enter with a later sample only, so what the filter was told is no measure of it
-        before = last.T_world_body if at_rest else pose_after(last, span, self._config.imu.gravity_m_s2)
+        before = pose_after(last, span, self._config.imu.gravity_m_s2)
+        way_m = float(np.linalg.norm(before[:3, 3] - last.T_world_body[:3, 3]))
+        if at_rest and way_m < _SWAY_M_S * (int(span.t_ns[-1]) - int(span.t_ns[0])) * 1e-9:
+            before = last.T_world_body
         return Estimate(before, after, float(np.sqrt(np.diag(state.covariance)[9:12].max()))), state
 
     def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:
