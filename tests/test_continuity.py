@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.config import Config, PublishConfig
+from vislam.config import PublishConfig, load
 from vislam.continuity import Continuity
 from vislam.geometry import invert, se3_exp, so3_log
 from vislam.messages import Array
@@ -95,12 +95,13 @@ def test_a_turned_map_does_not_swing_the_body_at_a_lever_arm() -> None:
         assert step_m(shown, T) < 1e-9
 
 
-@pytest.fixture(scope="module")
-def steps() -> list[tuple[Step, Array]]:
-    """One camera, a second of rest, 8 s by hand, then rest again: every step with the true pose of its frame."""
-    recording = open_points("stop-and-go", 0, rig="mono", start_s=2.0, duration_s=10.5, tracks=100)
-    config = Config()
-    slam = Slam(replace(config, map=replace(config.map, enabled=False)), recording.rig, recording.imu_noise)
+@pytest.fixture(scope="module", params=["mono, tight", "mono, loose", "stereo, tight", "stereo, loose"])
+def steps(request: pytest.FixtureRequest) -> list[tuple[Step, Array]]:
+    """A second of rest, 8 s by hand, then rest again: every step with the true pose of its frame."""
+    rig, coupling = request.param.split(", ")
+    recording = open_points("stop-and-go", 0, rig=rig, start_s=2.0, duration_s=10.5, tracks=100)
+    config = load(None, {"map.enabled": False, "ekf.coupling": coupling, "graph.coupling": coupling})
+    slam = Slam(config, recording.rig, recording.imu_noise)
     taken = [step for value in recording.events() for step in slam.feed(value)]
     truth = recording.true_states(np.array([step.front.frame.t_ns for step in taken])).T_world_body
     return list(zip(taken, truth, strict=True))
@@ -119,16 +120,17 @@ def motions(steps: list[tuple[Step, Array]], name: str) -> list[tuple[Array, Arr
 
 
 @pytest.mark.parametrize("name", ["odom", "map"])
-def test_with_one_camera_nothing_moves_at_rest(steps: list[tuple[Step, Array]], name: str) -> None:
-    still = [shown for shown, true, _ in motions(steps, name) if np.linalg.norm(true[:3, 3]) < 1e-5]
+def test_nothing_moves_at_rest(steps: list[tuple[Step, Array]], name: str, request: pytest.FixtureRequest) -> None:
+    """Loosely coupled, what a body that has just stopped still has of speed is up to 1.2 mm a frame, one camera."""
+    begun = [(step, true) for step, true in steps if step.T_map_body is not None]
+    still = [shown for shown, true, _ in motions(begun, name) if np.linalg.norm(true[:3, 3]) < 1e-5]
     assert len(still) > 20
-    assert max(np.linalg.norm(shown[:3, 3]) for shown in still) < 1e-3
+    limit_m = 1.5e-3 if "mono, loose" in request.node.name else 1e-3
+    assert max(np.linalg.norm(shown[:3, 3]) for shown in still) < limit_m
 
 
 @pytest.mark.parametrize("name", ["odom", "map"])
-def test_with_one_camera_a_step_errs_less_than_the_filter_says_of_its_place(
-    steps: list[tuple[Step, Array]], name: str
-) -> None:
+def test_a_step_errs_less_than_the_filter_says_of_its_place(steps: list[tuple[Step, Array]], name: str) -> None:
     ratios = [
         np.linalg.norm((invert(true) @ shown)[:3, 3]) / (3.0 * sigma_m) for shown, true, sigma_m in motions(steps, name)
     ]

@@ -216,6 +216,27 @@ def test_rest_takes_its_time_and_motion_ends_it() -> None:
     assert not detector.add(to_span(still[210:260]))
 
 
+def test_a_smooth_start_ends_rest_by_the_speed_that_it_gains() -> None:
+    """Force spreads by less than idling motors shake; 30 s of rest before it are told throughout."""
+    rng = np.random.default_rng(3)
+    t_s = 0.005 * np.arange(6601)
+    speed = np.where(t_s > 30.0, 0.15 * (t_s - 30.0) ** 2, 0.0)
+    white = np.array([EUROC_NOISE.gyro_noise_density, EUROC_NOISE.accel_noise_density]) * np.sqrt(200.0)
+    samples = [
+        ImuSample(
+            T0_NS + 5_000_000 * k,
+            np.array([0.02, -0.05, 0.08]) + rng.normal(size=3) * white[0],
+            np.array([0.3 + 0.3 * max(t - 30.0, 0.0), 1e-3 * t, 9.8]) + rng.normal(size=3) * white[1],
+        )
+        for k, t in enumerate(t_s)
+    ]
+    answers = np.array(rest_answers(samples))
+    told_s = t_s[10 * np.flatnonzero(answers) + 10]
+    assert answers[16 : 30 * 20].all()
+    assert np.interp(told_s.max(), t_s, speed) < 0.04
+    assert told_s.max() > 30.1
+
+
 @pytest.mark.data
 def test_rest_on_a_real_recording(data_root) -> None:
     """V1_01 stands on the floor with idling motors at its end, and flies in the middle."""

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.geometry import invert, se3_exp, se3_log, transform
-from vislam.imu import preintegrate
+from vislam.geometry import invert, se3_exp, se3_log
+from vislam.imu import pose_after
 from vislam.messages import Array, ImuSpan, NavState
 from vislam.trajectory import Trajectory
 
@@ -94,10 +94,5 @@ def _carried(state: NavState, span: ImuSpan, t_ns: int, gravity_m_s2: float) -> 
     def at(values: Array) -> Array:
         return np.stack([np.interp(wanted, own, column) for column in values.T], axis=1)
 
-    moved = preintegrate(
-        ImuSpan(stamps, at(span.gyro_rad_s), at(span.accel_m_s2)), state.gyro_bias_rad_s, state.accel_bias_m_s2
-    )
-    R, gravity = state.T_world_body[:3, :3], np.array([0.0, 0.0, -gravity_m_s2])
-    dt = moved.dt_s
-    position = state.T_world_body[:3, 3] + state.velocity_world_m_s * dt + 0.5 * gravity * dt**2 + R @ moved.dp_m
-    return transform(np.ascontiguousarray(R @ moved.dR), position)
+    between = ImuSpan(stamps, at(span.gyro_rad_s), at(span.accel_m_s2))
+    return pose_after(state, between, gravity_m_s2)

@@ -32,6 +32,7 @@ from vislam.imu import (
     NoiseFloor,
     NoiseRatios,
     RestDetector,
+    pose_after,
     subtract_bias,
 )
 from vislam.memory import FrontMemory, FrontNews, StartFacts
@@ -50,7 +51,7 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state, pose_after
+from vislam.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state
 from vislam.trajectory import Alignment, Trajectory, gauge_alignment
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
@@ -425,7 +426,7 @@ class Front:
         if refused is not None and np.isfinite(refused.time_offset_sigma_s):
             self._shift(self.camera_clock.tell(refused.time_offset_s, refused.time_offset_sigma_s))
         else:
-            self._shift(self.camera_clock.follow(vo, self._buffer))
+            self._shift(self.camera_clock.follow(vo, self._buffer, self.initialisation is not None))
 
     def _shift(self, shift_ns: int) -> None:
         """Bring what waits for gravity to the time that a change of the camera's offset gives it."""

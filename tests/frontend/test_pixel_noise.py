@@ -67,3 +67,14 @@ def test_few_tracks_or_few_frames_leave_what_was_told() -> None:
     assert noise.sigma_px == 0.7 and not noise.is_learnt
     noise.learn(rng.normal(0.0, 0.2, 100), UNIT, NOWHERE[:100])
     assert noise.is_learnt and noise.sigma_px < 0.3
+
+
+def test_a_frame_tells_its_own_noise_where_it_shows_enough_tracks() -> None:
+    rng, noise = np.random.default_rng(6), PixelNoise(1.0)
+    assert noise.frame_px == 1.0
+    for _ in range(20):
+        noise.learn(rng.normal(0.0, 0.3, 200), UNIT, NOWHERE)
+    noise.learn(rng.normal(0.0, 1.2, 200), UNIT, NOWHERE)
+    assert noise.frame_px == pytest.approx(1.2, rel=0.2) and noise.sigma_px < 0.4
+    noise.learn(np.full(200, np.nan), UNIT, NOWHERE)
+    assert noise.frame_px == noise.sigma_px

@@ -11,7 +11,7 @@ from vislam.camera import Camera
 from vislam.frontend.epipolar import essential_ransac, refine_two_view
 from vislam.frontend.landmarks import UNKNOWN_RHO_SIGMA, Landmarks, fuse, move, predict
 from vislam.frontend.locate import pnp_ransac
-from vislam.frontend.refine import extra_parameter, refine_pose
+from vislam.frontend.refine import extra_parameter, pose_covariance, refine_pose
 from vislam.frontend.shutter import Shutter
 from vislam.geometry import invert, se3_exp, se3_log, so3_exp, so3_log
 from vislam.messages import Array
@@ -115,6 +115,34 @@ def test_covariance_grows_with_errors_that_a_region_shares() -> None:
     together = refine_pose(np.eye(4), landmarks, P, shared, SIGMA, 3.0)
     growth = np.trace(together.covariance[:3, :3]) / np.trace(alone.covariance[:3, :3])
     assert growth > 2.0 > 1.5 * together.variance / alone.variance
+
+
+def test_covariance_by_measured_noise_and_an_unsure_parameter() -> None:
+    rng = np.random.default_rng(11)
+    landmarks, T = scene(rng, 80), se3_exp(np.array([0.02, -0.01, 0.03, 0.1, 0.05, -0.02]))
+    covariances = np.zeros((80, 3, 3))
+    xy = seen_from(landmarks, T)[:, :2] + rng.normal(0.0, SIGMA, (80, 2))
+    estimate = refine_pose(T, landmarks, covariances, xy, SIGMA, 3.0)
+    slope = np.column_stack([landmarks[:, 1], np.zeros(80)])  # a shear
+
+    def covariance(scale: float, slope_sigma: float) -> Array:
+        found = pose_covariance(
+            estimate.T_key_cam, landmarks, covariances, xy, SIGMA, 3.0, None, None, scale, slope, slope_sigma
+        )
+        assert found is not None
+        return found
+
+    assert np.allclose(covariance(1.0, 0.0), estimate.covariance, rtol=1e-6, atol=0.0)
+    assert np.allclose(covariance(3.0, 0.0), 9.0 * estimate.covariance, rtol=1e-6, atol=0.0)
+    # what the parameter does to the pose: once more with directions that it has changed by its sigma
+    change = 0.003
+    other = refine_pose(estimate.T_key_cam, landmarks, covariances, xy - change * slope, SIGMA, 3.0)
+    moved = se3_log(invert(estimate.T_key_cam) @ other.T_key_cam)
+    added = covariance(1.0, change) - covariance(1.0, 0.0)
+    assert np.linalg.norm(added - np.outer(moved, moved)) < 0.2 * np.linalg.norm(added)
+    assert (
+        pose_covariance(T, landmarks[:2], covariances[:2], xy[:2], SIGMA, 3.0, None, None, 1.0, slope[:2], 0.0) is None
+    )
 
 
 def test_points_of_unknown_depth_constrain_across_their_epipolar_line() -> None:

@@ -6,15 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2, NS, T0_NS
+from inertial_world import GRAVITY_M_S2
 from point_world import KINDS, Start, initialiser
 
 from vislam.config import ImuConfig, InitConfig
 from vislam.frontend.initialisation import Initialisation, Phase
-from vislam.geometry import invert, so3_log
 from vislam.imu import ImuBuffer
-from vislam.messages import ImuSample, NavState
-from vislam.odometry_keyframe import pose_before
+from vislam.messages import ImuSample
 
 _STARTS = {"static": 4, "moving": 10, "gentle": 2, "rotation": 3, "uniform": 3, "accelerating": 3}
 
@@ -161,18 +159,6 @@ def test_same_input_same_start(kind: str) -> None:
     assert a.last is not None
     assert b.last is not None
     np.testing.assert_array_equal(a.last.covariance, b.last.covariance)
-
-
-def test_what_came_before_the_window_is_reckoned_backwards() -> None:
-    start = Start("moving", 4)
-    end_ns, begin_ns = start.stamps[60], start.stamps[20]
-    T, velocity, *_ = start.at((end_ns - T0_NS) / NS)
-    state = NavState(end_ns, T, velocity, start.gyro_bias, start.accel_bias, np.eye(15))
-    span = start.buffer.span(begin_ns, end_ns)
-    assert span is not None
-    error = invert(pose_before(state, span, GRAVITY_M_S2)) @ start.pose(begin_ns)
-    assert np.linalg.norm(error[:3, 3]) < 0.02  # white noise of two seconds
-    assert np.linalg.norm(so3_log(error[:3, :3])) < 2e-3
 
 
 @pytest.mark.parametrize("shift_ns", [-20_000_000, 20_000_000])

@@ -1,7 +1,8 @@
 """The camera's clock: what is added to its stamps, so that everything behind it lives in the IMU's time.
 
 The offset that is applied follows the estimate only where that is significant, changes from one frame to the next, and
-never so far that time would not advance.
+never so far that time would not advance. While a start is awaited it has to be significant twice in a row: errors of a
+tracked rotation last for many frames, which its sigma takes for independent, and a wrong clock voids the attempts.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ class CameraClock:
         self._corrected_ns = 0  # by changes of the offset so far ...
         self._keyframe_ns = 0  # ... and when the newest keyframe was stamped
         self._frames = 0
+        self._wanted_before_ns = 0  # the significant change that rotations asked for last
         self._last_t_ns: int | None = None  # of the frame before, by the camera
         self._interval_ns = 0
 
@@ -104,12 +106,13 @@ class CameraClock:
         extra = np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
         return replace(vo, covariance=vo.covariance + extra)
 
-    def follow(self, vo: VoMeasurement, buffer: ImuBuffer) -> int:
+    def follow(self, vo: VoMeasurement, buffer: ImuBuffer, is_started: bool) -> int:
         """Learn from the newest frame's motion and return by how many ns the applied offset changes from now on.
 
         Args:
             vo: its motion, stamped in the IMU's time.
             buffer: the inertial data around it.
+            is_started: gravity is known, so that nothing is lost by a change that is taken back.
         """
         self._offset.add(vo.t_ns - self.applied_ns, vo)
         self._frames += 1
@@ -121,23 +124,31 @@ class CameraClock:
         if span is None:
             return 0
         self._offset.solve(span)
-        return self._change()
+        wanted_ns, before_ns = self._significant_ns(), self._wanted_before_ns
+        self._wanted_before_ns = wanted_ns
+        return self._change(wanted_ns if is_started or wanted_ns * before_ns > 0 else 0)
 
     def tell(self, further_s: float, sigma_s: float) -> int:
         """Take an offset beyond what is applied, found by other means; return the change as `follow` does."""
         self._offset.tell(self.applied_s + further_s, sigma_s)
-        return self._change()
+        return self._change(self._significant_ns())
 
-    def _change(self) -> int:
-        found = self._offset.estimate
-        now_ns = self._last_t_ns
+    def _significant_ns(self) -> int:
+        """Return by how much the estimate differs from what is applied; 0 where that may be chance or is too little."""
+        found, now_ns = self._offset.estimate, self._last_t_ns
+        if now_ns is None:
+            return 0
+        shift_ns = round(found.at(now_ns) * _NS) - self.applied_ns
+        needed_s = max(_SIGNIFICANT * found.sigma_s, self._config.time_offset_min_s)
+        return shift_ns if abs(shift_ns) >= needed_s * _NS else 0
+
+    def _change(self, shift_ns: int) -> int:
+        found, now_ns = self._offset.estimate, self._last_t_ns
         if now_ns is None:
             return 0
         if self._config.clock_drift and abs(found.drift) > _SIGNIFICANT * found.drift_sigma:
             self._offset_ns, self._offset_t_ns, self.drift = self.applied_ns, now_ns, found.drift
-        shift_ns = round(found.at(now_ns) * _NS) - self.applied_ns
-        needed_s = max(_SIGNIFICANT * found.sigma_s, self._config.time_offset_min_s)
-        if abs(shift_ns) < needed_s * _NS:
+        if shift_ns == 0:
             return 0
         shift_ns = max(shift_ns, -round(_MOST_BACK * self._interval_ns))
         self.applied_ns += shift_ns

@@ -17,7 +17,7 @@ from vislam.frontend.landmarks import Landmarks, fuse, move
 from vislam.frontend.locate import pnp_ransac, recognise
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor, body_motion
-from vislam.frontend.refine import PoseEstimate, extra_parameter, refine_pose
+from vislam.frontend.refine import PoseEstimate, extra_parameter, pose_covariance, refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
 from vislam.frontend.shutter import Shutter
 from vislam.frontend.tracker import Tracker, given_rows
@@ -29,6 +29,10 @@ from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Track
 Bools = NDArray[np.bool_]
 
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
+# times what tracks scatter by: the noise of independent tracks that would move a pose as much. What neighbours have in
+# common (patch, lens, registered depth) leaves no residual, since a pose can follow it; it is as if 16 of them were one
+_ALIKE = 4.0
+_USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is told: what blurs or bends images spoils both
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _ASTRAY_PX = 6.0  # from where a filter that knows its motion expects a track: it belongs to something that moves
@@ -46,6 +50,7 @@ class _Attempt:
     pixels: Array  # [N, 2] of all tracks, NaN where not found
     seen: Array  # [N, 2] their directions on z = 1
     xy: Array  # [N, 2] the same as of the middle row's time
+    depth_now: DepthReading | None  # what this frame measures, if that is used
     expected_rho: Array  # [N] in this frame
     twist_per_s: Array  # [6] velocity of the camera
     estimate: PoseEstimate
@@ -184,7 +189,7 @@ class MetricFrontEnd:
             xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
             estimate = self._polish(estimate, xy, depth_now)
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
-        return _Attempt(pixels, seen, xy, predicted[:, 2], twist, estimate, failure)
+        return _Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, failure)
 
     def _failure(self, estimate: PoseEstimate, followed: int) -> str:
         agree = int(estimate.inliers.sum())
@@ -214,10 +219,12 @@ class MetricFrontEnd:
 
     def _refine(self, T: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         mean, covariance = self._landmarks.mean, self._landmarks.covariance
-        rho, sigma_rho = None, None
-        if depth_now is not None:
-            rho, sigma_rho = depth_now.rho, self._config.depth_now_factor * depth_now.sigma_rho
-        return refine_pose(T, mean, covariance, xy, self._sigma_xy, self._config.cauchy, rho, sigma_rho)
+        return refine_pose(T, mean, covariance, xy, self._sigma_xy, self._config.cauchy, *self._weighed(depth_now))
+
+    def _weighed(self, depth_now: DepthReading | None) -> tuple[Array | None, Array | None]:
+        if depth_now is None:
+            return None, None
+        return depth_now.rho, self._config.depth_now_factor * depth_now.sigma_rho
 
     def _ransac(self, points_m: Array, xy: Array) -> Array | None:
         return pnp_ransac(points_m, xy, _RANSAC_PX / self._camera.fx, self._config.min_inliers)
@@ -244,13 +251,18 @@ class MetricFrontEnd:
             return
         mean, covariance = self._landmarks.mean, self._landmarks.covariance
         xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
+        change = extra_parameter(
+            self._T_key_cam, mean, covariance, xy, self._sigma_xy, self._config.cauchy, self._shear(attempt, xy)
+        )
+        self._shutter.learn(*change)
+
+    def _shear(self, attempt: _Attempt, xy: Array) -> Array:
+        """Return the derivative [N, 2] of predicted minus measured directions `xy` [N, 2] by the readout time."""
+        mean = self._landmarks.mean
         of_key = self._shutter.slope(self._tracker.pixels, mean[:, :2], mean[:, 2], self._keyframe_twist)
         of_now = self._shutter.slope(attempt.pixels, xy, attempt.expected_rho, attempt.twist_per_s)
         # a landmark's own shear is carried by the rotation between the two, nearly one over such short times
-        change = extra_parameter(
-            self._T_key_cam, mean, covariance, xy, self._sigma_xy, self._config.cauchy, of_key - of_now
-        )
-        self._shutter.learn(*change)
+        return of_key - of_now
 
     # -- looking through another camera ------------------------------------------------------------------------------
 
@@ -378,7 +390,7 @@ class MetricFrontEnd:
 
     def _measurement(self, frame: Frame, keyframe_id: int, attempt: _Attempt) -> VoMeasurement:
         adjoint = se3_adjoint(self._T_body_cam)
-        covariance = adjoint @ attempt.estimate.covariance @ adjoint.T
+        covariance = adjoint @ self._covariance(attempt, frame.tracks is not None) @ adjoint.T
         return VoMeasurement(
             t_ns=frame.t_ns,
             keyframe_id=keyframe_id,
@@ -388,6 +400,21 @@ class MetricFrontEnd:
             tracking=Tracking.DEGRADED if self._weakness(attempt) else Tracking.OK,
             inliers=attempt.inliers,
         )
+
+    def _covariance(self, attempt: _Attempt, given: bool) -> Array:
+        """Return the covariance [6, 6] of the camera's motion, by the noise that was measured instead of told."""
+        measured_px = self._noise.frame_px
+        # tracks that were followed elsewhere are independent, and the noise of their depth is told
+        pixel_px, scale = (measured_px, 1.0) if given else (_ALIKE * _USUAL_PX, measured_px / _USUAL_PX)
+        ratio = pixel_px / self._config.track_sigma_px
+        by_pixel = np.array([ratio, ratio, 1.0])
+        mean, covariance = self._landmarks.mean, self._landmarks.covariance * by_pixel[:, None] * by_pixel
+        xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
+        found = pose_covariance(
+            attempt.estimate.T_key_cam, mean, covariance, xy, ratio * self._sigma_xy, self._config.cauchy,
+            *self._weighed(attempt.depth_now), scale, self._shear(attempt, xy), self._shutter.sigma_s,
+        )  # fmt: skip
+        return attempt.estimate.covariance if found is None else found
 
     def _parallax_px(self, attempt: _Attempt) -> float:
         good = attempt.estimate.inliers
@@ -429,7 +456,7 @@ class MetricFrontEnd:
         failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         if failure:
             return self._start(frame, failure)
-        attempt = _Attempt(pixels, xy, xy, reading.rho, np.zeros(6), estimate, "")
+        attempt = _Attempt(pixels, xy, xy, None, reading.rho, np.zeros(6), estimate, "")
         self._T_key_cam = estimate.T_key_cam
         # followed for long, through a rolling shutter of which nothing was known: true, but not to the millimetre
         vo = replace(self._measurement(frame, keyframe.id, attempt), tracking=Tracking.DEGRADED)

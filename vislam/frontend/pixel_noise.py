@@ -47,6 +47,7 @@ class PixelNoise:
         self._told_px = told_px
         self._log_px = 0.0
         self._frames = 0
+        self._frame_px: float | None = None
 
     @property
     def is_learnt(self) -> bool:
@@ -58,6 +59,11 @@ class PixelNoise:
         """The standard deviation: measured, or as told while too little was seen."""
         return float(np.exp(self._log_px)) if self.is_learnt else self._told_px
 
+    @property
+    def frame_px(self) -> float:
+        """The standard deviation in the newest frame alone; where it shows too few tracks, that of the run."""
+        return self.sigma_px if self._frame_px is None else self._frame_px
+
     def learn(self, distances: Array, camera: Camera, xy: Array, ends: float = 1.0) -> None:
         """Take a frame's distances [N] of tracks at `xy` [N, 2] from their epipolar lines; NaN where there is none.
 
@@ -65,6 +71,7 @@ class PixelNoise:
         variances of such a distance in those of one pixel: 1 where the place in the keyframe is the track by
         definition, 2 where it is as noisy as the one in the frame.
         """
+        self._frame_px = None
         seen = np.isfinite(distances)
         if seen.sum() < _MIN_TRACKS:
             return
@@ -73,5 +80,6 @@ class PixelNoise:
         scaled = np.abs(distances[seen]) * px / np.sqrt(ends)
         freedom = len(scaled) / (len(scaled) - _PARAMETERS)
         measured_px = max(_spread_px(scaled) * np.sqrt(freedom), _MIN_PX)
+        self._frame_px = measured_px
         self._frames += 1
         self._log_px += (np.log(measured_px) - self._log_px) / min(self._frames, _MEMORY_FRAMES)

@@ -55,12 +55,10 @@ def refine_pose(
 
     Returns:
         The estimate; `converged` is False when the motion is not observable or the steps do not settle. The
-        covariance is that of independent residuals times what the residuals show: their variance, and how much those
-        of the same image region err together (cluster-robust variance, Liang and Zeger, Biometrika 1986). With
+        covariance is that of independent residuals times what the residuals show, see `pose_covariance`. With
         `rotation_only` that of the translation is meaningless.
     """
-    measured = np.column_stack([xy, np.full(len(xy), np.nan) if rho is None else rho])
-    sigma = np.column_stack([np.full((len(xy), 2), sigma_xy), np.ones(len(xy)) if sigma_rho is None else sigma_rho])
+    measured, sigma = _with_depth(xy, sigma_xy, rho, sigma_rho)
     T, H, chi2, variance, together, converged = _refine(
         T_key_cam, landmarks, covariances, measured, sigma, cauchy, rotation_only
     )
@@ -70,6 +68,40 @@ def refine_pose(
     with np.errstate(invalid="ignore"):
         inliers = np.asarray(chi2 < CHI2_GATE, dtype=np.bool_)
     return PoseEstimate(T, covariance, inliers, float(variance), bool(converged))
+
+
+def pose_covariance(
+    T_key_cam: Array, landmarks: Array, covariances: Array, xy: Array, sigma_xy: float, cauchy: float,
+    rho: Array | None, sigma_rho: Array | None, scale: float, slope: Array, slope_sigma: float,
+) -> Array | None:  # fmt: skip
+    """Return the covariance [6, 6] of a refined pose (right perturbation, rotation first), as residuals show it.
+
+    It is that of independent residuals, times their robust variance or how much those of the same image region err
+    together (cluster-robust variance, Liang and Zeger, Biometrika 1986), whichever is more and at least one. What one
+    more parameter is unsure of is added. None when the motion is not observable.
+
+    Args:
+        T_key_cam: pose [4, 4], the optimum.
+        landmarks: see `refine_pose`.
+        covariances: see `refine_pose`.
+        xy: see `refine_pose`.
+        sigma_xy: see `refine_pose`.
+        cauchy: see `refine_pose`.
+        rho: see `refine_pose`.
+        sigma_rho: see `refine_pose`.
+        scale: factor on all standard deviations, which does not change what counts as an outlier.
+        slope: see `extra_parameter`.
+        slope_sigma: standard deviation of that parameter.
+    """
+    measured, sigma = _with_depth(xy, sigma_xy, rho, sigma_rho)
+    r, A, chi2 = _whitened(T_key_cam, landmarks, covariances, measured, sigma, slope)
+    full, _, variance = _normal_equations(r, A, chi2, cauchy)
+    H = full[:6, :6].copy()
+    if not _solvable(H):
+        return None
+    factor = scale * scale * max(1.0, variance, _common_error(H, r, A, chi2, measured, cauchy))
+    moved = np.linalg.solve(H, full[:6, 6]) * slope_sigma
+    return np.asarray(np.linalg.inv(H) * factor + np.outer(moved, moved))
 
 
 def extra_parameter(
@@ -100,6 +132,13 @@ def extra_parameter(
     if not information > 0.0:
         return 0.0, 0.0
     return -float(b[6] - carried @ b[:6]) / information, information
+
+
+def _with_depth(xy: Array, sigma_xy: float, rho: Array | None, sigma_rho: Array | None) -> tuple[Array, Array]:
+    """Return measurements [N, 3] and their standard deviations [N, 3]; NaN where no depth was measured."""
+    measured = np.column_stack([xy, np.full(len(xy), np.nan) if rho is None else rho])
+    sigma = np.column_stack([np.full((len(xy), 2), sigma_xy), np.ones(len(xy)) if sigma_rho is None else sigma_rho])
+    return measured, sigma
 
 
 @njit(cache=True, nogil=True)

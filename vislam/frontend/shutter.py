@@ -39,6 +39,15 @@ class Shutter:
         return self._estimate_s if self._known or self._estimate_s > _GLOBAL_S else 0.0
 
     @property
+    def sigma_s(self) -> float:
+        """How well the readout is known, in seconds: told ones and global shutters are.
+
+        Velocities that an estimate rests on are wrong in the same way in frame after frame, so that frames do not make
+        it better than one of them: on fr1_desk it stays 10 ms below what its truth shows.
+        """
+        return 0.0 if self._known or self.readout_s == 0.0 else _FRAME_SIGMA_S
+
+    @property
     def learns(self) -> bool:
         """Whether the readout is estimated."""
         return not self._known

@@ -7,7 +7,7 @@ from vislam.imu.condition import ConditionWatch, InertialCondition
 from vislam.imu.noise import ImuCalibration, ImuNoise, MagCalibration
 from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
 from vislam.imu.power_up import PowerUp, Refusal, power_up
-from vislam.imu.preintegration import Preintegrated, preintegrate
+from vislam.imu.preintegration import Preintegrated, pose_after, preintegrate
 from vislam.imu.rest import RestDetector
 from vislam.imu.series import ImuSeries, join, shifted, subtract_bias
 
@@ -29,6 +29,7 @@ __all__ = [
     "RestDetector",
     "SeenNoise",
     "join",
+    "pose_after",
     "power_up",
     "preintegrate",
     "shifted",

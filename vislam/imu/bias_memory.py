@@ -13,6 +13,7 @@ import numpy as np
 
 from vislam.errors import DataError, StorageError
 from vislam.messages import Array
+from vislam.reading import read_json
 
 _MAX_BYTES = 100_000
 _MAX_RATE_RAD_S = 10.0
@@ -74,9 +75,7 @@ class BiasMemory:
         if not path.exists():
             return BiasMemory(limit)
         try:
-            if path.stat().st_size > _MAX_BYTES:
-                raise ValueError(f"{path.stat().st_size} bytes, {_MAX_BYTES} at most")
-            entries = [_entry(item) for item in json.loads(path.read_text(encoding="utf-8"))["gyro_biases"]]
+            entries = [_entry(item) for item in read_json(path, _MAX_BYTES)["gyro_biases"]]
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise DataError(f"{path} holds no gyro biases ({error}); delete it to begin anew") from error
         memory = BiasMemory(limit)

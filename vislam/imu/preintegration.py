@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import skew, so3_exp, so3_right_jacobian
+from vislam.geometry import skew, so3_exp, so3_right_jacobian, transform
 from vislam.imu.noise import ImuNoise
-from vislam.messages import Array, ImuSpan
+from vislam.messages import Array, ImuSpan, NavState
 
 _NS = 1e-9
 
@@ -94,6 +94,15 @@ def preintegrate(
         gyro_bias_rad_s=gyro_bias.copy(),
         accel_bias_m_s2=accel_bias.copy(),
     )
+
+
+def pose_after(state: NavState, span: ImuSpan, gravity_m_s2: float) -> Array:
+    """Return the pose [4, 4] at the end of a span that begins at `state`, by dead reckoning."""
+    piece = preintegrate(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+    dt, gravity = piece.dt_s, np.array([0.0, 0.0, -gravity_m_s2])
+    R, velocity = state.T_world_body[:3, :3], state.velocity_world_m_s
+    moved = velocity * dt + 0.5 * dt * dt * gravity + R @ piece.dp_m
+    return transform(R @ piece.dR, state.T_world_body[:3, 3] + moved)
 
 
 @njit(cache=True, nogil=True)

@@ -9,17 +9,20 @@ import numpy as np
 from vislam.config import InitConfig
 from vislam.imu.noise import ImuNoise
 from vislam.imu.series import join
-from vislam.messages import ImuSpan
+from vislam.messages import Array, ImuSpan
 
 _NS = 1_000_000_000
 _NOISE_SIGMAS = 3.0  # a sensor noisier than the thresholds assume must still be able to rest
+_SET_OFF_M_S = 0.02  # gained since the force was that of rest: a filter takes rest's speed for zero to 5 mm/s
+_MEMORY_S = 2.0  # of the force at rest: biases and tilt wander
 
 
 class RestDetector:
     """Decides whether the sensor has been still for `config.rest_s`: low spread of rate and force, low mean rate.
 
     An IMU alone cannot tell rest from uniform straight motion; ask the image too (median disparity below
-    `config.still_px`), as OpenVINS does for its zero-velocity update.
+    `config.still_px`), as OpenVINS does for its zero-velocity update. A smooth start spreads force little and shifts
+    far walls little for a second; the speed that it gains, integrated against the force of the rest before, shows it.
     """
 
     def __init__(self, config: InitConfig, noise: ImuNoise) -> None:
@@ -28,6 +31,10 @@ class RestDetector:
         self._rest_ns = round(config.rest_s * _NS)
         self._gyro_max = config.rest_gyro_max_rad_s
         self._spans: deque[ImuSpan] = deque()
+        self._force: Array = np.zeros(3)  # mean [3] of this rest before the spans, fading; m/s^2 ...
+        self._force_s = 0.0  # ... and over how long
+        self._set_off = False  # the last rest ended by speed gained, so the next one has to show that force is steady
+        self._accel_density = noise.accel_noise_density
         per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
         self._gyro_white_std = per_sample * noise.gyro_noise_density
         self._accel_white_std = per_sample * noise.accel_noise_density
@@ -35,6 +42,7 @@ class RestDetector:
     def clear(self) -> None:
         """Forget what was seen, as after a hole in the data."""
         self._spans.clear()
+        self._force_s = 0.0
 
     def add(self, span: ImuSpan | None) -> bool:
         """Take the span since the last call (None: a hole) and return whether the sensor has been at rest.
@@ -47,10 +55,34 @@ class RestDetector:
             return False
         self._spans.append(span)
         while span.t_ns[-1] - self._spans[0].t_ns[-1] >= self._rest_ns:
-            self._spans.popleft()
+            self._remember(self._spans.popleft())
         if span.t_ns[-1] - self._spans[0].t_ns[0] < self._rest_ns:
             return False
-        return self.is_still(join(list(self._spans)))
+        joined = join(list(self._spans))
+        if not self.is_still(joined):
+            self._force_s, self._set_off = 0.0, False
+            return False
+        if self._sets_off(joined):
+            self.clear()
+            self._set_off = True
+        elif self._force_s >= self._config.rest_s:
+            self._set_off = False
+        return not self._set_off
+
+    def _remember(self, span: ImuSpan) -> None:
+        dt_s = float(span.t_ns[-1] - span.t_ns[0]) / _NS
+        self._force_s = min(self._force_s + dt_s, _MEMORY_S)
+        self._force = self._force + dt_s / self._force_s * (span.accel_m_s2.mean(axis=0) - self._force)
+
+    def _sets_off(self, span: ImuSpan) -> bool:
+        """Return whether the speed gained over a span says that the rest before it is over."""
+        dt_s = float(span.t_ns[-1] - span.t_ns[0]) / _NS
+        if self._force_s < self._config.rest_s:  # what was before is known less well than what came
+            return False
+        gained_m_s = float(np.linalg.norm(span.accel_m_s2.mean(axis=0) - self._force)) * dt_s
+        density = self._accel_density * span.noise.accel
+        sigma_m_s = density * np.sqrt(3.0 * dt_s * (1.0 + dt_s / self._force_s))
+        return gained_m_s > max(_SET_OFF_M_S, _NOISE_SIGMAS * sigma_m_s)
 
     def is_still(self, span: ImuSpan) -> bool:
         """Return whether one span looks like rest, whatever its length."""

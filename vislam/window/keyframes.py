@@ -54,9 +54,12 @@ class Keyframes:
         self._gyro_rad_s = np.vstack([self._gyro_rad_s, gyro])
         self._T_odom.append(None if T_odom_body is None else T_odom_body.copy())
 
-    def pop_front(self, held: NDArray[np.bool_]) -> None:
-        """Let the oldest go; of the others, the prior holds from now on those in `held` [M - 1]."""
-        self.X_first = np.where(self.held[:, None], self.X_first, self.X)[1:]
+    def pop_front(self, held: NDArray[np.bool_], X_linear: Array) -> None:
+        """Let the oldest go; of the others, the prior holds from now on those in `held` [M - 1].
+
+        `X_linear` [M, 21] is where it was linearised.
+        """
+        self.X_first = X_linear[1:]
         self.held, self.X, self.ids, self.t_ns = held, self.X[1:], self.ids[1:], self.t_ns[1:]
         self.applied_offset_s, self._gyro_rad_s = self.applied_offset_s[1:], self._gyro_rad_s[1:]
         del self._T_odom[0]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vislam.messages import Array, NavState
 from vislam.window import inertial, schur, visual
-from vislam.window.layout import CALIBRATION, Camera, Links, Prior, Views, positions, prior_positions
+from vislam.window.layout import CALIBRATION, Camera, Links, Prior, Views, difference, positions, prior_positions
 from vislam.window.solver import Room, add_prior
 
 _NOTHING = 1e-12  # relative to the largest: information below it is rounding
@@ -25,8 +25,7 @@ class Leaving:
 
 def marginalise(
     X: Array,
-    X_first: Array,
-    held: NDArray[np.bool_],
+    X_linear: Array,
     calibration: Array,
     leaving: Leaving,
     camera: Camera,
@@ -38,8 +37,8 @@ def marginalise(
 ) -> Prior:
     """Return the prior [5 + (M - 1) * S] on calibration and the keyframes after the first.
 
-    States that the old prior holds keep their linearisation; the others are linearised at X, so the caller sets
-    `X_first` of every keyframe that the new prior touches to where it was, or to X. The views in `leaving`, the link
+    All states are linearised at `X_linear` [M, 21]: those that the old prior holds where they were, the others at X or
+    near it. The new prior speaks of states around there. The views in `leaving`, the link
     of keyframe 0 and its rest must not be used again. What lies in the room is lost.
     """
     count, size = len(X), 15 if full else 6
@@ -49,11 +48,12 @@ def marginalise(
     (A, landmarks), g = room.of(D, len(leaving.points), D - poses_at), np.zeros(D)
     A[:] = 0.0
     held_count = (len(prior.b) - CALIBRATION) // size
-    dx = inertial.prior_shift(X, X_first, calibration, prior.calibration, held_count, size)
+    dx = inertial.prior_shift(X, X_linear, calibration, prior.calibration, held_count, size)
     add_prior(prior, dx, prior_positions(count, held_count, full), A, g)
-    inertial.linearise(X, X_first, held, links, gravity_m_s2, where, min(1, count - 1), 1, A, g)
+    everywhere = np.ones(count, dtype=np.bool_)
+    inertial.linearise(X, X_linear, everywhere, links, gravity_m_s2, where, min(1, count - 1), 1, A, g)
     visual.linearise(
-        X, X_first, held, leaving.points, calibration, leaving.views, camera, poses_at, A, g, landmarks
+        X, X_linear, everywhere, leaving.points, calibration, leaving.views, camera, poses_at, A, g, landmarks
     )  # fmt: skip
     schur.eliminate(landmarks, 0.0, poses_at, A, g)
     gone, kept = where[0], np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
@@ -67,12 +67,8 @@ def marginalise(
     H, gradient = np.zeros((len(kept),) * 2), np.zeros(len(kept))
     H[np.ix_(told, told)] = 0.5 * (left + left.T)
     gradient[told] = g[kept[told]] - gain @ g[gone]
-    shift = np.concatenate([dx[:CALIBRATION], np.zeros(len(kept) - CALIBRATION)])
-    for k in range(1, held_count):
-        if held[k]:
-            shift[CALIBRATION + (k - 1) * size : CALIBRATION + k * size] = dx[
-                CALIBRATION + k * size : CALIBRATION + (k + 1) * size
-            ]
+    moved = [difference(x, first)[:size] for x, first in zip(X[1:], X_linear[1:], strict=True)]
+    shift = np.concatenate([dx[:CALIBRATION], *moved])
     return Prior(H, gradient - H @ shift, prior.calibration)
 
 

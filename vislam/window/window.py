@@ -25,6 +25,7 @@ from vislam.window.leaving import split
 from vislam.window.linear import joint_covariance
 from vislam.window.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowTilt, WindowUpdate
+from vislam.window.one_scale import at_first_scale, excitation_m_s2
 from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma, tilt
 from vislam.window.solver import Problem, Room, Solution, optimise
 from vislam.window.spans import LinkStore
@@ -117,6 +118,7 @@ class SlidingWindow:
         self._last_edges: list[WindowEdge] = []
         self._sure = False
         self._at_rest = False
+        self._shows_scale = True
 
     # ---- what comes in
 
@@ -215,13 +217,24 @@ class SlidingWindow:
         assert self._prior is not None
         keyframes = self._keyframes
         self._links.refresh(keyframes.X[:, 15:])
+        self._shows_scale = self._measures_scale or not self._is_uniform()
+        first, held = keyframes.X_first, keyframes.held
+        if not self._shows_scale and held.any():
+            first, held = at_first_scale(keyframes.X, first, held), np.ones(len(keyframes), dtype=np.bool_)
         problem = Problem(
-            keyframes.X, keyframes.X_first, keyframes.held, self._tracks.points[selection.slots],
+            keyframes.X, first, held, self._tracks.points[selection.slots],
             self._calibration.values, selection.views, self._camera(), self._links.arrays, self._prior,
             self._gravity_m_s2, self._full,
         )  # fmt: skip
         iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
         return optimise(problem, iterations, self._config.tolerance, self._room)
+
+    def _is_uniform(self) -> bool:
+        """Whether the window is full of motion without the change of acceleration that shows scale."""
+        links, config = self._links.arrays, self._config
+        if len(self._keyframes) < config.keyframes or links.rest_weight.any():
+            return False
+        return excitation_m_s2(self._keyframes.X, links) < config.min_excitation_m_s2
 
     # ---- what leaves
 
@@ -293,12 +306,15 @@ class SlidingWindow:
         given, dropped = split(tracks, keyframes.ids, self._config.split_min)
         selection = tracks.arrange(given, keyframes.ids)
         leaving = Leaving(selection.views, tracks.points[selection.slots])
+        X_linear = np.where(keyframes.held[:, None], keyframes.X_first, keyframes.X)
+        if not self._shows_scale:
+            X_linear = at_first_scale(keyframes.X, keyframes.X_first, keyframes.held)
         self._prior = marginalise(
-            keyframes.X, keyframes.X_first, keyframes.held, self._calibration.values, leaving, self._camera(),
-            self._links.arrays, self._prior, self._gravity_m_s2, self._full, self._room,
+            keyframes.X, X_linear, self._calibration.values, leaving, self._camera(), self._links.arrays, self._prior,
+            self._gravity_m_s2, self._full, self._room,
         )  # fmt: skip
         tracks.remove_rows(np.concatenate([given, dropped]))
-        keyframes.pop_front(touched(self._prior, len(keyframes) - 1, self._full))
+        keyframes.pop_front(touched(self._prior, len(keyframes) - 1, self._full), X_linear)
         self._links.pop_front()
 
     def _restart(self, packet: KeyframePacket) -> WindowUpdate:

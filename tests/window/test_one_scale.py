@@ -1,0 +1,65 @@
+"""Uniform motion of one camera: scale is forgotten, and the window says so."""
+
+from __future__ import annotations
+
+import numpy as np
+from inertial_world import GRAVITY_M_S2, Motion, state_error
+from window_world import MONO, World, start_state
+
+from vislam.config import WindowConfig
+from vislam.geometry import so3_exp, transform
+from vislam.messages import Array
+from vislam.window import SlidingWindow
+from vislam.window.one_scale import at_first_scale
+
+_SPEED_UP_S = 2.0
+
+
+class Ahead(Motion):
+    """Speeds up along x to 1 m/s within 2 s and keeps that velocity; never turns."""
+
+    def at(self, t_s: float) -> tuple[Array, Array, Array, Array]:
+        u = min(t_s / _SPEED_UP_S, 1.0)
+        x = _SPEED_UP_S * (u**6 - 3.0 * u**5 + 2.5 * u**4) + max(t_s - _SPEED_UP_S, 0.0)
+        v = 6.0 * u**5 - 15.0 * u**4 + 10.0 * u**3
+        a = (30.0 * u**4 - 60.0 * u**3 + 30.0 * u**2) / _SPEED_UP_S
+        way, force = np.array([x, 0.0, 0.0]), np.array([a, 0.0, GRAVITY_M_S2])
+        return transform(np.eye(3), way), np.array([v, 0.0, 0.0]), np.zeros(3), force
+
+
+def test_scale_that_nothing_shows_is_not_learnt_from_noise() -> None:
+    """Four runs of 25 s: errors of position and velocity stay within their sigmas, and these grow. Seeds 0 to 3."""
+    total, grown = np.zeros(2), []
+    for seed in range(4):
+        world = World(
+            Ahead(np.zeros((2, 3, 3)), np.zeros((2, 3, 3))), MONO, seed, duration_s=25.0, room_m=(40.0, 4.0, 2.5)
+        )
+        packets, truths = world.packets()
+        window = SlidingWindow(WindowConfig(), world.rig, world.noise, GRAVITY_M_S2)
+        window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
+        states = [window.add(p).newest for p in packets]
+        for k in (60, 80, 100, len(states) - 1):
+            error, P = state_error(truths[k], states[k]), states[k].covariance
+            for i, part in enumerate((slice(3, 6), slice(6, 9))):
+                total[i] += error[part] @ np.linalg.solve(P[part, part], error[part]) / 3.0
+        sigmas = [np.sqrt(states[k].covariance[6, 6]) for k in (30, 70, len(states) - 1)]
+        grown.append(sigmas)
+        print(f"seed {seed}: end {states[-1].velocity_world_m_s}, sigma of its speed {np.round(sigmas, 3)} m/s")
+    print("NEES per degree of freedom of position and velocity:", total / 16.0)
+    assert (total / 16.0 < 2.5).all()
+    assert (total / 16.0 > 0.1).all()
+    assert (np.diff(np.mean(grown, axis=0)) > 0.0).all()
+
+
+def test_new_states_are_linearised_as_if_estimated_with_the_held_ones() -> None:
+    """A similarity between the first and the present estimates of the held states carries the others over exactly."""
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(6, 21))
+    X[:, :9] = [so3_exp(w).ravel() for w in rng.normal(size=(6, 3))]
+    turn, factor, shift = so3_exp(np.array([0.02, -0.03, 0.5])), 1.3, np.array([2.0, -1.0, 0.5])
+    whole = X.copy()
+    whole[:, :9] = (turn @ X[:, :9].reshape(-1, 3, 3)).reshape(-1, 9)
+    held = np.array([True, True, True, False, False, False])
+    whole[:, 9:12], whole[:, 12:15] = factor * X[:, 9:12] @ turn.T + shift, factor * X[:, 12:15] @ turn.T
+    first = np.where(held[:, None], whole, np.nan)
+    np.testing.assert_allclose(at_first_scale(X, first, held), whole, atol=1e-12)
