@@ -3,13 +3,16 @@
     .venv/bin/python benchmarks/pose_graph.py FILE.g2o ...
     .venv/bin/python benchmarks/pose_graph.py growth --sizes 1000 10000 100000 --picture growth.png
 
-Each peer runs in a process of its own, reads the file, solves and writes a g2o file; times are its CPU seconds. Results
-are then judged alike: chi2 of the written poses (`PoseGraphProblem`: Log residuals, full information, no factor 1/2),
-and whether `certify` proves them; peers minimise costs that differ a little, so theirs can be 1e-4 above the best one
-and still be a minimum of their own. The first round of ours, which loads compiled code, does not count. g2o comes from
-the wheel g2opy, in a virtual environment that is made for it (needs the network); a peer that cannot be had or fails is
-listed with the reason. Ceres is not here: pycolmap's `RelativePosePriorCost` takes a pose as a block of seven numbers,
-and pyceres has no manifold for such a block.
+Each peer runs in a process of its own, reads the file, solves and writes a g2o file; times are its CPU seconds, the
+least of the rounds, in which peers take turns. Results are then judged alike, as they are in memory: chi2 of the poses
+(`PoseGraphProblem`: Log residuals, full information, no factor 1/2), how far it is above the lowest that a peer found,
+whether `certify` proves them, and where our descent ends from there: g2o minimises another cost (the vector part of
+quaternions), so its optimum is not one of this chi2, but it may lie in the same valley. The first round of ours, which
+loads compiled code, does not count. g2o and Ceres come from wheels that are no part of vislam:
+
+    pip install --no-deps --target FOLDER g2opy pyceres     # then --peers FOLDER
+
+Without them their rows say that they are missing, as do those of a peer that fails.
 """
 
 from __future__ import annotations
@@ -20,9 +23,10 @@ import os
 import subprocess
 import sys
 import tempfile
-import venv
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
@@ -34,12 +38,14 @@ from vislam.batch.graph_certificate import certify  # noqa: E402
 from vislam.batch.graph_files import read_pose_graph  # noqa: E402
 from vislam.batch.graph_g2o import write_g2o  # noqa: E402
 from vislam.batch.graph_problem import PoseGraphProblem  # noqa: E402
+from vislam.batch.graph_solver import levenberg_marquardt  # noqa: E402
+from vislam.batch.graph_structure import Structure  # noqa: E402
 from vislam.batch.graph_worlds import simulate_graph  # noqa: E402
 from vislam.config import GraphWorldConfig  # noqa: E402
 from vislam.errors import VislamError  # noqa: E402
 
 PEER = ROOT / "benchmarks" / "peers" / "pose_graph_peer.py"
-OURS, GTSAM, CHORDAL, G2O = "vislam", "gtsam_lm", "gtsam_chordal_lm", "g2o_lm"
+OURS, PEERS = "vislam", ("vislam", "gtsam_lm", "gtsam_chordal_lm", "g2o_lm", "ceres_lm")
 # SE-Sync's published costs (IJRR 2019); where the tables lack a file, of a run of its program
 SE_SYNC = {
     "intel": 52.348, "MIT": 61.154, "manhattan": 6431.4, "parking-garage": 1.2625, "sphere2500": 1687.01,
@@ -47,10 +53,10 @@ SE_SYNC = {
 }  # fmt: skip
 
 
-def run_peer(name: str, python: str, source: Path, result: Path, limit_s: float) -> dict[str, Any]:
+def run_peer(name: str, source: Path, result: Path, limit_s: float, wheels: str = "") -> dict[str, Any]:
     """Return the times of a peer, or {"reason": why there are none}."""
-    command = [python, str(PEER), name, str(source), str(result)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(PEER), name, str(source), str(result)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *([wheels] if wheels else [])])}
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s, check=False, env=environment)
     except subprocess.TimeoutExpired:
@@ -61,51 +67,49 @@ def run_peer(name: str, python: str, source: Path, result: Path, limit_s: float)
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
-def g2o_python(folder: Path) -> tuple[str, str]:
-    """Return a python that has g2opy, or "" and the reason why there is none."""
+def judge(problem: PoseGraphProblem, poses: np.ndarray) -> tuple[float, str, float]:
+    """Return chi2 of poses, the certificate's word, and chi2 where our descent ends from them."""
     try:
-        venv.create(folder, with_pip=True)
-        python = str(folder / "bin" / "python")
-        subprocess.run([python, "-m", "pip", "install", "-q", "g2opy"], check=True, capture_output=True, timeout=300)
-    except (OSError, subprocess.SubprocessError) as error:
-        return "", f"g2opy cannot be installed: {type(error).__name__}"
-    return python, ""
-
-
-def judge(problem: PoseGraphProblem, result: Path) -> tuple[str, str]:
-    """Return chi2 and the certificate's word of the poses that a peer wrote."""
-    try:
-        poses = read_pose_graph(result).poses
         certificate = certify(problem, poses)
     except VislamError as error:
-        return "-", str(error)[:40]
-    return f"{certificate.chi2:.7g}", certificate.word
+        return problem.chi2(poses), str(error)[:40], float("nan")
+    ones = np.ones(len(problem.edges))
+    refined = levenberg_marquardt(Structure(problem), poses, ones, iterations=200, tolerance=1e-12)
+    return certificate.chi2, "yes" if certificate.certified else "no", problem.chi2(refined.poses)
 
 
-def compare(files: list[Path], limit_s: float, folder: Path, g2o: str) -> None:
+def compare(files: list[Path], limit_s: float, folder: Path, wheels: str, rounds: int) -> None:
     """Print the table of all peers on files."""
-    python, reason = (g2o, "") if g2o else g2o_python(folder / "g2o")
-    print("| file | poses, edges | peer | load s | solve s | total s | wall s | chi2 | certified |")
-    print("|---|---|---|---:|---:|---:|---:|---:|---|")
+    print("| file | peer | load s | solve s | total s | wall s | chi2 | above the lowest | certified | refined |")
+    print("|---|---|---:|---:|---:|---:|---:|---:|---|---:|")
+    versions: dict[str, str] = {}
     for source in files:
         problem = read_pose_graph(source)
-        size = f"{len(problem.ids)}, {len(problem.edges)}"
-        best = None
-        for peer in (OURS, GTSAM, CHORDAL, G2O):
-            result = folder / f"{source.stem}_{peer}.g2o"
-            own = python if peer == G2O else sys.executable
-            times = run_peer(peer, own, source, result, limit_s) if own else {"reason": reason}
-            if "reason" in times:
-                print(f"| {source.stem} | {size} | {peer} | | | | | | {times['reason']} |", flush=True)
+        rows: dict[str, list[dict[str, Any]]] = {peer: [] for peer in PEERS}
+        for _ in range(rounds):
+            for peer, runs in rows.items():
+                if not runs or "reason" not in runs[-1]:
+                    runs.append(run_peer(peer, source, folder / f"{source.stem}_{peer}.g2o", limit_s, wheels))
+        ended = {peer: runs for peer, runs in rows.items() if "reason" not in runs[-1]}
+        judged = {peer: judge(problem, np.load(folder / f"{source.stem}_{peer}.g2o.npy")) for peer in ended}
+        lowest = min((chi2 for chi2, _, _ in judged.values()), default=float("nan"))
+        for peer, runs in rows.items():
+            if peer not in judged:
+                print(f"| {source.stem} | {peer} | | | | | | | {runs[-1]['reason']} | |", flush=True)
                 continue
-            chi2, word = judge(problem, result)
-            numbers = " | ".join(f"{times[key]:.3f}" for key in ("load", "solve", "total", "wall"))
-            print(f"| {source.stem} | {size} | {peer} | {numbers} | {chi2} | {word} |", flush=True)
-            if peer == OURS:
-                best = certify(problem, read_pose_graph(result).poses)
-        if best is not None:
+            versions[peer] = runs[-1]["version"]
+            least = min(runs, key=lambda run: float(run["total"]))
+            numbers = [f"{least[key]:.3f}" for key in ("load", "solve", "total", "wall")]
+            if least["evaluation"] > 0.0:
+                numbers[1] += f" ({least['solve'] * (1.0 - least['evaluation']):.3f} without Python)"
+            chi2, word, refined = judged[peer]
+            ends = f"{chi2:.9g} | {chi2 / lowest - 1.0:.1e} | {word} | {refined:.9g}"
+            print(f"| {source.stem} | {peer} | {' | '.join(numbers)} | {ends} |", flush=True)
+        if OURS in judged:
+            certificate = certify(problem, np.load(folder / f"{source.stem}_{OURS}.g2o.npy"))
             theirs = f", published {SE_SYNC[source.stem]:g}" if source.stem in SE_SYNC else ""
-            print(f"\n{source.stem}: SE-Sync's cost {best.isotropic_cost:.6g}{theirs}; {best.text}\n", flush=True)
+            print(f"\n{source.stem}: SE-Sync's cost {certificate.isotropic_cost:.6g}{theirs}; {certificate.text}\n")
+    print("versions: " + ", ".join(f"{peer} {number}" for peer, number in versions.items()))
 
 
 def growth(
@@ -121,7 +125,7 @@ def growth(
             problem, source = made.problem, folder / "made.g2o"
             write_g2o(problem, source)
             edges = len(problem.edges)
-            times = run_peer(OURS, sys.executable, source, folder / "result.g2o", limit_s)
+            times = run_peer(OURS, source, folder / "result.g2o", limit_s)
             if "reason" in times:
                 print(f"| {shape} | {size} | {edges} | {times['reason']} | | | | |", flush=True)
                 continue
@@ -139,7 +143,6 @@ def draw(rows: list[dict[str, Any]], picture: Path) -> None:
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
-    import numpy as np
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
     for shape in dict.fromkeys(row["shape"] for row in rows):
@@ -167,7 +170,8 @@ def main() -> None:
     parser.add_argument("--shapes", nargs="+", default=["manhattan", "torus", "sphere", "grid3d"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[1000, 3000, 10000, 30000, 100000])
     parser.add_argument("--loops-per-pose", type=float, default=1.0, help="4 makes 500,000 edges of 100,000 poses")
-    parser.add_argument("--g2o-python", default="", help="a python that has g2opy, instead of making one")
+    parser.add_argument("--peers", default="", help="folder with the wheels of g2opy and pyceres")
+    parser.add_argument("--rounds", type=int, default=3, help="in which peers take turns on a file")
     parser.add_argument("--picture", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -175,7 +179,7 @@ def main() -> None:
         if args.files == ["growth"]:
             growth(args.shapes, args.sizes, args.loops_per_pose, args.limit_s, folder, args.picture)
         else:
-            compare([Path(file) for file in args.files], args.limit_s, folder, args.g2o_python)
+            compare([Path(file) for file in args.files], args.limit_s, folder, args.peers, args.rounds)
 
 
 if __name__ == "__main__":

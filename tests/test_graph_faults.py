@@ -13,6 +13,8 @@ from graph_world import GRAVITY_M_S2, RIG, World, rmse_m, with_vo
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError
 from vislam.factors import solver as solver_module
+from vislam.factors.known import Known
+from vislam.factors.loop import LoopModel
 from vislam.graph import PoseGraph
 from vislam.messages import ImuSpan, KeyframePacket, LoopDecision, LoopEdge
 
@@ -204,13 +206,13 @@ def test_poisoned_loop_keeps_the_chain(
     graph = started(world, 110)
 
     edge = world.loop(7, 5, 105)
-    relative_covariance = graph._loops.relative_covariance
+    known = graph._loops._known
 
-    def arm(i: int, j: int) -> np.ndarray:
+    def arm(models: list[LoopModel]) -> Known | None:
         failing.armed = failures  # the gate comes after the keyframe and before the loop
-        return relative_covariance(i, j)
+        return known(models)
 
-    monkeypatch.setattr(graph._loops, "relative_covariance", arm)
+    monkeypatch.setattr(graph._loops, "_known", arm)
     update = graph.add(world.packet(110), [edge])
     assert (7 in update.accepted_loop_ids) == kept
     assert "rebuilt with QR" in update.note

@@ -2,13 +2,18 @@
 
     python pose_graph_peer.py NAME FILE RESULT
 
-Every peer is called as its users write it; NAME is one of the functions below. Needs nothing but the peer itself.
+Every peer is called as its users write it; NAME is one of the functions below. RESULT.npy gets the poses as they are in
+memory, [N, d + 1, d + 1] in the order of the ids: what a peer writes may have six digits. That is in none of its times.
 """
 
 import json
 import resource
 import sys
 import time
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
 
 
 def cpu_s() -> float:
@@ -24,9 +29,11 @@ def in_space(path: str) -> bool:
 
 
 class Laps:
-    """CPU seconds of the parts of a job."""
+    """CPU seconds of the parts of a job, the version of what did it, and the poses it ended with."""
 
-    def __init__(self) -> None:
+    def __init__(self, package: str) -> None:
+        self.version, self.poses = version(package), np.empty(0)
+        self.evaluation = 0.0  # share of the solution's time that was spent in cost functions written in Python
         self.at = self.begun = cpu_s()
         self.wall = time.perf_counter()
         self.seconds: dict[str, float] = {}
@@ -40,20 +47,19 @@ class Laps:
 
 def vislam(path: str, result: str) -> Laps:
     """Ours, as `vislam optimize` calls it."""
-    from pathlib import Path
-
     from vislam.batch.graph_files import read_pose_graph
     from vislam.batch.graph_g2o import write_g2o
     from vislam.batch.graph_optimize import optimize_pose_graph
 
     for _ in range(2):  # the first round loads compiled code
-        laps = Laps()
+        laps = Laps("vislam")
         problem = read_pose_graph(Path(path))
         laps.lap("load")
         solution = optimize_pose_graph(problem)
         laps.lap("solve")
         write_g2o(problem, Path(result), solution.poses)
         laps.lap("write")
+        laps.poses = solution.poses
         if laps.at - laps.begun > 60.0:
             break
     return laps
@@ -62,7 +68,7 @@ def vislam(path: str, result: str) -> Laps:
 def _gtsam(path: str, result: str, initialise: bool) -> Laps:
     import gtsam
 
-    laps = Laps()
+    laps = Laps("gtsam")
     space = in_space(path)
     graph, values = gtsam.readG2o(path, space)
     laps.lap("load")
@@ -79,6 +85,8 @@ def _gtsam(path: str, result: str, initialise: bool) -> Laps:
     laps.lap("solve")
     gtsam.writeG2o(graph, values, result)
     laps.lap("write")
+    at = values.atPose3 if space else values.atPose2
+    laps.poses = np.array([at(key).matrix() for key in sorted(values.keys())])
     return laps
 
 
@@ -96,7 +104,7 @@ def g2o_lm(path: str, result: str) -> Laps:
     """The wheel g2opy: Levenberg-Marquardt, block ordering, the pose of find_gauge() fixed."""
     import g2opy
 
-    laps = Laps()
+    laps = Laps("g2opy")
     optimizer = g2opy.SparseOptimizer()
     if in_space(path):
         linear, block = g2opy.LinearSolverEigenSE3(), g2opy.BlockSolverSE3
@@ -114,12 +122,44 @@ def g2o_lm(path: str, result: str) -> Laps:
     if not optimizer.save(result):
         raise RuntimeError("save() said no")
     laps.lap("write")
+    vertices = optimizer.vertices()
+    laps.poses = np.array([g2o_matrix(vertices[key].estimate()) for key in sorted(vertices)])
+    return laps
+
+
+def g2o_matrix(estimate: object) -> np.ndarray:
+    """Return g2o's SE2 or Isometry3d as a matrix."""
+    if hasattr(estimate, "matrix"):
+        return np.asarray(estimate.matrix())
+    x, y, angle = estimate.to_vector()
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
+
+
+def ceres_lm(path: str, result: str) -> Laps:
+    """The wheel pyceres: Levenberg-Marquardt and sparse Cholesky as Ceres' pose-graph examples call them."""
+    import ceres_pose_graph  # beside this file
+
+    from vislam.batch.graph_files import read_pose_graph
+    from vislam.batch.graph_g2o import write_g2o
+
+    ceres_pose_graph.compile_costs()
+    laps = Laps("pyceres")
+    problem = read_pose_graph(Path(path))  # Ceres reads no files
+    laps.lap("load")
+    laps.poses, laps.evaluation = ceres_pose_graph.solve(problem)
+    laps.lap("solve")
+    write_g2o(problem, Path(result), laps.poses)
+    laps.lap("write")
     return laps
 
 
 if __name__ == "__main__":
     name, source, target = sys.argv[1:]
-    done = {f.__name__: f for f in (vislam, gtsam_lm, gtsam_chordal_lm, g2o_lm)}[name](source, target)
+    peers = (vislam, gtsam_lm, gtsam_chordal_lm, g2o_lm, ceres_lm)
+    done = {f.__name__: f for f in peers}[name](source, target)
+    wall_s, total_s = time.perf_counter() - done.wall, done.at - done.begun
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    wall_s = time.perf_counter() - done.wall
-    print(json.dumps({**done.seconds, "total": done.at - done.begun, "wall": wall_s, "peak_mb": peak_mb}))
+    np.save(target + ".npy", done.poses)
+    told = {"total": total_s, "wall": wall_s, "peak_mb": peak_mb, "version": done.version}
+    print(json.dumps({**done.seconds, **told, "evaluation": done.evaluation}))

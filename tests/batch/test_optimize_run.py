@@ -71,10 +71,19 @@ def test_outlier_tracks_and_false_loops_change_little(kind, imu, false_loops):
 def test_a_false_loop_that_the_run_had_accepted_is_refused_and_named():
     run = simulate("stereo", duration_s=12.0, true_loops=0, false_loops=1)
     edges = [replace(edge, accepted=True) for edge in run.log.edges]
-    (verdict,) = optimize_run(replace(run.log, edges=edges), QUICK).loops
+    result = optimize_run(replace(run.log, edges=edges), QUICK)
+    (verdict,) = result.loops
     assert verdict.in_run
     assert not verdict.kept
-    assert "graduated non-convexity" in verdict.reason
+    assert "cannot tell" in verdict.reason
+    assert "cannot tell" in result.note
+
+
+@pytest.mark.parametrize("true_loops", [1, 2])
+def test_few_true_loops_are_kept(true_loops):
+    run = simulate("stereo", true_loops=true_loops, false_loops=0)
+    result = optimize_run(run.log, QUICK)
+    assert [verdict.kept for verdict in result.loops] == [True] * true_loops
 
 
 def test_a_loop_that_cannot_be_used_is_refused_with_its_reason():

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import signal
-import sqlite3
 import subprocess
 import sys
 import textwrap
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from needs import missing
+from session_entries import editing
 from session_world import simulate, store
 
 from vislam.cli import run_verb
@@ -47,10 +47,8 @@ def digests(folder):
 
 
 def damage(folder, statement):
-    database = sqlite3.connect(folder / "session.db")
-    database.execute(statement)
-    database.commit()
-    database.close()
+    with editing(folder / "session.db") as database:
+        database.execute(statement)
 
 
 def test_a_run_gets_its_batch_trajectory_states_and_metrics(folder, simulated):
@@ -152,10 +150,8 @@ def test_settings_that_this_version_does_not_know_are_left_aside(folder):
     config = asdict(Config())
     config["graph"]["retired_setting"] = 3
     config["retired_section"] = {}
-    database = sqlite3.connect(folder / "session.db")
-    database.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(config),))
-    database.commit()
-    database.close()
+    with editing(folder / "session.db") as database:
+        database.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(config),))
     assert optimize(folder, replace(QUICK, covariances=False))["keyframes"] > 0
 
 

@@ -88,5 +88,5 @@ def refuse_other_tags(path: Path, found: TaggedLines, known: Mapping[str, tuple[
 
 def refuse_what_is_lost(problem: PoseGraphProblem, path: Path, name: str) -> None:
     """Raise UsageError for a problem with fixed poses or landmarks, which the format has no lines for."""
-    if problem.fixed.any() or problem.passed_lines:
-        raise UsageError(f"{path}: {name} files have no lines for fixed poses and landmarks; write a g2o file")
+    if problem.fixed.any() or problem.passed_lines or not problem.of_poses:
+        raise UsageError(f"{path}: {name} files have no lines for fixed poses, landmarks, priors; write a g2o file")

@@ -4,9 +4,10 @@ The proof is SE-Sync's (see `graph_isotropic`), and it is one about a cost with 
 between rotations. Two costs of that kind say something about chi2, which `vislam optimize` minimises:
 
 - The isotropic problem has the weights that SE-Sync gives a file. Newton's method goes from the solution to the
-  nearest minimum of it. If that is proven to be its global minimum, and if minimising chi2 from there ends at no lower
-  chi2 than the solution has, the solution is certified. For isotropic information and small residuals both costs are
-  nearly the same; for other information this is strong evidence, not a proof.
+  nearest minimum of it, and where that is not the global one the Riemannian staircase (`graph_staircase`) goes on to a
+  lower one. If it is proven to be the global minimum, and if minimising chi2 from there ends at no lower chi2 than the
+  solution has, the solution is certified. For isotropic information and small residuals both costs are nearly the
+  same; for other information this is strong evidence, not a proof.
 - The bounding problem has weights so small that it is nowhere above chi2: with the residual r = (w, v) of an edge,
   |R_j - R_i Z|_F^2 <= 2 |w|^2 and |t_j - t_i - R_i z| <= |v|, so diag(2 kappa, tau) <= W suffices. What is proven of
   its minimum is a lower bound of chi2 itself, whatever the information: no poses cost less.
@@ -18,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.batch.graph_isotropic import IsotropicGraph
-from vislam.batch.graph_optimize import without_edges
+from vislam.batch.graph_isotropic import IsotropicGraph, Spectrum
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_solver import levenberg_marquardt
+from vislam.batch.graph_staircase import Climb, climb
 from vislam.batch.graph_structure import Structure
 from vislam.batch.graph_symbolic import FACTOR_MAX_BYTES
 from vislam.messages import Array
@@ -67,41 +68,68 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
     With `weights` [E], edges of weight 0 (rejected ones) do not count, and the others do as if they never were.
     """
     if weights is not None:
-        problem = without_edges(problem, weights == 0.0)
+        problem = problem.with_edges(weights != 0.0)
     chi2 = problem.chi2(poses)
+    if not problem.of_poses:
+        return _unproven(chi2, "there are landmarks or priors; the proof is for poses and relative poses alone")
     if (fixed := _tied(problem)) > 0:
         return _unproven(chi2, f"{fixed} poses are fixed, two or more in one part; the proof is for free poses")
     graph = IsotropicGraph(problem, *isotropic_weights(problem))
     if graph.factor_bytes > FACTOR_MAX_BYTES:
         return _unproven(chi2, f"its factor takes {graph.factor_bytes / 1e9:.1f} GB, more than is allowed")
     at = graph.minimise(poses)
-    cost, spectrum = graph.value(at), graph.spectrum(at)
-    size = problem.dimension * len(poses)
-    tolerance = max(_GAP * cost / size, 10.0 * spectrum.rounding)
+    spectrum = graph.spectrum(at)
     if not np.isfinite(spectrum.proven):
         return _unproven(chi2, "measurements leave translations of a part of the graph without any information")
+    climbed = None
+    if spectrum.proven > _tolerance(graph, at, spectrum):
+        climbed = climb(graph, at, problem.components(), _tolerance(graph, at, spectrum))
+        if graph.value(climbed.poses) < graph.value(at):
+            at = climbed.poses
+            spectrum = graph.spectrum(at)
+    cost, tolerance = graph.value(at), _tolerance(graph, at, spectrum)
     least = spectrum.proven <= tolerance
-    better = _descended(problem, at) if least else None
+    better = _descended(problem, at, poses) if least or climbed is not None else None
     if better is not None and problem.chi2(better) >= chi2 * (1.0 - _SAME) - _NOTHING:
         better = None
     if not least:
-        reason = "the isotropic cost may be lower elsewhere: its certificate matrix has a negative eigenvalue"
+        assert climbed is not None
+        reason = _left_open(climbed, cost)
     elif better is not None:
         reason = f"from the global minimum of the isotropic cost chi2 goes down to {problem.chi2(better):.8g}"
     else:
         reason = "the global minimum of the isotropic cost leads to this solution or to one of the same chi2"
+    proven = cost - problem.dimension * len(poses) * spectrum.proven
     return Certificate(
         certified=least and better is None,
         reason=reason,
         chi2=chi2,
         chi2_bound=min(_bound(problem, poses), chi2),
         isotropic_cost=cost,
-        isotropic_bound=max(cost - size * spectrum.proven, 0.0),
+        isotropic_bound=max(proven, 0.0 if climbed is None else climbed.bound, 0.0),
         least_eigenvalue=spectrum.least,
         proven_eigenvalue=-spectrum.proven,
         tolerance=tolerance,
         spectral_gap=spectrum.gap,
         better=better,
+    )
+
+
+def _tolerance(graph: IsotropicGraph, poses: Array, spectrum: Spectrum) -> float:
+    size = (poses.shape[1] - 1) * len(poses)
+    return max(_GAP * graph.value(poses) / size, 10.0 * spectrum.rounding)
+
+
+def _left_open(climbed: Climb, cost: float) -> str:
+    """Return why the staircase, too, did not settle it."""
+    if climbed.solved:
+        return (
+            f"no poses have an isotropic cost below {climbed.bound:.8g}, the best found have {cost:.8g}: the "
+            f"relaxation has its minimum in {climbed.rank} dimensions, and what lies between is open"
+        )
+    return (
+        "the isotropic cost may be lower elsewhere: its certificate matrix has a negative eigenvalue, also where the "
+        f"search ended in {climbed.rank} dimensions, with a gradient of {climbed.gradient:.2g}"
     )
 
 
@@ -126,10 +154,13 @@ def bounding_weights(problem: PoseGraphProblem) -> tuple[Array, Array]:
     turn, move = np.linalg.eigvalsh(W[:, :k, :k])[:, 0], np.linalg.eigvalsh(W[:, k:, k:])[:, 0]
     turn, move = np.maximum(turn, 0.0), np.maximum(move, 0.0)
     weights = np.sqrt(np.column_stack([turn] * k + [move] * d))
-    scaled = W / np.maximum(weights[:, :, None] * weights[:, None, :], np.finfo(float).tiny)
+    with np.errstate(over="ignore"):
+        scaled = W / np.maximum(weights[:, :, None] * weights[:, None, :], np.finfo(float).tiny)
     crossed = np.abs(W[:, :k, k:]).max(axis=(1, 2)) > 0.0
     share = np.ones(len(W))
-    share[crossed] = np.clip(np.linalg.eigvalsh(scaled[crossed])[:, 0], 0.0, 1.0)
+    known = np.isfinite(scaled).all(axis=(1, 2))  # else a weight is zero but for rounding, and the other is nothing
+    share[crossed & ~known] = 0.0
+    share[crossed & known] = np.clip(np.linalg.eigvalsh(scaled[crossed & known])[:, 0], 0.0, 1.0)
     return 0.5 * share * turn, share * move
 
 
@@ -140,10 +171,15 @@ def _bound(problem: PoseGraphProblem, poses: Array) -> float:
     return max(graph.value(at) - problem.dimension * len(poses) * proven, 0.0)
 
 
-def _descended(problem: PoseGraphProblem, poses: Array) -> Array:
-    """Return the minimum of chi2 that poses lead to."""
-    ones = np.ones(len(problem.edges))
-    return levenberg_marquardt(Structure(problem), poses, ones, iterations=_STEPS, tolerance=_CONVERGED).poses
+def _descended(problem: PoseGraphProblem, start: Array, poses: Array) -> Array:
+    """Return the minimum of chi2 that `start` leads to, the anchor of each part where `poses` have it."""
+    ones, anchors = np.ones(len(problem.edges)), problem.anchors()
+    labels = problem.components()
+    held = np.empty(len(anchors), dtype=np.int64)
+    held[labels[anchors]] = anchors
+    moved = (poses[held] @ np.linalg.inv(start[held]))[labels] @ start
+    moved[anchors] = poses[anchors]
+    return levenberg_marquardt(Structure(problem), moved, ones, iterations=_STEPS, tolerance=_CONVERGED).poses
 
 
 def _harmonic_mean(W: Array) -> Array:

@@ -66,6 +66,11 @@ class Factor:
         out[self.node] = y.reshape(rhs.shape)
         return out
 
+    def log_determinant(self) -> float:
+        """Return the logarithm of the determinant of what was factorised last."""
+        return 2.0 * _log_diagonal(self.d, self.symbolic.first, self.symbolic.row_begin, self.symbolic.panel_begin,
+                                   self._panels)  # fmt: skip
+
     def edge_covariances(self, ends: Ints, jacobians: Array) -> Array:
         """Return J @ A^-1 @ J^T [M, d, d] of pairs of free poses: J is jacobians [M, 2, d, d], by the ends' columns.
 
@@ -81,6 +86,17 @@ class Factor:
             np.ascontiguousarray(jacobians.transpose(0, 1, 3, 2)), out,
         )  # fmt: skip
         return out
+
+
+@njit(cache=True, nogil=True)
+def _log_diagonal(d: int, first: Ints, row_begin: Ints, panel_begin: Ints, panels: Array) -> float:
+    total = 0.0
+    for f in range(len(first) - 1):
+        width = (first[f + 1] - first[f]) * d
+        height = width + (row_begin[f + 1] - row_begin[f]) * d
+        for j in range(width):
+            total += math.log(panels[panel_begin[f] * d * d + j * height + j])
+    return total
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})

@@ -12,10 +12,11 @@ from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_toro import read_toro, write_toro
 from vislam.errors import DataError, UsageError
 from vislam.messages import Array
+from vislam.reading import open_file
 
 GraphFormat = Literal["g2o", "toro", "isam"]
 
-_READERS: dict[GraphFormat, Callable[[Path], PoseGraphProblem]] = {
+_READERS: dict[GraphFormat, Callable[[Path, bool], PoseGraphProblem]] = {
     "g2o": read_g2o, "toro": read_toro, "isam": read_isam,
 }  # fmt: skip
 _WRITERS: dict[GraphFormat, Callable[[PoseGraphProblem, Path, Array | None], None]] = {
@@ -38,7 +39,7 @@ def graph_format(path: Path) -> GraphFormat:
     if by_name is not None:
         return by_name
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             text = file.read(_LOOKED_AT_BYTES)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -51,9 +52,9 @@ def graph_format(path: Path) -> GraphFormat:
     )
 
 
-def read_pose_graph(path: Path) -> PoseGraphProblem:
-    """Read a pose graph of any format; see `graph_format` and the readers."""
-    return _READERS[graph_format(path)](path)
+def read_pose_graph(path: Path, repair: bool = False) -> PoseGraphProblem:
+    """Read a pose graph of any format; see `graph_format` and the readers. `repair`: make its information positive."""
+    return _READERS[graph_format(path)](path, repair)
 
 
 def write_pose_graph(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

@@ -1,4 +1,4 @@
-"""g2o files: poses and edges in the plane and in space, fixed poses; lines of landmarks are kept as they are."""
+"""g2o files: poses, landmarks, edges and priors in the plane and in space, and what is fixed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from vislam.batch.graph_extras import (
+    EXTRA_2D,
+    EXTRA_3D,
+    EXTRA_COLUMNS,
+    extra_edges,
+    extra_vertices,
+    pose_numbers,
+    read_extras,
+)
 from vislam.batch.graph_parts import (
     EdgeLines,
     PoseLines,
@@ -19,37 +28,29 @@ from vislam.batch.graph_parts import (
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.tagged_lines import Rows, TaggedLines, read_tagged_lines
 from vislam.errors import DataError
-from vislam.geometry import quaternion_xyzw_from_rotation
 from vislam.messages import Array
 from vislam.trajectory import write_text
 
 _POSE_2D, _POSE_3D, _EDGE_2D, _EDGE_3D = "VERTEX_SE2", "VERTEX_SE3:QUAT", "EDGE_SE2", "EDGE_SE3:QUAT"
 _COLUMNS = {_POSE_2D: (1, 3), _POSE_3D: (1, 7), _EDGE_2D: (2, 9), _EDGE_3D: (2, 28)}
-_PASSED = {  # tag: fields behind it
-    "VERTEX_XY": 3,
-    "VERTEX_TRACKXYZ": 4,
-    "EDGE_SE2_XY": 7,
-    "EDGE_SE3_TRACKXYZ": 12,
-    "EDGE_SE3_TRACKXYZ:QUAT": 12,
-    "PARAMS_SE2OFFSET": 4,
-    "PARAMS_SE3OFFSET": 8,
-}
-_LANDMARKS = ("VERTEX_XY", "VERTEX_TRACKXYZ")
+_PASSED = {"PARAMS_SE2OFFSET": 4}  # tag: fields behind it
 _POSE_DIGITS = {True: " ".join(["%.15g"] * 3), False: " ".join(["%.15g"] * 7)}
 _ORDER_2D, _ORDER_3D = (2, 0, 1), (3, 4, 5, 0, 1, 2)  # files have translation first
 
 
-def read_g2o(path: Path) -> PoseGraphProblem:
-    """Read VERTEX_SE2 and EDGE_SE2, or VERTEX_SE3:QUAT and EDGE_SE3:QUAT, with FIX.
+def read_g2o(path: Path, repair: bool = False) -> PoseGraphProblem:
+    """Read VERTEX_SE2 and EDGE_SE2, or VERTEX_SE3:QUAT and EDGE_SE3:QUAT, with FIX, landmarks and priors.
 
     The information of rotations is taken as of rotation vectors, as gtsam and SE-Sync read these files (g2o itself has
     it of the vector part of the quaternion, half of that). Raises DataError with the line number on damage of any kind,
     on both dimensions in one file and on tags that it does not know; see `problem_from_lines` for the rest.
     """
-    found = read_tagged_lines(path, _COLUMNS)
+    found = read_tagged_lines(path, _COLUMNS | EXTRA_COLUMNS)
     rows = found.rows
-    in_plane = rows[_POSE_2D].lines, rows[_EDGE_2D].lines
-    in_space = rows[_POSE_3D].lines, rows[_EDGE_3D].lines
+    in_plane, in_space = (
+        [rows[tag].lines for tag in (pose, edge, *extra)]
+        for pose, edge, extra in ((_POSE_2D, _EDGE_2D, EXTRA_2D), (_POSE_3D, _EDGE_3D, EXTRA_3D))
+    )
     first_2d, first_3d = (min((int(n[0]) for n in lines if len(n)), default=0) for lines in (in_plane, in_space))
     if first_2d and first_3d:
         raise DataError(f"{path}:{max(first_2d, first_3d)}: poses in the plane and in space in one file; give one kind")
@@ -63,14 +64,15 @@ def read_g2o(path: Path) -> PoseGraphProblem:
         vertices, edges = rows[_POSE_3D], rows[_EDGE_3D]
         poses, measured = _poses_3d(path, vertices), _poses_3d(path, edges)
         information = symmetric(edges.numbers[:, 7:], _ORDER_3D)
-    return problem_from_lines(
-        path,
-        2 if first_2d else 3,
-        PoseLines(vertices.ids[:, 0], poses, vertices.lines),
-        EdgeLines(edges.ids, measured, information, edges.lines),
-        fixed_ids,
-        passed,
-    )
+    d = 2 if first_2d else 3
+    pose_lines = PoseLines(vertices.ids[:, 0], poses, vertices.lines)
+    edge_lines = EdgeLines(edges.ids, measured, information, edges.lines)
+    extras = read_extras(path, rows, d)
+    if not len(extras):
+        return problem_from_lines(path, d, pose_lines, edge_lines, fixed_ids, passed, repair)
+    pose_lines, edge_lines = extras.joined(path, pose_lines, edge_lines)
+    world = ((0, int(pose_lines.ids[-1])),) if extras.has_priors else ()
+    return extras.marked(problem_from_lines(path, d, pose_lines, edge_lines, fixed_ids + world, passed, repair))
 
 
 def write_g2o(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
@@ -79,13 +81,16 @@ def write_g2o(problem: PoseGraphProblem, path: Path, poses: Array | None = None)
     Poses without a value are left out. The file appears whole or not at all. Raises StorageError.
     """
     values = problem.poses if poses is None else poses
-    known = ~np.isnan(values[:, 0, 0])
+    known = ~np.isnan(values[:, 0, 0]) & problem.is_pose
     two = problem.dimension == 2
     parts: list[str] = list(problem.passed_lines)
     row = f"{_POSE_2D if two else _POSE_3D} %d {_POSE_DIGITS[two]}"
-    for i, numbers in zip(problem.ids[known].tolist(), _pose_numbers(values[known]).tolist(), strict=True):
+    for i, numbers in zip(problem.ids[known].tolist(), pose_numbers(values[known]).tolist(), strict=True):
         parts.append(row % (i, *numbers))
-    parts += (f"FIX {i}" for i in problem.ids[problem.fixed].tolist())
+    parts += extra_vertices(problem, values)
+    fixed = problem.fixed & (problem.is_pose | problem.is_point)
+    parts += (f"FIX {i}" for i in problem.ids[fixed].tolist())
+    parts += extra_edges(problem)
     parts += _edge_lines(problem, f"{_EDGE_2D if two else _EDGE_3D} %d %d {_POSE_DIGITS[two]} %s")
     write_text(path, "\n".join(parts) + "\n")
 
@@ -94,10 +99,11 @@ def _edge_lines(problem: PoseGraphProblem, row: str) -> Iterator[str]:
     order = _ORDER_2D if problem.dimension == 2 else _ORDER_3D
     back = np.argsort(order)
     a, b = np.triu_indices(problem.tangent)
-    upper = problem.information[:, back[a], back[b]]
+    own = np.flatnonzero(~problem.is_position & (problem.edges[:, 0] != problem.world))
+    upper = problem.information[own][:, back[a], back[b]]
     digits = " ".join(["%.15g"] * len(a))
     texts: dict[bytes, str] = {}  # most files repeat a few matrices
-    ends, measured = problem.ids[problem.edges].tolist(), _pose_numbers(problem.measurements).tolist()
+    ends, measured = problem.ids[problem.edges[own]].tolist(), pose_numbers(problem.measurements[own]).tolist()
     for (i, j), numbers, information in zip(ends, measured, upper, strict=True):
         key = information.tobytes()
         if key not in texts:
@@ -105,43 +111,26 @@ def _edge_lines(problem: PoseGraphProblem, row: str) -> Iterator[str]:
         yield row % (i, j, *numbers, texts[key])
 
 
-def _pose_numbers(T: Array) -> Array:
-    """Return x, y, angle [M, 3] or x, y, z, quaternion [M, 7]."""
-    if T.shape[1] == 3:
-        return np.column_stack([T[:, :2, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
-    if not len(T):
-        return np.empty((0, 7))
-    return np.column_stack([T[:, :3, 3], quaternion_xyzw_from_rotation(T[:, :3, :3])])
-
-
 def _poses_3d(path: Path, rows: Rows) -> Array:
     return poses_from_quaternions(path, rows.numbers[:, :3], rows.numbers[:, 3:7], rows.lines)
 
 
 def _others(path: Path, found: TaggedLines) -> tuple[tuple[tuple[int, int], ...], tuple[str, ...]]:
-    """Return (line, id) of fixed poses, and the lines to keep: those of landmarks, fixed landmarks and parameters."""
-    fixes: list[tuple[int, str, list[str]]] = []
+    """Return (line, id) of what is fixed, and the lines to keep: those of parameters that nothing uses."""
+    fixed: list[tuple[int, int]] = []
     passed: list[str] = []
-    landmarks: set[str] = set()
     for line, text in found.others:
         tag, *fields = text.split()
         if tag == "FIX":
-            fixes.append((line, text, fields))
+            if not fields or not all(f.isascii() and f.isdigit() and len(f) < 20 for f in fields):
+                raise DataError(f"{path}:{line}: FIX needs ids, got '{text[:40]}'")
+            fixed += [(line, int(f)) for f in fields]
             continue
         if tag not in _PASSED:
-            known = ", ".join([*_COLUMNS, "FIX", *_PASSED])
+            known = ", ".join([*_COLUMNS, "FIX", *EXTRA_COLUMNS, *_PASSED])
             raise DataError(f"{path}:{line}: '{tag[:40]}' is no tag that is known here: {known}")
         _check_fields(path, line, tag, fields)
-        if tag in _LANDMARKS:
-            landmarks.add(fields[0])
         passed.append(text)
-    fixed: list[tuple[int, int]] = []
-    for line, text, fields in fixes:
-        if not fields or not all(f.isascii() and f.isdigit() and len(f) < 20 for f in fields):
-            raise DataError(f"{path}:{line}: FIX needs ids, got '{text[:40]}'")
-        if any(f in landmarks for f in fields):
-            passed.append(text)
-        fixed += [(line, int(f)) for f in fields if f not in landmarks]
     return tuple(fixed), tuple(passed)
 
 

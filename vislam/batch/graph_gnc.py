@@ -51,12 +51,12 @@ def reject_false_edges(structure: Structure, config: PoseGraphConfig, progress: 
     """
     problem = structure.problem
     trusted = ~doubtful_edges(problem)
-    trusted |= _joining(problem, trusted)
+    trusted |= joining_edges(problem, trusted)
     limit = float(chi2.ppf(config.inlier_probability, problem.tangent))
     poses, candidates, scale = _gated(problem, trusted, limit, progress)
     weights = candidates.astype(np.float64)
     weights[candidates] = graduated_non_convexity(
-        Structure(_subset(problem, candidates)), poses, trusted[candidates], _TAILS * limit * scale, progress
+        Structure(problem.with_edges(candidates)), poses, trusted[candidates], _TAILS * limit * scale, progress
     )
     return weights
 
@@ -70,9 +70,9 @@ def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraph
     return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)
 
 
-def _joining(problem: PoseGraphProblem, trusted: Mask) -> Mask:
+def joining_edges(problem: PoseGraphProblem, trusted: Mask) -> Mask:
     """Return edges [E] that join what the trusted ones leave apart, in the order of the file."""
-    labels = _subset(problem, trusted).components()
+    labels = problem.with_edges(trusted).components()
     out = np.zeros(len(trusted), dtype=np.bool_)
     for e in np.flatnonzero(labels[problem.edges[:, 0]] != labels[problem.edges[:, 1]]).tolist():
         a, b = labels[problem.edges[e]].tolist()
@@ -80,13 +80,6 @@ def _joining(problem: PoseGraphProblem, trusted: Mask) -> Mask:
             labels[labels == b] = a
             out[e] = True
     return out
-
-
-def _subset(problem: PoseGraphProblem, keep: Mask) -> PoseGraphProblem:
-    return PoseGraphProblem(
-        problem.dimension, problem.ids, problem.poses, problem.fixed, problem.edges[keep], problem.measurements[keep],
-        problem.information[keep],
-    )  # fmt: skip
 
 
 def _gated(
@@ -100,12 +93,12 @@ def _gated(
     """
     k = problem.tangent
     kept = trusted.copy()
-    chain = _subset(problem, trusted)
+    chain = problem.with_edges(trusted)
     poses = odometry_start(chain, chain.anchors())
     volume = _log_volume(problem, poses)
     level, scale = 0, 0.0
     for _ in range(_ROUNDS_MAX):
-        structure = Structure(_subset(problem, kept))
+        structure = Structure(problem.with_edges(kept))
         ones = np.ones(int(kept.sum()))
         poses = levenberg_marquardt(structure, poses, ones, iterations=10, tolerance=1e-4).poses
         cost = structure.problem.chi2(poses)

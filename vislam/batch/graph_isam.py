@@ -35,7 +35,7 @@ _IGNORED = ("SOLVE", "EDGE3_INIT", "EDGE3_TRUE", "POSE3D_TRUE")  # orders to the
 _UPRIGHT = 1e-6  # cosine of the pitch
 
 
-def read_isam(path: Path) -> PoseGraphProblem:
+def read_isam(path: Path, repair: bool = False) -> PoseGraphProblem:
     """Read ODOMETRY, EDGE2 and Constraint2, or EDGE3 and POSE3D_INIT; there are no poses of the plane to start from.
 
     Edges are in the order of the file. Raises DataError with the line number on damage of any kind, on both dimensions
@@ -58,7 +58,8 @@ def read_isam(path: Path) -> PoseGraphProblem:
         raise DataError(f"{path}:{line}: the square of the square root of the information is not finite")
     information = 0.5 * (information + information.transpose(0, 2, 1))
     poses = PoseLines(vertices.ids.reshape(-1), poses_of(vertices.numbers, two), vertices.lines)
-    return problem_from_lines(path, 2 if two else 3, poses, EdgeLines(edges.ids, measured, information, edges.lines))
+    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
+    return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
 
 
 def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

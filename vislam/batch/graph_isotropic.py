@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
 from vislam.batch.graph_cholesky import Factor
 from vislam.batch.graph_kernels import retract_2d, retract_3d
@@ -33,7 +33,7 @@ _LANCZOS_TOLERANCE = 1e-6
 _SPECTRUM = 2  # eigenvalues beyond those that are zero at a minimum
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
     """The low end of the spectrum of the certificate matrix, translations eliminated."""
 
@@ -41,6 +41,7 @@ class Spectrum:
     gap: float  # the first beyond the d zeros that every minimum has: how far it is from being ambiguous
     proven: float  # eta: no eigenvalue is below -eta; infinite where edges leave translations free
     rounding: float  # below, eigenvalues mean nothing
+    direction: Array  # [N, d + 1] eigenvector of the least one, with the translations that go with it
 
 
 class IsotropicGraph:
@@ -55,7 +56,7 @@ class IsotropicGraph:
         self._from = csr_array((np.ones(m), (self._edges[:, 0], ends)), shape=(n, m))
         self._to = csr_array((np.ones(m), (self._edges[:, 1], ends)), shape=(n, m))
         ZD = self._Z * self._D[:, None, :]
-        inner = np.asarray(self._from @ (ZD @ self._Z.transpose(0, 2, 1)).reshape(m, -1))
+        inner = np.asarray(self._from @ (ZD @ self._Z.transpose(0, 2, 1)).reshape(m, (d + 1) ** 2))
         self._diagonal = inner.reshape(n, d + 1, d + 1)  # of M
         self._diagonal[:, range(d + 1), range(d + 1)] += self._to @ self._D
         self._off = -ZD
@@ -67,21 +68,29 @@ class IsotropicGraph:
     @property
     def factor_bytes(self) -> int:
         """Memory that the largest of its factors takes."""
-        return self._symbolic.bytes(len(self._motions))
+        return self.bytes_of(len(self._motions))
 
     def value(self, poses: Array) -> float:
         """Return the cost of poses [N, d + 1, d + 1]."""
-        return float(np.einsum("eab,eab,eb->", E := self._residuals(poses), E, self._D))
+        return self.lifted_value(poses[:, : self._d])
+
+    def lifted_value(self, X: Array) -> float:
+        """Return the cost of X [N, r, d + 1], the matrices [R t] of poses in r >= d dimensions."""
+        return float(np.einsum("eab,eab,eb->", E := self._residuals(X), E, self._D))
+
+    def gradient(self, poses: Array) -> float:
+        """Return the norm of the gradient of half the cost at poses: near 0 at a minimum."""
+        return float(np.linalg.norm(self._along_motions(poses, self.force(poses[:, : self._d]))))
 
     def minimise(self, poses: Array) -> Array:
         """Return the poses at the local minimum that Newton's method reaches from these."""
         poses, cost, damping = poses.copy(), self.value(poses), 0.0
         factor = Factor(self._symbolic, len(self._motions))
         for _ in range(_STEPS):
-            force = self._force(poses)
+            force = self.force(poses[:, : self._d])
             gradient = self._along_motions(poses, force)
             curved = self._diagonal.copy()
-            curved[:, : self._d, : self._d] -= self._multipliers(poses, force)
+            curved[:, : self._d, : self._d] -= self._multipliers(poses[:, : self._d], force)
             blocks = self._projected(poses, curved)
             if damping > 0.0 or not factor.factorise(*blocks):  # Newton's matrix is indefinite far from a minimum
                 blocks = self._projected(poses, self._diagonal)
@@ -108,45 +117,81 @@ class IsotropicGraph:
 
     def spectrum(self, poses: Array) -> Spectrum:
         """Return the low end of the spectrum of the certificate matrix at poses."""
-        d, n = self._d, len(poses)
+        return self.lifted_spectrum(poses[:, : self._d])
+
+    def lifted_spectrum(self, X: Array) -> Spectrum:
+        """Return the low end of the spectrum of the certificate matrix at X [N, r, d + 1]."""
+        d, n = self._d, len(X)
         S = self._diagonal.copy()
-        S[:, :d, :d] -= self._multipliers(poses, self._force(poses))
+        S[:, :d, :d] -= self._multipliers(X, self.force(X))
         scale = float(np.abs(S[:, range(d), range(d)]).max())
         S[self._pinned, d, d] *= 2.0  # holds the translation of each part; costs nothing, as S does not see it
         rounding = _ROUNDING * scale
+        if not 0.0 < scale < np.inf:  # no edge knows a rotation, or one knows it beyond what numbers hold
+            return Spectrum(np.nan, np.nan, np.inf, 0.0, np.zeros((n, d + 1)))
         factor, eta = Factor(self._symbolic, d + 1), rounding
         off = self._placed(self._off)
         while not factor.factorise(_shifted(S, eta, d), off):
             eta *= 10.0
             if eta > 1e3 * scale:
-                return Spectrum(np.nan, np.nan, np.inf, rounding)
+                return Spectrum(np.nan, np.nan, np.inf, rounding, np.zeros((n, d + 1)))
 
-        def inverse(v: Array) -> Array:
+        def solved(v: Array) -> Array:
             rhs = np.zeros((n, d + 1))
             rhs[:, :d] = v.reshape(n, d)
-            return factor.solve(rhs)[:, :d].ravel()
+            return factor.solve(rhs)
 
         start = np.random.default_rng(0).normal(size=n * d)
         wanted = min(d + _SPECTRUM, n * d - 1)
-        operator = LinearOperator((n * d, n * d), matvec=inverse, dtype=np.float64)
-        found = eigsh(operator, k=wanted, which="LA", v0=start, tol=_LANCZOS_TOLERANCE, return_eigenvectors=False)
-        eigenvalues = np.sort(1.0 / found - eta)
-        return Spectrum(float(eigenvalues[0]), float(eigenvalues[min(d, wanted - 1)]), eta, rounding)
+        operator = LinearOperator((n * d, n * d), matvec=lambda v: solved(v)[:, :d].ravel(), dtype=np.float64)
+        try:
+            found, vectors = eigsh(operator, k=wanted, which="LA", v0=start, tol=_LANCZOS_TOLERANCE)
+        except ArpackError:  # eta is proven all the same
+            return Spectrum(np.nan, np.nan, eta, rounding, np.zeros((n, d + 1)))
+        order = np.argsort(1.0 / found)
+        eigenvalues = 1.0 / found[order] - eta
+        gap = float(eigenvalues[min(d, wanted - 1)])
+        return Spectrum(float(eigenvalues[0]), gap, eta, rounding, solved(vectors[:, order[0]]))
 
-    def _residuals(self, poses: Array) -> Array:
-        """Return X_j - X_i Z [E, d, d + 1]."""
-        X = poses[:, : self._d]
+    def force(self, X: Array) -> Array:
+        """Return X M in blocks [N, r, d + 1]: half the derivative of the cost by the matrices X [N, r, d + 1]."""
+        E = self._residuals(X) * self._D[:, None, :]
+        back, width = E @ self._Z.transpose(0, 2, 1), X.shape[1] * X.shape[2]
+        flat = np.asarray(self._to @ E.reshape(len(E), width) - self._from @ back.reshape(len(E), width))
+        return flat.reshape(X.shape)
+
+    def curvature(self, X: Array, force: Array, basis: Array) -> tuple[Array, Array, Array]:
+        """Return half the Hessian at X [N, r, d + 1] along a basis [N, k, r, d + 1] of the tangents of each pose.
+
+        Blocks of poses [N, k, k] and of edges [E, k, k] as `Factor` takes them, one pose of each part held, and the
+        diagonal [N, k] of the form M alone, which is positive.
+        """
+        n, k = basis.shape[:2]
+        flat = basis.reshape(n, k, -1)
+        plain = (basis @ self._diagonal[:, None]).reshape(n, k, -1) @ flat.transpose(0, 2, 1)
+        multiplied = basis.copy()
+        multiplied[..., : self._d] = basis[..., : self._d] @ self._multipliers(X, force)[:, None]
+        multiplied[..., self._d] = 0.0
+        own = plain - multiplied.reshape(n, k, -1) @ flat.transpose(0, 2, 1)
+        own[self._pinned] += plain[self._pinned]
+        start, end = basis[self._edges[:, 0]], flat[self._edges[:, 1]]
+        off = (start @ self._off[:, None]).reshape(len(end), k, -1) @ end.transpose(0, 2, 1)
+        return np.ascontiguousarray(own), self._placed(off), np.einsum("nkk->nk", plain)
+
+    def factor(self, k: int) -> Factor:
+        """Return an empty factor with blocks of k numbers per pose."""
+        return Factor(self._symbolic, k)
+
+    def bytes_of(self, k: int) -> int:
+        """Memory that a factor with blocks of k numbers per pose takes."""
+        return self._symbolic.bytes(k)
+
+    def _residuals(self, X: Array) -> Array:
+        """Return X_j - X_i Z [E, r, d + 1]."""
         return X[self._edges[:, 1]] - X[self._edges[:, 0]] @ self._Z
 
-    def _force(self, poses: Array) -> Array:
-        """Return X M in blocks [N, d, d + 1]: half the derivative of the cost by the poses' matrices."""
-        E = self._residuals(poses) * self._D[:, None, :]
-        back = E @ self._Z.transpose(0, 2, 1)
-        flat = np.asarray(self._to @ E.reshape(len(E), -1) - self._from @ back.reshape(len(E), -1))
-        return flat.reshape(len(poses), self._d, self._d + 1)
-
-    def _multipliers(self, poses: Array, force: Array) -> Array:
-        L = poses[:, : self._d, : self._d].transpose(0, 2, 1) @ force[:, :, : self._d]
+    def _multipliers(self, X: Array, force: Array) -> Array:
+        L = X[:, :, : self._d].transpose(0, 2, 1) @ force[:, :, : self._d]
         return 0.5 * (L + L.transpose(0, 2, 1))
 
     def _along_motions(self, poses: Array, force: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,24 @@ class PoseGraphSolution:
     parts: int  # connected parts, each with an anchor
     notes: tuple[str, ...]
     solve_s: float  # process time
+    robust_reason: str = ""  # why these edges were kept
+    undecided: tuple[int, ...] = ()  # edges left out because nothing tells whether they are true
 
     @property
     def rejected(self) -> NDArray[np.int64]:
         """Indices of the edges that were found false."""
         return np.flatnonzero(self.weights == 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """Which edges to believe, and why."""
+
+    poses: Array | None  # [N, d + 1, d + 1] near their optimum; None: not known
+    weights: Array  # [E] 1 kept, 0 rejected
+    reason: str  # the method that was taken and what speaks for it
+    undecided: NDArray[np.int64] = field(default_factory=lambda: np.array([], dtype=np.int64))  # edges left out so
+    warning: str = ""  # empty where everything was decided
 
 
 def optimize_pose_graph(
@@ -51,17 +64,27 @@ def optimize_pose_graph(
     """
     config = config or PoseGraphConfig()
     begun = time.process_time()
-    structure = Structure(problem, config.equations)
+    if not problem.of_poses and (config.robust != "none" or config.method not in ("lm", "dogleg")):
+        asked = f"--robust {config.robust}" if config.robust != "none" else f"--method {config.method}"
+        raise UsageError(
+            f"{asked} knows no landmarks and no priors, which this graph has; use --robust none, --method lm or dogleg"
+        )
+    structure, decision = Structure(problem, config.equations), None
     weights = np.ones(len(problem.edges))
-    if config.robust == "gnc":
-        from vislam.batch.graph_gnc import reject_false_edges
-
-        weights = reject_false_edges(structure, config, progress)
-        structure = Structure(without_edges(problem, weights == 0.0), config.equations)
-    start_name, start, start_costs = _start(structure, config)
+    if config.robust != "none":
+        decision = _decision(structure, config, progress)
+        weights = decision.weights
+        structure = Structure(problem.with_edges(weights != 0.0), config.equations)
+    if decision is not None and decision.poses is not None and config.start == "auto":
+        start_name, start = "robust", decision.poses
+        start_costs = {start_name: structure.problem.chi2(start)}
+    else:
+        start_name, start, start_costs = _start(structure, config)
     descent = _descend(structure, start, config, progress)
     parts = structure.parts
     notes = list(problem.notes)
+    if decision is not None and decision.warning:
+        notes.append(decision.warning)
     if parts > 1:
         notes.append(f"{parts} parts that no edge joins, each with a pose of its own that keeps its value")
     if not descent.converged:
@@ -69,18 +92,20 @@ def optimize_pose_graph(
     return PoseGraphSolution(
         descent.poses, start, start_name, start_costs, descent.costs, descent.converged, weights, structure.anchors,
         parts, tuple(notes), time.process_time() - begun,
+        "" if decision is None else decision.reason, () if decision is None else tuple(decision.undecided.tolist()),
     )  # fmt: skip
 
 
-def without_edges(problem: PoseGraphProblem, left_out: NDArray[np.bool_]) -> PoseGraphProblem:
-    """Return the problem without some edges [E]."""
-    if not left_out.any():
-        return problem
-    keep = ~left_out
-    return PoseGraphProblem(
-        problem.dimension, problem.ids, problem.poses, problem.fixed, problem.edges[keep], problem.measurements[keep],
-        problem.information[keep], problem.passed_lines, problem.notes,
-    )  # fmt: skip
+def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress | None) -> Decision:
+    """Return what the route that was asked for says about the edges."""
+    from vislam.batch.graph_auto import decide, decide_by_kernel
+    from vislam.batch.graph_gnc import reject_false_edges
+
+    if config.robust == "auto":
+        return decide(structure.problem, config, progress)
+    if config.robust in ("cauchy", "geman-mcclure", "dcs"):
+        return decide_by_kernel(structure.problem, config.robust, progress)
+    return Decision(None, reject_false_edges(structure, config, progress), "graduated non-convexity, as asked for")
 
 
 def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, dict[str, float]]:
@@ -106,6 +131,7 @@ def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, d
     costs: dict[str, float] = {}
     for name, make in makers.items():
         poses = make()
+        poses[problem.is_point, :-1, :-1] = np.eye(problem.dimension)
         costs[name] = problem.chi2(poses)
         if np.isfinite(costs[name]) and (best is None or costs[name] < best[0]):
             best = (costs[name], name, poses)

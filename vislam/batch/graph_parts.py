@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,12 @@ from vislam.errors import DataError
 from vislam.messages import Array
 
 _NORM_TOLERANCE = 0.02  # files round quaternions to as few as 4 decimals
+_FARTHEST_M = 1e15  # beyond, a double knows no metre
+_INFORMATION = (
+    1e-24,
+    1e24,
+)  # largest entry, 1/rad^2, 1/m^2: what is outside says nothing, or more than can be known
+_REPAIRED = 1e-9  # of the largest eigenvalue: least of a repaired matrix
 _NEGATIVE = 1e-6  # of the largest eigenvalue: what files' rounding makes of a zero one
 
 
@@ -81,14 +87,18 @@ def problem_from_lines(
     edges: EdgeLines,
     fixed_ids: tuple[tuple[int, int], ...] = (),
     passed_lines: tuple[str, ...] = (),
+    repair: bool = False,
 ) -> PoseGraphProblem:
-    """Return the checked problem; `fixed_ids` are (line, id).
+    """Return the checked problem; `fixed_ids` are (line, id). With `repair` negative information is made positive.
 
     A pose that only edges name has no initial value. A pose that is given twice alike counts once, several edges
     between two poses all count; `notes` tell. Raises DataError with the line for a pose given twice with different
     values, an edge from a pose to itself, information that is negative or zero, and a fixed pose that is none.
     """
     notes: list[str] = []
+    _check_reach(path, poses.poses, poses.lines)
+    _check_reach(path, edges.measurements, edges.lines)
+    _check_information(path, edges)
     poses = _without_repetition(path, poses, notes)
     ids = np.unique(np.concatenate([poses.ids, edges.ids.ravel()]))
     if not len(ids):
@@ -99,9 +109,7 @@ def problem_from_lines(
     if loops.any():
         i = int(np.argmax(loops))
         raise DataError(f"{path}:{edges.lines[i]}: an edge from pose {edges.ids[i, 0]} to itself; remove the line")
-    wrong = _first_not_semidefinite(edges.information)
-    if wrong >= 0:
-        raise DataError(f"{path}:{edges.lines[wrong]}: {_fault_of(edges.information[wrong])}")
+    edges = _with_sound_information(path, edges, repair, notes)
     fixed = np.zeros(len(ids), dtype=np.bool_)
     for line, pose_id in fixed_ids:
         at = int(np.searchsorted(ids, pose_id))
@@ -112,12 +120,35 @@ def problem_from_lines(
     if len(missing):
         notes.append(f"{len(missing)} of {len(ids)} poses have no initial value (the first: {missing[0]})")
     if len(passed_lines):
-        notes.append(f"{len(passed_lines)} lines of landmarks and parameters are kept as they are, not optimised")
+        notes.append(f"{len(passed_lines)} lines of parameters are kept as they are")
     problem = PoseGraphProblem(
         dimension, ids, start, fixed, np.searchsorted(ids, edges.ids), edges.measurements, edges.information,
         passed_lines, tuple(notes + _notes_on_edges(edges.ids)),
     )  # fmt: skip
     return problem
+
+
+def _check_reach(path: Path, poses: Array, lines: Ids) -> None:
+    """Raise DataError with the line of a pose or measurement that is too far away to count with."""
+    d = poses.shape[1] - 1
+    near = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(poses[:, :d, d]).max(axis=1, initial=0.0) <= _FARTHEST_M)
+    if not near.all():
+        i = int(np.argmin(near))
+        far_m = float(np.abs(poses[i, :d, d]).max())
+        raise DataError(f"{path}:{lines[i]}: {far_m:.3g} m are too far, {_FARTHEST_M:g} m at most; repair the line")
+
+
+def _check_information(path: Path, edges: EdgeLines) -> None:
+    """Raise DataError with the line of an edge whose information is too large or too small to count with."""
+    low, high = _INFORMATION
+    largest = np.abs(edges.information).max(axis=(1, 2), initial=0.0)
+    good = (largest == 0.0) | ((largest >= low) & (largest <= high))  # zero is refused in words of its own
+    if not good.all():
+        i = int(np.argmin(good))
+        raise DataError(
+            f"{path}:{edges.lines[i]}: information of {largest[i]:.3g} cannot be used, {low:g} to {high:g} can; repair "
+            "the line"
+        )
 
 
 def _without_repetition(path: Path, poses: PoseLines, notes: list[str]) -> PoseLines:
@@ -147,20 +178,46 @@ def _notes_on_edges(ids: Ids) -> list[str]:
     return [f"{int(again.sum())} edges join poses that another one joins too (the first: {low[i]} and {high[i]})"]
 
 
-def _fault_of(information: Array) -> str:
-    if not information.any():
-        return "the information is zero: the edge says nothing; remove the line"
-    return f"the information is not positive: its smallest eigenvalue is {np.linalg.eigvalsh(information)[0]:.4g}"
+def _with_sound_information(path: Path, edges: EdgeLines, repair: bool, notes: list[str]) -> EdgeLines:
+    """Return edges whose information is positive semidefinite. Raises DataError for others, unless they are repaired.
+
+    Repaired is by the nearest matrix, in Frobenius' norm, without eigenvalues below a billionth of the largest (Higham,
+    "Computing a nearest symmetric positive semidefinite matrix", 1988). What says nothing cannot be repaired.
+    """
+    wrong, eigenvalues = _indefinite(edges.information)
+    if not len(wrong):
+        return edges
+    empty = np.flatnonzero(eigenvalues[:, -1] <= 0.0)
+    first = int(empty[0]) if repair and len(empty) else 0
+    where, least = f"{path}:{edges.lines[wrong[first]]}", eigenvalues[first, 0]
+    if not edges.information[wrong[first]].any():
+        raise DataError(f"{where}: the information is zero: the edge says nothing; remove the line")
+    told = f"its smallest eigenvalue is {least:.4g}"
+    if repair and len(empty):
+        raise DataError(f"{where}: the information is not positive in any direction: {told}; remove the line")
+    if not repair:
+        raise DataError(
+            f"{where}: the information is not positive: {told}, and {len(wrong)} of {len(edges.lines)} edges are so; "
+            "--repair-information takes the nearest positive ones"
+        )
+    notes.append(
+        f"the information of {len(wrong)} of {len(edges.lines)} edges was not positive (the first: line "
+        f"{edges.lines[wrong[0]]}, {told}); the nearest positive definite one was taken"
+    )
+    values, vectors = np.linalg.eigh(edges.information[wrong])
+    values = np.maximum(values, _REPAIRED * values[:, -1:])
+    information = edges.information.copy()
+    repaired = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
+    information[wrong] = 0.5 * (repaired + repaired.transpose(0, 2, 1))
+    return replace(edges, information=information)
 
 
-def _first_not_semidefinite(information: Array) -> int:
-    """Return the first of the matrices [M, k, k] that is zero or has a negative eigenvalue, -1 where there is none."""
-    suspects = np.flatnonzero(_not_definite(information))
-    for i in suspects.tolist():
-        eigenvalues = np.linalg.eigvalsh(information[i])
-        if eigenvalues[-1] <= 0.0 or eigenvalues[0] < -_NEGATIVE * eigenvalues[-1]:
-            return i
-    return -1
+def _indefinite(information: Array) -> tuple[Ids, Array]:
+    """Return which of the matrices [M, k, k] are zero or have a negative eigenvalue [W], and eigenvalues [W, k]."""
+    suspects: Ids = np.flatnonzero(_not_definite(information))
+    eigenvalues = np.asarray(np.linalg.eigvalsh(information[suspects]), dtype=np.float64)
+    wrong = (eigenvalues[:, -1] <= 0.0) | (eigenvalues[:, 0] < -_NEGATIVE * eigenvalues[:, -1])
+    return suspects[wrong], eigenvalues[wrong]
 
 
 @njit(cache=True)

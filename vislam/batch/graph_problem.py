@@ -14,6 +14,11 @@ from vislam.errors import DataError
 from vislam.messages import Array
 
 Ids = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def _none() -> Mask:
+    return np.zeros(0, dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,11 +40,17 @@ class PoseGraphProblem:
     information: Array  # [E, k, k] symmetric, positive semidefinite
     passed_lines: tuple[str, ...] = ()  # of landmarks and parameters: kept, never optimised
     notes: tuple[str, ...] = field(default=())  # what a reader found odd and how it went about it
+    is_point: Mask = field(default_factory=_none)  # [N] landmarks: poses whose rotation means nothing
+    is_position: Mask = field(default_factory=_none)  # [E] edges that measure a position alone, see `graph_points`
+    world: int = -1  # the pose (index) at the origin, in no file, of which priors are edges; -1: there are none
 
     def __post_init__(self) -> None:
         d, n, m = self.dimension, len(self.ids), len(self.edges)
         k = 3 * (d - 1)
-        shapes = {"poses": (n, d + 1, d + 1), "fixed": (n,), "edges": (m, 2)}
+        for name, count in (("is_point", n), ("is_position", m)):
+            if not getattr(self, name).any():  # of any length, so that edges can be replaced where there are none
+                object.__setattr__(self, name, np.zeros(count, dtype=np.bool_))
+        shapes = {"poses": (n, d + 1, d + 1), "fixed": (n,), "edges": (m, 2), "is_point": (n,), "is_position": (m,)}
         shapes |= {"measurements": (m, d + 1, d + 1), "information": (m, k, k)}
         wrong = {name: getattr(self, name).shape for name in shapes if getattr(self, name).shape != shapes[name]}
         if d not in (2, 3) or wrong:
@@ -48,6 +59,26 @@ class PoseGraphProblem:
             raise DataError("the ids of a pose graph must ascend, without repetition, from 0 at least")
         if m and (self.edges.min() < 0 or self.edges.max() >= n or np.any(self.edges[:, 0] == self.edges[:, 1])):
             raise DataError(f"an edge must join two different poses of the {n} that there are")
+
+    def with_edges(self, edges: Ids | Mask) -> PoseGraphProblem:
+        """Return the problem with some of its edges, by index or by a mask [E]."""
+        return replace(
+            self, edges=self.edges[edges], measurements=self.measurements[edges], information=self.information[edges],
+            is_position=self.is_position[edges],
+        )  # fmt: skip
+
+    @property
+    def is_pose(self) -> Mask:
+        """Which poses [N] are poses of the file: neither landmarks nor the world."""
+        out = ~self.is_point
+        if self.world >= 0:
+            out[self.world] = False
+        return out
+
+    @property
+    def of_poses(self) -> bool:
+        """Whether all is poses and relative poses: no landmark, no prior."""
+        return self.world < 0 and not self.is_point.any() and not self.is_position.any()
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
@@ -68,6 +99,10 @@ class PoseGraphProblem:
         out = np.empty(len(self.edges))
         kernel = chi2_2d if self.dimension == 2 else chi2_3d
         kernel(self.edges, np.ascontiguousarray(poses, dtype=np.float64), self.measurements, self.information, out)
+        at = np.flatnonzero(self.is_position)
+        if len(at):
+            r, d = self._position_errors(poses, at), self.dimension
+            out[at] = np.einsum("ea,eab,eb->e", r, self.information[at, -d:, -d:], r)
         return out
 
     def residuals(self, poses: Array) -> Array:
@@ -75,7 +110,17 @@ class PoseGraphProblem:
         out = np.empty((len(self.edges), self.tangent))
         kernel = errors_2d if self.dimension == 2 else errors_3d
         kernel(self.edges, np.ascontiguousarray(poses, dtype=np.float64), self.measurements, out)
+        at = np.flatnonzero(self.is_position)
+        if len(at):
+            out[at] = 0.0
+            out[at, -self.dimension :] = self._position_errors(poses, at)
         return out
+
+    def _position_errors(self, poses: Array, at: Ids) -> Array:
+        """Return the errors [M, d] of edges that measure a position alone: the translation of Z^-1 T_i^-1 T_j."""
+        d, (i, j) = self.dimension, self.edges[at].T
+        seen = np.einsum("eba,eb->ea", poses[i, :d, :d], poses[j, :d, d] - poses[i, :d, d])
+        return np.asarray(np.einsum("eba,eb->ea", self.measurements[at, :d, :d], seen - self.measurements[at, :d, d]))
 
     def components(self) -> Ids:
         """Return for each pose [N] the number of the connected part that it is in, counted in the order of the ids."""
@@ -94,7 +139,9 @@ class PoseGraphProblem:
     def anchors_of(self, labels: Ids) -> Ids:
         """Return the anchors, given the parts [N] as `components` numbers them."""
         held = np.unique(labels[self.fixed])
-        first = np.unique(labels, return_index=True)[1]
+        # a landmark would leave its part free to turn, so poses come first
+        order = np.lexsort((np.arange(len(labels)), self.is_point, labels))
+        first = order[np.unique(labels[order], return_index=True)[1]]
         return np.sort(np.concatenate([np.flatnonzero(self.fixed), np.delete(first, held)]))
 
     def with_poses(self, poses: Array) -> PoseGraphProblem:

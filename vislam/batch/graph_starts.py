@@ -34,7 +34,10 @@ def file_start(problem: PoseGraphProblem) -> Array:
 
 def odometry_start(problem: PoseGraphProblem, anchors: Ints) -> Array:
     """Return poses chained from the anchors by edges between successive ids, other edges only where these end."""
-    successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
+    rank = np.cumsum(problem.is_pose)  # landmarks may have ids between those of poses
+    successive = (np.abs(rank[problem.edges[:, 1]] - rank[problem.edges[:, 0]]) == 1) & problem.is_pose[
+        problem.edges
+    ].all(axis=1)
     return _chained(problem, _mask(problem, anchors), successive)
 
 
@@ -207,6 +210,9 @@ def _placed_anchors(problem: PoseGraphProblem) -> Array:
 def _chained(problem: PoseGraphProblem, known: Mask, free_of_charge: Mask) -> Array:
     poses = _placed_anchors(problem)
     reached = known.copy()
+    if not problem.of_poses:  # what knows a rotation first
+        full = ~problem.is_position
+        _chain(problem.edges[full], problem.measurements[full], free_of_charge[full], reached, poses)
     _chain(problem.edges, problem.measurements, free_of_charge, reached, poses)
     return poses
 

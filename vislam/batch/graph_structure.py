@@ -10,6 +10,7 @@ import numpy as np
 from vislam.batch.graph_cholesky import Factor
 from vislam.batch.graph_clusters import ClusteredSolver, Clusters
 from vislam.batch.graph_kernels import linearise_2d, linearise_3d, retract_2d, retract_3d
+from vislam.batch.graph_points import PositionEdges
 from vislam.batch.graph_problem import Ids, PoseGraphProblem
 from vislam.batch.graph_symbolic import FACTOR_MAX_BYTES, analyse
 from vislam.errors import UsageError
@@ -86,16 +87,21 @@ class NormalEquations:
         self.gradient = np.zeros((n, k))
         self._linearise = linearise_2d if k == 3 else linearise_3d
         self._retract = retract_2d if k == 3 else retract_3d
+        p = structure.problem
+        self._positions = None if p.of_poses else PositionEdges(p, structure.index, solver.later_is_to)
 
     def linearise(self, poses: Array, weights: Array) -> float:
         """Form the equations at poses [N, d + 1, d + 1]; `weights` [E] multiply the edges. Return the cost."""
         s = self._structure
         p = s.problem
         self._poses = poses
+        between = weights if self._positions is None else np.where(p.is_position, 0.0, weights)
         cost: float = self._linearise(
-            p.edges, s.index, self._solver.later_is_to, poses, p.measurements, p.information, weights,
+            p.edges, s.index, self._solver.later_is_to, poses, p.measurements, p.information, between,
             self.diagonal, self.off, self.gradient,
         )  # fmt: skip
+        if self._positions is not None:
+            cost += self._positions.add(poses, weights, self.diagonal, self.off, self.gradient)
         return cost
 
     def factorise(self, damping: float) -> bool:

@@ -31,7 +31,7 @@ _ROWS_OF_TORO = [0, 1, 4, 2, 5, 3]  # its ff fs ss rr fr sr as an upper triangle
 _ORDER_3D = (3, 4, 5, 0, 1, 2)  # files have translation first
 
 
-def read_toro(path: Path) -> PoseGraphProblem:
+def read_toro(path: Path, repair: bool = False) -> PoseGraphProblem:
     """Read VERTEX2 and EDGE2 or VERTEX3 and EDGE3.
 
     Raises DataError with the line number on damage of any kind, on both dimensions in one file and on other tags (EQUIV
@@ -48,7 +48,8 @@ def read_toro(path: Path) -> PoseGraphProblem:
     else:
         information = symmetric(edges.numbers[:, 6:], _ORDER_3D)
     poses = PoseLines(vertices.ids[:, 0], poses_of(vertices.numbers, two), vertices.lines)
-    return problem_from_lines(path, 2 if two else 3, poses, EdgeLines(edges.ids, measured, information, edges.lines))
+    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
+    return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
 
 
 def write_toro(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

@@ -11,7 +11,6 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from vislam.batch.graph_cholesky import Factor
-from vislam.batch.graph_optimize import without_edges
 from vislam.batch.graph_problem import Ids, PoseGraphProblem
 from vislam.batch.graph_structure import NormalEquations, Structure, adjoints
 from vislam.errors import DataError, UsageError
@@ -29,7 +28,7 @@ class Uncertainty:
 
         Raises DataError where the measurements leave a pose undetermined, UsageError where the factor is too large.
         """
-        self._problem = problem if weights is None else without_edges(problem, weights == 0.0)
+        self._problem = problem if weights is None else problem.with_edges(weights != 0.0)
         self._poses = np.ascontiguousarray(poses, dtype=np.float64)
         self._structure = Structure(self._problem)
         self._factor = self._structure.factor(problem.tangent)

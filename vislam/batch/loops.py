@@ -8,10 +8,11 @@ import gtsam
 import numpy as np
 
 from vislam.batch.chain import Chain
-from vislam.config import BatchConfig, GraphConfig
+from vislam.batch.graph_auto import decide
+from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.config import BatchConfig, GraphConfig, PoseGraphConfig
 from vislam.errors import DataError
 from vislam.factor_log import LoggedEdge
-from vislam.factors.gnc import gnc_loops
 from vislam.factors.journal import LoopRecord, loop_record
 from vislam.factors.keys import X
 from vislam.factors.noise import cauchy, gaussian, inflated
@@ -19,7 +20,6 @@ from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.geometry import invert
 from vislam.messages import Array
 
-_KEPT = 0.5  # of the weight that graduated non-convexity ends with, which is 0 or 1
 _UNSCALED_SIGMA = 5.0  # relative, of the length of a loop without scale: wide, for its length was not measured
 
 
@@ -54,28 +54,27 @@ class Loops:
                 self.verdicts[edge.id] = verdict
         self.kept: list[LoopRecord] = []
 
-    def choose(self, chain: Chain, config: BatchConfig) -> None:
-        """Decide by graduated non-convexity on the run's odometry and all its loops; odometry is never doubted."""
+    def choose(self, chain: Chain, config: BatchConfig) -> str:
+        """Decide as `vislam optimize --robust auto` does, on the run's odometry and all its loops.
+
+        Odometry is never doubted. Returns what could not be decided, "" where all was.
+        """
         if not self._records:
-            return
-        graph = gtsam.NonlinearFactorGraph()
-        first = gtsam.noiseModel.Isotropic.Sigma(6, self._config.gauge_sigma_rad)
-        graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(chain.poses[0]), first))
-        for edge in chain.odometry_edges(config.unscaled_odometry_sigma):
-            graph.add(edge)
-        known = list(range(graph.size()))
-        for record in self._records:
-            graph.add(self._factor(record, chain.poses, robust=False))
-        values = gtsam.Values()
-        for k, T in enumerate(chain.poses):
-            values.insert(X(k), gtsam.Pose3(T))
-        _, weights = gnc_loops(graph, values, known, inlier_probability=config.loop_probability)
-        for record, weight in zip(self._records, weights[len(known) :].tolist(), strict=True):
-            kept = weight > _KEPT
-            reason = "agrees with odometry and the other loops" if kept else "refused by graduated non-convexity"
+            return ""
+        edges = chain.odometry_edges(config.unscaled_odometry_sigma)
+        edges += [self._factor(record, chain.poses, robust=False) for record in self._records]
+        decided = decide(_as_problem(edges, chain.poses), PoseGraphConfig(inlier_probability=config.loop_probability))
+        first = len(edges) - len(self._records)
+        undecided = set(decided.undecided.tolist())
+        for e, record in enumerate(self._records, start=first):
+            kept = bool(decided.weights[e] > 0.0)
+            reason = "agrees with odometry and the other loops" if kept else "contradicts odometry or the other loops"
+            if e in undecided:
+                reason = "cannot tell: too little speaks for it or against it"
             self._judge(record, kept, reason)
             if kept:
                 self.kept.append(record)
+        return decided.warning
 
     def factors(self, poses: Array) -> list[gtsam.NonlinearFactor]:
         """Return the factors of the kept loops under a kernel; `poses` [K, 4, 4] lend length to unscaled ones."""
@@ -97,7 +96,7 @@ class Loops:
         in_run = self._in_run[record.id]
         self.verdicts[record.id] = LoopVerdict(record.id, record.from_id, record.to_id, in_run, kept, reason)
 
-    def _factor(self, record: LoopRecord, poses: Array, robust: bool) -> gtsam.NonlinearFactor:
+    def _factor(self, record: LoopRecord, poses: Array, robust: bool) -> gtsam.BetweenFactorPose3:
         return loop_factor(record, poses, self._config, self._lever_m, robust)
 
 
@@ -122,6 +121,23 @@ def loop_factor(
     if robust:
         model = cauchy(model, config.loop_cauchy_k)
     return pose_factor(X(record.from_id), X(record.to_id), T, model)
+
+
+def _as_problem(edges: list[gtsam.BetweenFactorPose3], poses: Array) -> PoseGraphProblem:
+    """Return the pose graph of edges between poses [K, 4, 4], the keyframes."""
+    n = len(poses)
+    keys = [list(edge.keys()) for edge in edges]
+    pairs = np.array([[gtsam.Symbol(key).index() for key in pair] for pair in keys], dtype=np.int64)
+    measurements = np.array([edge.measured().matrix() for edge in edges])
+    information = np.array([_information(edge.noiseModel()) for edge in edges])
+    return PoseGraphProblem(
+        3, np.arange(n), np.ascontiguousarray(poses), np.zeros(n, dtype=np.bool_), pairs, measurements, information
+    )
+
+
+def _information(model: gtsam.noiseModel.Base) -> Array:
+    assert isinstance(model, gtsam.noiseModel.Gaussian)
+    return np.asarray(model.information())
 
 
 def _pair(record: LoopRecord, poses: Array) -> gtsam.Values:

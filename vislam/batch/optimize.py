@@ -1,7 +1,7 @@
 """A finished run estimated again, all at once: visual-inertial bundle adjustment over its factor log.
 
 Poses, velocities and biases of all keyframes, and the points that their tracks saw, under projection, depth, inertial,
-rest and loop factors. Loops are chosen first, by graduated non-convexity; tracks are judged between rounds.
+rest and loop factors. Loops are chosen first, as of pose-graph files (`graph_auto`); tracks are judged between rounds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vislam.batch.loops import Loops, LoopVerdict
 from vislam.batch.shutter import ReadoutSearch, camera_twists, readout_change_s, shear
 from vislam.batch.tracks import Mask, Tracks, collect, residuals, triangulate
 from vislam.config import BatchConfig, Config
-from vislam.errors import DataError
+from vislam.errors import DataError, UsageError
 from vislam.factor_log import FactorLog
 from vislam.factors.keys import B, V, X, nearest_rigid
 from vislam.messages import Array, NavState
@@ -86,8 +86,9 @@ class _Batch:
         """Choose loops, then alternate between judging tracks and optimising."""
         config, start = self._config, gtsam.Values(self._values)
         try:
-            self._loops.choose(self._chain, config)
-        except DataError as error:
+            if undecided := self._loops.choose(self._chain, config):
+                self._notes.append(undecided)
+        except (DataError, UsageError) as error:
             self._notes.append(f"no loop was used: {error}")
         solution = None
         for round_number in range(config.rounds):

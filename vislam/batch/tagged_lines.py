@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from vislam.batch.native_calls import call_double, strtod_address
 from vislam.errors import DataError
 from vislam.messages import Array
+from vislam.reading import open_file
 
 _MAX_BYTES = 512 * 2**20  # a million edges in space with all digits; ten times as much memory at worst
 _MAX_TAG_BYTES = 32
@@ -86,7 +87,7 @@ def read_tagged_lines(path: Path, columns: Mapping[str, tuple[int, int]]) -> Tag
 def _read(path: Path) -> Bytes:
     """Return the bytes of a file and a newline."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             size = path.stat().st_size
             if size > _MAX_BYTES:
                 raise DataError(f"{path} has {size / 2**20:.0f} MiB; at most {_MAX_BYTES >> 20} MiB are read")
@@ -166,17 +167,17 @@ def _count(text: Bytes, tags: Bytes, counts: NDArray[np.int64]) -> None:
 
 
 @njit(cache=True)
-def _id(text: Bytes, begin: int, end: int) -> int:
+def _id(text: Bytes, begin: int, end: int) -> np.int64:
     """Return the id in text[begin:end], -1 where it is none."""
     if end == begin or end - begin > 19:
-        return -1
+        return np.int64(-1)
     value = np.uint64(0)
     for i in range(begin, end):
         digit = text[i] - 48
         if digit < 0 or digit > 9:
-            return -1
+            return np.int64(-1)
         value = value * np.uint64(10) + np.uint64(digit)
-    return int(value) if value <= np.uint64(2**63 - 1) else -1
+    return np.int64(value) if value <= np.uint64(2**63 - 1) else np.int64(-1)  # a mix of signs would be a float
 
 
 @njit(cache=True)

@@ -20,7 +20,7 @@ class BatchConfig:
     vision_inflation: float = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
     pixel_sigma_min_px: float = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
     pixel_sigma_max_px: float = 3.0
-    loop_probability: float = 0.9999  # a loop beyond this chi-square is refused by graduated non-convexity
+    loop_probability: float = 0.9999  # chi-square of a true loop in the judging of all of them
     unscaled_odometry_sigma: float = 0.1  # one camera: relative, on the steps of the run's own odometry among the loops
     covariances: bool = True  # of all states; costs about as much as a round
 
@@ -32,12 +32,15 @@ class PoseGraphConfig:
     start: Literal["auto", "file", "odometry", "tree", "chordal", "angles"] = "auto"  # auto: the one of lowest cost
     method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
     equations: Literal["auto", "cholesky", "gradients"] = "auto"  # conjugate gradients where a factor would be large
-    robust: Literal["none", "gnc"] = "none"  # gnc: edges that do not join successive ids may be rejected
+    # which edges that do not join successive ids may be rejected, by what; auto tries several, judges, and says why
+    robust: Literal["none", "auto", "cauchy", "geman-mcclure", "dcs", "gnc"] = "none"
+    rescale_noise: bool = False  # variances of each kind of edge multiplied by what its residuals show, solved anew
     iterations: int = 100  # most of them; 3 to 8 as a rule
     tolerance: float = 1e-9  # of the cost: the decrease still to come at which to end
     inlier_probability: float = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
     certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
     covariances: bool = False  # write those of all poses: in space 300 bytes each
+    repair_information: bool = False  # take the nearest positive definite matrix for what is not; else it is refused
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,17 +12,20 @@ import numpy as np
 from vislam.batch.graph_certificate import Certificate, certify
 from vislam.batch.graph_files import read_pose_graph
 from vislam.batch.graph_g2o import write_g2o
+from vislam.batch.graph_noise import NoiseOfKind, noise_of_kinds, rescaled
 from vislam.batch.graph_optimize import PoseGraphSolution, optimize_pose_graph
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_solver import Progress
 from vislam.batch.graph_uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
-from vislam.errors import StorageError
+from vislam.errors import StorageError, UsageError
 from vislam.geometry import quaternion_xyzw_from_rotation
 from vislam.messages import Array
 from vislam.runfolder import write_json
 from vislam.trajectory import Trajectory, write_kitti, write_text, write_tum
 
+_BETTER = 4  # minima that are looked at, each lower than the one before
+_RESCALINGS, _RESCALED = 6, 0.02  # rounds of rescaling at most, and how near to 1 all factors end
 _MAX_ID_S = 9_000_000_000  # an id beyond does not fit into a stamp of nanoseconds
 
 
@@ -34,6 +37,7 @@ class OptimizedGraph:
     solution: PoseGraphSolution
     summary: dict[str, Any]
     certificate: Certificate | None
+    noise: tuple[NoiseOfKind, ...]  # what residuals show of the stated noise
 
 
 def optimize_graph_file(
@@ -44,8 +48,9 @@ def optimize_graph_file(
     Everything is computed before anything is written. Raises DataError, UsageError, StorageError.
     """
     begun = time.perf_counter()
-    problem = read_pose_graph(path)
+    problem = read_pose_graph(path, config.repair_information)
     solution = optimize_pose_graph(problem, config, progress)
+    problem, solution, noise = _noise(problem, solution, config, progress)
     certificate = None
     if config.certify:
         solution, certificate = _certified(problem, solution)
@@ -56,23 +61,64 @@ def optimize_graph_file(
     _write_edges(problem, solution, out / "edges.csv")
     if covariances is not None:
         _write_covariances(problem, covariances, out / "covariances.csv")
+    if problem.is_point.any():
+        _write_landmarks(problem, solution.poses, covariances, out / "landmarks.csv")
     summary = summarise(problem, solution) | {"source": str(path), "config": asdict(config)}
+    summary["noise"] = [{k: _finite(v) for k, v in asdict(kind).items()} for kind in noise]
     summary["certificate"] = None if certificate is None else certificate_entry(certificate)
     summary["wall_s"] = time.perf_counter() - begun
     write_json(out / "summary.json", summary)
-    return OptimizedGraph(problem, solution, summary, certificate)
+    return OptimizedGraph(problem, solution, summary, certificate, noise)
+
+
+def _noise(
+    problem: PoseGraphProblem, solution: PoseGraphSolution, config: PoseGraphConfig, progress: Progress | None
+) -> tuple[PoseGraphProblem, PoseGraphSolution, tuple[NoiseOfKind, ...]]:
+    """Return what residuals show of the stated noise; with `rescale_noise`, problem and solution rescaled by it."""
+    if not problem.of_poses:  # landmarks and priors are no odometry and no loops
+        if config.rescale_noise:
+            raise UsageError("--rescale-noise knows no landmarks and no priors, which this graph has; leave it away")
+        return problem, solution, ()
+    try:
+        noise = noise_of_kinds(problem, solution.poses, solution.weights)
+    except UsageError:
+        if config.rescale_noise:
+            raise
+        return problem, solution, ()  # the factor does not fit: nothing is told
+    if not config.rescale_noise:
+        return problem, solution, noise
+    weights, applied = solution.weights, {kind.kind: 1.0 for kind in noise}
+    for _ in range(_RESCALINGS):
+        applied |= {k.kind: applied[k.kind] * k.factor for k in noise if np.isfinite(k.factor)}
+        problem = rescaled(problem, noise)
+        solved = optimize_pose_graph(
+            problem.with_edges(weights != 0.0).with_poses(solution.poses),
+            replace(config, robust="none", start="file"), progress,
+        )  # fmt: skip
+        solution = replace(
+            solution, poses=solved.poses, costs=solved.costs, converged=solved.converged, start=solved.start
+        )
+        noise = noise_of_kinds(problem, solution.poses, weights)
+        if all(abs(kind.factor - 1.0) < _RESCALED or not np.isfinite(kind.factor) for kind in noise):
+            break
+    return problem, solution, tuple(replace(kind, applied=applied[kind.kind]) for kind in noise)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _certified(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[PoseGraphSolution, Certificate]:
     """Return the certificate, and with it the better solution where the search for it came across one."""
     certificate = certify(problem, solution.poses, solution.weights)
-    if certificate.better is None:
-        return solution, certificate
-    certificate, left = certify(problem, certificate.better, solution.weights), certificate
-    note = f"a minimum of chi2 {left.chi2:.9g} was left for a lower one that the certificate's check came across"
-    costs = (*solution.costs, certificate.chi2)
-    poses = left.better if left.better is not None else solution.poses
-    return replace(solution, poses=poses, costs=costs, notes=(*solution.notes, note)), certificate
+    for _ in range(_BETTER):
+        if certificate.better is None:
+            break
+        note = f"a minimum of chi2 {certificate.chi2:.9g} was left for a lower one that the certificate's check found"
+        poses, certificate = certificate.better, certify(problem, certificate.better, solution.weights)
+        notes, costs = (*solution.notes, note), (*solution.costs, certificate.chi2)
+        solution = replace(solution, poses=poses, costs=costs, notes=notes)
+    return solution, certificate
 
 
 def certificate_entry(certificate: Certificate) -> dict[str, Any]:
@@ -93,7 +139,8 @@ def summarise(problem: PoseGraphProblem, solution: PoseGraphSolution) -> dict[st
     """Return what an optimisation came to, for summary.json and --json."""
     return {
         "dimension": problem.dimension,
-        "poses": len(problem.ids),
+        "poses": int(problem.is_pose.sum()),
+        "landmarks": int(problem.is_point.sum()),
         "edges": len(problem.edges),
         "parts": solution.parts,
         "start": solution.start_name,
@@ -102,6 +149,8 @@ def summarise(problem: PoseGraphProblem, solution: PoseGraphSolution) -> dict[st
         "chi2_after": solution.costs[-1],
         "iterations": len(solution.costs) - 1,
         "converged": solution.converged,
+        "robust": solution.robust_reason or None,
+        "undecided": [problem.ids[problem.edges[e]].tolist() for e in solution.undecided],
         "rejected": [problem.ids[problem.edges[e]].tolist() for e in solution.rejected.tolist()],
         "solve_s": solution.solve_s,
         "warnings": list(solution.notes),
@@ -119,13 +168,13 @@ def _in_space(problem: PoseGraphProblem, poses: Array) -> Array:
 
 def _write_trajectories(problem: PoseGraphProblem, poses: Array, out: Path) -> None:
     """Write poses.csv, trajectory.tum (a pose's id is its time in seconds) and trajectory_kitti.txt."""
-    T = _in_space(problem, poses)
+    T, ids = _in_space(problem, poses)[problem.is_pose], problem.ids[problem.is_pose]
     q = quaternion_xyzw_from_rotation(T[:, :3, :3])
     row = "%d," + ",".join(["%.15g"] * 7)
-    lines = [row % (i, *p, *o) for i, p, o in zip(problem.ids.tolist(), T[:, :3, 3].tolist(), q.tolist(), strict=True)]
+    lines = [row % (i, *p, *o) for i, p, o in zip(ids.tolist(), T[:, :3, 3].tolist(), q.tolist(), strict=True)]
     write_text(out / "poses.csv", "\n".join(["id,x_m,y_m,z_m,qx,qy,qz,qw", *lines]) + "\n")
-    fits = int(problem.ids[-1]) <= _MAX_ID_S
-    stamps = (problem.ids if fits else np.arange(len(problem.ids))) * 1_000_000_000
+    fits = int(ids.max(initial=0)) <= _MAX_ID_S
+    stamps = (ids if fits else np.arange(len(ids))) * 1_000_000_000
     trajectory = Trajectory(stamps, T)
     write_tum(trajectory, out / "trajectory.tum")
     write_kitti(trajectory, out / "trajectory_kitti.txt")
@@ -137,14 +186,32 @@ def _write_covariances(problem: PoseGraphProblem, covariances: Array, path: Path
     a, b = np.triu_indices(len(axes))
     header = ",".join(["id", *(f"{axes[i]}_{axes[j]}" for i, j in zip(a, b, strict=True))])
     row = "%d," + ",".join(["%.9g"] * len(a))
-    lines = [row % (i, *u) for i, u in zip(problem.ids.tolist(), covariances[:, a, b].tolist(), strict=True)]
+    own = problem.is_pose
+    lines = [row % (i, *u) for i, u in zip(problem.ids[own].tolist(), covariances[own][:, a, b].tolist(), strict=True)]
     write_text(path, "\n".join([header, *lines]) + "\n")
+
+
+def _write_landmarks(problem: PoseGraphProblem, poses: Array, covariances: Array | None, path: Path) -> None:
+    """Write positions of landmarks, with the upper triangles, in rows, of their covariances in the world's axes."""
+    d, at = problem.dimension, np.flatnonzero(problem.is_point)
+    axes, (a, b) = "xyz"[:d], np.triu_indices(d)
+    header, columns = ["id", *(f"{axis}_m" for axis in axes)], [poses[at, :d, d]]
+    if covariances is not None:
+        header += [f"{axes[i]}_{axes[j]}" for i, j in zip(a, b, strict=True)]
+        columns.append(covariances[at][:, -d:, -d:][:, a, b])
+    row = "%d" + ",%.15g" * d + ",%.9g" * (len(header) - 1 - d)
+    values = np.column_stack(columns).tolist()
+    lines = [row % (i, *v) for i, v in zip(problem.ids[at].tolist(), values, strict=True)]
+    write_text(path, "\n".join([",".join(header), *lines]) + "\n")
 
 
 def _write_edges(problem: PoseGraphProblem, solution: PoseGraphSolution, path: Path) -> None:
     """Write which edges were kept, with their chi2 before and after."""
+    names = np.array([str(i) for i in problem.ids.tolist()], dtype=object)
+    if problem.world >= 0:
+        names[problem.world] = "world"
     columns = zip(
-        problem.ids[problem.edges].tolist(),
+        names[problem.edges].tolist(),
         problem.edge_chi2(solution.start).tolist(),
         problem.edge_chi2(solution.poses).tolist(),
         solution.weights.tolist(),

@@ -37,7 +37,7 @@ def write_graph_report(
     unit = "ms" if solution.solve_s < 1.0 else "s"
     took = solution.solve_s * (1000.0 if unit == "ms" else 1.0)
     tiles = (
-        tile(number(len(problem.ids), 0), "", f"poses, {problem.dimension}D"),
+        tile(number(int(problem.is_pose.sum()), 0), "", f"poses, {problem.dimension}D"),
         tile(number(len(problem.edges), 0), "", "edges"),
         tile(f"{solution.costs[-1]:.6g}", "", f"chi², from {solution.costs[0]:.6g}"),
         tile(number(took, 1), unit, f"to solve, {len(solution.costs) - 1} iterations"),
@@ -85,7 +85,7 @@ def _plane(poses: Array) -> tuple[int, int]:
 def _regions(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[Array, float]:
     """Return outlines [M, P, 2] of some poses' regions, none where they are undetermined, and how much enlarged."""
     step = max(1, len(problem.ids) // _REGIONS)
-    chosen = np.arange(step // 2, len(problem.ids), step)
+    chosen = np.flatnonzero(problem.is_pose | problem.is_point)[step // 2 :: step]
     try:
         covariances = Uncertainty(problem, solution.poses, solution.weights).of(problem.ids[chosen])
     except DataError:
@@ -107,14 +107,15 @@ def _picture(
     d = problem.dimension
     first, second = _plane(solution.poses)
     points = poses[:, [first, second], d]
+    shown = (problem.edges != problem.world).all(axis=1)
     successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
     with mpl.rc_context(RC):
         figure = Figure(figsize=(5.5, 4.7), layout="constrained")
         axes = figure.add_subplot()
         rejected = solution.weights == 0.0
         _lines(axes, points, problem.edges[rejected], CODE["bad"], 0.4, 0.5)
-        _lines(axes, points, problem.edges[~successive & ~rejected], CODE["muted"], 0.4, 0.5)
-        _lines(axes, points, problem.edges[successive], CODE["graph"], 1.2, 1.0)
+        _lines(axes, points, problem.edges[shown & ~successive & ~rejected], CODE["muted"], 0.4, 0.5)
+        _lines(axes, points, problem.edges[shown & successive & ~problem.is_position], CODE["graph"], 1.2, 1.0)
         if regions is not None:
             axes.add_collection(LineCollection(list(regions), colors=CODE["ekf"], linewidths=0.8))
         axes.autoscale_view()

@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import Positional
 
 from vislam.config import BatchConfig, PoseGraphConfig
-from vislam.errors import TrackingLostError
+from vislam.errors import TrackingLostError, printable
 from vislam.verbs.arguments import parse
 from vislam.verbs.results import print_evaluation
 from vislam.verbs.terminal import progress_bar
@@ -68,9 +68,13 @@ def main(arguments: list[str]) -> int:
     sessions = [a for a in arguments if (Path(a) / "session.db").is_file() or Path(a).name == "session.db"]
     if len(folders) > 1 or len(sessions) > 1 or (sessions and any(a.partition("=")[0] == "--out" for a in arguments)):
         return _join_sessions(parse(JoinOptions, arguments, "optimize"))
-    if any(Path(argument).is_file() or argument.endswith(".g2o") for argument in arguments):
+    if any(_is_graph(Path(argument)) for argument in arguments):
         return _optimize_graph(parse(OptimizeGraphOptions, arguments, "optimize"))
     return _optimize_run(parse(OptimizeOptions, arguments, "optimize"))
+
+
+def _is_graph(path: Path) -> bool:
+    return path.suffix in (".g2o", ".toro", ".isam") or (path.exists() and not path.is_dir())
 
 
 def _optimize_run(options: OptimizeOptions) -> int:
@@ -90,7 +94,7 @@ def _optimize_run(options: OptimizeOptions) -> int:
         f"{entry['wall_s']:.1f} s"
     )
     for warning in entry["warnings"]:
-        print(f"warning: {warning}")
+        print(f"warning: {printable(warning)}")
     if entry["accuracy"]:
         print_evaluation({f"{options.out_name} ({mode})": entry["accuracy"][mode] for mode in entry["accuracy"]})
     print(f"trajectory: {options.run / f'trajectory_{options.out_name}.tum'}")
@@ -117,10 +121,14 @@ def _optimize_graph(options: OptimizeGraphOptions) -> int:
             f"{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
             f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
         )
+        if summary["robust"]:
+            print(f"robust: {summary['robust']}")
+        for kind in result.noise:
+            print(f"noise of {kind.text}")
         if result.certificate is not None:
             print(result.certificate.text)
         for warning in summary["warnings"]:
-            print(f"warning: {warning}")
+            print(f"warning: {printable(warning)}")
         print(f"results: {out}")
     return 0 if summary["converged"] else TrackingLostError.exit_code
 
@@ -143,6 +151,6 @@ def _join_sessions(options: JoinOptions) -> int:
             f"{summary['loops_between']} loops between them kept; chi2 {summary['chi2_after']:.6g}"
         )
         for warning in summary["warnings"]:
-            print(f"warning: {warning}")
+            print(f"warning: {printable(warning)}")
         print(f"results: {options.out}")
     return 0 if summary["converged"] else TrackingLostError.exit_code

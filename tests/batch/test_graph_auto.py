@@ -1,0 +1,151 @@
+"""`--robust auto`: false loops of every kind go, true ones stay, and what evidence does not decide is said."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from needs import missing
+from test_graph_gnc import _with_false_loops
+from test_graph_optimize import world
+
+from vislam.batch.graph_files import read_pose_graph
+from vislam.batch.graph_noise import covariances_of_edges, noise_of_kinds, rescaled
+from vislam.batch.graph_optimize import optimize_pose_graph
+from vislam.batch.graph_robust import kernel_weights
+from vislam.batch.graph_structure import Structure
+from vislam.batch.graph_worlds import simulate_graph
+from vislam.config import GraphWorldConfig, PoseGraphConfig
+from vislam.geometry import align_points
+
+AUTO = PoseGraphConfig(robust="auto")
+
+
+def _city(fraction, group, poses=600):
+    return simulate_graph(
+        "manhattan", GraphWorldConfig(poses=poses, outlier_fraction=fraction, alias_group=group, seed=3)
+    )
+
+
+@pytest.mark.parametrize(("fraction", "group"), [(0.1, 1), (0.5, 1), (0.8, 1), (0.5, 10), (0.7, 10)])
+def test_false_loops_of_a_city_go_and_true_ones_stay(fraction, group):
+    city = _city(fraction, group)
+    solution = optimize_pose_graph(city.problem, AUTO)
+    loops = np.abs(np.diff(city.problem.edges, axis=1)[:, 0]) != 1
+    assert solution.weights[city.outlier].sum() == 0
+    assert solution.weights[loops & ~city.outlier].mean() > 0.97
+    assert "loops agree" in solution.robust_reason
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("overstated", [1.0, 1e4])
+def test_half_of_the_loops_may_be_false(d, overstated):
+    problem, _ = world(d, n=120, loops=60, seed=3)
+    problem = replace(problem, information=problem.information / overstated)
+    robust = optimize_pose_graph(_with_false_loops(problem, 60, seed=4), AUTO)
+    assert robust.weights[len(problem.edges) :].sum() == 0
+    assert robust.weights[: len(problem.edges)].mean() > 0.97
+
+
+def test_without_loops_there_is_nothing_to_doubt():
+    problem, _ = world(2, n=40, loops=0)
+    solution = optimize_pose_graph(problem, AUTO)
+    assert solution.weights.all()
+    assert solution.undecided == ()
+
+
+def test_loops_that_say_anything_are_not_believed_and_that_is_said():
+    city = _city(0.0, 1, poses=300)
+    loops = np.flatnonzero(np.abs(np.diff(city.problem.edges, axis=1)[:, 0]) != 1)
+    edges = city.problem.edges.copy()
+    rng = np.random.default_rng(0)
+    edges[loops] = np.column_stack([rng.integers(0, 140, len(loops)), rng.integers(150, 300, len(loops))])
+    problem = replace(city.problem, edges=edges)
+    solution = optimize_pose_graph(problem, AUTO)
+    odometry = city.problem.poses[:, :2, 2]
+    assert solution.weights[loops].mean() < 0.05
+    away = np.linalg.norm(solution.poses[:, :2, 2] - odometry, axis=1)
+    assert solution.weights[loops].any() or "cannot tell" in " ".join(solution.notes)
+    assert solution.weights[loops].any() or away.max() < 1e-6
+
+
+@pytest.mark.parametrize("robust", ["cauchy", "geman-mcclure", "dcs"])
+def test_kernels_on_their_own(robust):
+    problem, _ = world(2, n=120, loops=60, seed=3)
+    solution = optimize_pose_graph(_with_false_loops(problem, 20, seed=4), PoseGraphConfig(robust=robust))
+    assert solution.weights[len(problem.edges) :].sum() == 0
+    assert solution.weights[: len(problem.edges)].mean() > 0.6
+    weights = kernel_weights(robust, np.array([0.0, 4.0, 400.0]), 4.0)
+    assert weights[0] == 1.0
+    assert np.all(np.diff(weights) <= 0.0)
+    assert weights[2] < 0.02
+
+
+def test_residuals_show_by_how_much_the_noise_is_stated_wrongly():
+    city = _city(0.0, 1)
+    odometry = np.abs(np.diff(city.problem.edges, axis=1)[:, 0]) == 1
+    information = city.problem.information * np.where(odometry, 4.0, 0.1)[:, None, None]
+    problem = replace(city.problem, information=information)
+    for _ in range(5):
+        poses = optimize_pose_graph(problem).poses
+        noise = noise_of_kinds(problem, poses)
+        problem = rescaled(problem, noise)
+    assert [kind.kind for kind in noise] == [
+        "odometry rotation", "odometry translation", "loops rotation", "loops translation"
+    ]  # fmt: skip
+    ratio = problem.information / city.problem.information.clip(1e-300)
+    found = np.diagonal(ratio, axis1=1, axis2=2)
+    assert np.allclose(found, 1.0, atol=0.3)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_no_edge_gives_a_solution_more_than_it_says(d):
+    problem, _ = world(d, n=60, loops=6, seed=5)
+    loops = np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1
+    turn = problem.tangent - problem.dimension
+    weak = problem.information.copy()
+    weak[~loops, :turn, :turn] *= 1e-4  # so that residuals of loops are large, and hardly anything confirms them
+    problem = replace(problem, information=weak)
+    poses = optimize_pose_graph(problem).poses
+    W, at = problem.information, np.arange(len(problem.edges))
+    inside, ones = np.ones(len(at), dtype=bool), np.ones(len(at))
+    S, _ = covariances_of_edges(Structure(problem), problem, poses, ones, at, inside)
+    L = np.linalg.cholesky(W)
+    share = np.linalg.eigvalsh(L.transpose(0, 2, 1) @ S @ L)
+    assert share.min() > -1e-6
+    assert share.max() < 1.0 + 1e-6
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "share"), [("MIT", 1.0), ("M3500", 1.0), ("smallGrid3D", 1.0), ("intel", 0.98)])
+def test_clean_files_keep_their_loops(name, share, data_root):
+    problem = read_pose_graph(data_root / "g2o" / f"{name}.g2o")
+    plain, robust = optimize_pose_graph(problem), optimize_pose_graph(problem, AUTO)
+    loops = np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1
+    assert robust.weights[loops].mean() >= share
+    d = problem.dimension
+    ours, theirs = np.zeros((len(problem.ids), 3)), np.zeros((len(problem.ids), 3))
+    ours[:, :d], theirs[:, :d] = robust.poses[:, :d, d], plain.poses[:, :d, d]
+    T = align_points(ours, theirs)
+    apart = np.sqrt(np.mean(np.sum((ours @ T[:3, :3].T + T[:3, 3] - theirs) ** 2, axis=1)))
+    assert apart <= 1e-3 * np.ptp(theirs, axis=0).max()
+
+
+@pytest.mark.data
+def test_lecture_hall_with_real_aliasing(data_root):
+    folder = data_root / "tuc_lecture_hall"
+    if not folder.is_dir():
+        missing(f"{folder}")
+    problem = read_pose_graph(folder / "Lecture_Hall.g2o")
+    solution = optimize_pose_graph(problem, AUTO)
+    with (folder / "Lecture_Hall_loops.csv").open() as file:
+        far = {(int(r["from"]), int(r["to"])): float(r["true_distance_m"]) > 3.0 for r in csv.DictReader(file)}
+    label = [far.get((int(a), int(b))) for a, b in problem.ids[problem.edges]]
+    true, false = np.array([x is False for x in label]), np.array([x is True for x in label])
+    assert solution.weights[true].mean() >= 0.95
+    assert solution.weights[false].mean() <= 0.15
+    truth = np.loadtxt(folder / "Lecture_Hall_truth.txt")
+    ours, real = np.zeros((len(truth), 3)), np.zeros((len(truth), 3))
+    ours[:, :2], real[:, :2] = solution.poses[:, :2, 2], truth[:, 1:3]
+    T = align_points(ours, real)
+    assert np.sqrt(np.mean(np.sum((ours @ T[:3, :3].T + T[:3, 3] - real) ** 2, axis=1))) <= 0.40
