@@ -1,28 +1,41 @@
 """How far loop closing can be trusted: precision, recall and gross edges over worlds, recordings and seeds.
 
     .venv/bin/python experiments/loop_precision_recall.py [--seeds 3] [--camera-hz 6] [--out FOLDER] [--reuse]
-        [--sources sim:aliased-halls tum:/data/tum_fr1_desk ...] [-- --loop.min-inliers 15 ...]
+        [--sources sim:aliased-halls tum:/data/tum_fr1_desk ...] [--drift 0.05 [--no-guess]]
+        [-- --loop.min-inliers 15 ...]
 
 Each run is a process of its own, as a user would start it, without map and viewer. A seed is that of the pipeline; of a
 simulated world also that of the place, the motion and the sensors. The runs of a source are pooled: one table
 (`table.md`), one row of pictures per source (`curves.png`), all numbers (`results.json`). What follows `--` goes to
 every `vislam run`. A run that fails stays in the table and says so; --reuse takes run folders that are there already.
+
+With --drift the keyframes of each run go through a new detector again, without a graph that would mend anything: their
+poses are those of odometry, pulled away along one axis by so many metres per metre of the way. --no-guess takes the
+candidates away that these poses suggest, so that appearance has to do alone. What is judged then is the detector.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vislam.config import LoopTruthConfig
 from vislam.errors import VislamError
+from vislam.loop.detector import LoopDetector
+from vislam.loop.table import LoopRow, loops_text, retrieved_text
+from vislam.messages import Array, Frame, Keyframe, LoopCandidate
 from vislam.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
 from vislam.report import write_loop_plot
 from vislam.runfolder import write_json
+from vislam.session import Session
 from vislam.trajectory import write_text
 
 WORLDS = ("workshop-cart", "corridor-loop", "aliased-halls")
@@ -44,7 +57,8 @@ def main() -> None:
             is_there = options.reuse and (run / "metrics.json").is_file()
             failure = "" if is_there else _run(source, seed, run, options, extra)
             try:
-                judged.append(judge_loops(run, rule))
+                told = run if options.drift is None else _drifted(run, options.drift, options.no_guess)
+                judged.append(judge_loops(told, rule))
                 print(f"{source} seed {seed}: {_line(judged[-1])}", flush=True)
             except VislamError as error:
                 failures.append(f"seed {seed}: {failure or error}")
@@ -64,6 +78,8 @@ def _options() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--camera-hz", type=float, default=None, help="of simulated worlds; rendering takes most time")
     parser.add_argument("--out", type=Path, default=Path("results/loop_precision_recall"))
     parser.add_argument("--reuse", action="store_true")
+    parser.add_argument("--drift", type=float, default=None, help="of the way, for a second look without a graph")
+    parser.add_argument("--no-guess", action="store_true", help="with --drift: no candidates by odometry")
     return parser.parse_args(given[:end]), given[end + 1 :]
 
 
@@ -83,9 +99,50 @@ def _run(source: str, seed: int, run: Path, options: argparse.Namespace, extra: 
     return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
 
 
+def _drifted(run: Path, share: float, no_guess: bool) -> Path:
+    """Send the keyframes of a run through a new detector with odometry that drifts; return a folder that tells it."""
+    out = run.with_name(f"{run.name}_drift")
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    for name in ("session.db", "trajectory_truth.tum"):
+        shutil.copy(run / name, out / name)
+    session = Session(run / "session.db")
+    log, config, stored = session.factor_log(), session.config(), list(session.keyframes())
+    session.close()
+    loop = replace(config.loop, max_odometry=0) if no_guess else config.loop
+    detector = LoopDetector(loop, log.rig, config.seed, log.first_state is not None)
+    rows, retrieved = [], []
+    for k, T in zip(stored, pulled_away(np.array([k.T_odom_body for k in stored]), share), strict=True):
+        keyframe = Keyframe(k.id, k.t_ns, Frame(k.t_ns, k.id, ()), k.keypoints_px, k.descriptors, k.points_body_m)
+        rows += [_row(candidate) for candidate in detector.detect(keyframe, T, tags=())[1]]
+        retrieved += detector.retrieved
+    detector.close()
+    write_text(out / "loops.csv", loops_text(rows))
+    write_text(out / "retrieved.csv", retrieved_text(retrieved))
+    return out
+
+
+def pulled_away(T_odom_body: Array, share: float) -> Array:
+    """Return poses [N, 4, 4] that are off along x by a share of the way until then."""
+    moved = T_odom_body.copy()
+    steps_m = np.linalg.norm(np.diff(T_odom_body[:, :3, 3], axis=0), axis=1)
+    moved[:, 0, 3] += share * np.concatenate([[0.0], np.cumsum(steps_m)])
+    return moved
+
+
+def _row(c: LoopCandidate) -> LoopRow:
+    nan = float("nan")
+    return LoopRow(
+        c.from_id, c.to_id, -1, -1, c.source, c.score, c.inliers, c.supporters, c.sigma_m, c.consistency, nan, nan, nan,
+        nan, c.T_from_to, c.decision.value, c.reason,
+    )  # fmt: skip
+
+
 def _line(judged: JudgedLoops) -> str:
     gross = sum(edge.is_gross for edge in judged.edges)
-    return f"{len(judged.edges)} edges, {gross} gross, {int(judged.revisits.sum())} revisits"
+    sources = [f"{near} of {count} by {source} near" for source, (count, near) in judged.proposals.items()]
+    steps = [f"{name} {count}" for name, count in judged.found.items()]
+    return f"{len(judged.edges)} edges, {gross} gross; {'; '.join(sources)}; keyframes: {', '.join(steps)}"
 
 
 def _write(out: Path, answers: dict[str, dict[str, Any]]) -> None:

@@ -12,6 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from vislam.errors import DataError
+
 Array = NDArray[np.float64]
 
 _SMALL_RAD = 1e-7  # below this angle, series of second order are exact to double precision
@@ -227,13 +229,18 @@ def sim3_parts(S: Array) -> tuple[float, Array, Array]:
 def align_points(source: Array, target: Array, with_scale: bool = False) -> Array:
     """Return the similarity [4, 4] that best maps source [N, 3] onto target [N, 3] in the least-squares sense.
 
-    Without scale it is rigid. Umeyama, PAMI 1991. Raises ValueError with fewer than 3 points.
+    Without scale it is rigid. Umeyama, PAMI 1991. Raises ValueError with fewer than 3 points, DataError for
+    points too far apart to count with.
     """
     if len(source) < 3 or len(source) != len(target):
         raise ValueError(f"alignment needs at least 3 pairs of points, got {len(source)} and {len(target)}")
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     centred_source, centred_target = source - mean_source, target - mean_target
-    U, singular, Vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
+    with np.errstate(over="ignore", invalid="ignore"):
+        moments = centred_target.T @ centred_source / len(source)
+    if not np.isfinite(moments).all():  # of which no decomposition would come to an end
+        raise DataError("the positions are too far apart to be aligned; is a number damaged?")
+    U, singular, Vt = np.linalg.svd(moments)
     sign = np.ones(3)
     sign[2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     R = U @ np.diag(sign) @ Vt

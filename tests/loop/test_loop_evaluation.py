@@ -225,6 +225,26 @@ def test_a_run_is_judged_stage_by_stage(finished: Path) -> None:
     assert max(float(line.split(",")[2]) for line in lines[1:]) == pytest.approx(answer["edges"]["error_m"]["max"])
 
 
+def test_what_was_proposed_is_compared_with_what_is_truly_near(finished: Path, tmp_path: Path) -> None:
+    for path in finished.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    before = evaluate_loops(tmp_path, RULE)
+    found, told = before["found"], before["proposals"]["appearance"]
+    assert found["near"] >= found["retrieved"] >= found["proposed"] > 0.8 * found["near"]
+    assert found["proposed"] >= found["posed"] >= found["accepted"] > 0
+    assert 0.5 * told["verified"] < told["near"] <= told["verified"]
+    far = row(from_id=0, to_id=PER_LAP + PER_LAP // 2, source="appearance", decision="rejected", reason="made up")
+    unasked = replace(far, reason="not verified: 5 verifications per keyframe are spent")
+    (tmp_path / "loops.csv").write_text(loops_text([*read_loops(tmp_path / "loops.csv"), far, unasked]))
+    after = evaluate_loops(tmp_path, RULE)
+    assert after["proposals"]["appearance"] == {"verified": told["verified"] + 1, "near": told["near"]}
+    assert after["found"] == found
+    (tmp_path / "retrieved.csv").write_text(retrieved_text([]))
+    assert evaluate_loops(tmp_path, RULE)["found"] == {**found, "retrieved": 0}
+    strict = replace(RULE, near_m=0.0)
+    assert evaluate_loops(tmp_path, strict)["found"]["near"] == 0
+
+
 def test_a_truth_with_few_poses_is_interpolated(finished: Path, tmp_path: Path) -> None:
     for path in finished.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())

@@ -13,6 +13,7 @@ from vislam.config import LoopConfig
 from vislam.geometry import invert, se3_exp, transform_points
 from vislam.loop.candidates import AppearanceCandidates, islands, odometry_candidates, view_bounds
 from vislam.loop.checks import Measured, agree, agrees_with_map, judge, tilt_error_rad
+from vislam.loop.likeness import Likeness
 from vislam.loop.pose_table import PoseTable
 from vislam.loop.verifier import Verification
 from vislam.messages import Array, GraphUpdate, LoopDecision
@@ -37,12 +38,25 @@ def test_islands_keep_every_keyframe_and_are_apart(retrieved: dict[int, float], 
     assert all(b.first_id - a.last_id > gap for a, b in itertools.pairwise(ordered))
 
 
-def test_places_that_persist_come_before_better_scores() -> None:
+def _like(rigid: int, matches: int = 30, is_alike: bool = True) -> Likeness:
+    return Likeness(np.zeros((matches, 2), np.int64), rigid, is_alike)
+
+
+def test_the_surest_of_each_place_come_first_and_the_unlike_not_at_all() -> None:
     appearance = AppearanceCandidates(max_gap=3)
-    appearance.select([10, 11], [0.3, 0.2])
-    second = appearance.select([40, 12], [0.9, 0.2])
-    assert [(c.id, c.consistency) for c in second] == [(12, 1), (40, 0)]
-    assert [c.consistency for c in appearance.select([14], [0.1])] == [2]
+    likeness = {10: _like(9), 11: _like(12), 12: _like(4, is_alike=False), 40: _like(8), 60: _like(8, matches=50)}
+    found = appearance.select([12, 40, 10, 11, 60], [0.9, 0.5, 0.3, 0.2, 0.1], likeness)
+    assert [c.id for c in found] == [11, 60, 40, 10]
+    assert found[0].score == pytest.approx(1.4)  # of the whole place, what is unlike included
+
+
+def test_places_that_persist_are_counted() -> None:
+    appearance = AppearanceCandidates(max_gap=3)
+    likeness = {i: _like(10) for i in (10, 11, 12, 14, 40)}
+    appearance.select([10, 11], [0.3, 0.2], likeness)
+    second = appearance.select([40, 12], [0.9, 0.2], likeness)
+    assert {c.id: c.consistency for c in second} == {12: 1, 40: 0}
+    assert [c.consistency for c in appearance.select([14], [0.1], likeness)] == [2]
 
 
 def _near(T_old: list[Array], T_new: Array, count: int = 5) -> list[int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -10,6 +10,8 @@ import numpy as np
 from fake_window import FakeWindow
 from graph_world import EUROC_NOISE, GRAVITY_M_S2, LAP_S, T_BODY_CAM0, _derivative, position, rotation
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from vislam.camera import Camera, Rig
 from vislam.geometry import invert, se3_exp, transform, transform_points
@@ -25,8 +27,11 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
+from vislam.sim.path import rounded_path
 
 Array = NDArray[np.float64]
+Path = Callable[[Array], Array]
+Turn = Callable[[Array], Rotation]
 
 _IMU_HZ = 200
 _CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0)
@@ -54,17 +59,22 @@ class LapWorld:
         tracks: int = 80,
         loop_every: int = 10,
         noise: ImuNoise = EUROC_NOISE,
+        motion: tuple[Path, Turn, float] = (position, rotation, LAP_S),
     ) -> None:
-        """Prepare one lap; a lap must hold a whole number of keyframes. `tracks` 0: no observations."""
+        """Prepare one lap; a lap must hold a whole number of keyframes. `tracks` 0: no observations.
+
+        `motion` is position and rotation by the time in seconds, both periodic, and their period.
+        """
         print(f"lap world seed {seed}")
         self.rng = np.random.default_rng(seed)
         self.keyframe_hz, self.tracks, self.loop_every, self.noise = keyframe_hz, tracks, loop_every, noise
         self.imu_hz = _IMU_HZ
-        self.per_lap = round(LAP_S * keyframe_hz)
+        self.position, self.rotation, self.lap_s = motion
+        self.per_lap = round(self.lap_s * keyframe_hz)
         times = np.arange(self.per_lap) / keyframe_hz
-        R, p = rotation(times).as_matrix(), position(times)
+        R, p = self.rotation(times).as_matrix(), self.position(times)
         self.truth = np.stack([transform(R[k], p[k]) for k in range(self.per_lap)])
-        self.velocity = _derivative(position, times, 1e-3)
+        self.velocity = _derivative(self.position, times, 1e-3)
         self._make_imu()
         self.vo_sigmas = np.repeat([np.deg2rad(0.15), 0.004], 3)
         u = self.rng.uniform(-1.0, 1.0, (3000, 3))
@@ -75,14 +85,14 @@ class LapWorld:
         self.views = [[_seen(T @ T_cam, self.landmarks) for T_cam in STEREO.T_body_cams] for T in self.truth]
 
     def _make_imu(self) -> None:
-        t, h = np.arange(round(LAP_S * _IMU_HZ) + 1) / _IMU_HZ, 1e-3
-        R = rotation(t)
+        t, h = np.arange(round(self.lap_s * _IMU_HZ) + 1) / _IMU_HZ, 1e-3
+        R = self.rotation(t)
 
         def turned(s: float) -> Array:
-            return (R.inv() * rotation(t + s)).as_rotvec()
+            return (R.inv() * self.rotation(t + s)).as_rotvec()
 
         self.gyro = (8 * (turned(h) - turned(-h)) - (turned(2 * h) - turned(-2 * h))) / (12 * h)
-        acceleration = _derivative(lambda s: _derivative(position, s, 1e-3), t, 1e-3)
+        acceleration = _derivative(lambda s: _derivative(self.position, s, 1e-3), t, 1e-3)
         self.accel = R.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
 
     def initial_state(self) -> NavState:
@@ -110,7 +120,7 @@ class LapWorld:
     def _span(self, k: int, bias: Array) -> tuple[ImuSpan, Array]:
         per = round(_IMU_HZ / self.keyframe_hz)
         n = np.arange((k - 1) * per, k * per + 1)
-        at, noise, rng = n % (round(LAP_S * _IMU_HZ)), self.noise, self.rng
+        at, noise, rng = n % (round(self.lap_s * _IMU_HZ)), self.noise, self.rng
         walk = np.repeat([noise.gyro_bias_walk, noise.accel_bias_walk], 3) / np.sqrt(_IMU_HZ)
         white = np.repeat([noise.gyro_noise_density, noise.accel_noise_density], 3) * np.sqrt(_IMU_HZ)
         biases = bias + np.cumsum(rng.normal(size=(len(n), 6)) * walk, axis=0)
@@ -151,6 +161,27 @@ class LapWorld:
         ids = np.array([live[i] for i in chosen.tolist()], dtype=np.int64)
         noise = self.rng.normal(size=(2, len(chosen), 2)) * 1.0
         return Observations(ids, left[chosen] + noise[0], right[chosen] + noise[1] * np.array([0.5, 1.0]))
+
+
+def cart_round(lap_s: float = 40.0) -> tuple[Path, Turn, float]:
+    """Return one round through the hall of `workshop-cart` as a motion of `LapWorld`: it heads where it drives."""
+    path = rounded_path(
+        [(-4.55, -2.65), (4.55, -2.65), (4.55, 2.65), (-4.55, 2.65), (-4.55, -2.65), (0.0, -2.65)], 1.05
+    )
+    begin_m, end_m = 4.55, path.length_m  # both in the middle of the first side, one round apart
+    t = np.linspace(0.0, lap_s, 81)
+    xy, heading = path.at(begin_m + (end_m - begin_m) * t / lap_s)
+    xy[-1] = xy[0]
+    way = CubicSpline(t, np.column_stack([xy, np.full(len(t), 0.3)]), bc_type="periodic")
+    turn = np.unwrap(heading) - 2.0 * np.pi * t / lap_s
+    turn[-1] = turn[0]
+    rest = CubicSpline(t, turn, bc_type="periodic")
+
+    def rotation(s: Array) -> Rotation:
+        yaw = rest(np.mod(s, lap_s)) + 2.0 * np.pi * s / lap_s
+        return Rotation.from_euler("z", yaw[:, None])
+
+    return lambda s: way(np.mod(s, lap_s)), rotation, lap_s
 
 
 def window_of_truth(world: LapWorld, count: int) -> FakeWindow:

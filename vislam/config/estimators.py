@@ -98,6 +98,8 @@ class WindowConfig:
     rest_sigma_m: float = 0.001  # motion between two keyframes at rest
     rest_sigma_deg: float = 0.05
 
+    min_excitation_m_s2: float = 0.15  # one camera: rms change of acceleration below which it does not see scale
+
     gauge_sigma_m: float = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
     gauge_sigma_rad: float = 1e-3
     restart_sigma_m: float = 0.1  # of the state a window restarts from after a failed solution
@@ -160,6 +162,7 @@ class GraphConfig:
     window_refresh_sigma: float = 0.3  # a provisional edge that moved by more of its sigma is replaced at once ...
     window_refresh_max: int = 3  # ... up to so many per keyframe, those that moved most
     tilt_every: int = 10  # keyframes between tilt factors; errors of nearer ones are the same accelerometer bias
+    edges_share_scale: bool = False  # of a window: set by the run, for one camera whose scale is the IMU's
     tilt_floor_deg: float = 0.1  # an accelerometer's scale and misalignment, which the window does not estimate
     huber_k: float = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
     imu_integration_sigma: float = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
@@ -192,10 +195,14 @@ class GraphConfig:
     review_loops: int = 20  # loops after which all are weighed anew, if any was kept out; ...
     review_doubts: int = 3  # ... or so many that were kept out
     review_steps: int = 4  # of a review's work per keyframe: joint marginals of a small graph, 1 to 3 ms each
-    loop_gain_min: float = 1.0  # variance of the graph over that of a loop; on long runs less adds no factor
-    anchor_after: int = 20  # loops in the graph; after them a loop to a keyframe that is tied to an older one, or ...
+    loop_gain_min: float = 0.5  # nats that a keyframe's loops must tell the graph to get factors, where loops are many
+    anchor_after: int = (
+        20  # loops in the graph are many; then a loop to a keyframe that is tied to an older one, or ...
+    )
     anchor_reach: int = 10  # ... is so many keyframes from one that is, ties to that older one, the place's anchor ...
     anchor_variance_max: float = 4.0  # ... if the way there adds at most so many times the loop's own variance
+    freeze_keyframes: int = 20  # where loops are many, what so many keyframes know of others is summed up in one of ...
+    freeze_after: int = 200  # ... them once they are so many keyframes old, and the rest keep their place beside it
     vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
 
     # the link to a keyframe with which a new piece of trajectory begins: nothing is known, but equations stay solvable.

@@ -46,11 +46,13 @@ class LoopConfig:
     min_overlap: float = 0.35  # share of what is seen that a candidate should see too, by the map
     min_apart_keyframes: int = 3  # between odometry candidates, so that they constrain different places
     nominal_depth_m: float = 3.0  # of features without depth, to guess what two keyframes share
-    max_appearance: int = 2  # candidates per keyframe that look alike
+    max_appearance: int = 2  # candidates per keyframe that look alike; more where the map suggests too few
+    min_rigid: int = 5  # matches that keep their distances, for views with depth to be alike; chance gives 3, rarely 4
+    chance_matched_share: float = 0.015  # of the features that chance matches; views without depth need clearly more
     tags: Literal["off", "16h5", "25h9", "36h10", "36h11"] = "36h11"  # AprilTag family; 3 ms per keyframe
     tag_size_m: float | None = None  # side of the black square; known, a tag alone gives a relative pose
     max_tags: int = 2  # candidates per keyframe that saw the same tag
-    retrieved: int = 10  # keyframes asked of the index before they are grouped into islands
+    retrieved: int = 10  # keyframes asked of the index and matched, 0.4 ms each
     island_gap: int = 3  # ids in one island differ by at most this
     appearance_skip_keyframes: int = 20  # the newest ones always look most alike
     appearance_skip_s: float = 5.0  # and so do those of the last seconds
@@ -74,6 +76,8 @@ class LoopTruthConfig:
 
     min_overlap: float = 0.3  # of two views by their true poses; ORB closes few loops below
     doubtful_overlap: float = 0.05  # between this and min_overlap a retrieved image is neither right nor wrong
+    near_m: float = 1.0  # a keyframe that was proposed is truly near below this, ...
+    near_deg: float = 40.0  # ... turned by less than this, and where the views overlap by min_overlap
     min_apart_s: float = 10.0  # a pair is a loop when it is this far apart in time ...
     min_apart_keyframes: int = 30  # ... or by so many keyframes; nearer pairs are tied by odometry anyway
     gross_m: float = 0.5  # an edge whose translation is off by more would ruin a map

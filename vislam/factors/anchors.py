@@ -31,10 +31,6 @@ class Anchors:
         around = [c for c in self._ids[max(n - 1, 0) : n + 1] if abs(c - k) <= self._reach]
         return self._tied[min(around, key=lambda c: abs(c - k))] if around else None
 
-    def of(self, k: int) -> int:
-        """Return the anchor of a keyframe; itself when nothing ties it yet."""
-        return self._tied[k].anchor_id if k in self._tied else k
-
     def tie(self, tied: Tied) -> None:
         """Take note of a keyframe; what is known of one stays."""
         if tied.id not in self._tied:

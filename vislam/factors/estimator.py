@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from vislam.config import GraphConfig
 from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
 from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
+from vislam.factors.known import Known
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
+from vislam.factors.segments import Segment, shape_factors, summarised
 from vislam.factors.solver import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
 from vislam.messages import Array
 
@@ -61,6 +63,7 @@ class Estimator(Generic[L]):
         self._next_old = 0  # where the next block of older poses begins
         self._read: list[NDArray[np.int64]] = []  # ids since `take_read`
         self._held: dict[int, Array] = {}  # poses that stay, by keyframe id
+        self.frozen: set[int] = set()  # first keyframes of summed up segments; none after a new start
         self.loops: dict[int, L] = {}  # in the graph, by loop id
         self.spare: dict[int, L] = {}  # accepted without a factor, which only `converge` takes
         self.vo_scale = 1.0  # on the sigma of visual odometry, learnt from loops that it contradicted
@@ -101,11 +104,18 @@ class Estimator(Generic[L]):
         return ids
 
     def joint_covariance(self, keys: list[int]) -> Array | None:
-        """Return the joint marginal covariance of variables; None when gtsam cannot give it."""
+        """Return the joint marginal covariance of variables; None when gtsam cannot give it.
+
+        That of poses alone has in it what their odometry is wrong by in common.
+        """
         try:
             joint = self._solver.joint_covariance(keys)
         except FAILURES:
             return None
+        ids = [key - X(0) for key in keys]
+        if all(0 <= k < self._count for k in ids):
+            shared = self._odometry.shared_error(ids, self.poses)
+            joint = joint if shared is None else joint + shared @ shared.T
         return joint if np.all(np.isfinite(joint)) else None
 
     def begin(self) -> str:
@@ -208,8 +218,44 @@ class Estimator(Generic[L]):
             return self._recover(self._values, [], error)
         return ""
 
+    def can_freeze(self, segment: Segment) -> bool:
+        """Return whether named factors alone tie these keyframes, which are of one piece and free to move."""
+        inside = range(segment.first, segment.end)
+        if any(k in self._held for k in inside) or not np.all(np.isfinite(self._reach_m[segment.first : segment.end])):
+            return False
+        labels: list[Label] = [("edge", k) for k in inside[1:]]
+        return all(label in self._slots for label in (*labels, *(("loop", n) for n in segment.loops)))
+
+    def freeze(self, segment: Segment) -> str:
+        """Let keyframes stand in the shape that they have now around one of them; return what went wrong.
+
+        Their loops and the odometry between them, back to the keyframe before, leave the solver. What these say of the
+        anchors goes to the central keyframe. Records stay as they are: a new start of the solver has all of it again.
+        """
+        self.frozen.add(segment.first)
+        inside = range(segment.first, segment.end)
+        self.look_at([*inside, *segment.anchors])
+        joint = self.joint_covariance([X(k) for k in inside])
+        labels: list[Label] = [("edge", k) for k in inside[1:]]
+        labels += [("loop", n) for n in segment.loops]
+        try:
+            ties = summarised(self._solver.factors([self._slots[label] for label in labels]), segment, self._values)
+        except FAILURES:
+            return ""
+        if joint is None:
+            return ""
+        shape = shape_factors(Known({k: self.poses[k] for k in inside}, joint), segment)
+        slots = [self._slots.pop(label) for label in (("edge", segment.first), *labels) if label in self._slots]
+        try:
+            self._solver.update(_graph([*ties, *shape]), gtsam.Values(), slots, X(self._count - 1))
+        except FAILURES as error:
+            return self._recover(self._values, [], error)
+        return ""
+
     def drop(self, edges: list[L]) -> str:
         """Take loops out again; return what went wrong."""
+        if any(("loop", edge.id) not in self._slots for edge in edges):
+            return self.revise(edges, [])
         slots = [self._slots.pop(("loop", edge.id)) for edge in edges]
         for edge in edges:
             del self.loops[edge.id]
@@ -340,6 +386,7 @@ class Estimator(Generic[L]):
         graph, labels = self._whole(values, self.loops)
         slots = solver.update(graph, values, [])
         self._solver, self._slots = solver, _named(labels, slots)
+        self.frozen = set()
         try:
             self._take()
         except FAILURES:  # nothing converges: keep what was there, with the guess of the newest keyframe
@@ -372,6 +419,7 @@ class Estimator(Generic[L]):
         solver.iterate(self._config.loop_iterations)
         self._adopt(solver.estimate(), np.arange(self._count))
         self._solver, self.loops, self._slots = solver, loops, _named(labels, slots)
+        self.frozen = set()
 
     def _whole(
         self,

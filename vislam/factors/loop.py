@@ -12,6 +12,7 @@ from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.noise import cauchy, conditioned, gaussian, inflated
 from vislam.factors.visual import (
     DirectionMeasurement,
+    direction_as_pose,
     direction_factor,
     direction_measurement,
     direction_residual,
@@ -21,6 +22,7 @@ from vislam.geometry import invert, se3_adjoint, se3_log
 from vislam.memory import Tie
 from vislam.messages import Array
 
+_SCALE_SIGMA = 5.0  # relative, on the length of the way of a loop that did not measure it
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
 
 
@@ -48,29 +50,34 @@ class LoopModel:
         """Return the id of the loop."""
         return self.record.id
 
-    def gain(self, relative_covariance: Array) -> float:
-        """Return how large the graph's variance of the relative pose [6, 6] is in units of the loop's own.
-
-        The larger of rotation and translation. For scale-free loops infinity: they measure something else.
-        """
-        if self._direction is not None:
-            return float("inf")
-        parts = (slice(3), slice(3, 6))
-        return float(max(np.trace(relative_covariance[n, n]) / np.trace(self.covariance[n, n]) for n in parts))
-
-    def tie_to(self, anchor_id: int, T_anchor_from: Array, covariance: Array) -> bool:
+    def tie_to(self, anchor_id: int, T_anchor_from: Array, covariance: Array, T_from_to: Array) -> bool:
         """Let another keyframe stand for the older one: T_anchor_from [4, 4] is where that is, known to `covariance`.
 
-        Returns False, and changes nothing, where that would add too much to the loop's own variance in rotation or
-        translation, and for scale-free loops, whose meaning is bound to their ends.
+        T_from_to [4, 4] is how the graph has the loop now: without scale, the loop takes the length of the way from it,
+        and keeps a variance along the way that says that it did not measure it. Returns False, and changes nothing,
+        where that would add too much to the loop's own variance in rotation or translation.
         """
-        T = self.record.T_from_to
+        T, own = self._as_pose(T_from_to)
         carry = se3_adjoint(invert(T))
         added = carry @ covariance @ carry.T
-        if self.gain(added) > self._config.anchor_variance_max:
+        most = self._config.anchor_variance_max
+        if any(np.trace(added[n, n]) > most * np.trace(own[n, n]) for n in (slice(3), slice(3, 6))):
             return False
-        self.tie = Tie(anchor_id, nearest_rigid(T_anchor_from @ T), self.covariance + added)
+        self.tie = Tie(anchor_id, nearest_rigid(T_anchor_from @ T), own + added)
         return True
+
+    def _as_pose(self, T_from_to: Array) -> tuple[Array, Array]:
+        """Return the loop as a metric relative pose [4, 4] with covariance [6, 6], near the graph's own T_from_to."""
+        config, record = self._config, self.record
+        if self._direction is None:
+            return record.T_from_to, self.covariance
+        moved = T_from_to[:3, 3] + (T_from_to[:3, :3] - np.eye(3)) @ self._lever_m
+        floor = np.deg2rad(config.direction_floor_deg)
+        covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), 0.0)
+        return direction_as_pose(
+            record.T_from_to, covariance, self._lever_m, max(float(np.linalg.norm(moved)), config.direction_soft_m),
+            floor_rad=floor, scale_sigma=_SCALE_SIGMA,
+        )  # fmt: skip
 
     def factor(self, robust: bool, as_measured: bool = False) -> gtsam.NonlinearFactor:
         """Return the factor, under a Cauchy kernel when `robust`, between the loop's own ends when `as_measured`."""
@@ -82,7 +89,7 @@ class LoopModel:
         if robust:
             model = cauchy(model, config.loop_cauchy_k)
         a, b = X(tie.from_id), X(record.to_id)
-        if self._direction is None:
+        if self._direction is None or tie is self.tie:
             return pose_factor(a, b, tie.T_from_to, model)
         return direction_factor(
             a, b, self._direction, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model

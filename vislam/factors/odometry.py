@@ -37,6 +37,12 @@ class Odometry(Protocol):
     def reach_m(self, k: int) -> float:
         """Return how far keyframe k can be from the one before; an estimate beyond has diverged."""
 
+    def shared_error(self, ids: list[int], poses: Array) -> Array | None:
+        """Return what errors that all odometry shares do to poses of keyframes, [6 N, C] at one sigma; None: nothing.
+
+        Rotation and position on the body side; `poses` [M, 4, 4] are those of all keyframes.
+        """
+
 
 class MotionOdometry:
     """Loose coupling: motions of visual odometry and preintegrated IMU, one keyframe to the next."""
@@ -85,6 +91,10 @@ class MotionOdometry:
         if self._records[k].begins_piece:
             return float("inf")
         return SPEED_MAX_M_S * (self._records[k].t_ns - self._records[k - 1].t_ns) * 1e-9
+
+    def shared_error(self, ids: list[int], poses: Array) -> Array | None:
+        """See Odometry; here the IMU is in the graph itself."""
+        return None
 
     def relink(self, k: int, T_previous_body: Array) -> None:
         """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""

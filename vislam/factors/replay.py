@@ -118,6 +118,9 @@ class _Chain:
     def reach_m(self, k: int) -> float:
         return float("inf")
 
+    def shared_error(self, ids: list[int], poses: Array) -> Array | None:
+        return None
+
 
 def _guess(T: Array) -> Guess:
     return Guess(T, np.zeros(3), bias_of(np.zeros(3), np.zeros(3)))

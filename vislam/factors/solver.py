@@ -26,8 +26,16 @@ class Solver(Protocol):
     name: str
     reads_all: bool  # whether `estimate` always gives all variables
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
-        """Add factors and new values, remove factors by slot, improve the estimate; return the slots of what is new."""
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
+    ) -> list[int]:
+        """Add factors and new values, remove factors by slot, improve the estimate; return the slots of what is new.
+
+        `last` is the variable to which the next factors will come, by default those of these factors.
+        """
+
+    def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+        """Return the factors in some slots."""
 
     def iterate(self, count: int) -> None:
         """Improve the estimate by up to `count` steps."""
@@ -58,10 +66,20 @@ class IncrementalSolver:
         params.setRelinearizeThreshold(thresholds)
         self._isam = gtsam.ISAM2(params)
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
+    ) -> list[int]:
         """See Solver."""
-        result = self._isam.update(graph, values, remove)
+        groups = None
+        if last is not None:
+            groups = gtsam.KeyGroupMap()
+            groups.insert2(last, 1)
+        result = self._isam.update(graph, values, remove, groups)
         return [int(slot) for slot in result.getNewFactorsIndices()]
+
+    def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+        """See Solver."""
+        return _some(self._isam.getFactorsUnsafe(), slots)
 
     def iterate(self, count: int) -> None:
         """See Solver."""
@@ -87,7 +105,9 @@ class BatchSolver:
         self._graph = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int]) -> list[int]:
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
+    ) -> list[int]:
         """See Solver."""
         self._values.insert(values)
         first = self._graph.size()
@@ -96,6 +116,10 @@ class BatchSolver:
         self._graph.push_back(graph)
         self.iterate(_BATCH_ITERATIONS)
         return list(range(first, self._graph.size()))
+
+    def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+        """See Solver."""
+        return _some(self._graph, slots)
 
     def iterate(self, count: int) -> None:
         """See Solver; keeps the values it has when even LM fails."""
@@ -121,3 +145,10 @@ def optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations
     params.setRelativeErrorTol(1e-7)
     params.setlambdaUpperBound(1e9)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _some(graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+    some = gtsam.NonlinearFactorGraph()
+    for slot in slots:
+        some.add(graph.at(slot))
+    return some

@@ -14,6 +14,7 @@ from vislam.factors.keys import X, bias_of, nearest_rigid
 from vislam.factors.motion import no_motion, on_floor
 from vislam.factors.noise import gaussian, huber, inflated
 from vislam.factors.priors import pose_covariance
+from vislam.factors.shared import SharedErrors
 from vislam.factors.visual import pose_factor
 from vislam.geometry import se3_log
 from vislam.memory import EdgeRecord, TiltRecord, WindowRecord
@@ -35,6 +36,7 @@ class WindowOdometry:
         self._edges: list[EdgeRecord | None] = []  # by the newer keyframe
         self._tilts: dict[int, TiltRecord] = {}
         self._rest_from: list[int | None] = []
+        self._shared = SharedErrors() if config.edges_share_scale else None
 
     @property
     def has_imu(self) -> bool:
@@ -54,6 +56,11 @@ class WindowOdometry:
         for edge in record.edges:
             self._edges[edge.to_id] = edge
         self._tilts |= {tilt.id: tilt for tilt in record.tilts}
+        if self._shared is not None:
+            for edge in record.edges:
+                self._shared.take(edge)
+            for tilt in record.tilts:
+                self._shared.level(tilt)
 
     def edge(self, k: int) -> EdgeRecord | None:
         """Return the edge that ends at keyframe k; None for the first."""
@@ -122,6 +129,10 @@ class WindowOdometry:
         if edge is not None and edge.begins_piece:
             return float("inf")
         return SPEED_MAX_M_S * (self._t_ns[k] - self._t_ns[k - 1]) * 1e-9
+
+    def shared_error(self, ids: list[int], poses: Array) -> Array | None:
+        """See Odometry."""
+        return None if self._shared is None else self._shared.effect(ids, poses)
 
     def relink(self, k: int, T_previous_body: Array) -> None:
         """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""

@@ -15,12 +15,15 @@ from vislam.factors.estimator import Estimator
 from vislam.factors.gate import CarPark, EdgeReport
 from vislam.factors.journal import loop_record
 from vislam.factors.keys import X
+from vislam.factors.known import Known, worth_a_factor
 from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.segments import segments
 from vislam.factors.travel import Travel
-from vislam.geometry import invert, se3_adjoint
+from vislam.geometry import invert
 from vislam.memory import LoopPlace, LoopState, OfferedLoop, Tied
 from vislam.messages import Array, LoopDecision, LoopEdge
 
+_DOUBTS = 100  # loops that are looked at again when a review is due
 _FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
 
 
@@ -41,6 +44,7 @@ class LoopSet:
         self._consensus = Consensus(config)
         self._beyond_help: set[int] = set()  # loops that a review brought in and the graph contradicted
         self._anchors = Anchors(config)
+        self._next_doubt = 0  # where the next block of loops begins that are looked at again
         self._reports: dict[int, EdgeReport] = {}
         self._changed: dict[int, None] = {}  # ids of reports since `take_states`
 
@@ -124,6 +128,17 @@ class LoopSet:
             self.report(model, LoopDecision.REJECTED, "left the full car park")
         return [model.record.id for model in gone]
 
+    def freeze(self) -> str:
+        """Sum up the oldest segment of keyframes that many loops tie, now and then; return what went wrong."""
+        size, newest = self._config.freeze_keyframes, len(self._estimator.poses) - 1
+        if not self._are_many or newest % (size // 4 or 1):
+            return ""
+        last = newest - self._config.freeze_after
+        for segment in segments(self._estimator.loops.values(), size, last):
+            if segment.first not in self._estimator.frozen and self._estimator.can_freeze(segment):
+                return self._estimator.freeze(segment)
+        return ""
+
     def review(self, notes: list[str]) -> list[int]:
         """Let the review of all loops work for a while; return the ids about which it decided."""
         if self._consensus.is_due:
@@ -133,7 +148,7 @@ class LoopSet:
 
     def finish(self, notes: list[str]) -> list[int]:
         """Review all loops to the end; return the ids about which it decided."""
-        self._look_for_doubts()
+        self._look_for_doubts(everywhere=True)
         verdict = self._consensus.finish(self._travel, self._scale_left, self._held_ids)
         return [] if verdict is None else self._apply(verdict, notes)
 
@@ -150,20 +165,33 @@ class LoopSet:
         accepted = [n for n in decided if self._reports[n].decision is LoopDecision.ACCEPTED]
         return accepted, [n for n in decided if n not in accepted]
 
-    def test(self, model: LoopModel) -> bool:
-        """Test an edge against the current estimate, and give it to the next review."""
-        inside = self._gate(model)
-        self._consensus.offer(model, not inside, self._travel)
-        return inside
+    def test(self, models: Sequence[LoopModel]) -> tuple[list[LoopModel], list[LoopModel]]:
+        """Test loops against the current estimate, and give them to the next review.
+
+        Returns those that are to enter the graph and those to be parked. Where loops are many, one that fits and tells
+        the graph next to nothing is kept in spare.
+        """
+        if not models:
+            return [], []
+        known = self._known(models)
+        inside, outside = list[LoopModel](), list[LoopModel]()
+        for model in models:
+            fits = self._gate(model, known)
+            self._consensus.offer(model, not fits, self._travel)
+            (inside if fits else outside).append(model)
+        if known is None:
+            return inside, outside
+        worth = self._thinned(inside, known) if self._are_many else inside
+        self._remember(worth, known)
+        return worth, outside
 
     def accept(self, fresh: list[LoopModel], notes: list[str], reason: str) -> list[LoopModel]:
         """Put loops into the graph, take out again and return those that the optimised graph contradicts."""
-        fresh = [m for m in fresh if m.record.id not in self._estimator.spare]
         if not fresh:
             return []
         far = any(self._is_far(m) for m in fresh)
         fits = not far and all(m.weight(*self._ends(m)) >= _FITS for m in fresh)
-        notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._estimator.is_long))
+        notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._are_many))
         contradicted = self._judge(fresh, reason)
         if contradicted:
             notes.append(self._estimator.drop(contradicted))
@@ -197,28 +225,31 @@ class LoopSet:
             place = LoopPlace.SPARE
         return LoopState(loop_id, report.decision, report.reason, report.chi2, place, tie)
 
-    def _gate(self, model: LoopModel) -> bool:
-        """Test an edge against the current estimate and note the chi-square.
+    @property
+    def _are_many(self) -> bool:
+        """Return whether there are so many loops that the work of an update has to be kept from growing with them."""
+        return self._estimator.is_long or len(self._estimator.loops) >= self._config.anchor_after
 
-        On long runs one that passes, and of whose relative pose the graph is as sure as the loop, is kept in spare.
-        """
+    def _known(self, models: Sequence[LoopModel]) -> Known | None:
+        """Return what the graph knows of all ends of loops, and of the anchors near to them: one joint marginal."""
+        ends = {k for m in models for k in (m.record.from_id, m.record.to_id)}
+        near = [self._anchors.near(m.record.from_id) for m in models]
+        ids = sorted(ends | {tied.anchor_id for tied in near if tied is not None})
+        joint = self._estimator.joint_covariance([X(k) for k in ids])
+        if joint is None:
+            return None
+        self._estimator.look_at(ids)
+        return Known({k: self._estimator.poses[k].copy() for k in ids}, joint)
+
+    def _gate(self, model: LoopModel, known: Known | None) -> bool:
+        """Test a loop against the current estimate and note the chi-square."""
         record = model.record
-        to_anchor = self._tie(model)
-        if model.tie is None or to_anchor is None:
-            known = self.relative_covariance(record.from_id, record.to_id)
-        else:  # an upper bound, as if the two ways shared nothing
-            T_map_older, T_map_newer = self._ends(model)
-            carry = se3_adjoint(invert(T_map_newer) @ T_map_older)
-            known = self.relative_covariance(model.tie.from_id, record.to_id) + carry @ to_anchor @ carry.T
-        chi2 = model.chi2(*self._ends(model), known)
+        relative = self._travel.relative_covariance if known is None else known.relative
+        chi2 = model.chi2(*self._ends(model), relative(record.from_id, record.to_id))
         inside = bool(chi2 <= model.threshold)
         decision = LoopDecision.ACCEPTED if inside else LoopDecision.PARKED
         reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
         self._set_report(EdgeReport(record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason))
-        gain = model.gain(known)
-        if inside and self._estimator.is_long and gain < self._config.loop_gain_min:
-            self._estimator.spare[record.id] = model
-            self.report(model, decision, f"redundant, the graph has {gain:.2f} times its variance")
         return inside
 
     def _set_report(self, report: EdgeReport) -> None:
@@ -239,45 +270,57 @@ class LoopSet:
             else:
                 way = "" if model.tie is None else f", by way of keyframe {model.tie.from_id}"
                 self.report(model, LoopDecision.ACCEPTED, reason + way)
-                self._remember(model)
         return contradicted
 
     def _is_torn(self, model: LoopModel) -> bool:
         """Return whether the graph contradicts a loop that is in it."""
         return model.weight(*self._ends(model)) < self._config.loop_min_weight
 
-    def _remember(self, model: LoopModel) -> None:
-        """Take note of which anchor an accepted loop ties its newer end to."""
-        older, newer = model.record.from_id, model.record.to_id
-        if not model.record.has_scale:
-            return
-        anchor = self._anchors.of(older) if model.tie is None else model.tie.from_id
-        if anchor == older:
-            self._anchors.tie(Tied(older, older, np.zeros((6, 6))))
-        self._anchors.tie(Tied(newer, anchor, self.relative_covariance(anchor, newer)))
+    def _remember(self, models: Sequence[LoopModel], known: Known) -> None:
+        """Take note of which anchor loops tie their newer ends to, and what is known of it before they do."""
+        for model in models:
+            older, newer = model.record.from_id, model.record.to_id
+            anchor = older if model.tie is None else model.tie.from_id
+            if anchor == older:
+                self._anchors.tie(Tied(older, older, np.zeros((6, 6))))
+            self._anchors.tie(Tied(newer, anchor, known.relative(anchor, newer)))
 
-    def _tie(self, model: LoopModel) -> Array | None:
-        """Where loops are many, let an anchor stand for the older end; return the covariance [6, 6] of T_anchor_older.
+    def _thinned(self, models: Sequence[LoopModel], known: Known) -> list[LoopModel]:
+        """Return the loops that are to enter the graph where they are many; what the graph knows already is spare.
 
-        Otherwise each visit of a place would tie to all others, and the work of an update would grow with their number.
-        What was known when the older end was tied does mostly; an exact marginal takes long where loops are many.
+        Work grows with the number of pairs that loops tie, so all loops of a keyframe tie to one anchor as far as they
+        can, and are judged together: what each of many adds is little, and their sum is not.
         """
-        model.tie = None
-        older = model.record.from_id
-        near = self._anchors.near(older) if len(self._estimator.loops) >= self._config.anchor_after else None
-        if near is None or near.anchor_id in (older, model.record.to_id):
-            return None
-        anchor = near.anchor_id
-        self._estimator.look_at([anchor, near.id])
-        T_map_anchor, T_map_near, T_map_older = (self._estimator.poses[k] for k in (anchor, near.id, older))
-        carry = se3_adjoint(invert(T_map_older) @ T_map_near)
-        covariance = carry @ near.covariance @ carry.T
-        if near.id != older:
-            covariance += self._travel.relative_covariance(near.id, older)
-        if not model.tie_to(anchor, invert(T_map_anchor) @ T_map_older, covariance):
-            covariance = self.relative_covariance(anchor, older)
-            model.tie_to(anchor, invert(T_map_anchor) @ T_map_older, covariance)
-        return None if model.tie is None else covariance
+        anchors = [self._anchor(model) for model in models]
+        often = sorted(anchors, key=lambda k: (-anchors.count(k), k))
+        groups: dict[int, list[LoopModel]] = {}
+        for model, own in zip(models, anchors, strict=True):
+            model.tie = None
+            held = next((k for k in (often[0], own) if self._tie(model, k, known)), model.record.from_id)
+            groups.setdefault(held, []).append(model)
+        worth = worth_a_factor([groups[k] for k in sorted(groups)], known, self._config.loop_gain_min)
+        chosen = {model.id for group in worth for model in group}
+        for model in (m for m in models if m.id not in chosen):
+            model.tie = None
+            gain = known.gain([model])
+            self._estimator.spare[model.id] = model
+            self.report(model, LoopDecision.ACCEPTED, f"redundant, it would tell the graph {gain:.2f} nats")
+        return [model for group in worth for model in group]
+
+    def _anchor(self, model: LoopModel) -> int:
+        """Return the anchor near to a loop's older end; this end where there is none."""
+        older, newer = model.record.from_id, model.record.to_id
+        near = self._anchors.near(older)
+        return older if near is None or near.anchor_id == newer else near.anchor_id
+
+    def _tie(self, model: LoopModel, anchor: int, known: Known) -> bool:
+        """Let an anchor stand for the older end of a loop; return whether it does, or is that end itself."""
+        older, newer = model.record.from_id, model.record.to_id
+        if anchor in (older, newer) or len(self._estimator.loops) < self._config.anchor_after:
+            return anchor == older
+        T_map_anchor, T_map_older, T_map_newer = (self._estimator.poses[k] for k in (anchor, older, newer))
+        T_anchor_older, T_older_newer = invert(T_map_anchor) @ T_map_older, invert(T_map_older) @ T_map_newer
+        return model.tie_to(anchor, T_anchor_older, known.relative(anchor, older), T_older_newer)
 
     def _is_far(self, model: LoopModel) -> bool:
         """Return whether a loop asks for a correction beyond what incremental steps should try."""
@@ -306,9 +349,17 @@ class LoopSet:
             notes.append(estimator.drop(torn))
         return [m.id for m in (*out, *back)]
 
-    def _look_for_doubts(self) -> None:
-        """Tell the next review if loops that were let in do not fit any more: the kernel keeps them without a say."""
-        if any(m.chi2(*self._ends(m)) > m.threshold for m in self._estimator.loops.values()):
+    def _look_for_doubts(self, everywhere: bool = False) -> None:
+        """Tell the next review if loops that were let in do not fit any more: the kernel keeps them without a say.
+
+        Those with and without a factor; a block of them in turn, so that the work does not grow with their number.
+        """
+        held = self.held
+        block = held
+        if len(held) > _DOUBTS and not everywhere:
+            block = [held[n % len(held)] for n in range(self._next_doubt, self._next_doubt + _DOUBTS)]
+            self._next_doubt = (self._next_doubt + _DOUBTS) % len(held)
+        if any(m.chi2(*self._ends(m)) > m.threshold for m in block):
             self._consensus.doubt()
 
     def _rebuild(self, out: list[LoopModel], back: list[LoopModel], notes: list[str]) -> None:

@@ -250,8 +250,7 @@ class PoseGraph:
 
     def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
         """Gate loops, accept or park them, and let the review work; return accepted and refused ids."""
-        passed: list[LoopModel] = []
-        parked: list[LoopModel] = []
+        here: list[LoopModel] = []
         touched: list[int] = []
         self._estimator.look_at([k for e in edges for k in (e.from_id, e.to_id) if 0 <= k < len(self._keyframes)])
         for edge in edges:
@@ -263,12 +262,12 @@ class PoseGraph:
             if not self._pieces.are_joined(edge.from_id, edge.to_id):
                 touched += self._wait(model)
             else:
-                (passed if self._loops.test(model) else parked).append(model)
-        for model in self._join(touched, notes):
-            (passed if self._loops.test(model) else parked).append(model)
-        if passed:
-            parked += self._loops.accept(passed, notes, "inside the gate")
+                here.append(model)
+        here += self._join(touched, notes)
+        passed, parked = self._loops.test(here)
+        parked += self._loops.accept(passed, notes, "inside the gate")
         touched += self._loops.park(parked) + self._loops.review(notes)
+        notes.append(self._loops.freeze())
         return self._loops.split(touched)
 
     def _wait(self, model: LoopModel) -> list[int]:

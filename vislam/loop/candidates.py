@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from vislam.camera import Camera
+from vislam.loop.likeness import Likeness
 from vislam.messages import Array
 
 _MAX_VIEW_ANGLE_RAD = np.deg2rad(45.0)  # between the rays to one point; ORB matches little beyond
@@ -58,12 +59,20 @@ class AppearanceCandidates:
         self._max_gap = max_gap
         self._last: list[Island] = []
 
-    def select(self, ids: Sequence[int], scores: Sequence[float]) -> list[Candidate]:
-        """Return one candidate per island: those that keyframe after keyframe points at first, then by score."""
-        now = [self._with_history(island) for island in islands(ids, scores, self._max_gap)]
-        self._last = now
-        chosen = sorted(now, key=lambda island: (-min(island.consistency, 1), -island.score, island.best_id))
-        return [Candidate(island.best_id, "appearance", island.score, island.consistency) for island in chosen]
+    def select(self, ids: Sequence[int], scores: Sequence[float], likeness: Mapping[int, Likeness]) -> list[Candidate]:
+        """Return the retrieved keyframes that are alike: the surest of each island, then the second of each, ..."""
+        self._last = [self._with_history(island) for island in islands(ids, scores, self._max_gap)]
+        turns: dict[int, int] = {}  # how many of an island, by its first keyframe, came already
+        order: list[tuple[int, int]] = []
+        for i in sorted((i for i in ids if likeness[i].is_alike), key=lambda i: likeness[i].rank, reverse=True):
+            place = self.island_of(i).first_id
+            order.append((turns.get(place, 0), i))
+            turns[place] = turns.get(place, 0) + 1
+        return [self._candidate(i) for _, i in sorted(order, key=lambda entry: entry[0])]
+
+    def _candidate(self, keyframe_id: int) -> Candidate:
+        place = self.island_of(keyframe_id)
+        return Candidate(keyframe_id, "appearance", place.score, place.consistency)
 
     def island_of(self, keyframe_id: int) -> Island:
         """Return the island of the last selection that holds a retrieved keyframe."""

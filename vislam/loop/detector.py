@@ -14,6 +14,7 @@ from vislam.geometry import invert_many, transform_points
 from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
 from vislam.loop.checks import Judgement, Measured, agree, agrees_with_map, judge, objection, tilt_error_rad
 from vislam.loop.database import PlaceDatabase, side_by_side
+from vislam.loop.likeness import Likeness
 from vislam.loop.pose_table import PoseTable
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verifier import Verification, Verifier
@@ -68,8 +69,9 @@ class LoopDetector:
         self._witnesses: list[Measured] = []  # poses that the last keyframes measured, accepted or parked
         self._parked: list[_Trial] = []
         self._next_edge_id = 0
+        self._likeness: dict[int, Likeness] = {}  # of those to the newest keyframe
         self.retrieved: list[RetrievedKeyframe] = []  # what looked most like the newest keyframe
-        self.counters = {"verified": 0, "accepted": 0, "parked": 0, "rejected": 0, "promoted": 0}
+        self.counters = {"unlike": 0, "verified": 0, "accepted": 0, "parked": 0, "rejected": 0, "promoted": 0}
 
     @property
     def vocabulary(self) -> Vocabulary:
@@ -155,23 +157,25 @@ class LoopDetector:
         self._pieces = update.pieces
 
     def _candidates(self, view: View) -> list[Candidate]:
-        """Return candidates in the order of verification: by tags, then by odometry and appearance in turn."""
-        gap = self._config.island_gap
+        """Return candidates in the order of verification: by tags, then by appearance and odometry in turn.
+
+        Of an old keyframe and its neighbours that both suggest, it is appearance that matching has confirmed already.
+        """
+        config = self._config
         old = self._poses.ids[self._old(view)]
-        order = self._tags.candidates(view.id, int(old[-1]), self._config.max_tags) if len(old) else []
-        near = [c for c in self._near(view) if all(c.id != other.id for other in order)]
-        alike = [c for c in self._alike(view) if all(abs(c.id - other.id) > gap for other in near + order)]
+        order = self._tags.candidates(view.id, int(old[-1]), config.max_tags) if len(old) else []
+        near = _apart(self._near(view), order, 0)
+        wanted = max(config.max_appearance, config.max_verifications - len(order) - len(near))
+        alike = _apart(self._alike(view), order, config.island_gap)[: wanted if config.max_appearance else 0]
+        near = _apart(near, alike, config.island_gap)
         for turn in range(max(len(near), len(alike))):
-            order += near[turn : turn + 1] + alike[turn : turn + 1]
+            order += alike[turn : turn + 1] + near[turn : turn + 1]
         return order
 
     def _alike(self, view: View) -> list[Candidate]:
-        """Return candidates by appearance, leaving out what was seen just now: it always looks most alike.
-
-        Until its piece is joined with the oldest, a keyframe has no other candidates, and gets more of these.
-        """
+        """Return candidates by appearance, leaving out what was seen just now: it always looks most alike."""
         config = self._config
-        self.retrieved = []
+        self.retrieved, self._likeness = [], {}
         recent: list[int] = []
         for old in reversed(self._views.values()):
             age_s = (view.t_ns - old.t_ns) * 1e-9
@@ -179,16 +183,22 @@ class LoopDetector:
             if long_ago or self._pieces.of(old.id) != self._pieces.of(view.id):
                 break
             recent.append(old.id)
-        is_lost = self._pieces.group(view.id) != 0
-        wanted = config.max_verifications if is_lost else config.max_appearance
         ids, scores = self._database.query(view, config.retrieved, np.array(recent, dtype=np.int64))
-        chosen = self._appearance.select(ids, scores)
+        chosen = self._appearance.select(ids, scores, {i: self._compare(i, view) for i in ids})
         self.retrieved = [
             RetrievedKeyframe(id, view.id, score, place.score, place.consistency)
             for id, score in zip(ids, scores, strict=True)
             for place in (self._appearance.island_of(id),)
         ]
-        return chosen[:wanted]
+        return chosen
+
+    def _compare(self, keyframe_id: int, view: View) -> Likeness:
+        """Return how alike an old keyframe is to a view, matched once."""
+        known = self._likeness.get(keyframe_id)
+        if known is None:
+            known = self._likeness[keyframe_id] = self._verifier.compare(self._views[keyframe_id], view)
+            self.counters["unlike"] += not known.is_alike
+        return known
 
     def _old(self, view: View) -> NDArray[np.int64]:
         """Return the places, in the table of poses, of keyframes that visual odometry does not tie to a view."""
@@ -236,6 +246,8 @@ class LoopDetector:
                 if len(trials) >= budget or neighbour in tried or neighbour not in allowed:
                     continue
                 tried.add(neighbour)
+                if not self._compare(neighbour, view).is_alike:
+                    continue
                 extra = Candidate(neighbour, trial.candidate.source, trial.candidate.score, trial.candidate.consistency)
                 trials.append(self._trial(extra, view))
                 if self._is_settled(trial, trials):
@@ -245,7 +257,7 @@ class LoopDetector:
 
     def _trial(self, candidate: Candidate, view: View) -> _Trial:
         self.counters["verified"] += 1
-        found = self._verifier.verify(self._views[candidate.id], view)
+        found = self._verifier.verify(self._views[candidate.id], view, self._likeness.get(candidate.id))
         if found.T_a_b is None and candidate.source == "tag":
             found = self._tags.verify(candidate.id, view.id, self._rig.T_body_cams[0], self._config) or found
         tilt_rad, measured = None, None
@@ -341,3 +353,8 @@ class LoopDetector:
         oldest = newest_id - self._config.neighbour_keyframes
         self._witnesses = [witness for witness in self._witnesses if witness.to_id > oldest]
         self._parked = [trial for trial in self._parked if trial.to_id > oldest]
+
+
+def _apart(candidates: list[Candidate], others: list[Candidate], gap: int) -> list[Candidate]:
+    """Return the candidates whose ids are more than `gap` from those of the others."""
+    return [c for c in candidates if all(abs(c.id - other.id) > gap for other in others)]

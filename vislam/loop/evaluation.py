@@ -8,6 +8,7 @@ are part of every answer (`LoopTruthConfig`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ _PROBES = 64  # points per keyframe that are looked for in the other views
 RIGHT, DOUBTFUL, WRONG = 1, 0, -1  # verdicts
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class TruePlaces:
     """Keyframes with their true poses, and which of them truly see the same."""
 
@@ -44,6 +45,16 @@ class TruePlaces:
         """Which keyframes [N] see again what an earlier one saw long before."""
         earlier = np.tri(len(self.ids), k=-1, dtype=np.bool_)
         return np.asarray((self.apart & earlier & (self.overlap > self.rule.min_overlap)).any(axis=1), dtype=np.bool_)
+
+    @cached_property
+    def near(self) -> NDArray[np.bool_]:
+        """Which pairs [N, N] are truly near: in place, in heading, and in what they see."""
+        positions, rotations = self.T_world_body[:, :3, 3], self.T_world_body[:, :3, :3]
+        apart_m = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+        cosine = 0.5 * (np.einsum("aij,bij->ab", rotations, rotations) - 1.0)
+        turned_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        near = (apart_m < self.rule.near_m) & (turned_deg < self.rule.near_deg)
+        return np.asarray(near & (self.overlap > self.rule.min_overlap), dtype=np.bool_)
 
     def image_verdict(self, a: int, b: int) -> int:
         """Say whether two rows show the same place, by how much their views overlap."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vislam.errors import DataError
 from vislam.hamming import DESCRIPTOR_BYTES
 from vislam.loop.vocabulary import Vocabulary
+from vislam.reading import read_bytes
 
 _MAX_FILE_BYTES = 2**30  # ORBvoc.txt has 145 MB
 _MIN_LINE_BYTES = 2 * (DESCRIPTOR_BYTES + 3)  # a digit and a blank per field: bounds what the file can make us allocate
@@ -154,10 +155,7 @@ def read_orbslam(path: Path) -> Vocabulary:
     Raises DataError, with the line, for a file that is not one or was damaged.
     """
     try:
-        size = path.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            raise DataError(f"{path} has {size} bytes, the limit for a text vocabulary is {_MAX_FILE_BYTES}")
-        text = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        text = np.frombuffer(read_bytes(path, _MAX_FILE_BYTES), dtype=np.uint8)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}; give a vocabulary in ORB-SLAM's format") from error
     branching, depth, begin = _header(text, path)

@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from io import StringIO
+from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from vislam.errors import DataError
 from vislam.geometry import quaternion_xyzw_from_rotation, rotation_from_quaternion_xyzw
 from vislam.messages import Array, RetrievedKeyframe
+from vislam.reading import open_file
 
 _POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LOOPS_HEADER = (
@@ -133,7 +134,7 @@ def caption(row: LoopRow) -> str:
 def read_rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """Return (line, fields) of a CSV file with this header; a line cut short is an error."""
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with TextIOWrapper(open_file(path), encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file, restkey="", restval="")
             if tuple(reader.fieldnames or ()) != columns:
                 raise DataError(f"{path}:1: expected the columns {','.join(columns)}, got {reader.fieldnames}")

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from vislam.camera import Rig
 from vislam.config import LoopConfig
-from vislam.features import match
 from vislam.geometry import invert, se3_adjoint
 from vislam.loop.epipolar import relative_direction
 from vislam.loop.guided import match_guided
+from vislam.loop.likeness import Likeness, compare
 from vislam.loop.relative_pose import Matched, errors, refine
 from vislam.loop.view import View
 from vislam.messages import Array
@@ -61,10 +61,14 @@ class Verifier:
         camera = rig.cameras[0]
         self._px = 2.0 / (camera.fx + camera.fy)  # one pixel on the plane z = 1
 
-    def verify(self, a: View, b: View) -> Verification:
-        """Verify an older view a against a newer view b; deterministic for a pair."""
+    def compare(self, a: View, b: View) -> Likeness:
+        """Match an older view a with a newer view b and say whether they are worth verifying."""
+        return compare(a, b, self._config, self._px)
+
+    def verify(self, a: View, b: View, known: Likeness | None = None) -> Verification:
+        """Verify an older view a against a newer view b, whose likeness may be known; deterministic for a pair."""
         config = self._config
-        pairs = match(a.descriptors, b.descriptors, config.match_ratio, config.match_max_distance)
+        pairs = (known or self.compare(a, b)).pairs
         if len(pairs) < config.min_inliers:
             return Verification(f"{len(pairs)} matches, needs {config.min_inliers}", len(pairs), pairs=pairs)
         if not a.has_points and not b.has_points:

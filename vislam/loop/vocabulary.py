@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from vislam.errors import DataError, StorageError
 from vislam.hamming import packed
 from vislam.loop.tree import MAX_CHILDREN, descend, grow, similarity, walk_table, weigh
+from vislam.reading import read_bytes
 
 _FORMAT = 1
 _PER_WORD = 5  # descriptors
@@ -124,10 +125,7 @@ class Vocabulary:
     def load(path: Path) -> Vocabulary:
         """Read a vocabulary that `save` wrote; raises DataError when the file is not a sound one."""
         try:
-            size = path.stat().st_size
-            if size > _MAX_FILE_BYTES:
-                raise DataError(f"vocabulary {path} has {size} bytes, the limit is {_MAX_FILE_BYTES}")
-            data = path.read_bytes()
+            data = read_bytes(path, _MAX_FILE_BYTES)
         except OSError as error:
             raise DataError(f"vocabulary {path} cannot be read: {error.strerror}; give one that exists") from error
         return Vocabulary.from_bytes(data, str(path))

@@ -12,7 +12,7 @@ import numpy as np
 
 from vislam.batch.graph_g2o import write_g2o
 from vislam.batch.graph_gnc import reject_suspects
-from vislam.batch.graph_optimize import PoseGraphSolution, optimize_pose_graph, without_edges
+from vislam.batch.graph_optimize import PoseGraphSolution, optimize_pose_graph
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
@@ -77,7 +77,7 @@ def write_joined(joined: JoinedSessions, out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     for name, trajectory in zip(joined.names, joined.trajectories, strict=True):
         write_tum(trajectory, out / f"trajectory_{name}.tum")
-    kept = without_edges(joined.problem, joined.solution.weights == 0.0)
+    kept = joined.problem.with_edges(joined.solution.weights != 0.0)
     write_g2o(kept, out / "joined.g2o", joined.solution.poses)
     rows = ["from_session,from_id,to_session,to_id,has_scale,inliers,chi2,kept"]
     rows += [
@@ -233,7 +233,7 @@ def _optimised(
     weights = reject_suspects(problem, is_suspect, config)
     kept = weights[is_suspect] > 0.0
     _check_joined(parts, search, [m for m, k in zip(suspects, kept, strict=True) if k], len(models))
-    solution = optimize_pose_graph(without_edges(problem, weights == 0.0), replace(config, robust="none"))
+    solution = optimize_pose_graph(problem.with_edges(weights != 0.0), replace(config, robust="none"))
     own = np.concatenate([part.poses for part in parts])
     solution = replace(solution, start=own, start_name="each session in its own map", weights=weights)
     chi2 = dict(zip([m.id for m in suspects], problem.edge_chi2(solution.poses)[is_suspect].tolist(), strict=True))

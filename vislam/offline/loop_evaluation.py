@@ -24,7 +24,7 @@ from vislam.loop.evaluation import (
     true_places,
 )
 from vislam.loop.table import LoopRow, csv_text, read_loops, read_retrieved
-from vislam.messages import Array, LoopDecision
+from vislam.messages import Array, LoopDecision, RetrievedKeyframe
 from vislam.runfolder import write_json
 from vislam.session import Session, StoredKeyframe
 from vislam.trajectory import Trajectory, associate, read_trajectory, write_text
@@ -55,6 +55,8 @@ class JudgedLoops:
     revisits: NDArray[np.bool_]  # [N] which keyframes see again what an earlier one saw
     stages: dict[str, Detections]  # the best answer of each stage for each keyframe
     edges: list[JudgedEdge]
+    proposals: dict[str, tuple[int, int]]  # by source: how many candidates were verified, how many are truly near
+    found: dict[str, int]  # keyframes with a truly near one long before, and at how many each step had a right one
 
 
 def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> dict[str, Any]:
@@ -94,7 +96,9 @@ def judge_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None)
         "checks": _verified(rows, places, lambda row: row.was_offered or row.decision == LoopDecision.ACCEPTED),
         "graph": _verified(rows, places, lambda row: row.decision == LoopDecision.ACCEPTED),
     }
-    return JudgedLoops(places.revisits, stages, _judged_edges(rows, places))
+    tried = [row for row in rows if "not verified" not in row.reason]
+    found = _found(tried, read_retrieved(run / "retrieved.csv"), places)
+    return JudgedLoops(places.revisits, stages, _judged_edges(rows, places), _proposals(tried, places), found)
 
 
 def pooled(runs: Sequence[JudgedLoops]) -> JudgedLoops:
@@ -106,7 +110,14 @@ def pooled(runs: Sequence[JudgedLoops]) -> JudgedLoops:
         )
         for name in runs[0].stages
     }
-    return JudgedLoops(np.concatenate([run.revisits for run in runs]), stages, [e for run in runs for e in run.edges])
+    sources = sorted({source for run in runs for source in run.proposals})
+    proposals = {}
+    for source in sources:
+        each = [run.proposals.get(source, (0, 0)) for run in runs]
+        proposals[source] = (sum(count for count, _ in each), sum(near for _, near in each))
+    found = {step: sum(run.found[step] for run in runs) for step in runs[0].found}
+    edges = [edge for run in runs for edge in run.edges]
+    return JudgedLoops(np.concatenate([run.revisits for run in runs]), stages, edges, proposals, found)
 
 
 def summarise(judged: JudgedLoops, rule: LoopTruthConfig) -> dict[str, Any]:
@@ -117,6 +128,8 @@ def summarise(judged: JudgedLoops, rule: LoopTruthConfig) -> dict[str, Any]:
         "revisits": int(judged.revisits.sum()),
         "stages": {name: _stage(found, judged.revisits, rule) for name, found in judged.stages.items()},
         "edges": _edges(judged.edges),
+        "proposals": {source: {"verified": n, "near": near} for source, (n, near) in judged.proposals.items()},
+        "found": judged.found,
     }
 
 
@@ -184,6 +197,39 @@ def _verified(rows: list[LoopRow], places: TruePlaces, chosen: Callable[[LoopRow
             gross = places.is_gross(places.pose_error(*pair, row.T_from_to))
             answers.append((pair[1], row.inliers, WRONG if gross else RIGHT))
     return _best(answers, len(places.ids))
+
+
+def _proposals(tried: Sequence[LoopRow], places: TruePlaces) -> dict[str, tuple[int, int]]:
+    """Return by source how many candidates were verified, and how many of them are truly near."""
+    out: dict[str, tuple[int, int]] = {}
+    for row in tried:
+        pair = _rows_of(places, row)
+        if pair is not None:
+            count, near = out.get(row.source, (0, 0))
+            out[row.source] = (count + 1, near + int(places.near[pair]))
+    return out
+
+
+def _found(
+    tried: Sequence[LoopRow], retrieved: Sequence[RetrievedKeyframe], places: TruePlaces
+) -> dict[str, int]:  # fmt: skip
+    """Return at how many keyframes that have a truly near one long before each step came upon one that is right."""
+    near = places.near & places.apart & np.tri(len(places.ids), k=-1, dtype=np.bool_)
+    steps = {name: np.zeros(len(places.ids), np.bool_) for name in ("retrieved", "proposed", "posed", "accepted")}
+    for seen in retrieved:
+        pair = _rows_of(places, seen)
+        if pair is not None and near[pair[1], pair[0]]:
+            steps["retrieved"][pair[1]] = True
+    for row in tried:
+        pair = _rows_of(places, row)
+        if pair is None or not places.apart[pair]:
+            continue
+        steps["proposed"][pair[1]] |= near[pair[1], pair[0]]
+        if row.T_from_to is not None and not places.is_gross(places.pose_error(*pair, row.T_from_to)):
+            steps["posed"][pair[1]] = True
+            steps["accepted"][pair[1]] |= row.decision == LoopDecision.ACCEPTED
+    has_near = near.any(axis=1)
+    return {"near": int(has_near.sum()), **{name: int((has_near & hit).sum()) for name, hit in steps.items()}}
 
 
 def _best(answers: Iterable[Answer], count: int) -> Detections:
