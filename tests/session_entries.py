@@ -2,9 +2,29 @@
 
 from __future__ import annotations
 
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
 from vislam.imu import ImuNoise
 from vislam.memory import LoopPlace, LoopState, StartFacts
 from vislam.messages import LoopDecision, NavState
+from vislam.session.checks import checksums
+
+
+@contextmanager
+def editing(path: Path) -> Iterator[sqlite3.Connection]:
+    """Change what a session says, and give it checksums that fit: damage that only its meaning gives away."""
+    with closing(sqlite3.connect(path)) as db:
+        yield db
+        for (table,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
+            crcs = [row[1] for row in db.execute(f"PRAGMA table_info({table})") if row[1].startswith("crc")]
+            columns = ", ".join(f"{name} = ?" for name in crcs)
+            for rowid, *row in db.execute(f"SELECT rowid, * FROM {table}").fetchall():
+                sound = checksums(table, tuple(row[: -len(crcs)]))
+                db.execute(f"UPDATE {table} SET {columns} WHERE rowid = ?", (*sound, rowid))
+        db.commit()
 
 
 def decided(loop_id: int, accepted: bool) -> LoopState:

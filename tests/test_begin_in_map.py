@@ -12,6 +12,7 @@ import pytest
 from vislam.cli import run_verb
 from vislam.config import load
 from vislam.geometry import invert
+from vislam.loop.table import read_loops
 from vislam.run import execute
 from vislam.runfolder import MapChoice, prepare
 from vislam.session import Session
@@ -83,7 +84,7 @@ def test_a_run_is_found_in_the_map_of_another_which_is_not_written(localize_only
     moved_m = np.linalg.norm(new[: len(old), :3, 3] - old[:, :3, 3], axis=1).max()
     error_m = error_in_map_m(yesterday, tmp_path / "today")
     print(f"old keyframes moved {moved_m:.2e} m, rms error in their map {error_m:.3f} m")
-    assert moved_m < (1e-4 if localize_only else 0.1)
+    assert moved_m < (3e-4 if localize_only else 0.1)  # they are held at 1 mm (1 sigma), each, and loops pull
     assert error_m < 0.06
 
 
@@ -96,6 +97,10 @@ def test_maps_are_chained_and_a_run_in_one_is_resumed(yesterday, tmp_path, capsy
     assert metrics["resumed"][0]["keyframe"] >= metrics["map"]["keyframes"]
     assert metrics["frames"] == metrics["frames_expected"]
     assert error_in_map_m(yesterday, today) < 0.06
+    stamps = [keyframe.t_ns for keyframe in keyframes_of(today)]
+    loops = read_loops(today / "loops.csv")
+    assert any(loop.from_id < metrics["map"]["keyframes"] <= loop.to_id for loop in loops)
+    assert all((loop.from_t_ns, loop.to_t_ns) == (stamps[loop.from_id], stamps[loop.to_id]) for loop in loops)
     chained = run(YESTERDAY.replace("camera_hz=10", "camera_hz=9"), tomorrow, MapChoice(today, False))
     assert chained["map"]["keyframes"] == len(poses_of(today))
     assert chained["map"]["found_t_s"] < 6.0

@@ -12,7 +12,8 @@ from vislam.geometry import so3_exp, transform
 from vislam.run import execute
 from vislam.runfolder import prepare
 from vislam.sources import open_source
-from vislam.trajectory import evaluate, read_trajectory
+from vislam.trajectory import anees, associate, evaluate, read_trajectory
+from vislam.trajectory.states import read_states_csv
 
 SEED = 0
 QUICK = {"map.enabled": False, "view.enabled": False, "loop.enabled": False, "seed": SEED}
@@ -112,6 +113,49 @@ def test_uniform_motion_of_one_camera_is_told(tmp_path, world, uniform):
     assert any("uniform motion for" in reason for reason in metrics["verdict"]["reasons"]) == uniform
     assert (metrics["counters"]["front"]["frames_without_excitation"] > 150) == uniform
     assert errors["ekf"]["ate_max_m"] < (2.0 if uniform else 0.2)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_in_uniform_motion_sigmas_say_that_scale_is_forgotten(tmp_path, seed):
+    uri = f"points:straight,rig=mono,duration_s=28,{CAMERA}"
+    prepare(tmp_path / "run", False)
+    execute(open_source(uri, seed), load(None, QUICK | {"seed": seed}), tmp_path / "run", uri, [])
+    truth = read_trajectory(tmp_path / "run" / "trajectory_truth.tum")
+    for name in ("ekf", "graph"):
+        states = read_states_csv(tmp_path / "run" / f"states_{name}.csv")[1]
+        sigmas_m = [np.sqrt(np.trace(s.covariance[3:6, 3:6])) for s in states]
+        found = anees(states, truth)
+        print(f"seed {seed}, {name}: {found['position'].mean:.2f}, sigma at the end {sigmas_m[-1]:.2f} m")
+        assert 0.05 < found["position"].mean < 4.0, name  # one run of 28 s is little: its errors are one draw
+        assert 0.3 < sigmas_m[-1] < 3.0, name
+        assert sigmas_m[len(states) // 3] < 0.5 * sigmas_m[-1], name
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        "straight,start_s=2.5,duration_s=8",
+        pytest.param("euroc_v101_imu,start_s=12,duration_s=8", marks=pytest.mark.data),
+    ],
+)
+def test_what_came_before_a_start_in_motion_has_its_scale(tmp_path, world, request):
+    """Every piece of 2 s of the final path is as long as it was; what has no pose is not counted as covered."""
+    folder = f"{request.getfixturevalue('data_root')}/" if world.startswith("euroc") else ""
+    metrics, _, found = run(tmp_path, f"points:{folder}{world},rig=mono,{CAMERA}")
+    truth = read_trajectory(tmp_path / "run" / "trajectory_truth.tum")
+    pairs = associate(found["graph"], truth)
+    assert metrics["initialisation"]["status"] == "moving"
+    assert metrics["initialisation"]["t_s"] > 1.0, "no longer a late start"
+    assert metrics["accuracy"]["graph"]["coverage"] == pytest.approx(len(found["graph"]) / metrics["frames"], abs=0.02)
+    scales = []
+    for t_ns in np.arange(pairs.t_ns[0], pairs.t_ns[-1] - 1_900_000_000, 500_000_000):
+        inside = (pairs.t_ns >= t_ns) & (pairs.t_ns < t_ns + 2_000_000_000)
+        shape, true = pairs.estimate[inside, :3, 3], pairs.reference[inside, :3, 3]
+        if len(true) >= 10 and np.linalg.norm(np.ptp(true, axis=0)) > 0.1:
+            scales.append(np.linalg.norm(np.std(shape, axis=0)) / np.linalg.norm(np.std(true, axis=0)))
+    print("local scales:", np.round(scales, 3))
+    assert len(scales) >= 8
+    assert 0.9 < min(scales) <= max(scales) < 1.1
 
 
 def test_a_point_is_on_its_epipolar_segment_and_a_walker_is_not():

@@ -16,6 +16,7 @@ from vislam.errors import DataError
 from vislam.factors import estimator
 from vislam.factors.estimator import Estimator
 from vislam.factors.journal import KeyframeRecord, StartRecord
+from vislam.factors.known import Known
 from vislam.factors.loop import LoopModel
 from vislam.factors.window import WindowOdometry
 from vislam.geometry import invert, so3_log
@@ -266,6 +267,68 @@ def test_a_loop_that_a_long_run_knows_already_is_accepted_without_a_factor(
     assert rmse_m(graph.poses(), world.truth) < 0.02
 
 
+def test_where_loops_are_many_work_does_not_grow_with_their_number(make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four loops with every keyframe: one joint marginal for all, few pairs tied, none lost; a false one is parked."""
+    world = World(36.0, seed=12, vo_sigma_rad=np.deg2rad(0.005), vo_sigma_m=0.0001)
+    graph, _ = make(world)
+    asked: list[int] = []
+    joint_covariance = Estimator.joint_covariance
+    monkeypatch.setattr(
+        Estimator, "joint_covariance", lambda self, keys: asked.append(len(keys)) or joint_covariance(self, keys)
+    )
+    pairs = []
+    for k in range(world.count):
+        edges = [world.loop(10 * k + n, k - 100 - 2 * n, k) for n in range(4)] if k >= 110 else []
+        if k % 20 == 0 and edges:
+            edges.append(world.false_loop(10 * k + 9, 3, k))
+        asked.clear()
+        update = graph.add(world.packet(k), edges)
+        assert update.note == ""
+        assert sum(n > 1 for n in asked) <= (1 if edges else 0)
+        factors = [model.factor(robust=True).keys() for model in graph._estimator.loops.values()]
+        pairs.append(len({tuple(keys) for keys in factors}))
+    reports = graph.edge_reports()
+    true, false = [r for r in reports if r.loop_id % 10 < 9], [r for r in reports if r.loop_id % 10 == 9]
+    assert all(r.decision is LoopDecision.ACCEPTED for r in true) and len(true) == 4 * (world.count - 110)
+    assert false and all(r.decision is not LoopDecision.ACCEPTED for r in false)
+    held = graph._estimator.loops.keys() | graph._estimator.spare.keys()
+    assert held == {r.loop_id for r in true} and len(graph._estimator.spare) > 0.2 * len(true)
+    print(f"{pairs[-1]} pairs of keyframes are tied by {len(graph._estimator.loops)} factors, {len(true)} loops")
+    assert pairs[-1] < 1.2 * (world.count - 110) and pairs[-1] < 0.4 * len(true)
+    assert rmse_m(graph.poses(), world.truth) < 0.02
+
+
+def test_what_old_keyframes_know_is_summed_up(make) -> None:
+    """The map stays where it would be, a loop can still be taken out, and the end has every factor again."""
+    maps, finals = {}, {}
+    for name, after in (("all", 10**6), ("summed up", 40)):
+        world = World(42.0, seed=12)
+        graph, _ = make(world, config=replace(TIGHT, loop_gain_min=0.0, freeze_keyframes=20, freeze_after=after))
+        for k in range(world.count):
+            edges = [world.loop(k, k - 100, k)] if k >= 100 else []
+            if k % 40 == 0 and edges:
+                edges.append(world.false_loop(1000 + k, 3, k))
+            assert graph.add(world.packet(k), edges).note == ""
+        estimator = graph._estimator
+        held = set(estimator.loops)
+        maps[name], frozen = graph.poses(), set(estimator.frozen)
+        assert (len(frozen) > 1) == (name == "summed up")
+        sure = np.sqrt(np.trace(graph.relative_covariance(0, min(frozen, default=140) + 3)))
+        assert 1e-4 < sure < 0.1
+        if frozen:
+            inside = [n for n in held if min(frozen) <= n < min(frozen) + 20]
+            assert all(("loop", n) not in estimator._slots for n in inside)
+            estimator.drop([estimator.loops[inside[0]]])
+            assert not estimator.frozen and held - set(estimator.loops) == {inside[0]}
+            assert rmse_m(graph.poses(), world.truth) < 1.2 * rmse_m(maps["all"], world.truth)
+        print(name, len(frozen), rmse_m(maps[name], world.truth))
+        graph.finish()
+        finals[name] = graph.poses()
+    assert np.max(np.linalg.norm((maps["all"] - maps["summed up"])[:, :3, 3], axis=1)) < 0.02
+    assert rmse_m(maps["summed up"], world.truth) < 1.1 * rmse_m(maps["all"], world.truth)
+    assert np.max(np.abs(finals["all"] - finals["summed up"])) < 0.002
+
+
 def test_loops_that_contradict_the_window_teach_distrust(make) -> None:
     world = World(50.0, seed=3, vo_sigma_rad=np.deg2rad(0.3), vo_sigma_m=0.008)
     graph, window = make(world, imu=False, sigma_scale=4.0)
@@ -321,13 +384,13 @@ def test_poisoned_loop_is_given_up_and_the_window_goes_on(world: World, make, mo
     failing = Failing(monkeypatch)
     graph, _ = make(world)
     feed(graph, world, 0, 110)
-    relative_covariance = graph._loops.relative_covariance
+    known = graph._loops._known
 
-    def arm(i: int, j: int) -> np.ndarray:
+    def arm(models: list[LoopModel]) -> Known | None:
         failing.armed = 2
-        return relative_covariance(i, j)
+        return known(models)
 
-    monkeypatch.setattr(graph._loops, "relative_covariance", arm)
+    monkeypatch.setattr(graph._loops, "_known", arm)
     update = graph.add(world.packet(110), [world.loop(7, 5, 105)])
     assert 7 in update.rejected_loop_ids and "without the new loops" in update.note
     monkeypatch.undo()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from session_entries import editing
 
 from vislam.batch.graph_files import read_pose_graph
 from vislam.batch.graph_gnc import reject_suspects
@@ -38,12 +38,10 @@ T_NEW_OLD = transform(
 
 def turn_map(session: Path) -> None:
     """Give a session another map frame with the same up, as if it had begun elsewhere."""
-    db = sqlite3.connect(session)
-    for k, blob in db.execute("SELECT id, T_map_body FROM keyframes").fetchall():
-        T = T_NEW_OLD @ np.frombuffer(blob, "<f8").reshape(4, 4)
-        db.execute("UPDATE keyframes SET T_map_body = ? WHERE id = ?", (T.astype("<f8").tobytes(), k))
-    db.commit()
-    db.close()
+    with editing(session) as db:
+        for k, blob in db.execute("SELECT id, T_map_body FROM keyframes").fetchall():
+            T = T_NEW_OLD @ np.frombuffer(blob, "<f8").reshape(4, 4)
+            db.execute("UPDATE keyframes SET T_map_body = ? WHERE id = ?", (T.astype("<f8").tobytes(), k))
 
 
 @pytest.fixture(scope="module")
@@ -131,17 +129,15 @@ def test_what_does_not_overlap_ends_with_4(runs, tmp_path, capsys):
 )
 def test_sessions_that_do_not_fit_are_told_in_one_line(change, message, runs, tmp_path, capsys):
     shutil.copytree(runs / "tuesday", tmp_path / "other")
-    db = sqlite3.connect(tmp_path / "other" / "session.db")
-    for key, value in change.items():
-        if value is None:
-            rig = json.loads(db.execute("SELECT value FROM info WHERE key = ?", (key,)).fetchone()[0])
-            rig["T_body_cams"][0][0][3] += 0.01
-            text = json.dumps(rig)
-        else:
-            text = value
-        db.execute("UPDATE info SET value = ? WHERE key = ?", (text, key))
-    db.commit()
-    db.close()
+    with editing(tmp_path / "other" / "session.db") as db:
+        for key, value in change.items():
+            if value is None:
+                rig = json.loads(db.execute("SELECT value FROM info WHERE key = ?", (key,)).fetchone()[0])
+                rig["T_body_cams"][0][0][3] += 0.01
+                text = json.dumps(rig)
+            else:
+                text = value
+            db.execute("UPDATE info SET value = ? WHERE key = ?", (text, key))
     code = run_verb(["optimize", str(runs / "monday"), str(tmp_path / "other"), "--out", str(tmp_path / "out")])
     error = capsys.readouterr().err.strip()
     assert code in (2, 3)

@@ -128,6 +128,9 @@ def test_loops_are_drawn_between_their_keyframes(run):
     assert len(segments) == len(accepted) == 12
     expected = scene.paths["graph"].positions_m[[accepted[3].from_id * 10, accepted[3].to_id * 10]]
     np.testing.assert_allclose(segments[3], expected, atol=1e-9)
+    files.metrics["map"] = {"keyframes": accepted[3].from_id + 1}  # the older ends up to this one have foreign stamps
+    inside = [loop for loop in accepted if loop.from_id > accepted[3].from_id]
+    assert 0 < len(loop_segments(files, scene, "accepted")) == len(inside) < len(accepted)
 
 
 def test_sections_without_files_are_left_out(copy):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from fake_window import FakeWindow
 from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
-from session_entries import start_facts
+from session_entries import editing, start_facts
 
 from vislam.cli import run_verb
 from vislam.config import GraphConfig, WindowConfig, load
@@ -222,7 +222,7 @@ def edit_manifest(out: Path) -> None:
 
 
 def edit_session(out: Path, statement: str) -> None:
-    with sqlite3.connect(out / "session.db") as database:
+    with editing(out / "session.db") as database:
         database.execute(statement)
 
 
@@ -234,7 +234,7 @@ def edit_session(out: Path, statement: str) -> None:
         (edit_config, 2, "was changed since the run began"),
         (edit_manifest, 3, "is not the recording"),
         (lambda out: (out / "session.db").write_bytes(b"no database at all " * 400), 3, "cannot be read"),
-        (lambda out: edit_session(out, "PRAGMA user_version=2"), 3, "format 2, this vislam reads 5"),
+        (lambda out: edit_session(out, "PRAGMA user_version=2"), 3, "format 2, this vislam reads 6"),
         (lambda out: edit_session(out, "DELETE FROM windows WHERE id = 3"), 3, "run the recording again"),
         (lambda out: edit_session(out, "DELETE FROM keyframes WHERE id = 3"), 3, "run the recording again"),
         (lambda out: edit_session(out, "UPDATE states SET state = x'00'"), 3, "run the recording again"),
@@ -294,7 +294,7 @@ def test_a_folder_that_cannot_be_written_is_a_storage_error(copied, capsys):
 
 
 def test_settings_that_came_with_a_newer_version_do_not_stop_a_run_from_being_resumed(copied):
-    with sqlite3.connect(copied / "session.db") as database:
+    with editing(copied / "session.db") as database:
         config = json.loads(database.execute("SELECT value FROM info WHERE key = 'config'").fetchone()[0])
         del config["loop"]["min_inliers"]
         database.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(config),))

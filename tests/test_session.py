@@ -4,13 +4,15 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+from contextlib import closing
 from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
-from session_entries import decided, start_facts
+from session_entries import decided, editing, start_facts
 
 from vislam.camera import Camera, Rig
+from vislam.database import connect
 from vislam.errors import DataError, StorageError
 from vislam.geometry import se3_exp
 from vislam.imu import ImuNoise
@@ -206,10 +208,8 @@ def test_damage_and_strangers_are_refused(tmp_path):
         Session(tmp_path / "stranger.db")
     writer, *_ = write_three(tmp_path / "cut.db")
     writer.close()
-    database = sqlite3.connect(tmp_path / "cut.db")
-    database.execute("UPDATE keyframes SET T_map_body = x'0011' WHERE id = 1")
-    database.commit()
-    database.close()
+    with editing(tmp_path / "cut.db") as database:
+        database.execute("UPDATE keyframes SET T_map_body = x'0011' WHERE id = 1")
     with pytest.raises(DataError, match="damaged"):
         list(Session(tmp_path / "cut.db").keyframes())
 
@@ -234,12 +234,60 @@ def test_damage_and_strangers_are_refused(tmp_path):
 def test_a_damaged_factor_log_is_a_data_error(damage, tmp_path):
     writer, *_ = write_three(tmp_path / "session.db")
     writer.close()
-    database = sqlite3.connect(tmp_path / "session.db")
-    database.execute(damage)
-    database.commit()
-    database.close()
+    with editing(tmp_path / "session.db") as database:
+        database.execute(damage)
     with pytest.raises(DataError, match="run the recording again"):
         Session(tmp_path / "session.db").factor_log()
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "CREATE TRIGGER t AFTER UPDATE ON info BEGIN DELETE FROM keyframes; END",
+        "CREATE VIEW v AS SELECT * FROM info",
+        "CREATE TABLE more (x)",
+        "CREATE INDEX i ON frames (abs(t_ns))",
+    ],
+)
+def test_what_is_planted_in_a_session_never_runs(planted, tmp_path):
+    path = tmp_path / "session.db"
+    write_three(path)[0].close()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(planted)
+        database.commit()
+    before = path.read_bytes()
+    for opened in (Session, SessionWriter.reopen):
+        with pytest.raises(DataError, match="other tables, triggers or views"):
+            opened(path)
+    assert path.read_bytes() == before
+    if "TABLE" in planted or "INDEX" in planted:
+        return
+    with closing(connect(path)) as database, pytest.raises(sqlite3.DatabaseError, match=r"prohibited|authorized"):
+        # even where nobody looked first
+        database.execute("UPDATE info SET value = value" if "TRIGGER" in planted else "SELECT * FROM v")
+
+
+def test_a_flipped_bit_is_noticed_or_changes_nothing(tmp_path):
+    path = tmp_path / "session.db"
+    write_three(path)[0].close()
+    sound, whole = path.read_bytes(), dump(path)
+    rng, noticed = np.random.default_rng(4), 0
+    for at in rng.integers(0, 8 * len(sound), 60).tolist():
+        data = bytearray(sound)
+        data[at // 8] ^= 1 << at % 8
+        path.write_bytes(data)
+        try:
+            Session(path).close()
+        except DataError:
+            noticed += 1
+        else:
+            assert dump(path) == whole
+    assert noticed > 10
+
+
+def dump(path):
+    with closing(sqlite3.connect(path)) as database:
+        return list(database.iterdump())
 
 
 def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
@@ -248,7 +296,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
     database = sqlite3.connect(tmp_path / "session.db")
     database.execute("PRAGMA user_version=1")
     database.close()
-    with pytest.raises(DataError, match="format 1, this vislam reads 5; run the recording again"):
+    with pytest.raises(DataError, match="format 1, this vislam reads 6; run the recording again"):
         Session(tmp_path / "session.db")
 
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from vislam.errors import UsageError, VislamError
+from vislam.errors import UsageError, VislamError, printable
 from vislam.verbs import VERBS
 
 # the matrices here are small: threads cost more than they bring, and replay must not depend on them
@@ -45,7 +45,7 @@ def run_verb(arguments: list[str]) -> int:
 
 
 def _complain(message: str) -> None:
-    print(f"vislam: {message}", file=sys.stderr)
+    print(f"vislam: {printable(message)}", file=sys.stderr)
 
 
 def _help() -> str:

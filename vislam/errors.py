@@ -1,10 +1,26 @@
 """The errors a user of vislam can meet. Each message says what happened, where, asked versus got, and the next step."""
 
 
+def printable(text: object) -> str:
+    """Return text with escapes in the place of what a terminal would obey or not show.
+
+    Whatever is quoted from a file may hold such: control characters, escape sequences, bytes that are no text, marks
+    that turn the direction of writing.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text))
+
+
 class VislamError(Exception):
-    """Root of every expected failure; the command line turns it into one line and `exit_code`."""
+    """Root of every expected failure; the command line turns it into one line and `exit_code`.
+
+    Its text is `printable`, whatever it quotes.
+    """
 
     exit_code = 3
+
+    def __str__(self) -> str:
+        """Return the message in one line of printable characters."""
+        return printable(super().__str__())
 
 
 class UsageError(VislamError):

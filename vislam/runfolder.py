@@ -37,6 +37,7 @@ from vislam.messages import (
     RetrievedKeyframe,
     Tracking,
 )
+from vislam.reading import read_json
 from vislam.session import Session
 from vislam.slam import KeyframeStep, Step
 from vislam.sources import recorded_path
@@ -99,7 +100,7 @@ def read_setup(out: Path) -> tuple[str, Config, MapChoice | None]:
 def _read_json(path: Path) -> dict[str, Any]:
     """Return an object of a run folder."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
     except FileNotFoundError as error:
         raise UsageError(
             f"{path.parent} holds no run to resume ({path.name} is missing); start one with --out {path.parent}, and "
@@ -132,7 +133,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics = read_json(path)
         if not (isinstance(metrics, dict) and all(isinstance(metrics.get(k, {}), dict) for k in ("accuracy", "batch"))):
             raise ValueError("it holds something else than metrics")
     except (OSError, ValueError) as error:
@@ -237,6 +238,7 @@ class RunLog:
         self._frames: list[FrameEntry] = []
         self._ekf_states: dict[int, NavState] = {}
         self._keyframe_t_ns: dict[int, int] = {}
+        self._map_t_ns: dict[int, int] = {}  # of the keyframes of a map, by the clock of its own recording
         self._spans: dict[int, ImuSpan] = {}  # between a keyframe and the one before
         self._candidates: list[LoopCandidate] = []
         self._edge_ids: dict[tuple[int, int, bool], int] = {}  # by ends, and whether it was made up on purpose
@@ -288,6 +290,7 @@ class RunLog:
         self._first_id = session.first_id
         self._frames = session.frames()
         self._ekf_states = session.states("filter")
+        self._take_map(memory)
         for packet in memory.graph.packets[self._first_id :]:
             self._keyframe_t_ns[packet.keyframe.id] = packet.keyframe.t_ns
             if packet.imu is not None:
@@ -301,7 +304,12 @@ class RunLog:
     def begin_in_map(self, memory: SlamMemory) -> None:
         """Number keyframes on from those of a map."""
         self._first_id = len(memory.graph.packets)
+        self._take_map(memory)
         self._place(memory)
+
+    def _take_map(self, memory: SlamMemory) -> None:
+        stamps = (packet.keyframe for packet in memory.graph.packets[: self._first_id])
+        self._map_t_ns = {keyframe.id: keyframe.t_ns for keyframe in stamps}
 
     def _place(self, memory: SlamMemory) -> None:
         self._positions = {k: T[:3, 3] for k, T in enumerate(memory.graph.T_map_body)}
@@ -407,7 +415,7 @@ class RunLog:
         return LoopRow(
             from_id=candidate.from_id,
             to_id=candidate.to_id,
-            from_t_ns=self._keyframe_t_ns.get(candidate.from_id, -1),
+            from_t_ns=self._keyframe_t_ns.get(candidate.from_id, self._map_t_ns.get(candidate.from_id, -1)),
             to_t_ns=self._keyframe_t_ns.get(candidate.to_id, -1),
             source=candidate.source,
             score=candidate.score,

@@ -101,7 +101,8 @@ class Back:
         readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
         window = replace(config.window, readout_s=readout_s)
         scale_sigma = float(np.hypot(config.graph.scale_sigma, lasting_scale_sigma(config.frontend, rig, noise)))
-        graph = replace(config.graph, scale_sigma=scale_sigma)
+        by_imu = has_gravity and not rig.is_stereo and not rig.has_depth
+        graph = replace(config.graph, scale_sigma=scale_sigma, edges_share_scale=by_imu)
         self.graph = PoseGraph(graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, window)
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None

@@ -1,5 +1,6 @@
 """Naming a recording: formats, bare paths, and clear errors for what is none."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -46,13 +47,13 @@ def test_a_path_may_contain_a_colon(tmp_path: Path) -> None:
 
 def test_a_file_without_permission_is_an_error_not_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = write_asl(tmp_path, frames=2)
-    blocked = Path.open
+    opened = os.open
 
-    def refuse(self: Path, *args: object, **kwargs: object) -> object:
-        if self.name == "data.csv":
-            raise PermissionError(13, "Permission denied", str(self))
-        return blocked(self, *args, **kwargs)
+    def refuse(path: Path, flags: int, *args: int) -> int:
+        if Path(path).name == "data.csv":
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, flags, *args)
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(DataError, match=r"data.csv cannot be read: Permission denied"):
         open_dataset(str(root))

@@ -4,6 +4,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from session_entries import editing
 
 from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
@@ -73,10 +74,8 @@ def test_other_filters_read_the_recording_again(run, tmp_path):
 
 
 def _write_config(run, config):
-    import sqlite3
-
     data = asdict(config)
-    with sqlite3.connect(run / "session.db") as db:
+    with editing(run / "session.db") as db:
         db.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(data),))
     (run / "config.json").write_text(json.dumps(data))
 

@@ -198,7 +198,7 @@ def _driven(recording: Recording, options: FloorOptions, planar: PlanarConfig, k
         if track.keyframe is not None:
             T_key = T
         if known is None:
-            clock.follow(track.vo, buffer)
+            clock.follow(track.vo, buffer, is_started=True)
         now = frontend.calibration
         poses.append(T)
         said.append([now["tilt_deg"], now["tilt_sigma_deg"], now["roll_deg"], now["roll_sigma_deg"]])

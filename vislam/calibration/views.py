@@ -17,6 +17,7 @@ from vislam.datasets.video import SUFFIXES as VIDEO_SUFFIXES
 from vislam.errors import DataError
 from vislam.hw.source import ImageSource
 from vislam.messages import Array, ImageU8
+from vislam.reading import check_file
 
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _LIVE_WAIT_S = 1.0
@@ -119,6 +120,10 @@ def _evenly(files: list[Path], at_most: int) -> list[Path]:
 
 
 def _video(path: Path, at_most: int) -> Images:
+    try:
+        check_file(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(f"{path} cannot be opened as a video; check that it plays")

@@ -34,6 +34,7 @@ from vislam.config.sensors import (
 )
 from vislam.config.verdict import VerdictConfig
 from vislam.errors import UsageError
+from vislam.reading import read_text
 
 __all__ = [
     "AttitudeConfig",
@@ -133,8 +134,8 @@ def load_sensors(path: Path | None = None) -> SensorsConfig:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        return tomllib.loads(read_text(path))
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"config {path} cannot be read: {error}; see docs/config.md for an example") from error
 
 

@@ -20,6 +20,7 @@ from vislam.datasets.tables import check_size
 from vislam.errors import DataError
 from vislam.geometry import invert
 from vislam.imu import ImuNoise
+from vislam.reading import read_text
 
 Array = NDArray[np.float64]
 
@@ -60,7 +61,7 @@ def load_yaml(path: Path) -> dict[str, Any]:
     """
     check_size(path, _MAX_YAML_BYTES)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, _MAX_YAML_BYTES)
         lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
         data = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:

@@ -24,6 +24,7 @@ from vislam.errors import DataError, UsageError
 from vislam.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.imu import ImuNoise
 from vislam.messages import Array, Frame, ImuSample, Observations
+from vislam.reading import open_file
 from vislam.trajectory import Trajectory
 
 Stamps = NDArray[np.int64]
@@ -161,7 +162,7 @@ def read_track_table(path: Path, problems: dict[str, int]) -> TrackTable:
 
 def _check_head(path: Path) -> None:
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.readline(256)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vislam.camera import Camera
 from vislam.errors import DataError
 from vislam.messages import ImageF32, ImageU8
+from vislam.reading import open_file, read_bytes
 
 Stamps = NDArray[np.int64]
 Job = TypeVar("Job")
@@ -107,7 +108,7 @@ def probe(path: Path) -> tuple[int, int]:
     The end mark is checked too: decoders show the missing part of a file that was cut short as grey, without an error.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(_SHORT_HEAD_BYTES)
             if image_size(head) is None:
                 head += file.read(_HEAD_BYTES - _SHORT_HEAD_BYTES)
@@ -129,8 +130,7 @@ def _checked_size(head: bytes, tail: bytes, path: Path) -> tuple[int, int]:
 
 def _decode(path: Path, camera: Camera, flags: int) -> NDArray[np.generic]:
     try:
-        size_bytes = path.stat().st_size
-        data = path.read_bytes() if size_bytes <= MAX_IMAGE_BYTES else b""
+        data = read_bytes(path, MAX_IMAGE_BYTES)
     except FileNotFoundError as error:
         raise UnreadableImageError("missing image", path) from error
     except OSError as error:

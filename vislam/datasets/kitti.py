@@ -17,6 +17,7 @@ from vislam.datasets.stream import Survey
 from vislam.datasets.tables import MAX_FILE_BYTES, Problems, check_size, parse_seconds
 from vislam.datasets.truth import Truth, kitti_truth
 from vislam.errors import DataError
+from vislam.reading import open_file, read_bytes
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def _times(path: Path) -> NDArray[np.int64]:
     """Return the stamps [N]; row n belongs to image n, so a row that cannot be read makes the file unusable."""
     check_size(path, MAX_FILE_BYTES)
     stamps: list[int] = []
-    with path.open("rb") as file:
+    with open_file(path) as file:
         for number in count(1):
             line = file.readline(256)
             if not line:
@@ -75,6 +76,8 @@ def _times(path: Path) -> NDArray[np.int64]:
                 raise DataError(
                     f"{path}:{number}: time {line.decode('ascii').strip()} s does not rise; repair the list"
                 )
+    if not stamps:
+        raise DataError(f"{path} holds no times; restore the benchmark's file")
     return np.array(stamps, dtype=np.int64)
 
 
@@ -95,7 +98,7 @@ def _rig(path: Path, numbers: tuple[int, ...], size: tuple[int, int]) -> Rig:
     """Return cameras and their places from the projections `Pn: 12 numbers`: K [R | t] with R = I for all."""
     check_size(path, _MAX_CALIB_BYTES)
     projections: dict[str, Array] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bytes(path, _MAX_CALIB_BYTES).decode("utf-8", errors="replace").splitlines():
         key, _, rest = line.partition(":")
         try:
             values = np.array([float(x) for x in rest.split()])

@@ -20,6 +20,7 @@ from vislam.datasets.images import (
 )
 from vislam.errors import DataError
 from vislam.messages import ImageF32, ImageU8
+from vislam.reading import check_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +142,10 @@ def video_facts(path: Path) -> tuple[tuple[int, int], int]:
 
 
 def _open_video(path: Path) -> cv2.VideoCapture:
+    try:
+        check_file(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(f"{path} cannot be opened as a video; check that it plays, or convert it to H.264 or MJPEG")

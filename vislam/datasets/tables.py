@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from vislam.errors import DataError
+from vislam.reading import open_file
 
 T = TypeVar("T")
 Row = tuple[int, T]  # stamp in ns, and what the row holds
@@ -210,7 +211,7 @@ def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str) -> Iter
 def _lines(path: Path, problems: Problems) -> Iterator[tuple[int, str, bool]]:
     """Yield number, text and whether it was ended, of each line that is neither blank nor a comment."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             yield from _bounded_lines(file, path, problems)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error

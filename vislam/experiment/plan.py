@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vislam.config import validated
 from vislam.errors import UsageError
+from vislam.reading import read_text
 from vislam.sources import is_world, split_source
 
 Scalar = bool | int | float | str
@@ -90,8 +91,8 @@ def load_plan(path: Path, variables: Mapping[str, str] | None = None) -> Plan:
         UsageError: naming the file, the field, what was asked and what is allowed.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        data = tomllib.loads(read_text(path))
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"plan {path} cannot be read: {error}; see docs/experiments.md for an example") from error
     return plan_from_data(data, str(path), path.resolve().parent, os.environ if variables is None else variables)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from vislam.database import connect
 from vislam.errors import DataError, StorageError
 
 _SCHEMA_VERSION = 1
@@ -35,7 +36,7 @@ class ResultStore:
         self._path = path
         with self._storage():
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None)
+            self._db = connect(path, timeout=_BUSY_S, isolation_level=None)
             self._prepare()
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")  # a power cut may cost the last results, never the file

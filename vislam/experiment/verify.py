@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import tomllib
 from collections.abc import Callable, Sequence
@@ -15,6 +14,7 @@ from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, source_identities
 from vislam.experiment.plan import Plan
 from vislam.experiment.trials import Trial, trials
+from vislam.reading import read_json
 
 Outcome = Literal["identical", "within the spread", "differs"]
 Rerun = Callable[[Sequence[Job]], dict[str, dict[str, Any]]]  # from jobs to results by key, without the store
@@ -36,7 +36,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     """Read the manifest of a comparison, given it or its folder. Raises DataError when it is none."""
     file = path / "manifest.json" if path.is_dir() else path
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = read_json(file)
     except (OSError, ValueError) as error:
         raise DataError(f"{file} cannot be read: {error}; give what `vislam compare` wrote") from error
     if not isinstance(data, dict) or not isinstance(data.get("results"), list) or "plan_text" not in data:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -24,6 +23,7 @@ from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.place import PlaceOptions
 from vislam.messages import Frame, ImuSample, MagSample
+from vislam.reading import read_json
 from vislam.trajectory import Trajectory
 
 
@@ -58,7 +58,7 @@ def stored_sensors(out: Path) -> SensorsConfig:
     """Return the sensors of the live run in a folder; raises DataError when their file cannot be used."""
     path = out / "sensors.json"
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         if not isinstance(data, dict):
             raise ValueError("it holds something else than settings")
     except (OSError, ValueError) as error:

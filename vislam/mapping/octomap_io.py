@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vislam.errors import DataError
 from vislam.mapping.octree import TREE_LEVELS, Octree, log_odds
+from vislam.reading import read_bytes
 
 _BINARY_TITLE = b"# Octomap OcTree binary file"
 _FULL_TITLE = b"# Octomap OcTree file"
@@ -68,10 +69,7 @@ def read_octree(path: Path, occupied_probability: float = 0.971, free_probabilit
     complete tree of kind OcTree or ColorOcTree. Memory is bounded by the file's size.
     """
     try:
-        size = path.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            raise DataError(f"{path} has {size} bytes, octrees of up to {_MAX_FILE_BYTES} are read")
-        content = path.read_bytes()
+        content = read_bytes(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
     is_binary, fields, offset = _parse_header(content, path)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vislam.errors import DataError
 from vislam.mapping.files import replacing
+from vislam.reading import open_file
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
@@ -103,7 +104,7 @@ def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.
     short, before memory is taken.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             count, point = read_header(file, path)
             available = path.stat().st_size - file.tell()
             if count * point.itemsize > available:

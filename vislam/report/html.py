@@ -11,9 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
+
+from vislam.datasets.images import image_size
+from vislam.reading import read_bytes
 
 _MAX_PICTURE_PX = 1600
 _KEEP_BYTES = 400_000  # a smaller picture is embedded as it is
+_MAX_PICTURE_BYTES = 64 * 2**20
+_MAX_PIXELS = 64 * 10**6  # what a forged header may claim
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +113,15 @@ def folded(title: str, content: str) -> str:
 
 def picture(path: Path, caption: str) -> str:
     """Return an image embedded as data, made smaller where it is large; a reason when it cannot be read."""
-    data = path.read_bytes()
+    try:
+        data = read_bytes(path, _MAX_PICTURE_BYTES)
+    except OSError as error:
+        return card(note(f"{path.name} cannot be read: {error.strerror or error}"))
     mime = "image/png" if path.suffix == ".png" else "image/jpeg"
     if len(data) > _KEEP_BYTES:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        width, height = image_size(data) or (0, 0)
+        fits = 0 < width * height <= _MAX_PIXELS
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if fits else None
         if image is None:
             return card(note(f"{path.name} is not a readable image"))
         scale = min(1.0, _MAX_PICTURE_PX / max(image.shape[:2]))

@@ -89,14 +89,23 @@ def _loop_pictures(run: RunFiles) -> str:
 
 
 def _reasons(loops: list[LoopRow]) -> str:
-    """Return how often each reason occurred; reasons that differ only in their numbers are one."""
-    refused = Counter(re.sub(r"\d+(\.\d+)?", "…", loop.reason) for loop in loops if loop.decision != "accepted")
-    if len(refused) < 2:
+    """Return how often each reason occurred, and between which images; those that differ only in numbers are one."""
+    pairs: dict[str, list[str]] = {}
+    for loop in loops:
+        if loop.decision != "accepted":
+            reason = re.sub(r"\d+(\.\d+)?", "…", loop.reason)
+            pairs.setdefault(reason, []).append(f"{loop.from_id} and {loop.to_id}")
+    if len(pairs) < 2:
         return ""
+    often = sorted(pairs.items(), key=lambda item: -len(item[1]))[:8]
     rows: list[list[str | Cell]] = [
-        [Cell(reason, kind="text long"), str(count)] for reason, count in refused.most_common(8)
+        [Cell(reason, kind="text long"), str(len(some)), Cell(_few(some), kind="text")] for reason, some in often
     ]
-    return card(table(["why not accepted", "candidates"], rows))
+    return card(table(["why not accepted", "candidates", "of keyframes"], rows))
+
+
+def _few(pairs: list[str], most: int = 4) -> str:
+    return "; ".join(pairs[:most]) + ("; …" if len(pairs) > most else "")
 
 
 def _rank(decision: str) -> int:

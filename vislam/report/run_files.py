@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from vislam.errors import DataError
 from vislam.loop.table import LoopRow, read_loops, read_rows
 from vislam.messages import NavState, Tracking
+from vislam.reading import read_json
 from vislam.runfolder import TRACKING_COLUMNS
 from vislam.trajectory import Trajectory, read_states_csv, read_tum
 
@@ -95,11 +95,9 @@ def read_run(folder: Path) -> RunFiles:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    if path.stat().st_size > _MAX_JSON_BYTES:
-        raise DataError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
+        data = read_json(path, _MAX_JSON_BYTES)
+    except ValueError as error:
         raise DataError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(data, dict):
         raise DataError(f"{path} holds a {type(data).__name__} instead of an object")

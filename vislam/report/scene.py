@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.errors import VislamError
 from vislam.geometry import invert, sim3_parts, transform
-from vislam.report.run_files import RunFiles
+from vislam.report.run_files import RunFiles, as_dict
 from vislam.runfolder import recorded_alignment
 from vislam.trajectory import Trajectory, align, associate, nees
 
@@ -91,11 +91,14 @@ def build_scene(run: RunFiles) -> Scene:
 
 
 def loop_segments(run: RunFiles, scene: Scene, decision: str) -> Array:
-    """Return the ends [L, 2, 3] of the loops with this decision, on the best trajectory there is."""
+    """Return the ends [L, 2, 3] of the loops with this decision within the run, on its best trajectory."""
     path = next((scene.paths[name] for name in ("batch", "graph", "live") if len(scene.paths.get(name, ()))), None)
     if path is None:
         return np.empty((0, 2, 3))
-    rows = [loop for loop in run.loops if loop.decision == decision and min(loop.from_t_ns, loop.to_t_ns) >= 0]
+    of_map = as_dict(run.metrics, "map").get("keyframes", 0)  # the first ids: their stamps are of another clock
+    first = of_map if isinstance(of_map, int) else 0
+    rows = [loop for loop in run.loops if loop.decision == decision and loop.from_id >= first]
+    rows = [loop for loop in rows if min(loop.from_t_ns, loop.to_t_ns) >= 0]
     t_ns = np.array([[loop.from_t_ns, loop.to_t_ns] for loop in rows], dtype=np.int64).reshape(-1, 2)
     t_ns = np.clip(t_ns, path.t_ns[0], path.t_ns[-1])  # a keyframe may lie just outside the per-frame trajectory
     return path.at(t_ns.ravel())[:, :3, 3].reshape(-1, 2, 3)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import Config, from_data
+from vislam.database import connect
 from vislam.errors import DataError, UsageError
 from vislam.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
 from vislam.frames import LoggedFrames
@@ -29,11 +30,10 @@ from vislam.messages import (
     RetrievedKeyframe,
     Tracking,
 )
+from vislam.session.checks import check_records, check_sound
 from vislam.session.packets import LIGHT_COLUMNS, packet_of
 from vislam.session.schema import (
-    APPLICATION_ID,
     DESCRIPTOR_BYTES,
-    SCHEMA_VERSION,
     from_bytes,
     maybe_numbers,
     numbers,
@@ -68,23 +68,12 @@ class StoredEdge:
     inliers: int
 
 
-def check_version(db: sqlite3.Connection, path: Path) -> None:
-    """Raise DataError unless the file is a session of the format that is read here."""
-    application = db.execute("PRAGMA application_id").fetchone()[0]
-    version = db.execute("PRAGMA user_version").fetchone()[0]
-    if application != APPLICATION_ID:
-        raise DataError(f"{path} is not a vislam session")
-    if version != SCHEMA_VERSION:
-        step = "update vislam" if version > SCHEMA_VERSION else "run the recording again"
-        raise DataError(f"{path} has session format {version}, this vislam reads {SCHEMA_VERSION}; {step}")
-
-
 def has_begun(path: Path) -> bool:
     """Return whether a file is there with anything in it; a process that ended at once may have left an empty one."""
     if not path.is_file():
         return False
     with readable(path):
-        db = sqlite3.connect(path)
+        db = connect(path, read_only=True)
         try:
             return bool(db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0])
         finally:
@@ -100,8 +89,13 @@ class Session:
         if not path.is_file():
             raise DataError(f"no session at {path}; a run leaves one as session.db")
         with readable(path):
-            self._db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
-            check_version(self._db, path)
+            self._db = connect(path, read_only=True)
+        try:
+            check_sound(self._db, path)
+            check_records(self._db, path)
+        except DataError:
+            self._db.close()
+            raise
 
     def info(self) -> dict[str, Any]:
         """Return what the writer stored about the run."""

@@ -145,7 +145,8 @@ def _ties(session: Session) -> list[Tied]:
 
 def _tags(session: Session) -> dict[int, tuple[TagSighting, ...]]:
     out: dict[int, tuple[TagSighting, ...]] = {}
-    for i, tag_id, side_px, T, covariance in session.rows("SELECT * FROM tags ORDER BY id, rowid"):
+    rows = session.rows("SELECT id, tag_id, side_px, T_cam_tag, covariance FROM tags ORDER BY id, rowid")
+    for i, tag_id, side_px, T, covariance in rows:
         poses = maybe_numbers(T, "<f8", (4, 4)), maybe_numbers(covariance, "<f8", (6, 6))
         out[i] = (*out.get(i, ()), TagSighting(tag_id, side_px, *poses))
     return out

@@ -16,7 +16,7 @@ from vislam.memory import EdgeRecord, TiltRecord, WindowRecord
 from vislam.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": tells our files from other SQLite files
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -24,11 +24,12 @@ _EDGE_NUMBERS = 55
 _TILT_NUMBERS = 5
 
 SCHEMA = """
-CREATE TABLE info (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE info (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL);
 CREATE TABLE keyframes (
     id INTEGER PRIMARY KEY, t_ns INTEGER NOT NULL,
     T_map_body BLOB NOT NULL, T_odom_body BLOB NOT NULL,
-    keypoints_px BLOB NOT NULL, descriptors BLOB NOT NULL, points_body_m BLOB
+    keypoints_px BLOB NOT NULL, descriptors BLOB NOT NULL, points_body_m BLOB,
+    crc INTEGER NOT NULL, crc_pose INTEGER NOT NULL
 );
 CREATE TABLE packets (
     id INTEGER PRIMARY KEY,
@@ -36,47 +37,54 @@ CREATE TABLE packets (
     vo_has_scale INTEGER NOT NULL, vo_tracking TEXT NOT NULL, vo_inliers INTEGER NOT NULL,
     track_ids BLOB NOT NULL, pixels_px BLOB NOT NULL, right_px BLOB, depth_m BLOB,
     imu_t_ns BLOB, imu_gyro BLOB, imu_accel BLOB, mag_t_ns INTEGER, mag_field BLOB,
-    at_rest INTEGER NOT NULL, time_offset_s REAL NOT NULL, begins_piece INTEGER NOT NULL, state BLOB, imu_noise BLOB
+    at_rest INTEGER NOT NULL, time_offset_s REAL NOT NULL, begins_piece INTEGER NOT NULL, state BLOB, imu_noise BLOB,
+    crc INTEGER NOT NULL
 );
 CREATE TABLE windows (
-    id INTEGER PRIMARY KEY, edges BLOB NOT NULL, tilts BLOB NOT NULL, note TEXT NOT NULL, rest_from INTEGER
+    id INTEGER PRIMARY KEY, edges BLOB NOT NULL, tilts BLOB NOT NULL, note TEXT NOT NULL, rest_from INTEGER,
+    crc INTEGER NOT NULL
 );
 CREATE TABLE states (id INTEGER NOT NULL, whose TEXT NOT NULL, t_ns INTEGER NOT NULL, state BLOB NOT NULL,
-    PRIMARY KEY (id, whose)
+    crc INTEGER NOT NULL, PRIMARY KEY (id, whose)
 );
 CREATE TABLE edges (
     id INTEGER PRIMARY KEY, from_id INTEGER NOT NULL, to_id INTEGER NOT NULL,
     T_from_to BLOB NOT NULL, covariance BLOB NOT NULL, has_scale INTEGER NOT NULL, inliers INTEGER NOT NULL,
     score REAL NOT NULL, offered_with INTEGER NOT NULL, number INTEGER NOT NULL,
     decision TEXT NOT NULL, reason TEXT NOT NULL, chi2 REAL, place TEXT NOT NULL,
-    tie_id INTEGER, tie_T BLOB, tie_covariance BLOB, moved_rms_m REAL, moved_max_m REAL
+    tie_id INTEGER, tie_T BLOB, tie_covariance BLOB, moved_rms_m REAL, moved_max_m REAL,
+    crc INTEGER NOT NULL, crc_decided INTEGER NOT NULL, crc_moved INTEGER NOT NULL
 );
-CREATE TABLE ties (id INTEGER PRIMARY KEY, anchor_id INTEGER NOT NULL, covariance BLOB NOT NULL);
+CREATE TABLE ties (
+    id INTEGER PRIMARY KEY, anchor_id INTEGER NOT NULL, covariance BLOB NOT NULL, crc INTEGER NOT NULL
+);
 CREATE TABLE candidates (
     number INTEGER PRIMARY KEY, from_id INTEGER NOT NULL, to_id INTEGER NOT NULL, source TEXT NOT NULL,
     score REAL, inliers INTEGER NOT NULL, decision TEXT NOT NULL, reason TEXT NOT NULL, sigma_m REAL,
-    consistency INTEGER NOT NULL, supporters INTEGER NOT NULL, T_from_to BLOB
+    consistency INTEGER NOT NULL, supporters INTEGER NOT NULL, T_from_to BLOB, crc INTEGER NOT NULL
 );
 CREATE TABLE retrieved (
     number INTEGER PRIMARY KEY, from_id INTEGER NOT NULL, to_id INTEGER NOT NULL, score REAL, island_score REAL,
-    consistency INTEGER NOT NULL
+    consistency INTEGER NOT NULL, crc INTEGER NOT NULL
 );
 CREATE TABLE frames (
     t_ns INTEGER PRIMARY KEY, keyframe_id INTEGER NOT NULL, T_keyframe_body BLOB, T_odom_body BLOB, T_map_body BLOB,
     tracking TEXT NOT NULL, inliers INTEGER NOT NULL, vo_keyframe_id INTEGER NOT NULL, reason TEXT NOT NULL,
-    localisation TEXT NOT NULL, piece INTEGER NOT NULL
+    localisation TEXT NOT NULL, piece INTEGER NOT NULL, crc INTEGER NOT NULL
 );
 CREATE TABLE scans (
-    id INTEGER PRIMARY KEY, t_ns INTEGER NOT NULL, depth_png BLOB NOT NULL, points BLOB NOT NULL, colors BLOB NOT NULL
+    id INTEGER PRIMARY KEY, t_ns INTEGER NOT NULL, depth_png BLOB NOT NULL, points BLOB NOT NULL, colors BLOB NOT NULL,
+    crc INTEGER NOT NULL
 );
 CREATE TABLE tags (
     id INTEGER NOT NULL, tag_id INTEGER NOT NULL, side_px REAL NOT NULL, T_cam_tag BLOB, covariance BLOB,
-    PRIMARY KEY (id, tag_id)
+    crc INTEGER NOT NULL, PRIMARY KEY (id, tag_id)
 );
 CREATE TABLE vocabulary (
-    one INTEGER PRIMARY KEY CHECK (one = 1), data BLOB NOT NULL, trained_at INTEGER NOT NULL, trainings INTEGER NOT NULL
+    one INTEGER PRIMARY KEY CHECK (one = 1), data BLOB NOT NULL, trained_at INTEGER NOT NULL,
+    trainings INTEGER NOT NULL, crc INTEGER NOT NULL
 );
-CREATE TABLE newest (one INTEGER PRIMARY KEY CHECK (one = 1), value TEXT NOT NULL);
+CREATE TABLE newest (one INTEGER PRIMARY KEY CHECK (one = 1), value TEXT NOT NULL, crc INTEGER NOT NULL);
 """
 
 
@@ -171,6 +179,8 @@ def readable(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise DataError(f"session {path} cannot be read: {error}; run the recording again") from error
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except OSError as error:
+        raise DataError(f"session {path} cannot be read: {error.strerror or error}") from error
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise DataError(f"{path} is damaged ({reason}); run the recording again") from error

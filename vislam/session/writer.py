@@ -12,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from vislam.camera import Rig
+from vislam.database import connect
 from vislam.errors import DataError
 from vislam.factor_log import rig_data, state_data
 from vislam.imu import ImuNoise
 from vislam.memory import FrameEntry, FrontNews, GraphNews, KeyframeEntry, LoopPlace, LoopState, StartFacts, TagSighting
 from vislam.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
+from vislam.session.checks import check_records, check_sound, checksum, checksums
 from vislam.session.packets import packet_row
-from vislam.session.reader import Session, check_version
+from vislam.session.reader import Session
 from vislam.session.schema import (
     APPLICATION_ID,
     SCHEMA,
@@ -59,14 +61,12 @@ class SessionWriter:
             raise DataError(f"no session at {path}; a run leaves one as session.db")
         writer = cls.__new__(cls)
         with readable(path):
-            probe = sqlite3.connect(path)
-            try:
-                check_version(probe, path)
-                fault = probe.execute("PRAGMA quick_check(1)").fetchone()[0]
-            finally:
-                probe.close()
-        if fault != "ok":
-            raise DataError(f"session {path} is damaged ({fault}); run the recording again")
+            probe = connect(path)  # what a write-ahead log holds is taken in
+        try:
+            check_sound(probe, path)
+            check_records(probe, path)
+        finally:
+            probe.close()
         writer._open(path)
         with storage(path), writer._transaction():
             db = writer._db
@@ -91,7 +91,7 @@ class SessionWriter:
         writer = cls.__new__(cls)
         with storage(path):
             part.unlink(missing_ok=True)
-            writer._db = sqlite3.connect(part, isolation_level=None)
+            writer._db = connect(part, isolation_level=None)
             base.copy_to(writer._db)
             with writer._transaction():
                 foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans",)))
@@ -116,10 +116,10 @@ class SessionWriter:
         writer = cls.__new__(cls)
         writer.path = path
         with storage(path):
-            writer._db = sqlite3.connect(path, isolation_level=None)
+            writer._db = connect(path, isolation_level=None)
         try:
             with readable(path):
-                check_version(writer._db, path)
+                check_sound(writer._db, path)
                 newest = json.loads(writer._db.execute("SELECT value FROM newest").fetchone()[0])
             with storage(path), writer._transaction():
                 writer._move(update, news)
@@ -134,7 +134,7 @@ class SessionWriter:
         self._edges = 0
         self._first_id = 0  # of the keyframes of this recording
         with storage(path):
-            self._db = sqlite3.connect(path, isolation_level=None)
+            self._db = connect(path, isolation_level=None)
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
 
@@ -183,8 +183,8 @@ class SessionWriter:
             self._insert("retrieved", [(None, *astuple(found)) for found in entry.retrieved])
             self._write_frames()
             self._move(update, news)
-            moved = [(*shift, edge_id) for edge_id, shift in entry.shifts.items()]
-            self._db.executemany("UPDATE edges SET moved_rms_m = ?, moved_max_m = ? WHERE id = ?", moved)
+            moved = [(*shift, checksum((edge_id, *shift)), edge_id) for edge_id, shift in entry.shifts.items()]
+            self._db.executemany("UPDATE edges SET moved_rms_m = ?, moved_max_m = ?, crc_moved = ? WHERE id = ?", moved)
             newest = {"revision": update.revision, "vo_scale": news.vo_scale, "front": _front_data(entry.front)}
             self._replace("newest", [(1, json.dumps(newest))])
 
@@ -208,10 +208,14 @@ class SessionWriter:
             self._db.close()
 
     def _move(self, update: GraphUpdate, news: GraphNews) -> None:
-        rows = [(to_bytes(T, "<f8"), int(i)) for i, T in zip(update.ids, update.T_map_body, strict=True)]
-        self._db.executemany("UPDATE keyframes SET T_map_body = ? WHERE id = ?", rows)
-        decided = [(*_state_row(state), state.id) for state in news.loops]
-        columns = "decision = ?, reason = ?, chi2 = ?, place = ?, tie_id = ?, tie_T = ?, tie_covariance = ?"
+        placed = [(int(i), to_bytes(T, "<f8")) for i, T in zip(update.ids, update.T_map_body, strict=True)]
+        rows = [(T, checksum((i, T)), i) for i, T in placed]
+        self._db.executemany("UPDATE keyframes SET T_map_body = ?, crc_pose = ? WHERE id = ?", rows)
+        states = [(state.id, _state_row(state)) for state in news.loops]
+        decided = [(*row, checksum((i, *row)), i) for i, row in states]
+        columns = (
+            "decision = ?, reason = ?, chi2 = ?, place = ?, tie_id = ?, tie_T = ?, tie_covariance = ?, crc_decided = ?"
+        )
         self._db.executemany(f"UPDATE edges SET {columns} WHERE id = ?", decided)
         if news.window is not None:
             said = news.window
@@ -245,7 +249,8 @@ class SessionWriter:
 
     def _insert(self, table: str, rows: list[tuple[Any, ...]], or_else: str = "") -> None:
         if rows:
-            self._db.executemany(f"INSERT {or_else} INTO {table} VALUES ({', '.join('?' * len(rows[0]))})", rows)
+            checked = [(*row, *checksums(table, row)) for row in rows]
+            self._db.executemany(f"INSERT {or_else} INTO {table} VALUES ({', '.join('?' * len(checked[0]))})", checked)
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vislam.errors import DataError, StorageError
 from vislam.geometry import quaternion_xyzw_from_rotation
+from vislam.reading import open_file
 from vislam.trajectory.poses import Trajectory
 
 Array = NDArray[np.float64]
@@ -24,6 +25,7 @@ _MAX_BYTES = 512 * 2**20  # ten million poses; a larger file is not a trajectory
 _MAX_LINE_BYTES = 16_384  # a state line with its covariance has about 3000
 _MAX_STAMP_NS = 2**62
 _QUATERNION_NORM_TOLERANCE = 0.02  # files round to as few as 4 decimals
+_FARTHEST_M = 1e15  # beyond, a double knows no metre
 _ROTATION_TOLERANCE = 1e-3  # KITTI files round to 7 digits
 
 
@@ -53,6 +55,7 @@ def read_kitti(path: Path, times: Path | NDArray[np.int64]) -> Trajectory:
     t_ns = _read_kitti_times(times) if isinstance(times, Path) else np.asarray(times, dtype=np.int64)
     if len(t_ns) != len(numbers):
         raise DataError(f"{path} has {len(numbers)} poses but there are {len(t_ns)} times; give the times of this file")
+    _check_reach(numbers, path, lines)
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     poses[:, :3, :4] = numbers.reshape(-1, 3, 4)
     U, _, Vt = np.linalg.svd(poses[:, :3, :3])
@@ -120,7 +123,7 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
         size = path.stat().st_size
         if size > _MAX_BYTES:
             raise DataError(f"{path} has {size / 2**20:.0f} MiB; a trajectory file has at most {_MAX_BYTES >> 20} MiB")
-        with path.open("rb") as file:
+        with open_file(path) as file:
             number = 0
             while raw := file.readline(_MAX_LINE_BYTES):
                 number += 1
@@ -186,7 +189,8 @@ def stamp_ns(text: str, unit_ns: float, path: Path, line: int) -> int:
         value = Decimal(text.strip())
     except InvalidOperation as error:
         raise DataError(f"{path}:{line}: '{text[:40]}' is not a time stamp") from error
-    if not value.is_finite() or abs(value) > _MAX_STAMP_NS / unit_ns:
+    limit = Decimal(_MAX_STAMP_NS / unit_ns)
+    if not value.is_finite() or not -limit <= value <= limit:  # comparing never overflows, abs() may
         raise DataError(f"{path}:{line}: time stamp {text[:40]} is out of range")
     return int((value * int(unit_ns)).to_integral_value())
 
@@ -200,6 +204,7 @@ def _read_kitti_times(path: Path) -> NDArray[np.int64]:
 
 def _trajectory(t_ns: NDArray[np.int64], positions: Array, q_xyzw: Array, path: Path, lines: list[int]) -> Trajectory:
     _check_increasing(t_ns, path, lines)
+    _check_reach(positions, path, lines)
     norms = np.linalg.norm(q_xyzw, axis=1)
     wrong = np.abs(norms - 1.0) > _QUATERNION_NORM_TOLERANCE
     if wrong.any():
@@ -209,6 +214,13 @@ def _trajectory(t_ns: NDArray[np.int64], positions: Array, q_xyzw: Array, path: 
     poses[:, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
     poses[:, :3, 3] = positions
     return Trajectory(t_ns, poses)
+
+
+def _check_reach(numbers: Array, path: Path, lines: list[int]) -> None:
+    near = (np.abs(numbers) <= _FARTHEST_M).all(axis=1)
+    if not near.all():
+        i = int(np.argmin(near))
+        raise DataError(f"{path}:{lines[i]}: {np.abs(numbers[i]).max():.3g} m are too far, {_FARTHEST_M:g} m at most")
 
 
 def _check_increasing(t_ns: NDArray[np.int64], path: Path, lines: list[int]) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from tyro.conf import Positional
 
-from vislam.errors import DataError, HardwareError, UsageError
+from vislam.errors import DataError, HardwareError, UsageError, printable
 from vislam.verbs.arguments import parse
 from vislam.verbs.terminal import number, print_table
 
@@ -86,7 +86,7 @@ def _print_hardware(report: HardwareReport) -> None:
 
 def _print_inspection(inspection: Inspection) -> None:
     size = f"{inspection.duration_s:.1f} s, {inspection.size_bytes / 1e6:.1f} MB"
-    Console().print(f"{inspection.source}: {inspection.format}, {size}", soft_wrap=True)
+    Console().print(f"{printable(inspection.source)}: {inspection.format}, {size}", soft_wrap=True)
     rows = [(s.name, str(s.count), f"{s.rate_hz:.1f}", f"{s.longest_gap_s:.3f}") for s in inspection.streams]
     print_table(("stream", "count", "rate [Hz]", "longest gap [s]"), rows)
     _print_findings(inspection.findings)
@@ -97,6 +97,6 @@ def _print_findings(findings: Sequence[Finding]) -> None:
     styles = {"ok": "green", "warning": "yellow", "error": "red"}
     for finding in findings:
         console.print(f"{finding.severity:<8}", style=styles[finding.severity], end="")
-        console.print(f"{finding.what} ({finding.where})", soft_wrap=True, highlight=False, markup=False)
+        console.print(printable(f"{finding.what} ({finding.where})"), soft_wrap=True, highlight=False, markup=False)
         if finding.next_step:
-            console.print(f"        -> {finding.next_step}", soft_wrap=True, highlight=False, markup=False)
+            console.print(printable(f"        -> {finding.next_step}"), soft_wrap=True, highlight=False, markup=False)

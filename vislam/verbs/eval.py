@@ -103,7 +103,13 @@ def _print_loops(answer: dict[str, Any]) -> None:
         interval = f"{number(low, 2)} to {number(high, 2)}" if answer["revisits"] else "-"
         rows.append((name, str(stage["answers"]), str(stage["wrong"]), *numbers, interval))
     print_table(columns, rows, f"{answer['revisits']} of {answer['keyframes']} keyframes revisit a place")
-    edges, rule = answer["edges"], answer["rule"]
+    edges, rule, found = answer["edges"], answer["rule"], answer["found"]
+    for source, told in answer["proposals"].items():
+        Console().print(f"{told['near']} of {told['verified']} candidates by {source} are truly near")
+    Console().print(
+        f"{found['near']} keyframes have a truly near one long before; it was retrieved at {found['retrieved']}, "
+        f"proposed at {found['proposed']}, given a right pose at {found['posed']}, accepted at {found['accepted']}"
+    )
     errors = [number(edges[part][key], 3) for part in ("error_m", "error_deg") for key in ("median", "max")]
     Console().print(
         f"{edges['accepted']} edges in the graph, {edges['apart']} of them loops; off by {errors[0]} m and "

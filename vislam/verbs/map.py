@@ -11,6 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from vislam.config import MapConfig
+from vislam.errors import printable
 from vislam.verbs.arguments import parse
 from vislam.verbs.terminal import progress_bar
 
@@ -81,5 +82,5 @@ def _rebuild(options: MapOptions) -> int:
     for name, path in answer["written"].items():
         print(f"{name}: {path}")
     for name, reason in answer["left_out"].items():
-        print(f"warning: no {name}: {reason}")
+        print(f"warning: no {name}: {printable(reason)}")
     return 0

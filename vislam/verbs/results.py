@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from vislam.errors import VislamError
+from vislam.errors import VislamError, printable
 from vislam.verbs.terminal import number, print_table
 from vislam.verdict import verdict_sentence
 
@@ -46,7 +46,7 @@ def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{loops['candidates']} candidates, {number(metrics['realtime_factor'], 1)} x real time"
     )
     for warning in metrics["warnings"]:
-        console.print(f"warning: {warning}", style="yellow")
+        console.print(f"warning: {printable(warning)}", style="yellow", markup=False)
     for name, title in (("report.html", "report"), ("run.rrd", "Rerun recording"), ("map", "map")):
         if (out / name).exists():
             console.print(f"{title}: {out / name}", soft_wrap=True)
@@ -69,9 +69,9 @@ def _print_verdict(console: Console, verdict: dict[str, Any]) -> None:
     """Print what the run is worth, and under it what its calibration found."""
     if verdict:
         style = "green" if verdict["state"] == "trusted" else "red"
-        console.print(f"{verdict_sentence(verdict)}.", style=style, soft_wrap=True)
+        console.print(f"{printable(verdict_sentence(verdict))}.", style=style, soft_wrap=True, markup=False)
     for moved in verdict.get("moved", []):
-        console.print(f"found out: {moved}", soft_wrap=True)
+        console.print(f"found out: {printable(moved)}", soft_wrap=True, markup=False)
 
 
 def _print_accuracy(metrics: dict[str, Any]) -> None:

@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
+
+from vislam.errors import printable
 
 
 @contextmanager
@@ -49,7 +52,7 @@ def print_table(
     for column in columns:
         table.add_column(column, justify="left" if column in left else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(printable(cell)) for cell in row))
     Console().print(table)
 
 

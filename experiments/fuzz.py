@@ -1,0 +1,621 @@
+"""Mutates files of every kind that vislam reads and looks for tracebacks, hangs and memory taken.
+
+    python experiments/fuzz.py --minutes 10 --seed 1 [--only graph session] [--hostile FOLDER] [--keep FOLDER]
+
+Cases run in a forked process whose parent notices when it hangs or dies. A case is named TARGET:NUMBER and is the same
+for a seed, whatever ran before it: `--only TARGET --first NUMBER --cases 1` gives it again. What must hold: a reader
+returns or raises a VislamError of one printable line within 10 seconds of
+the processor's time, takes less than ten times the file and 300 MB,
+and a session that is taken says what it said before it was damaged.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import select
+import signal
+import sqlite3
+import sys
+import tempfile
+import time
+import traceback
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from vislam.errors import VislamError, printable
+
+LIMIT_S = 10.0  # of the processor's time
+FREE_BYTES, TIMES = 300 * 2**20, 10
+_MOST_BYTES = 4 * 2**20  # of a mutated file
+_SILENT_S = 90.0  # of the clock, until a case is killed: it waits for something, or takes no signal
+TOKENS = (
+    b"nan", b"-inf", b"1e159", b"-1e308", b"1e-320", b"0", b"-1", b"9223372036854775808", b"4294967296", b"1e12",
+    b"9" * 5000, b"", b"\x1b[31m", b"\x00", "\u202e".encode(), b"\xff\xfe", b'"', b"[" * 100_000, b'{"a":' * 20_000,
+    b"a." * 5_000, b"&a [*a,*a]", b"!!python/object:os.system x", b"\r", b",", b"#", b"1_0", b"0x10", b"true", b"null",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that reads files: sound ones by name, and how they are read from a folder."""
+
+    name: str
+    seeds: list[dict[str, bytes]]
+    read: Callable[[Path], object]
+    turns: int = 20  # in a round: fewer where a case takes long
+
+
+@dataclass
+class Tally:
+    """What came of the cases of a target."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    finds: list[str] = field(default_factory=list)
+    slowest_s: float = 0.0
+    most_bytes: int = 0
+
+
+class Answer(NamedTuple):
+    """What came of a case."""
+
+    what: str
+    words: str
+    took_s: float
+    grown_bytes: int  # at most
+
+
+def mutated(data: bytes, other: bytes, rng: np.random.Generator) -> bytes:
+    """Return data with one to four changes; `other` is spliced in at times."""
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        a, b = sorted(rng.integers(0, len(out) + 1, 2).tolist())
+        b = min(b, a + int(rng.integers(1, 200)))
+        kind = int(rng.integers(0, 10))
+        if kind == 0 and out:
+            out[min(a, len(out) - 1)] ^= 1 << int(rng.integers(0, 8))
+        elif kind == 1:
+            out[a:b] = rng.bytes(b - a)
+        elif kind == 2:
+            del out[a:b]
+        elif kind == 3:
+            out[a:a] = out[a:b] * int(rng.integers(1, 50))
+        elif kind == 4:
+            del out[a:]
+        elif kind == 5:
+            out[a:b] = other[a : a + int(rng.integers(1, 200))]
+        elif kind == 6:
+            out[a:a] = TOKENS[int(rng.integers(0, len(TOKENS)))]
+        elif kind == 7:
+            lines = out.split(b"\n")
+            i, j = rng.integers(0, len(lines), 2).tolist()
+            lines[i] = lines[j] if rng.integers(0, 2) else lines[i] + b"\n" + lines[j]
+            out = bytearray(b"\n".join(lines))
+        else:  # a number or word replaced by a telling one
+            begin = end = min(a, max(len(out) - 1, 0))
+            while begin > 0 and out[begin - 1] not in b" ,\t\n:[]{}=()":
+                begin -= 1
+            while end < len(out) and out[end] not in b" ,\t\n:[]{}=()":
+                end += 1
+            out[begin:end] = TOKENS[int(rng.integers(0, len(TOKENS)))]
+    return bytes(out[:_MOST_BYTES])
+
+
+def case(target: Target, number: int, seed: int, folder: Path) -> int:
+    """Write the files of a case; return how many bytes they have."""
+    rng = np.random.default_rng([seed, zlib.crc32(target.name.encode()), number])
+    files = dict(target.seeds[int(rng.integers(0, len(target.seeds)))])
+    changed = sorted(files)[int(rng.integers(0, len(files)))]
+    other = target.seeds[int(rng.integers(0, len(target.seeds)))]
+    files[changed] = mutated(files[changed], other[sorted(other)[int(rng.integers(0, len(other)))]], rng)
+    write(folder, files)
+    return sum(map(len, files.values()))
+
+
+def write(folder: Path, files: dict[str, bytes]) -> None:
+    """Make a folder hold these files and nothing else."""
+    for path in sorted(folder.rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+def outcome(target: Target, folder: Path, size: int) -> Answer:
+    """Read a folder whose files have `size` bytes; return what came of it."""
+    Path("/proc/self/clear_refs").write_text("5")
+    before, begun = _memory("VmRSS"), time.process_time()
+    signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
+    what, words = "read", ""
+    try:
+        target.read(folder)
+    except VislamError as error:
+        what, words = "refused", str(error)
+        if words != printable(words) or not words:
+            what = "UNPRINTABLE"
+    except TimeoutError:
+        what, words = "SLOW", traceback.format_exc(limit=-3)
+    except BaseException as error:
+        what, words = "TRACEBACK", f"{type(error).__name__} {error}\n" + traceback.format_exc(limit=-4)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+    took_s, grown = time.process_time() - begun, _memory("VmHWM") - before
+    if what in ("read", "refused") and grown > TIMES * size + FREE_BYTES:
+        what, words = "MEMORY", f"{grown / 2**20:.0f} MiB for {size} bytes"
+    return Answer(what, words[:20_000], took_s, grown)
+
+
+def refused_seeds(targets: list[Target]) -> list[str]:
+    """Read every sound file, which also compiles and imports what cases need; return what was refused."""
+    refused = []
+    with tempfile.TemporaryDirectory() as scratch, open(os.devnull, "w", encoding="utf-8") as null:
+        for target in targets:
+            for files in target.seeds:
+                write(Path(scratch), files)
+                try:
+                    with redirect_stdout(null), redirect_stderr(null):
+                        target.read(Path(scratch))
+                except VislamError as error:
+                    refused.append(f"{target.name}: {error}")
+    return refused
+
+
+def run_cases(
+    targets: list[Target], seed: int, first: int, cases: int, until: float, keep: Path | None = None
+) -> dict[str, Tally]:
+    """Run cases of the targets in turns and return what came of each; finds are kept in a folder."""
+    tallies = {target.name: Tally() for target in targets}
+    at, end = 0, cases * len(targets)
+    round_of = [(target, turn) for turn in range(20) for target in targets if turn < target.turns]
+
+    def named(at: int) -> tuple[Target, int]:
+        target, turn = round_of[at % len(round_of)]
+        return target, first + at // len(round_of) * target.turns + turn
+
+    with tempfile.TemporaryDirectory() as scratch:
+        while at < end and time.monotonic() < until:
+            reader, writer = os.pipe()
+            child = os.fork()
+            if not child:
+                os.close(reader)
+                _work(map(named, range(at, end)), seed, Path(scratch), writer, until)
+            os.close(writer)
+            for answer in _answers(reader):
+                _count(tallies, *named(at), answer or Answer("HANG", "killed", LIMIT_S, 0), seed, keep)
+                at += 1
+                if answer is None:
+                    os.kill(child, signal.SIGKILL)
+                    break
+            os.close(reader)
+            _, status = os.waitpid(child, 0)
+            if os.WIFSIGNALED(status) and os.WTERMSIG(status) != signal.SIGKILL and at < end:
+                _count(tallies, *named(at), Answer("CRASH", f"signal {os.WTERMSIG(status)}", 0.0, 0), seed, keep)
+                at += 1
+    return tallies
+
+
+def _work(order: Iterable[tuple[Target, int]], seed: int, scratch: Path, writer: int, until: float) -> None:
+    """Answer case after case, a line of JSON each, and leave the process."""
+    null = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    signal.signal(signal.SIGPROF, _too_slow)
+    taken = _memory("VmSize")
+    resource.setrlimit(resource.RLIMIT_AS, (taken + 8 * FREE_BYTES, resource.RLIM_INFINITY))
+    for target, number in order:
+        if time.monotonic() > until:
+            break
+        size = case(target, number, seed, scratch)
+        os.write(writer, json.dumps(outcome(target, scratch, size)).encode() + b"\n")
+    os._exit(0)
+
+
+def _too_slow(*_: object) -> None:
+    raise TimeoutError
+
+
+def _answers(reader: int) -> Iterator[Answer | None]:
+    """Yield a worker's lines, None where it hangs; ends when the worker does."""
+    rest = b""
+    while True:
+        if not select.select([reader], [], [], _SILENT_S)[0]:
+            yield None
+            return
+        got = os.read(reader, 1 << 16)
+        if not got:
+            return
+        *lines, rest = (rest + got).split(b"\n")
+        for line in lines:
+            yield Answer(*json.loads(line))
+
+
+def _count(
+    tallies: dict[str, Tally], target: Target, number: int, answer: Answer, seed: int, keep: Path | None
+) -> None:
+    tally, (what, words, took_s, grown) = tallies[target.name], answer
+    tally.counts[what] += 1
+    tally.slowest_s, tally.most_bytes = max(tally.slowest_s, took_s), max(tally.most_bytes, grown)
+    if what in ("read", "refused"):
+        return
+    tally.finds.append(f"{target.name}:{number} {what} {words}")
+    if keep is not None:
+        folder = keep / f"{target.name}-{number}"
+        folder.mkdir(parents=True, exist_ok=True)
+        case(target, number, seed, folder)
+
+
+def _memory(name: str) -> int:
+    with open("/proc/self/status", encoding="ascii") as file:
+        return next(int(line.split()[1]) * 1024 for line in file if line.startswith(name + ":"))
+
+
+def hostile_target(folder: Path) -> Target:
+    """Return the target whose sound files are hostile ones."""
+    return Target("hostile", [{p.name: p.read_bytes()} for p in sorted(folder.iterdir()) if p.is_file()], _optimize, 5)
+
+
+def small_targets() -> list[Target]:
+    """Return the targets whose sound files are made at once."""
+    return [
+        Target("graph", _graphs(), _optimize),
+        Target("trajectory", _trajectories(), _read_trajectories),
+        Target("recording", [_asl(), _tum(), _kitti()], _survey),
+        Target("calibration", _calibrations(), _read_calibrations),
+        Target("settings", _settings(), _read_settings),
+        Target("tracks", [{"tracks.csv": _TRACKS}], _read_tracks),
+        Target("map", _maps(), _read_maps),
+        Target("vocabulary", _vocabularies(), _read_vocabularies),
+        Target("bridge", [{"bytes": _bridge()}], _read_bridge),
+        Target("tables", [{"loops.csv": _loops_csv(), "retrieved.csv": _RETRIEVED}], _read_tables),
+    ]
+
+
+def run_target(folder: Path) -> list[Target]:
+    """Return the targets that need a run folder, which is made here."""
+    from vislam.cli import run_verb
+    from vislam.session import SessionWriter
+
+    source = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=60"
+    with open(os.devnull, "w", encoding="utf-8") as null, redirect_stdout(null):
+        code = run_verb(["run", source, "--out", str(folder), "--view.no-enabled", "--json", "--map.products"])
+    if code:
+        raise SystemExit(f"no run folder could be made: exit code {code}")
+    names = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.suffix in (".json", ".csv", ".tum", ".db")]
+    files = {str(p.relative_to(folder)): p.read_bytes() for p in names}
+    session = {"session.db": files.pop("session.db")}
+    SessionWriter.reopen(folder / "session.db").close()  # which drops frames behind the last keyframe
+    whole = _dump(folder / "session.db")
+    return [
+        Target("run folder", [files | session], _read_run, 1),
+        Target("session", [session], lambda at: _read_session(at, whole)),
+    ]
+
+
+def _verb(*arguments: str) -> None:
+    from vislam.cli import run_verb
+
+    if (code := run_verb(list(arguments))) not in (0, 2, 3, 4):
+        raise RuntimeError(f"exit code {code}")
+
+
+def _optimize(folder: Path) -> None:
+    out = folder / "out"
+    for path in sorted(folder.iterdir()):
+        _verb("optimize", str(path), "--out", str(out), "--no-report", "--iterations", "30")
+
+
+def _graphs() -> list[dict[str, bytes]]:
+    rng = np.random.default_rng(0)
+    plane, space, toro, isam = [], [], [], []
+    for i in range(12):
+        plane.append(f"VERTEX_SE2 {i} {i} {rng.normal():.3f} 0.1")
+        space.append(f"VERTEX_SE3:QUAT {i} {i} 0.5 {rng.normal():.3f} 0 0 0 1")
+        toro.append(f"VERTEX2 {i} {i} 0 0.1")
+    for i, j in [(i, i + 1) for i in range(11)] + [(0, 6), (2, 9), (11, 0)]:
+        plane.append(f"EDGE_SE2 {i} {j} {j - i} 0.02 0.01 100 0 0 100 0 400")
+        upper = " ".join("100" if a == b else "0" for a in range(6) for b in range(a, 6))
+        space.append(f"EDGE_SE3:QUAT {i} {j} {j - i} 0.01 0.02 0 0 0 1 {upper}")
+        toro.append(f"EDGE2 {i} {j} {j - i} 0.1 0.02 100 0 100 400 0 0")
+        isam.append(f"EDGE2 {i} {j} {j - i} 0.1 0.02 10 0 0 10 0 20")
+    plane += ["FIX 0", "VERTEX_XY 100 3 2", "EDGE_SE2_XY 2 100 1 2 100 0 100", "EDGE_SE2_XY 4 100 -1 2 100 0 100"]
+    texts = {"a.g2o": plane, "b.g2o": space, "c.toro": toro, "d.isam": isam}
+    return [{name: "\n".join(lines).encode() + b"\n"} for name, lines in texts.items()]
+
+
+def _trajectories() -> list[dict[str, bytes]]:
+    tum = "".join(f"{1.4e9 + i / 10:.6f} {i} 0 1 0 0 0 1\n" for i in range(30))
+    euroc = "#timestamp,x,y,z,qw,qx,qy,qz\n" + "".join(f"{14 * 10**17 + i},{i},0,1,1,0,0,0\n" for i in range(30))
+    kitti = "1 0 0 1 0 1 0 2 0 0 1 3\n" * 20
+    times = "".join(f"{i / 10:.6e}\n" for i in range(20))
+    return [{"a.tum": tum.encode()}, {"a.csv": euroc.encode()}, {"a.txt": kitti.encode(), "times.txt": times.encode()}]
+
+
+def _read_trajectories(folder: Path) -> None:
+    from vislam.trajectory import evaluate, read_kitti, read_trajectory
+
+    if (folder / "times.txt").exists():
+        read_kitti(folder / "a.txt", folder / "times.txt")
+        return
+    for path in folder.iterdir():
+        trajectory = read_trajectory(path)
+        evaluate(trajectory, trajectory, "se3")
+
+
+_IMAGE = cv2.imencode(".png", np.arange(48, dtype=np.uint8).reshape(6, 8))[1].tobytes()
+_SENSOR = (
+    b"T_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\nrate_hz: 20\n"
+    b"resolution: [8, 6]\ncamera_model: pinhole\nintrinsics: [5.0, 5.0, 4.0, 3.0]\n"
+    b"distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 1e-4, 2e-4]\n"
+)
+_IMU = (
+    b"rate_hz: 200\ngyroscope_noise_density: 1.7e-04\ngyroscope_random_walk: 2e-5\n"
+    b"accelerometer_noise_density: 2e-3\naccelerometer_random_walk: 3e-3\n"
+)
+
+
+def _asl() -> dict[str, bytes]:
+    begin, files = 14 * 10**17, {}
+    stamps = [begin + i * 50_000_000 for i in range(4)]
+    files["mav0/cam0/sensor.yaml"], files["mav0/imu0/sensor.yaml"] = _SENSOR, _IMU
+    files["mav0/cam0/data.csv"] = b"#timestamp [ns],filename\n" + b"".join(b"%d,%d.png\n" % (t, t) for t in stamps)
+    files |= {f"mav0/cam0/data/{t}.png": _IMAGE for t in stamps}
+    rows = b"".join(b"%d,0,0,0,0,0,9.81\n" % (begin + i * 5_000_000) for i in range(31))
+    files["mav0/imu0/data.csv"] = b"#timestamp [ns],wx,wy,wz,ax,ay,az\n" + rows
+    truth = b"".join(b"%d,0,0,0,1,0,0,0\n" % t for t in stamps)
+    return files | {"mav0/mocap0/data.csv": b"#timestamp [ns],x,y,z,qw,qx,qy,qz\n" + truth}
+
+
+def _tum() -> dict[str, bytes]:
+    rows = b"".join(b"%d.5 rgb/%d.png\n" % (i, i) for i in range(1, 5))
+    files = {f"rgb/{i}.png": _IMAGE for i in range(1, 5)}
+    accelerations = b"".join(b"%d.25 0 0 9.81\n" % i for i in range(1, 5))
+    truth = b"".join(b"%d.5 0 0 0 0 0 0 1\n" % i for i in range(1, 5))
+    named = {"rgb.txt": rows, "accelerometer.txt": accelerations, "groundtruth.txt": truth, "sensor.yaml": _SENSOR}
+    return files | named | {"depth.txt": rows.replace(b"rgb/", b"depth/")}
+
+
+def _kitti() -> dict[str, bytes]:
+    files = {f"image_0/{i:06d}.png": _IMAGE for i in range(4)}
+    return files | {
+        "calib.txt": b"P0: 5 0 4 0 0 5 3 0 0 0 1 0\nP1: 5 0 4 -2 0 5 3 0 0 0 1 0\n",
+        "times.txt": b"0\n1e-1\n2e-1\n3e-1\n",
+    }
+
+
+def _survey(folder: Path) -> None:
+    from vislam.datasets import open_dataset
+
+    recording = open_dataset(str(folder))
+    for _ in zip(range(50), recording.events(), strict=False):
+        pass
+
+
+def _calibrations() -> list[dict[str, bytes]]:
+    chain = (
+        b"cam0:\n  camera_model: pinhole\n  intrinsics: [5.0, 5.0, 4.0, 3.0]\n  distortion_model: radtan\n"
+        b"  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  resolution: [8, 6]\n"
+        b"  T_cam_imu:\n  - [1, 0, 0, 0]\n  - [0, 1, 0, 0]\n  - [0, 0, 1, 0]\n  - [0, 0, 0, 1]\n"
+    )
+    info = (
+        b"image_width: 8\nimage_height: 6\ndistortion_model: plumb_bob\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        b"  data: [5, 0, 4, 0, 5, 3, 0, 0, 1]\n"
+        b"distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0, 0, 0, 0, 0]\n"
+    )
+    memory = b'{"gyro_biases": [{"temperature_c": 20.0, "gyro_bias_rad_s": [0.01, 0.0, 0.0]}]}'
+    return [{"c.yaml": chain}, {"c.yaml": info}, {"c.yaml": _SENSOR}, {"c.yaml": _IMU}, {"c.yaml": memory}]
+
+
+def _read_calibrations(folder: Path) -> None:
+    from vislam.datasets.calibration import read_camera, read_imu_config
+    from vislam.datasets.camera_files import read_cameras
+    from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
+    from vislam.imu.bias_memory import BiasMemory
+
+    readers: tuple[Callable[[Path], object], ...] = (
+        read_cameras, read_camera, read_imu_config, read_noise, read_imu_calibration, read_mag_calibration,
+        lambda path: BiasMemory.read(path, 100),
+    )  # fmt: skip
+    refusals = []
+    for read in readers:
+        try:
+            read(folder / "c.yaml")
+        except VislamError as error:
+            refusals.append(error)
+    if len(refusals) == len(readers):
+        raise refusals[0]
+
+
+def _settings() -> list[dict[str, bytes]]:
+    text = (
+        b'seed = 3\n[loop]\nmin_inliers = 20\n[graph]\ncoupling = "tight"\nhuber_k = 1.3\n[imu]\ngravity_m_s2 = 9.81\n'
+    )
+    plan = Path(__file__).with_name("ekf_vs_graph.toml").read_bytes()
+    sensors = b'hfov_deg = 60.0\n[gy85]\nbus = "1"\n'
+    return [{"c.toml": text}, {"sensors.toml": sensors}, {"plan.toml": plan}]
+
+
+def _read_settings(folder: Path) -> None:
+    from vislam.config import load, load_sensors
+    from vislam.experiment.plan import load_plan
+
+    if (folder / "plan.toml").exists():
+        load_plan(folder / "plan.toml", {"VISLAM_DATA": "/data"})
+        return
+    if (folder / "c.toml").exists():
+        load(folder / "c.toml")
+        return
+    load_sensors(folder / "sensors.toml")
+
+
+_TRACKS = (
+    b"row_type,t,a,b,frame,landmark,wx,wy,wz,ax,ay,az,m,n,o,p,q,r,u,v,key,value\n"
+    + b"".join(b"meta,,,,,,,,,,,,,,,,,,,,camera_%s,400\n" % name for name in (b"fx", b"fy"))
+    + b"".join(b"meta,,,,,,,,,,,,,,,,,,,,T_ci_%s,%d\n" % (n, n == b"qw") for n in
+               (b"tx", b"ty", b"tz", b"qx", b"qy", b"qz", b"qw"))
+    + b"".join(b"imu,%d.%02d,,,,,0,0,0,0,0,9.81,,,,,,,,,,\n" % (i // 20, i % 20 * 5) for i in range(40))
+    + b"".join(b"vision_feature,%d.%d,,,%d,%d,,,,,,,,,,,,,0.1,0.2,,\n" % (i // 10, i % 10, i, i % 5) for i in range(15))
+)  # fmt: skip
+
+
+def _read_tracks(folder: Path) -> None:
+    from vislam.datasets.eqvio import read_track_table
+
+    read_track_table(folder / "tracks.csv", {})
+
+
+def _maps() -> list[dict[str, bytes]]:
+    from vislam.mapping.octomap_io import encode_bt, encode_ot
+    from vislam.mapping.octree import Octree
+    from vislam.mapping.pcd import write_pcd
+    from vislam.mapping.ply import write_ply
+
+    starts = np.arange(32, dtype=np.int64) * 9 + (1 << 45)
+    values = np.where(np.arange(32) % 2, 2.0, -2.0).astype(np.float32)
+    octree = Octree(0.05, starts, np.zeros(32, np.uint8), values)
+    rng = np.random.default_rng(1)
+    points, colors = rng.normal(size=(40, 3)).astype(np.float32), rng.integers(0, 255, (40, 3), np.uint8)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_ply(folder / "a.ply", points, colors)
+        write_pcd(folder / "a.pcd", points, colors)
+        written = [{path.name: path.read_bytes()} for path in sorted(folder.iterdir())]
+    return [{"a.bt": encode_bt(octree)}, {"a.ot": encode_ot(octree)}, *written]
+
+
+def _read_maps(folder: Path) -> None:
+    from vislam.mapping.octomap_io import read_octree
+    from vislam.mapping.pcd import read_pcd
+    from vislam.mapping.ply import read_ply
+
+    for path in folder.iterdir():
+        read: Callable[[Path], object] = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix, read_octree)
+        read(path)
+
+
+def _vocabularies() -> list[dict[str, bytes]]:
+    from vislam.loop.vocabulary import train
+
+    rng = np.random.default_rng(2)
+    small = train([rng.integers(0, 256, (60, 32), np.uint8) for _ in range(3)], 3, 2, 0, 1000)
+    text = "3 1 0 0\n" + "".join(f"0 1 {' '.join(str(7 * i + j) for j in range(32))} 0.5\n" for i in range(3))
+    return [{"v.npz": small.to_bytes()}, {"v.txt": text.encode()}]
+
+
+def _read_vocabularies(folder: Path) -> None:
+    from vislam.loop.orbslam import read_orbslam
+    from vislam.loop.vocabulary import Vocabulary
+
+    for path in folder.iterdir():
+        vocabulary = Vocabulary.load(path) if path.suffix == ".npz" else read_orbslam(path)
+        vocabulary.words(np.random.default_rng(3).integers(0, 256, (20, 32), np.uint8))
+
+
+def _bridge() -> bytes:
+    from vislam.hw.bridge_protocol import Chips, Hello, RawSample, Status, encode
+
+    hello = Hello(0, 1000, Chips(7), 0xE5, 0x68, b"H43", 200, 38, 1213, 92, 1, 35000, 4000, 30000, 2000)
+    samples = [RawSample(i, 1000 * i, Status(0), (0, 0, 256), (1, 2, 3), (4, 5, 6), 100) for i in range(20)]
+    return encode(hello) + b"".join(map(encode, samples))
+
+
+def _read_bridge(folder: Path) -> None:
+    from vislam.hw.bridge_protocol import FrameDecoder
+
+    data, decoder = (folder / "bytes").read_bytes(), FrameDecoder()
+    for at in range(0, len(data), 61):
+        decoder.feed(data[at : at + 61])
+
+
+_RETRIEVED = b"from_id,to_id,score,island_score,consistency\n" + b"".join(b"%d,1,0.5,0.6,2\n" % i for i in range(9))
+
+
+def _loops_csv() -> bytes:
+    from vislam.loop.table import LoopRow, loops_text
+
+    told = ("words", 0.5, 40, 3, 0.1, 2, 1.5, 1.0, float("nan"), float("nan"), np.eye(4), "accepted", "")
+    rows = [LoopRow(i, i + 5, 10 * i, 10 * i + 50, *told) for i in range(9)]
+    return loops_text(rows).encode()
+
+
+def _read_tables(folder: Path) -> None:
+    from vislam.loop.table import read_loops, read_retrieved
+
+    read_loops(folder / "loops.csv")
+    read_retrieved(folder / "retrieved.csv")
+
+
+def _read_run(folder: Path) -> None:
+    from vislam.runfolder import read_metrics, read_setup
+
+    for arguments in (("report", str(folder)), ("loops", str(folder)), ("eval", str(folder))):
+        _verb(*arguments)
+    read_metrics(folder)
+    read_setup(folder)
+
+
+def _read_session(folder: Path, whole: list[str]) -> None:
+    from vislam.session import Session, SessionWriter, has_begun, recall
+
+    path = folder / "session.db"
+    has_begun(path)
+    SessionWriter.reopen(path).close()
+    session = Session(path)
+    try:
+        recall(session)
+        session.factor_log()
+        session.config()
+    finally:
+        session.close()
+    if _dump(path) != whole:
+        raise AssertionError("a damaged session was taken, and says something else than before")
+
+
+def _dump(path: Path) -> list[str]:
+    with closing(sqlite3.connect(path)) as database:
+        return list(database.iterdump())
+
+
+def main() -> int:
+    """Fuzz for the time given; exit code 1 where something was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cases", type=int, default=10**7, help="of each target, at most")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--only", nargs="*", default=[], help="targets")
+    parser.add_argument("--hostile", type=Path, help="folder of pose graphs to mutate as well")
+    parser.add_argument("--keep", type=Path, help="folder for the files of what was found")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        targets = small_targets()
+        if options.hostile is not None:
+            targets.append(hostile_target(options.hostile))
+        if not options.only or {"run folder", "session"} & set(options.only):
+            targets += run_target(Path(name) / "run")
+        targets = [target for target in targets if not options.only or target.name in options.only]
+        refused = refused_seeds(targets)
+        until = time.monotonic() + 60.0 * options.minutes
+        tallies = run_cases(targets, options.seed, options.first, options.cases, until, options.keep)
+    print(*(f"not sound at the outset: {told}" for told in refused), sep="\n")
+    for name, tally in tallies.items():
+        counts = ", ".join(f"{count} {what}" for what, count in sorted(tally.counts.items()))
+        print(f"{name}: {counts}; slowest {tally.slowest_s:.2f} s, {tally.most_bytes / 2**20:.0f} MiB at most")
+    finds = [find for tally in tallies.values() for find in tally.finds]
+    print(*finds[:100], sep="\n")
+    print(f"{sum(t.counts.total() for t in tallies.values())} cases, {len(finds)} finds")
+    return 1 if finds else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
