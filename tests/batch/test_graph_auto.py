@@ -132,18 +132,22 @@ def test_clean_files_keep_their_loops(name, share, data_root):
 
 
 @pytest.mark.data
-def test_lecture_hall_with_real_aliasing(data_root):
+@pytest.mark.parametrize(("true_loops", "true_share", "false_share"), [(3348, 0.95, 0.15), (1832, 0.85, 0.05)])
+def test_lecture_hall_with_real_aliasing(true_loops, true_share, false_share, data_root):
+    """Its false loops come in dozens from the same two places, and agree; true ones are left out till they are half."""
     folder = data_root / "tuc_lecture_hall"
     if not folder.is_dir():
         missing(f"{folder}")
     problem = read_pose_graph(folder / "Lecture_Hall.g2o")
-    solution = optimize_pose_graph(problem, AUTO)
     with (folder / "Lecture_Hall_loops.csv").open() as file:
         far = {(int(r["from"]), int(r["to"])): float(r["true_distance_m"]) > 3.0 for r in csv.DictReader(file)}
-    label = [far.get((int(a), int(b))) for a, b in problem.ids[problem.edges]]
-    true, false = np.array([x is False for x in label]), np.array([x is True for x in label])
-    assert solution.weights[true].mean() >= 0.95
-    assert solution.weights[false].mean() <= 0.15
+    label = np.array([{None: 0, False: 1, True: 2}[far.get((a, b))] for a, b in problem.ids[problem.edges].tolist()])
+    true = np.flatnonzero(label == 1)
+    out = np.random.default_rng(0).choice(true, len(true) - true_loops, replace=False)
+    problem, label = problem.with_edges(np.delete(np.arange(len(label)), out)), np.delete(label, out)
+    solution = optimize_pose_graph(problem, AUTO)
+    assert solution.weights[label == 1].mean() >= true_share
+    assert solution.weights[label == 2].mean() <= false_share
     truth = np.loadtxt(folder / "Lecture_Hall_truth.txt")
     ours, real = np.zeros((len(truth), 3)), np.zeros((len(truth), 3))
     ours[:, :2], real[:, :2] = solution.poses[:, :2, 2], truth[:, 1:3]

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vislam.batch.graph_gnc import doubtful_edges, joining_edges, reject_false_edges
-from vislam.batch.graph_judge import Judge, Judgement, extent
+from vislam.batch.graph_judge import PLACE, Judge, Judgement, extent
 from vislam.batch.graph_optimize import Decision
 from vislam.batch.graph_problem import PoseGraphProblem
 from vislam.batch.graph_robust import Kernel, kernel_route
@@ -44,7 +44,6 @@ _APART = 8.0  # log-likelihood between them, below which witnesses do not matter
 _GAIN_MIN = 16.0  # of the objective, per number of a pose: what a solution must explain beyond odometry alone
 _ALONE = 0.5  # leverage from which on nothing else confirms a loop
 _THIN = 4.0  # log-odds of a cluster that stands alone, below which it is not believed
-_PLACE = 20  # successive poses that make one place
 _NAMED = 5  # clusters in a message
 
 
@@ -200,7 +199,7 @@ def _thin(problem: PoseGraphProblem, best: Judgement, trusted: Mask) -> Mask:
 def _clusters(problem: PoseGraphProblem, at: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the cluster of each of the edges `at`: chains of loops whose ends are near each other in time."""
     ends = np.sort(problem.edges[at], axis=1)
-    pairs = cKDTree(ends).query_pairs(_PLACE / 2, p=np.inf, output_type="ndarray") if len(at) else ends
+    pairs = cKDTree(ends).query_pairs(PLACE / 2, p=np.inf, output_type="ndarray") if len(at) else ends
     joined = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(at), len(at)))
     return connected_components(joined, directed=False)[1].astype(np.int64)
 
@@ -209,7 +208,7 @@ def _witnesses(problem: PoseGraphProblem, edges: Mask) -> int:
     """Return how many clusters edges [E] form, each counted once per place: witnesses independent of each other."""
     at = np.flatnonzero(edges)
     cluster, first = _clusters(problem, at), problem.edges[at].min(axis=1, initial=len(problem.ids))
-    return int(sum(1 + np.ptp(first[cluster == c]) // _PLACE for c in range(int(cluster.max(initial=-1)) + 1)))
+    return int(sum(1 + np.ptp(first[cluster == c]) // PLACE for c in range(int(cluster.max(initial=-1)) + 1)))
 
 
 def _warning(problem: PoseGraphProblem, disputed: Mask, thin: Mask) -> str:

@@ -5,6 +5,9 @@ solution's own residual and covariance give that (studentised residuals; Foerstn
 speaks for it is a Bayes factor: the density of the innovation if the loop is true, against that of a false one, which
 may say anything in the space of the trajectory, times the share of true loops. Directions of which a loop knows
 nothing, as the heading of one from places that only look alike, neither speak for it nor against it.
+
+Loops between the same two places err together: what looked alike once looks alike in the next image, too. So however
+many they are, they weigh as one, and a place that was seen often does not outweigh several that were seen once.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from vislam.batch.graph_noise import covariances_of_edges, spread_out
@@ -41,6 +45,9 @@ _SHARE_MIN = 0.1  # redundancy of odometry over its numbers: below, loops say li
 _REDUNDANCY_MIN = 5.0
 _LEVERAGE_MAX = 1.0 - 1e-9
 _ITERATIONS, _TOLERANCE = 10, 1e-5
+_PLACE_WAY = 0.05  # of the extent: as far along the way a place reaches
+
+PLACE = 20  # successive poses that make one place, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +71,7 @@ class Judge:
         self._problem, self._trusted = problem, trusted
         self._loops = np.flatnonzero(~trusted)
         self._space_m = extent(problem, poses)
+        self._at = _along(problem, poses, _PLACE_WAY * self._space_m)
         d, k = problem.dimension, problem.tangent
         spread = np.full(k, self._space_m / math.sqrt(2.0 * math.pi))  # a Gaussian with a box's density at its peak
         spread[: k - d] = (2.0 * math.pi if d == 2 else (8.0 * math.pi**2) ** (1.0 / 3.0)) / math.sqrt(2.0 * math.pi)
@@ -85,7 +93,7 @@ class Judge:
             structure, poses, scales, _ = self._calibrated(poses, kept, scales)
             if _apart(scales, judged_with) > _SETTLED or changed > _CHANGED * kept[at].sum():
                 stale[:], changed, judged_with = True, 0, scales
-            weights = 1.0 / self._variances(scales)[kept]
+            weights = (self._counts_for(kept) / self._variances(scales))[kept]
             S[stale], _ = covariances_of_edges(structure, self._problem, poses, weights, at[stale], kept[at[stale]])
             score, share = self._scores(poses, kept, scales, S)
             inside, was_fresh = kept[at], stale.all()
@@ -116,6 +124,20 @@ class Judge:
     def _variances(self, scales: tuple[float, float]) -> Array:
         return np.where(self._trusted, scales[0], scales[1])
 
+    def _counts_for(self, kept: Mask) -> Array:
+        """Return what share of itself each edge [E] counts for: kept loops between the same two places make one."""
+        out = np.ones(len(kept))
+        at = self._loops[kept[self._loops]]
+        out[at] = 1.0 / self._alike(at)
+        return out
+
+    def _alike(self, loops: NDArray[np.int64]) -> Array:
+        """Return how many of the loops [M] (indices of edges) join the same two places as each, itself among them."""
+        if not len(loops):
+            return np.ones(0)
+        ends = self._at[np.sort(self._problem.edges[loops], axis=1)].reshape(-1, 4)
+        return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
+
     def _calibrated(
         self, poses: Array, kept: Mask, scales: tuple[float, float]
     ) -> tuple[Structure, Array, tuple[float, float], float]:
@@ -123,31 +145,37 @@ class Judge:
         edges = np.flatnonzero(kept)
         structure, trusted = Structure(self._problem.with_edges(edges)), self._trusted[edges]
         sample = np.concatenate([spread_out(edges[trusted], _SAMPLE), spread_out(edges[~trusted], _SAMPLE)])
+        counts_for = self._counts_for(kept)
         for _ in range(_CALIBRATIONS):
             variances = self._variances(scales)
-            weights = 1.0 / variances[edges]
+            weights = (counts_for / variances)[edges]
             poses = levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
             S, log_determinant = covariances_of_edges(structure, self._problem, poses, weights, sample, kept[sample])
-            before, scales = scales, self._scales(*self._whitened(poses, S, variances, sample), sample, scales)
+            z, L = self._whitened(poses, S, variances, sample)
+            before, scales = scales, self._scales(z, L, counts_for[sample], sample, scales)
             if _apart(scales, before) < _SETTLED:
                 break
         squares = np.sum(self._errors(poses, variances, edges) ** 2, axis=1)
         terms = squares + self._dof[edges] * np.log(variances[edges]) - np.log(self._values[edges]).sum(axis=1)
-        count, held = len(self._loops), int(np.sum(~trusted))
-        share = self._share(kept)
-        rate = -2.0 * (held * math.log(share) + (count - held) * math.log(1.0 - share))
+        terms *= counts_for[edges]
+        rest = self._loops[~kept[self._loops]]
+        share, held = self._share(kept), float(counts_for[edges[~trusted]].sum())
+        lost = float(np.sum(1.0 / self._alike(rest)))
+        rate = -2.0 * (held * math.log(share) + lost * math.log(1.0 - share))
         return structure, poses, scales, float(terms.sum()) + log_determinant + rate
 
-    def _scales(self, z: Array, L: Array, edges: NDArray[np.int64], scales: tuple[float, float]) -> tuple[float, float]:
+    def _scales(
+        self, z: Array, L: Array, counts_for: Array, edges: NDArray[np.int64], scales: tuple[float, float]
+    ) -> tuple[float, float]:
         """Return new factors on variances: of odometry by chi2 over redundancy, of loops by the median."""
         odometry, loops = scales
         trusted, dof = self._trusted[edges], self._dof[edges]
-        free = dof - np.einsum("eaa->e", L)
+        free = dof - counts_for * np.einsum("eaa->e", L)
         if float(free[trusted].sum()) > max(_REDUNDANCY_MIN, _SHARE_MIN * float(dof[trusted].sum())):
             odometry *= float(np.sum(z[trusted] ** 2)) / float(free[trusted].sum())
         judged = ~trusted & (free >= 0.5 * dof)
         if judged.sum() > _REDUNDANCY_MIN:
-            studentised = _studentised(z[judged], -L[judged])[0]
+            studentised = _studentised(z[judged], L[judged], counts_for[judged])[0]
             loops *= float(np.median(studentised / self._medians[edges][judged]))
         return (
             min(max(odometry, _SCALE_MIN), _ODOMETRY_SCALE_MAX),
@@ -158,16 +186,15 @@ class Judge:
         """Return log-odds of all loops above those asked for, and leverages, given covariances S [L, k, k]."""
         at, variances = self._loops, self._variances(scales)
         z, L = self._whitened(poses, S, variances, at)
-        inside = kept[at]
-        distance, spread = _studentised(z, np.where(inside[:, None, None], -L, L))
-        spread = np.where(inside, -spread, spread)
+        taken = np.where(kept, self._counts_for(kept), 0.0)[at]
+        distance, spread = _studentised(z, L, taken)
         stated = np.log(self._values[at]).sum(axis=1) - self._dof[at] * np.log(variances[at])
         # the space as it is now: that of odometry may be many times too large
         smaller = math.log(extent(self._problem, poses) / self._space_m)
         share = self._share(kept)
         evidence = 0.5 * (stated - spread - distance) + math.log(share / (1.0 - share))
         evidence += np.minimum(self._dof[at], self._problem.dimension) * min(smaller, 0.0)
-        leverage = np.einsum("eaa->e", L) / np.maximum(self._dof[at], 1)
+        leverage = taken * np.einsum("eaa->e", L) / np.maximum(self._dof[at], 1)
         return np.minimum(evidence, 0.5 * (self._limit[at] - distance)) - _ODDS, leverage
 
     def _share(self, kept: Mask) -> float:
@@ -194,11 +221,25 @@ def extent(problem: PoseGraphProblem, poses: Array) -> float:
     return float(np.exp(np.mean(np.log(np.maximum(sides, max(0.1 * sides.max(initial=0.0), 1e-9))))))
 
 
-def _studentised(z: Array, L: Array) -> tuple[Array, Array]:
-    """Return z^T (I + L)^-1 z and log det (I + L), of which -L is at most a hair below I."""
-    values, axes = np.linalg.eigh(np.eye(z.shape[1]) + L)
-    values = np.maximum(values, 1.0 - _LEVERAGE_MAX)
-    return np.sum(np.einsum("eab,ea->eb", axes, z) ** 2 / values, axis=1), np.log(values).sum(axis=1)
+def _along(problem: PoseGraphProblem, poses: Array, place_m: float) -> Array:
+    """Return where poses are in the sequence and along the way [N, 2], in places."""
+    d = problem.dimension
+    steps = np.linalg.norm(np.diff(poses[:, :d, d], axis=0, prepend=poses[:1, :d, d]), axis=1)
+    return np.column_stack([np.arange(len(poses)) / (PLACE / 2), np.cumsum(steps) / place_m])
+
+
+def _studentised(z: Array, L: Array, taken: Array) -> tuple[Array, Array]:
+    """Return the squared length of innovations [M] in their standard deviations, and log det of their covariance.
+
+    z [M, k] are errors and L [M, k, k] covariances of the solution, in the loop's standard deviations; the solution has
+    taken the loop with the weight `taken` [M] (0: not at all), which is undone.
+    """
+    values, axes = np.linalg.eigh(L)
+    values = np.maximum(values, 0.0)
+    without = np.maximum(1.0 - taken[:, None] * values, 1.0 - _LEVERAGE_MAX)
+    variances = 1.0 + values / without
+    innovations = np.einsum("eab,ea->eb", axes, z) / without
+    return np.sum(innovations**2 / variances, axis=1), np.log(variances).sum(axis=1)
 
 
 def _leaving(inside: Mask, score: Array) -> Mask:
