@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 
 from vislam.clock import StageClock
-from vislam.config import Config, LoopConfig, LoopTruthConfig, load
+from vislam.config import Config, LoopTruthConfig, load
 from vislam.datasets import open_dataset
 from vislam.front import Front
 from vislam.frontend import make_frontend
@@ -65,6 +65,8 @@ QUERY_S = 1.0
 RIGHT_M, RIGHT_DEG = 0.05, 2.0
 WRONG_M, WRONG_DEG = 0.5, 10.0
 RIGHT_FRAME_M, RIGHT_FRAME_DEG = 0.25, 5.0  # truth and map of a recording are good to centimetres
+SURE_SIGMA_M = 0.03  # of a single frame's answer that no other candidate confirms
+AGREEMENT_M, AGREEMENT_DEG = 0.15, 8.0  # two candidates of one frame that differ by less say the same
 MAP_SIGMAS = np.repeat([np.deg2rad(0.05), 0.002], 3)  # between keyframes of the map, which is held fixed anyway
 
 
@@ -290,29 +292,29 @@ def _ask_frame(
     candidates = detector.detect(query, np.eye(4), begins_piece=True, tags=())[1]
     cpu_ms = 1e3 * (time.thread_time() - start)
     detector.close()
-    T_map_body = _answer(candidates, known, config)
+    T_map_body = _answer(candidates, known)
     if T_map_body is None:
         return FrameAnswer(query.t_ns, sees, None, None, cpu_ms)
     error = _error(T_truth_body, known.T_truth_map @ T_map_body)
     return FrameAnswer(query.t_ns, sees, *error, cpu_ms)
 
 
-def _answer(candidates: list[LoopCandidate], known: SavedMap, config: Config) -> Array | None:
+def _answer(candidates: list[LoopCandidate], known: SavedMap) -> Array | None:
     """Return T_map_body [4, 4] of the candidate with most support, if another one or its own sigma speaks for it."""
     told = [(c, known.T_map_body[c.from_id] @ c.T_from_to) for c in candidates if c.T_from_to is not None]
     sound = [(c, T) for c, T in told if c.decision is not LoopDecision.REJECTED]
     if not sound:
         return None
     best, T_best = max(sound, key=lambda answer: answer[0].supporters)
-    agreeing = {c.from_id: _agree(T_best, T, config.loop) for c, T in told if c is not best}
+    agreeing = {c.from_id: _agree(T_best, T) for c, T in told if c is not best}
     if not all(agreeing[c.from_id] for c, _ in sound if c is not best):
         return None  # the place may exist twice
-    return T_best if any(agreeing.values()) or best.sigma_m <= config.loop.max_sigma_m else None
+    return T_best if any(agreeing.values()) or best.sigma_m <= SURE_SIGMA_M else None
 
 
-def _agree(T: Array, other: Array, config: LoopConfig) -> bool:
+def _agree(T: Array, other: Array) -> bool:
     metres, degrees = _error(T, other)
-    return metres <= config.agreement_m and degrees <= config.agreement_deg
+    return metres <= AGREEMENT_M and degrees <= AGREEMENT_DEG
 
 
 def _error(T: Array, other: Array) -> tuple[float, float]:

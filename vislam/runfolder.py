@@ -406,7 +406,7 @@ class RunLog:
 
     def _loop_row(self, candidate: LoopCandidate, loop_reports: dict[int, Any]) -> LoopRow:
         decision, reason, report, edge_id = candidate.decision, candidate.reason, None, -1
-        if decision == LoopDecision.ACCEPTED:  # a pair that was parked before has a row for that, too
+        if decision == LoopDecision.ACCEPTED:  # offered to the graph, which has the last word
             edge_id = self._edge_ids.get((candidate.from_id, candidate.to_id, candidate.source == INJECTED), -1)
             report = loop_reports.get(edge_id)
         if report is not None:

@@ -1,4 +1,4 @@
-"""The detector end to end on two laps through landmarks: what it accepts, rejects, parks, and why."""
+"""The detector end to end on two laps through landmarks: what it offers, what it rejects, and why."""
 
 import itertools
 from collections import Counter
@@ -97,11 +97,9 @@ def test_every_candidate_has_a_decision_and_a_reason(
     assert rejected
     assert all(any(word in c.reason for word in ("needs", "limit", "not verified")) for c in rejected)
     decisions = Counter(c.decision.value for c in candidates)
-    assert {k: v for k, v in detector.counters.items() if k in ("accepted", "rejected", "parked")} == {
-        k: decisions.get(k, 0) for k in ("accepted", "rejected", "parked")
-    }
+    assert {k: detector.counters[k] for k in ("accepted", "rejected")} == dict(decisions)
     per_keyframe = Counter(c.to_id for c in candidates if "not verified" not in c.reason)
-    assert max(per_keyframe.values()) <= CONFIG.max_verifications + 1  # one may be an old one that was parked
+    assert max(per_keyframe.values()) <= CONFIG.max_verifications
 
 
 def test_two_runs_give_the_same_bytes(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
@@ -160,25 +158,20 @@ def test_a_tilted_copy_of_a_place_contradicts_gravity() -> None:
     assert [c for c in candidates if "off gravity" in c.reason]
 
 
-def test_an_unsure_edge_waits_for_a_witness() -> None:
-    """Held to a sigma that none has, an edge is too unsure alone: parked until a later keyframe says the same."""
-    world, rng, poses = room(3), np.random.default_rng(4), lap_poses(1.4, PER_LAP)
+def test_what_nothing_speaks_against_is_offered_at_once(
+    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
+) -> None:
+    """The first keyframe that sees an old place offers its loops, however far off odometry is: the graph decides."""
+    world, poses, keyframes = laps
     away = np.eye(4)
-    away[:3, 3] = [30.0, 0.0, 0.0]
-    keyframes = [world.see(i, pose, rng) for i, pose in enumerate(poses)]
-    estimates = [pose if i < PER_LAP else away @ pose for i, pose in enumerate(poses)]
-    strict = replace(CONFIG, max_sigma_m=1e-4, max_odometry=0, max_verifications=1)
-    detector = LoopDetector(strict, world.rig, 0)
-    edges, candidates = run(detector, keyframes, estimates)
-    parked = [(c.from_id, c.to_id) for c in candidates if c.decision is LoopDecision.PARKED]
-    promoted = [c for c in candidates if "parked until keyframe" in c.reason]
-    assert parked
-    assert promoted
-    assert detector.counters["promoted"] == len(promoted)
-    assert {(c.from_id, c.to_id) for c in promoted} <= set(parked)
-    assert all(c.to_id < int(c.reason.rsplit(" ", 1)[1]) for c in promoted)
-    assert len({(e.from_id, e.to_id) for e in edges}) == len(edges)
-    assert worst_error(edges, poses)[0] < 0.2
+    away[:3, 3] = [40.0, 0.0, 0.0]
+    detector = LoopDetector(replace(CONFIG, max_odometry=0), world.rig, 0)
+    run(detector, keyframes[:PER_LAP], poses[:PER_LAP])
+    edges, candidates = detector.detect(keyframes[PER_LAP], away @ poses[PER_LAP])
+    sound = [c for c in candidates if c.decision is not LoopDecision.REJECTED]
+    assert edges
+    assert {c.decision for c in sound} == {LoopDecision.ACCEPTED}
+    assert [(c.from_id, c.to_id) for c in sound] == [(e.from_id, e.to_id) for e in edges]
 
 
 def test_a_map_that_moves_is_followed(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
@@ -197,7 +190,7 @@ def test_a_map_that_moves_is_followed(laps: tuple[LandmarkWorld, list[Array], li
         assert bool(edges) == moves
 
 
-def test_without_depth_edges_have_no_scale_and_need_witnesses() -> None:
+def test_without_depth_edges_have_no_scale() -> None:
     world, rng, poses = room(1), np.random.default_rng(0), lap_poses(1.5, PER_LAP)
     # a second lap half a metre further in, so that there is a direction
     inner = lap_poses(1.5, PER_LAP, 2.0)
@@ -211,7 +204,7 @@ def test_without_depth_edges_have_no_scale_and_need_witnesses() -> None:
         assert np.linalg.norm(edge.T_from_to[:3, 3]) == pytest.approx(1.0)
         assert np.rad2deg(np.linalg.norm(se3_log(invert(edge.T_from_to) @ truth)[:3])) < 2.0
     accepted = [c.reason for c in candidates if c.decision is LoopDecision.ACCEPTED]
-    assert all(int(reason.split(" deg, ")[1].split(" of ")[0]) >= CONFIG.min_agreeing_direction for reason in accepted)
+    assert all("direction good to" in reason for reason in accepted)
 
 
 def test_poor_keyframes_do_no_harm(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:

@@ -1,4 +1,4 @@
-"""Loop detection where odometry was lost: no help from poses that mean nothing, and never one image alone."""
+"""Loop detection where odometry was lost: no help from poses that mean nothing."""
 
 from dataclasses import replace
 
@@ -39,20 +39,18 @@ def go_on(
     ]
 
 
-def test_a_new_piece_is_placed_by_its_second_keyframe(
+def test_a_new_piece_offers_what_looks_alike_from_its_first_keyframe_on(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
     world, poses, keyframes = laps
     detector = begin(world, keyframes, poses, CONFIG)
-    first, second = go_on(detector, keyframes[LOST : LOST + 2], [AWAY @ pose for pose in poses[LOST : LOST + 2]])
-    assert first[0] == []
-    waiting = [c for c in first[1] if c.decision is LoopDecision.PARKED]
-    assert waiting and all("no other frame agrees yet" in c.reason for c in waiting)
-    assert {edge.to_id for edge in second[0]} == {LOST, LOST + 1}
-    for edge in second[0]:
-        error = se3_log(invert(edge.T_from_to) @ invert(poses[edge.from_id]) @ poses[edge.to_id])
-        assert np.linalg.norm(error[3:]) < 0.05 and np.linalg.norm(error[:3]) < np.deg2rad(1.0)
-    assert {c.source for c in first[1] + second[1]} == {"appearance"}  # poses mean nothing yet
+    found = go_on(detector, keyframes[LOST : LOST + 2], [AWAY @ pose for pose in poses[LOST : LOST + 2]])
+    for n, (edges, candidates) in enumerate(found):
+        assert {edge.to_id for edge in edges} == {LOST + n}
+        assert {c.source for c in candidates} == {"appearance"}  # poses mean nothing yet
+        for edge in edges:
+            error = se3_log(invert(edge.T_from_to) @ invert(poses[edge.from_id]) @ poses[edge.to_id])
+            assert np.linalg.norm(error[3:]) < 0.05 and np.linalg.norm(error[:3]) < np.deg2rad(1.0)
 
 
 def test_poses_count_again_once_the_graph_has_joined(
@@ -68,26 +66,6 @@ def test_poses_count_again_once_the_graph_has_joined(
     assert "odometry" in {c.source for c in candidates if c.decision is LoopDecision.ACCEPTED}
 
 
-def test_the_same_image_again_is_no_second_witness(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
-    """One frame that resembles several old keyframes waits, however sure it is."""
-    world, poses, keyframes = laps
-    detector = begin(world, keyframes, poses, CONFIG)
-    edges, candidates = go_on(detector, keyframes[LOST : LOST + 1], [AWAY @ poses[LOST]])[0]
-    parked = [c for c in candidates if c.decision is LoopDecision.PARKED]
-    assert len({c.from_id for c in parked}) >= 2
-    assert edges == []
-
-
-def test_frames_that_disagree_through_odometry_wait(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
-    """The odometry of the new piece says that it moved 2 m between two frames that old keyframes place 0.4 m apart."""
-    world, poses, keyframes = laps
-    detector = begin(world, keyframes, poses, CONFIG)
-    estimates = [AWAY @ poses[LOST], AWAY @ poses[LOST + 1] @ body_pose((2.0, 0.0, 0.0), 0.0)]
-    found = go_on(detector, keyframes[LOST : LOST + 2], estimates)
-    assert [edges for edges, _ in found] == [[], []]
-    assert [c for c in found[1][1] if "disagree" in c.reason]
-
-
 def test_a_loss_right_at_the_start_needs_no_words_of_the_run(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
@@ -97,7 +75,7 @@ def test_a_loss_right_at_the_start_needs_no_words_of_the_run(
         detector.detect(keyframes[k], poses[k])
     again = [replace(keyframes[k], id=k + 3) for k in (1, 2)]
     found = go_on(detector, again, [AWAY @ poses[k] for k in (1, 2)])
-    assert {edge.to_id for edge in found[1][0]} == {4, 5}
+    assert [{edge.to_id for edge in edges} for edges, _ in found] == [{4}, {5}]
 
 
 def test_the_wrong_place_is_never_found() -> None:

@@ -12,16 +12,15 @@ from landmark_world import body_pose, make_rig
 from vislam.config import LoopConfig
 from vislam.geometry import invert, se3_exp, transform_points
 from vislam.loop.candidates import AppearanceCandidates, islands, odometry_candidates, view_bounds
-from vislam.loop.checks import Measured, agree, agrees_with_map, judge, tilt_error_rad
+from vislam.loop.checks import judge, tilt_error_rad
 from vislam.loop.likeness import Likeness
 from vislam.loop.pose_table import PoseTable
 from vislam.loop.verifier import Verification
-from vislam.messages import Array, GraphUpdate, LoopDecision
+from vislam.messages import Array, LoopDecision
 
 CONFIG = LoopConfig()
 GOOD = Verification(
-    "", 100, 40, 80, np.eye(4), np.eye(6) * 1e-4, True, sigma_m=0.02, median_depth_m=2.0, reverse_agreement=0.9,
-    depth_agreement=0.9,
+    "", 100, 40, 80, np.eye(4), np.eye(6) * 1e-4, True, sigma_m=0.02, reverse_agreement=0.9, depth_agreement=0.9,
 )  # fmt: skip
 
 
@@ -102,33 +101,28 @@ def test_tilt_ignores_heading_and_measures_the_rest(yaw: float, tilt: float, axi
 
 
 @pytest.mark.parametrize(
-    ("change", "tilt_deg", "agreeing", "disagreeing", "decision", "says"),
+    ("change", "tilt_deg", "decision", "says"),
     [
-        ({}, None, 0, 0, LoopDecision.ACCEPTED, "sigma 2.0 cm"),
-        ({}, 2.0, 3, 1, LoopDecision.ACCEPTED, "3 of 4 neighbours agree"),
-        ({}, None, 1, 2, LoopDecision.PARKED, "2 of 3 neighbours disagree"),
-        ({"sigma_m": 0.05}, None, 0, 0, LoopDecision.PARKED, "above 3.0 cm"),
-        ({"sigma_m": 0.05}, None, 1, 0, LoopDecision.ACCEPTED, "1 of 1"),
-        ({"sigma_m": 0.05, "median_depth_m": 8.0}, None, 0, 0, LoopDecision.ACCEPTED, "sigma 5.0 cm"),
-        ({"sigma_m": 0.5}, None, 9, 0, LoopDecision.REJECTED, "sigma 50 cm"),
-        ({"sigma_m": float("nan")}, None, 9, 0, LoopDecision.REJECTED, "sigma nan"),
-        ({}, 12.0, 9, 0, LoopDecision.REJECTED, "12.0 deg off gravity"),
-        ({"reverse_agreement": 0.2}, None, 9, 0, LoopDecision.REJECTED, "20% agree the other way round"),
-        ({"depth_agreement": 0.1}, None, 9, 0, LoopDecision.REJECTED, "10% agree in depth"),
-        ({"T_a_b": None, "reason": "5 matches, needs 12"}, None, 0, 0, LoopDecision.REJECTED, "5 matches, needs 12"),
-        ({"has_scale": False}, None, 1, 0, LoopDecision.PARKED, "needs 2 without depth"),
-        ({"has_scale": False}, None, 2, 0, LoopDecision.ACCEPTED, "2 of 2"),
-        ({"has_scale": False, "sigma_m": 0.3}, None, 9, 0, LoopDecision.REJECTED, "17.2 deg only"),
+        ({}, None, LoopDecision.ACCEPTED, "sigma 2.0 cm"),
+        ({}, 2.0, LoopDecision.ACCEPTED, "80 with guided matching"),
+        ({"sigma_m": 0.05}, None, LoopDecision.ACCEPTED, "sigma 5.0 cm"),
+        ({"sigma_m": 0.5}, None, LoopDecision.REJECTED, "sigma 50 cm"),
+        ({"sigma_m": float("nan")}, None, LoopDecision.REJECTED, "sigma nan"),
+        ({}, 12.0, LoopDecision.REJECTED, "12.0 deg off gravity"),
+        ({"reverse_agreement": 0.2}, None, LoopDecision.REJECTED, "20% agree the other way round"),
+        ({"depth_agreement": 0.1}, None, LoopDecision.REJECTED, "10% agree in depth"),
+        ({"T_a_b": None, "reason": "5 matches, needs 12"}, None, LoopDecision.REJECTED, "5 matches, needs 12"),
+        ({"has_scale": False}, None, LoopDecision.ACCEPTED, "direction good to 1.1 deg"),
+        ({"has_scale": False, "sigma_m": 0.3}, None, LoopDecision.REJECTED, "17.2 deg only"),
     ],
 )
 def test_each_rule_decides_with_its_reason(
-    change: dict[str, float | None], tilt_deg: float | None, agreeing: int, disagreeing: int, decision: LoopDecision,
-    says: str,
-) -> None:  # fmt: skip
+    change: dict[str, float | None], tilt_deg: float | None, decision: LoopDecision, says: str
+) -> None:
     tilt = None if tilt_deg is None else float(np.deg2rad(tilt_deg))
-    judgement = judge(replace(GOOD, **change), tilt, agreeing, disagreeing, CONFIG)
-    assert judgement.decision is decision
-    assert says in judgement.reason
+    decided, reason = judge(replace(GOOD, **change), tilt, CONFIG)
+    assert decided is decision
+    assert says in reason
 
 
 def _table(poses: dict[int, Array]) -> PoseTable:
@@ -136,41 +130,6 @@ def _table(poses: dict[int, Array]) -> PoseTable:
     for keyframe_id, pose in poses.items():
         table.add(keyframe_id, pose)
     return table
-
-
-def test_witnesses_agree_through_odometry() -> None:
-    """Two measurements of different pairs, in a map whose second half has drifted away as a whole."""
-    drift = body_pose((5.0, 1.0, 0.0), 30.0)
-    truth = {i: body_pose((0.3 * i, 0.1 * i, 0.0), 5.0 * i) for i in (1, 3)}
-    truth |= {i: body_pose((0.3 * (i - 50), 0.2, 0.0), 4.0 * (i - 50)) for i in (50, 52)}
-    table = _table({i: T if i < 10 else drift @ T for i, T in truth.items()})
-
-    def measured(a: int, b: int, error: Array, sigma_m: float = 0.02, scale: bool = True) -> Measured:
-        T = invert(truth[a]) @ truth[b] @ error
-        if not scale:
-            T[:3, 3] /= np.linalg.norm(T[:3, 3])
-        return Measured(a, b, T, scale, 2.0, sigma_m)
-
-    one = measured(1, 50, np.eye(4))
-    assert agree(one, measured(3, 52, np.eye(4)), table, CONFIG)
-    assert not agree(one, measured(3, 52, body_pose((0.2, 0.0, 0.0), 0.0)), table, CONFIG)
-    assert not agree(one, measured(3, 52, body_pose((0.0, 0.0, 0.0), 10.0)), table, CONFIG)
-    # as far as both sigmas explain, and no further
-    near = body_pose((0.0, 0.1, 0.0), 0.0)
-    assert agree(one, measured(3, 52, near, 0.03), table, CONFIG)
-    assert not agree(measured(1, 50, np.eye(4), 0.002), measured(3, 52, near, 0.002), table, CONFIG)
-    # without scale: rotations alike and rays that meet
-    flat = measured(1, 50, np.eye(4), scale=False)
-    assert agree(flat, measured(3, 52, np.eye(4), scale=False), table, CONFIG)
-    assert not agree(flat, measured(3, 52, body_pose((0.0, 0.0, 0.0), 20.0), scale=False), table, CONFIG)
-    backwards = measured(3, 52, np.eye(4), scale=False)
-    backwards.T_from_to[:3, 3] *= -1.0
-    assert not agree(flat, backwards, table, CONFIG)
-    assert not agree(one, measured(3, 52, np.eye(4), scale=False), table, CONFIG)
-    # the map itself is a witness only where it has not drifted
-    assert not agrees_with_map(one, table, CONFIG)
-    table.move(GraphUpdate(1, np.array([50, 52, 99]), np.stack([truth[50], truth[52], np.eye(4)]), np.eye(4), None))
-    assert agrees_with_map(one, table, CONFIG)
 
 
 def test_the_pose_table_grows_and_refuses_nonsense() -> None:

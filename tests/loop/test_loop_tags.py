@@ -11,7 +11,7 @@ from vislam.features import find_tags
 from vislam.geometry import invert, se3_log
 from vislam.loop.detector import LoopDetector
 from vislam.loop.tags import TagBook, sight_tags
-from vislam.messages import Frame, Keyframe, LoopDecision
+from vislam.messages import Frame, Keyframe
 
 SEED = 5
 SIZE_M = 0.2
@@ -91,31 +91,26 @@ def test_what_says_nothing_is_left_out():
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")
-@pytest.mark.parametrize("visits", [1, 3])
-def test_a_blank_wall_with_tags_closes_the_loop(visits):
-    """Nothing but two tags ties the second visit to the first: one pair of images waits for another as its witness."""
+def test_a_blank_wall_with_tags_closes_the_loop():
+    """Nothing but two tags ties the second visit to the first."""
     rng = np.random.default_rng(SEED)
     tags = {7: hung(1.5, 0.35, 0.1, 225.0), 9: hung(1.5, -0.35, 0.0, 135.0)}
     detector = LoopDetector(load(None, WITH_SIZE).loop, RIG, SEED)
-    first = [body_pose((0.1 * k, 0.0, 0.0), 2.0 * k) for k in range(visits)]
-    second = [body_pose((0.05 + 0.1 * k, 0.1, 0.0), 2.0 - k) for k in range(visits)]
+    first = [body_pose((0.1 * k, 0.0, 0.0), 2.0 * k) for k in range(3)]
+    second = [body_pose((0.05 + 0.1 * k, 0.1, 0.0), 2.0 - k) for k in range(3)]
     poses = [*first, *[body_pose((0.0, 0.0, 0.0), 180.0)] * 8, *second]
     edges, records = [], []
     for k, pose in enumerate(poses):
         nothing = np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3))
         keyframe = Keyframe(k, k * 300_000_000, frame(pose, tags, rng, k), *nothing)
         drifted = pose.copy()
-        drifted[1, 3] += 0.4 if k >= visits else 0.0
+        drifted[1, 3] += 0.4 if k >= 3 else 0.0
         found, said = detector.detect(keyframe, drifted)
         edges += found
         records += said
     print(*(f"{r.from_id}-{r.to_id} {r.source} {r.decision}: {r.reason}" for r in records), sep="\n")
     assert {r.source for r in records} == {"tag"}
-    if visits == 1:
-        assert [r.from_id for r in records if r.decision is LoopDecision.PARKED] == [0]
-        assert not edges
-    else:
-        assert len(edges) >= 3
+    assert len(edges) >= 3
     for edge in edges:
         error = se3_log(invert(edge.T_from_to) @ invert(poses[edge.from_id]) @ poses[edge.to_id])
         assert np.linalg.norm(error[3:]) < 0.05

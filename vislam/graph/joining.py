@@ -98,10 +98,12 @@ class Waiting:
     def _agree(self, one: LoopModel, other: LoopModel, T: Array, ends: _Ends, known: RelativeCovariance) -> bool:
         """Return whether a loop fits where another one, which asks for the motion `T`, says that it should."""
         config, a, b = self._config, one.record, other.record
+        T_from, T_to = ends.of(other, T)
+        if self._are_far(other, T_from, T_to):
+            return False
         uncertainty = np.zeros((6, 6))
         if b.to_id != a.to_id:
             uncertainty += known(a.to_id, b.to_id)
-        T_from, T_to = ends.of(other, T)
         T_one_from, T_one_to = ends.of(one, T)
         back = se3_adjoint(invert(T_to) @ T_one_to)
         uncertainty += back @ one.covariance @ back.T
@@ -111,6 +113,14 @@ class Waiting:
         if np.trace(uncertainty[3:, 3:]) > 3.0 * config.consistency_max_sigma_m**2:
             return False  # odometry so loose proves nothing
         return other.chi2(T_from, T_to, uncertainty) < self._limit
+
+    def _are_far(self, edge: LoopModel, T_from: Array, T_to: Array) -> bool:
+        """Return whether a loop misses by more than any uncertainty that may prove something: no marginal is needed."""
+        if not edge.record.has_scale:
+            return False
+        missed_m = edge.residual(T_from, T_to)[0][3:]
+        most_m2 = 3.0 * self._config.consistency_max_sigma_m**2 + np.trace(edge.covariance[3:, 3:])
+        return bool(missed_m @ missed_m > self._limit * most_m2)
 
     def _place_by_directions(self, edges: list[LoopModel], ends: _Ends) -> tuple[Array, list[LoopModel]] | None:
         """Return the motion that lets most loops without scale look along their directions, at least three of them."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -12,7 +11,7 @@ from vislam.camera import Rig
 from vislam.config import LoopConfig
 from vislam.geometry import invert_many, transform_points
 from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
-from vislam.loop.checks import Judgement, Measured, agree, agrees_with_map, judge, objection, tilt_error_rad
+from vislam.loop.checks import judge, tilt_error_rad
 from vislam.loop.database import PlaceDatabase, side_by_side
 from vislam.loop.likeness import Likeness
 from vislam.loop.pose_table import PoseTable
@@ -34,22 +33,12 @@ from vislam.messages import (
 
 _PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
 _SHOWN_MATCHES = 40  # per candidate, for the picture that explains it
-_NEIGHBOUR_STEPS = (-1, 1, -2, 2)  # where a second witness is looked for beside a candidate
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """A candidate of one keyframe and what verification made of it; `measured` only when nothing speaks against it."""
-
-    candidate: Candidate
-    to_id: int
-    found: Verification
-    tilt_rad: float | None
-    measured: Measured | None
 
 
 class LoopDetector:
-    """Finds loops: owns the vocabulary, the index, the features of old keyframes, and what is parked.
+    """Finds loops and verifies them one by one; owns the vocabulary, the index and the features of old keyframes.
+
+    Whether a verified one is believed is for the graph to decide.
 
     `gravity_aligned` says that the map's z axis is up (there is an IMU), so that a loop's tilt can be checked.
     """
@@ -66,12 +55,10 @@ class LoopDetector:
         self._appearance = AppearanceCandidates(config.island_gap)
         self._verifier = Verifier(config, rig, seed)
         self._tags = TagBook()
-        self._witnesses: list[Measured] = []  # poses that the last keyframes measured, accepted or parked
-        self._parked: list[_Trial] = []
         self._next_edge_id = 0
         self._likeness: dict[int, Likeness] = {}  # of those to the newest keyframe
         self.retrieved: list[RetrievedKeyframe] = []  # what looked most like the newest keyframe
-        self.counters = {"unlike": 0, "verified": 0, "accepted": 0, "parked": 0, "rejected": 0, "promoted": 0}
+        self.counters = {"unlike": 0, "verified": 0, "accepted": 0, "rejected": 0}
 
     @property
     def vocabulary(self) -> Vocabulary:
@@ -92,7 +79,7 @@ class LoopDetector:
         return self._tags.of(keyframe_id)
 
     def restore(self, memory: PlacesMemory) -> None:
-        """Take over the keyframes of an earlier run; edges that it had parked here are forgotten.
+        """Take over the keyframes of an earlier run.
 
         Raises DataError when features or vocabulary are damaged.
         """
@@ -121,8 +108,8 @@ class LoopDetector:
             tags: that it saw; None: they are looked for in its image.
 
         Returns:
-            Verified edges, some perhaps to an earlier keyframe whose parked edge was confirmed now, and every candidate
-            with its decision and reason. Raises DataError for features that cannot be used.
+            Verified edges, to be offered to the graph, and every candidate with its decision and reason. Raises
+            DataError for features that cannot be used.
         """
         if not self._config.enabled:
             return [], []
@@ -133,18 +120,11 @@ class LoopDetector:
         if tags is None:
             tags = sight_tags(keyframe.frame, self._rig.cameras[0], self._config)
         self._tags.add(view.id, tags)
-        trials = self._try(view)
+        verified = self._verify(view)
         self._views[view.id] = view
-        self._witnesses += [trial.measured for trial in trials if trial.measured is not None]
         edges: list[LoopEdge] = []
-        records = self._reconsider(view.id, edges)
-        for trial in trials:
-            record = self._record(trial, self._judge(trial), edges)
-            if record.decision is LoopDecision.PARKED:
-                self._parked.append(trial)
-            records.append(record)
+        records = [self._record(candidate, view, found, edges) for candidate, found in verified]
         self._database.add(view)
-        self._forget(view.id)
         return edges, records
 
     def close(self) -> None:
@@ -231,111 +211,40 @@ class LoopDetector:
             points = rays * self._config.nominal_depth_m
         return np.asarray(points[:: max(1, len(points) // _PROBES)], dtype=np.float64)
 
-    def _try(self, view: View) -> list[_Trial]:
-        """Verify candidates within the budget; what is left of it goes to neighbours of those that need a witness."""
+    def _verify(self, view: View) -> list[tuple[Candidate, Verification]]:
+        """Return the candidates of a view, verified within the budget."""
         budget = self._config.max_verifications
-        candidates = self._candidates(view)
-        trials = [self._trial(candidate, view) for candidate in candidates[:budget]]
-        tried = {candidate.id for candidate in candidates}
-        allowed = set(self._poses.ids[self._old(view)].tolist())
-        for trial in list(trials):
-            if trial.measured is None or trial.found.T_a_b is None or self._is_settled(trial, trials):
-                continue
-            for step in _NEIGHBOUR_STEPS:
-                neighbour = trial.candidate.id + step
-                if len(trials) >= budget or neighbour in tried or neighbour not in allowed:
-                    continue
-                tried.add(neighbour)
-                if not self._compare(neighbour, view).is_alike:
-                    continue
-                extra = Candidate(neighbour, trial.candidate.source, trial.candidate.score, trial.candidate.consistency)
-                trials.append(self._trial(extra, view))
-                if self._is_settled(trial, trials):
-                    break
         skipped = Verification(f"not verified: {budget} verifications per keyframe are spent", 0)
-        return trials + [_Trial(candidate, view.id, skipped, None, None) for candidate in candidates[budget:]]
+        found = []
+        for n, candidate in enumerate(self._candidates(view)):
+            found.append((candidate, self._verified(candidate, view) if n < budget else skipped))
+        return found
 
-    def _trial(self, candidate: Candidate, view: View) -> _Trial:
+    def _verified(self, candidate: Candidate, view: View) -> Verification:
         self.counters["verified"] += 1
         found = self._verifier.verify(self._views[candidate.id], view, self._likeness.get(candidate.id))
         if found.T_a_b is None and candidate.source == "tag":
-            found = self._tags.verify(candidate.id, view.id, self._rig.T_body_cams[0], self._config) or found
-        tilt_rad, measured = None, None
-        if found.T_a_b is not None:
-            if self._gravity_aligned:
-                tilt_rad = tilt_error_rad(found.T_a_b, self._poses[candidate.id], self._poses[view.id])
-            if not objection(found, tilt_rad, self._config):
-                measured = Measured(
-                    candidate.id, view.id, found.T_a_b, found.has_scale, found.median_depth_m, found.sigma_m
-                )
-        return _Trial(candidate, view.id, found, tilt_rad, measured)
+            return self._tags.verify(candidate.id, view.id, self._rig.T_body_cams[0], self._config) or found
+        return found
 
-    def _is_settled(self, trial: _Trial, trials: list[_Trial]) -> bool:
-        fresh = [other.measured for other in trials if other.measured is not None]
-        return self._judge(trial, fresh).decision is not LoopDecision.PARKED
-
-    def _judge(self, trial: _Trial, fresh: list[Measured] | None = None) -> Judgement:
-        """Judge a trial with all witnesses, and those of this keyframe that are not among them yet."""
-        agreeing, disagreeing = 0, 0
-        measured, joined = trial.measured, True
-        if measured is not None:
-            joined = self._pieces.are_joined(measured.from_id, measured.to_id)
-            agreeing += joined and agrees_with_map(measured, self._poses, self._config)
-            for witness in self._witnesses + (fresh or []):
-                if self._can_witness(witness, measured, joined):
-                    says_the_same = agree(measured, witness, self._poses, self._config)
-                    agreeing += says_the_same and (joined or witness.to_id != measured.to_id)
-                    disagreeing += not says_the_same
-        return judge(trial.found, trial.tilt_rad, agreeing, disagreeing, self._config, joined)
-
-    def _can_witness(self, witness: Measured, measured: Measured, joined: bool) -> bool:
-        """Return whether a measurement can tell about another one: if the way between them is known on both sides.
-
-        Between pieces that are not joined one image can only contradict itself: two places that look alike.
-        """
-        apart = (abs(witness.from_id - measured.from_id), abs(witness.to_id - measured.to_id))
-        reach = self._config.neighbour_keyframes
-        if joined:
-            return apart != (0, 0) and max(apart) <= reach
-        return (
-            apart != (0, 0)
-            and apart[1] <= reach
-            and self._pieces.are_joined(witness.to_id, measured.to_id)
-            and self._pieces.are_joined(witness.from_id, measured.from_id)
-        )
-
-    def _reconsider(self, newest_id: int, edges: list[LoopEdge]) -> list[LoopCandidate]:
-        """Promote parked edges that the new keyframe, or the map that moved meanwhile, confirms."""
-        records: list[LoopCandidate] = []
-        waiting: list[_Trial] = []
-        for trial in self._parked:
-            judgement = self._judge(trial)
-            if judgement.decision is LoopDecision.ACCEPTED:
-                self.counters["promoted"] += 1
-                reason = f"{judgement.reason}; parked until keyframe {newest_id}"
-                records.append(self._record(trial, Judgement(judgement.decision, reason), edges))
-            else:
-                waiting.append(trial)
-        self._parked = waiting
-        return records
-
-    def _record(self, trial: _Trial, judgement: Judgement, edges: list[LoopEdge]) -> LoopCandidate:
-        """Return the record of a decision; an accepted one also becomes an edge."""
-        self.counters[judgement.decision.value] += 1
-        found, candidate = trial.found, trial.candidate
-        accepted = judgement.decision is LoopDecision.ACCEPTED
-        if accepted and found.T_a_b is not None and found.covariance is not None:
+    def _record(self, candidate: Candidate, view: View, found: Verification, edges: list[LoopEdge]) -> LoopCandidate:
+        """Return the record of a candidate; one that nothing speaks against also becomes an edge."""
+        tilt_rad = None
+        if found.T_a_b is not None and self._gravity_aligned:
+            tilt_rad = tilt_error_rad(found.T_a_b, self._poses[candidate.id], self._poses[view.id])
+        decision, reason = judge(found, tilt_rad, self._config)
+        self.counters[decision.value] += 1
+        if decision is LoopDecision.ACCEPTED and found.T_a_b is not None and found.covariance is not None:
             edges.append(
                 LoopEdge(
-                    self._next_edge_id, candidate.id, trial.to_id, found.T_a_b, found.covariance, found.has_scale,
+                    self._next_edge_id, candidate.id, view.id, found.T_a_b, found.covariance, found.has_scale,
                     found.inliers, candidate.score,
                 )
             )  # fmt: skip
             self._next_edge_id += 1
         return LoopCandidate(
-            candidate.id, trial.to_id, candidate.source, candidate.score, found.inliers, judgement.decision,
-            judgement.reason, found.sigma_m, candidate.consistency, found.supporters, found.T_a_b,
-            self._matches_px(candidate.id, trial.to_id, found),
+            candidate.id, view.id, candidate.source, candidate.score, found.inliers, decision, reason, found.sigma_m,
+            candidate.consistency, found.supporters, found.T_a_b, self._matches_px(candidate.id, view.id, found),
         )  # fmt: skip
 
     def _matches_px(self, from_id: int, to_id: int, found: Verification) -> Array | None:
@@ -347,12 +256,6 @@ class LoopDetector:
         project = self._rig.cameras[0].project
         ends = [np.column_stack([view.xy[pairs[:, k]], np.ones(len(pairs))]) for k, view in enumerate((a, b))]
         return np.hstack([project(rays.astype(np.float64)) for rays in ends])
-
-    def _forget(self, newest_id: int) -> None:
-        """Let go of witnesses and parked edges that no coming keyframe is close enough to confirm."""
-        oldest = newest_id - self._config.neighbour_keyframes
-        self._witnesses = [witness for witness in self._witnesses if witness.to_id > oldest]
-        self._parked = [trial for trial in self._parked if trial.to_id > oldest]
 
 
 def _apart(candidates: list[Candidate], others: list[Candidate], gap: int) -> list[Candidate]:

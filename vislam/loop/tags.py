@@ -99,10 +99,7 @@ class TagBook:
         return [Candidate(k, "tag", 1.0) for k in order[:count]]
 
     def verify(self, from_id: int, to_id: int, T_body_cam: Array, config: LoopConfig) -> Verification | None:
-        """Return the relative pose of two keyframes by the best tag that both saw; None where none gives poses.
-
-        Four corners of one image are too little to be taken alone: such a pose always needs a witness.
-        """
+        """Return the relative pose of two keyframes by the best tag that both saw; None where none gives poses."""
         pairs = [
             (min(a.side_px, b.side_px), a, b)
             for a in self._sightings.get(from_id, ())
@@ -123,8 +120,6 @@ class TagBook:
             T_a_b=T_body_cam @ a.T_cam_tag @ invert(T_body_cam @ b.T_cam_tag),
             covariance=0.5 * (covariance + covariance.T),
             sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
-            median_depth_m=float(max(a.T_cam_tag[2, 3], b.T_cam_tag[2, 3])),
-            needs_witness=True,
         )  # fmt: skip
 
     def _side_px(self, keyframe_id: int, tag_id: int) -> float:

@@ -44,10 +44,8 @@ class Verification:
     covariance: Array | None = None  # [6, 6] of T_a_b, rotation first, perturbed in b
     has_scale: bool = True
     sigma_m: float = float("nan")  # largest standard deviation of the translation; of the unit direction without scale
-    median_depth_m: float = float("nan")
     reverse_agreement: float = float("nan")  # share of matches that also agree the other way round; NaN: none could
     depth_agreement: float = float("nan")  # share of matches with two depths whose depths agree; NaN: too few
-    needs_witness: bool = False  # never taken alone, however small its sigma
     pairs: NDArray[np.int64] | None = None  # [M, 2] features of a and b that agree with the pose; without one, matched
 
 
@@ -155,7 +153,6 @@ class Verifier:
             T_a_b=self._T_body_cam @ T_a_b @ invert(self._T_body_cam),
             covariance=0.5 * (covariance + covariance.T),
             sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance_cam[3:, 3:])[-1])),
-            median_depth_m=float(np.nanmedian(np.concatenate([support.points_a[:, 2], support.points_b[:, 2]]))),
             reverse_agreement=reverse,
             depth_agreement=depth,
             pairs=pairs[agreeing],
