@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -152,17 +152,22 @@ def whole_evidence(
         pieces_apart: pieces of the trajectory that are joined with nothing.
         keyframes: see `KeyframeWitness.evidence`.
     """
-    decided = Counter(report.decision for report in reports)
     return replace(
         front,
         coverage=len(final) / max(len(log), 1),
         pieces_apart=pieces_apart,
         sigma_m=log.worst_position_sigma_m,
         apart=_apart(log, final, states) if front.has_imu and front.is_started else None,
-        loops_accepted=decided[LoopDecision.ACCEPTED],
-        loops_contradicting=sum(decided.values()) - decided[LoopDecision.ACCEPTED],
+        loops_accepted=sum(report.decision is LoopDecision.ACCEPTED for report in reports),
+        loops_contradicting=contradicting(reports),
         **keyframes,
     )
+
+
+def contradicting(reports: Sequence[EdgeReport]) -> int:
+    """Return how many loops the graph tested and does not believe; those that wait for their piece were not tested."""
+    refused = [report for report in reports if report.decision is not LoopDecision.ACCEPTED]
+    return sum(report.decision is LoopDecision.REJECTED or isfinite(report.chi2) for report in refused)
 
 
 def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart | None:
