@@ -87,6 +87,20 @@ def test_frames_that_contradict_each_other_join_nothing(world: World) -> None:
     assert run(graph, world, edges, False, TILTED)[-1].pieces.groups == (0, 1)
 
 
+def test_loops_that_ask_for_places_far_apart_wait_without_a_marginal(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph, asked = loose(world, imu=False), []
+    monkeypatch.setattr(graph, "_between", lambda i, j: asked.append((i, j)))
+    edges = {}
+    for n, k in enumerate((158, 160, 162)):
+        away = transform(np.eye(3), np.array([20.0 * n, 0.0, 0.0]))
+        true = world.loop(k, k - 100, k)
+        edges[k] = [replace(true, T_from_to=true.T_from_to @ away)]
+    assert run(graph, world, edges, False, TILTED, 170)[-1].pieces.groups == (0, 1)
+    assert asked == []
+
+
 def test_a_lie_among_true_loops_is_left_out(world: World) -> None:
     graph = loose(world, imu=False)
     edges = loops(world, 158, 160, 162, 164)
