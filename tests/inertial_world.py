@@ -7,7 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.geometry import interpolate, invert, rotation_from_quaternion_xyzw, se3_exp, so3_exp, so3_log, transform
+from vislam.geometry import (
+    interpolate,
+    invert,
+    rotation_from_quaternion_xyzw,
+    se3_exp,
+    skew,
+    so3_exp,
+    so3_log,
+    transform,
+)
 from vislam.imu import ImuNoise
 from vislam.messages import Array, ImuSample, ImuSpan, NavState, Tracking, VoMeasurement
 
@@ -156,6 +165,31 @@ def state_error(truth: tuple[Array, Array, Array], state: NavState) -> Array:
             bias[3:] - state.accel_bias_m_s2,
         ]
     )
+
+
+def still(roll_rad: float, pitch_rad: float) -> Motion:
+    """Return a body that never moves."""
+    angles = np.zeros((2, 3, 3))
+    angles[0] = [[roll_rad, 0.0, 0.5 * np.pi], [pitch_rad, 0.0, 0.5 * np.pi], [0.4, 0.0, 0.5 * np.pi]]
+    return Motion(np.zeros((2, 3, 3)), angles)
+
+
+def levelled(
+    rng: np.random.Generator, T: Array, gyro_bias: Array, accel_bias: Array, bias_sigma_m_s2: float = 0.1
+) -> NavState:
+    """Return the state that a second of rest gives: the sum of tilt and bias is known, each alone is not."""
+    sigmas = np.repeat([1e-4, 1e-4, 1e-3, 5e-4, 5e-3], 3)
+    drawn = rng.normal(size=15) * sigmas
+    share = rng.normal(size=3) * bias_sigma_m_s2
+    up = T[:3, :3].T @ [0.0, 0.0, 1.0]
+    R = T[:3, :3] @ so3_exp(-np.cross(up, share) / GRAVITY_M_S2 - drawn[:3])
+    up, old_up = R.T @ [0.0, 0.0, 1.0], up
+    bias = accel_bias - GRAVITY_M_S2 * (up - old_up) - drawn[12:15]  # the same force at rest
+    J = np.zeros((15, 3))  # of tilt and bias by what of the bias is taken for tilt
+    J[:3] = skew(up) / GRAVITY_M_S2
+    J[12:15] = -GRAVITY_M_S2 * skew(up) @ J[:3]
+    P = J @ J.T * bias_sigma_m_s2**2 + np.diag(sigmas**2)
+    return NavState(T0_NS, transform(R, T[:3, 3]), -drawn[6:9], gyro_bias - drawn[9:12], bias, P)
 
 
 @dataclass(frozen=True)

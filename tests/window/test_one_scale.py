@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from inertial_world import GRAVITY_M_S2, Motion, state_error
+from inertial_world import GRAVITY_M_S2, Motion, levelled, state_error, still
 from window_world import MONO, World, start_state
 
 from vislam.config import WindowConfig
 from vislam.geometry import so3_exp, transform
 from vislam.messages import Array
+from vislam.sim.sensors import CONSUMER_IMU
 from vislam.window import SlidingWindow
 from vislam.window.one_scale import at_first_scale
 
@@ -63,3 +66,31 @@ def test_new_states_are_linearised_as_if_estimated_with_the_held_ones() -> None:
     whole[:, 9:12], whole[:, 12:15] = factor * X[:, 9:12] @ turn.T + shift, factor * X[:, 12:15] @ turn.T
     first = np.where(held[:, None], whole, np.nan)
     np.testing.assert_allclose(at_first_scale(X, first, held), whole, atol=1e-12)
+
+
+def test_a_minute_and_a_half_at_rest_tells_nothing_of_tilt() -> None:
+    """Tilt and the bias of force are one there: which is which was told before, and stays as unsure as it was."""
+    motion = still(0.1, -0.15)
+    world = World(
+        motion, MONO, 1, duration_s=90.0, keyframe_hz=0.5, tracks=60, sigma_px=0.5, noise=CONSUMER_IMU, rest_until_s=1e9
+    )
+    packets, truths = world.packets()
+    T, _, bias = truths[0]
+    start = levelled(np.random.default_rng(1), T, bias[:3], bias[3:])
+    window = SlidingWindow(WindowConfig(), world.rig, world.noise, GRAVITY_M_S2)
+    window.initialise(replace(start, t_ns=packets[0].keyframe.t_ns))
+    tilts, sigmas, tests = [], [], []
+    for packet, truth in zip(packets, truths, strict=True):
+        state = window.add(packet).newest
+        R = state.T_world_body[:3, :3]
+        tilt, P = (R @ state_error(truth, state)[:3])[:2], (R @ state.covariance[:3, :3] @ R.T)[:2, :2]
+        tilts.append(np.rad2deg(tilt))
+        sigmas.append(np.rad2deg(np.sqrt(0.5 * np.trace(P))))
+        tests.append(tilt @ np.linalg.solve(P, tilt))
+    wander_deg = np.linalg.norm(np.array(tilts) - tilts[0], axis=1)
+    print(
+        f"wander {wander_deg.max():.3f} deg, sigma {sigmas[0]:.3f} to {sigmas[-1]:.3f}, NEES {tests[0]:.2f} to {tests[-1]:.2f}"
+    )
+    assert sigmas[-1] > 0.95 * sigmas[0]
+    assert wander_deg.max() < 0.4
+    assert max(tests) < 13.8  # 99.9 % of chi-square with 2 degrees of freedom

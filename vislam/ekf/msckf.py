@@ -203,8 +203,9 @@ class MsckfEkf:
             return
         values = self._series.values  # the way of nearly every sample: one step, no measurement on it
         kernels.step(
-            self._x, self._Phi, self._Q, values[-2], values[-1], dt_ns * 1e-9, 0.0, self._sigmas, self._gravity
-        )
+            self._x, self._Phi, self._Q, values[-2], values[-1], dt_ns * 1e-9, 0.0, self._sigmas, self._gravity,
+            self._window.to_first,
+        )  # fmt: skip
         self._series.extra[-1] = self._x[:10]
         self._t_ns = sample.t_ns
         if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
@@ -269,7 +270,7 @@ class MsckfEkf:
         if checkpoint is None:
             return None
         x, Phi, Q = checkpoint.x.copy(), checkpoint.Phi.copy(), checkpoint.Q.copy()
-        self._integrate(x, Phi, Q, checkpoint.t_ns, t_ns, self._sigmas_in(checkpoint.window))
+        self._integrate(x, Phi, Q, checkpoint.t_ns, t_ns, checkpoint.window)
         return self._nav_state(t_ns, x, Phi, Q, checkpoint.window)
 
     def pose_at(self, t_ns: int) -> Array | None:
@@ -323,7 +324,7 @@ class MsckfEkf:
             if step_ns < t_ns:  # stop on a sample: stopping between two would change the arithmetic
                 step_ns = int(self._series.t_ns[np.searchsorted(self._series.t_ns, step_ns)])
                 step_ns = min(step_ns, t_ns)
-            self._integrate(self._x, self._Phi, self._Q, self._t_ns, step_ns, self._sigmas, keep=True)
+            self._integrate(self._x, self._Phi, self._Q, self._t_ns, step_ns, self._window, keep=True)
             self._t_ns = step_ns
             if self._history is not None and step_ns - self._history.checkpoints[-1].t_ns >= self._checkpoint_ns:
                 self._take_checkpoint()
@@ -332,13 +333,16 @@ class MsckfEkf:
         return self._told_sigmas * np.array([*window.noise, 1.0, 1.0, 1.0, 1.0])
 
     def _integrate(
-        self, x: Array, Phi: Array, Q: Array, t0_ns: int, t1_ns: int, sigmas: Array, keep: bool = False
+        self, x: Array, Phi: Array, Q: Array, t0_ns: int, t1_ns: int, window: Window, keep: bool = False
     ) -> None:
         if t1_ns <= t0_ns:
             return
         piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
         track = np.empty((len(piece.t_ns), 10))
-        kernels.run(x, Phi, Q, piece.t_ns, piece.samples, piece.gaps_s, track, sigmas, self._gravity)
+        kernels.run(
+            x, Phi, Q, piece.t_ns, piece.samples, piece.gaps_s, track, self._sigmas_in(window), self._gravity,
+            window.to_first,
+        )  # fmt: skip
         if keep:
             keep_track(self._series, piece, track)
 

@@ -6,7 +6,8 @@ right-invariant, in world axes: `R = Exp(e) R^`, `p = Exp(e) p^ + e_p`, `v = Exp
 what cannot be observed (yaw and position) is the same direction for every estimate, so the filter cannot gain
 information on it by moving its linearisation point: no first-estimates Jacobians are needed. Barrau and Bonnabel,
 "An EKF-SLAM algorithm with consistency properties", 2015; Wu et al., "An invariant-EKF VINS algorithm for improving
-consistency", IROS 2017.
+consistency", IROS 2017. The bias of the accelerometer is told in body axes, which breaks this for the tilt of a body
+at rest, whose other half that bias is: see `msckf_state.Rest`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,16 @@ INERTIAL = 15
 
 @njit(cache=True, nogil=True)
 def step(
-    x: Array, Phi: Array, Q: Array, rate0: Array, rate1: Array, dt: float, gap_s: float, sigmas: Array, gravity: float
+    x: Array,
+    Phi: Array,
+    Q: Array,
+    rate0: Array,
+    rate1: Array,
+    dt: float,
+    gap_s: float,
+    sigmas: Array,
+    gravity: float,
+    to_first: Array,
 ) -> None:
     """Move x [16] by one step and chain its error transition onto Phi and Q [15, 15], all in place.
 
@@ -41,6 +51,8 @@ def step(
         sigmas: [6] gyro and accel noise densities, gyro and accel bias walks, then what mean rate and force may have
             done unseen inside a hole (rad/s and m/s^2).
         gravity: m/s^2.
+        to_first: [3, 3] from the world by x to that by the attitude at which the bias of the accelerometer is
+            linearised, see `Rest`.
     """
     turning = np.empty(3)
     force = np.empty(3)
@@ -59,7 +71,7 @@ def step(
         acceleration = f[i] - (gravity if i == 2 else 0.0)
         x[i] += dt * x[3 + i] + 0.5 * dt * dt * acceleration
         x[3 + i] += dt * acceleration
-    _chain(x, Phi, Q, turning, f, middle, end, dt, gravity, sigmas, gap_s)
+    _chain(x, Phi, Q, turning, f, middle, end, dt, gravity, sigmas, gap_s, to_first)
 
 
 @njit(cache=True, nogil=True)
@@ -75,17 +87,20 @@ def _chain(
     gravity: float,
     sigmas: Array,
     gap_s: float,
+    to_first: Array,
 ) -> None:
     """Phi = F Phi and Q = F Q F^T + noise; x is that at the end of the step, f the mean force in world axes."""
     J_end = so3_right_jacobian(turning)
     J_middle = so3_right_jacobian(np.array([0.5 * turning[0], 0.5 * turning[1], 0.5 * turning[2]]))
     B = np.zeros((9, 3))  # rotation, position, velocity by gyro bias
     M = np.zeros((3, 3))  # rotation at mid-step by gyro bias
+    push = np.zeros((3, 3))  # acceleration by accel bias, less its sign
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 B[i, j] -= dt * end[i, k] * J_end[k, j]
                 M[i, j] -= 0.5 * dt * middle[i, k] * J_middle[k, j]
+                push[i, j] += to_first[i, k] * middle[k, j]
     S_f = skew(f)
     S_p = skew(x[0:3])
     S_v = skew(x[3:6])
@@ -95,11 +110,11 @@ def _chain(
                 B[3 + i, j] += S_p[i, k] * B[k, j] - 0.5 * dt * dt * S_f[i, k] * M[k, j]
                 B[6 + i, j] += S_v[i, k] * B[k, j] - dt * S_f[i, k] * M[k, j]
     for j in range(INERTIAL):
-        _advance(Phi[:, j], B, middle, dt, gravity)
+        _advance(Phi[:, j], B, push, dt, gravity)
     for j in range(INERTIAL):
-        _advance(Q[:, j], B, middle, dt, gravity)
+        _advance(Q[:, j], B, push, dt, gravity)
     for j in range(INERTIAL):
-        _advance(Q[j], B, middle, dt, gravity)
+        _advance(Q[j], B, push, dt, gravity)
     gyro = (sigmas[0] * sigmas[0] + sigmas[4] * sigmas[4] * gap_s) / dt
     accel = (sigmas[1] * sigmas[1] + sigmas[5] * sigmas[5] * gap_s) * dt
     for i in range(9):
@@ -115,16 +130,16 @@ def _chain(
 
 
 @njit(cache=True, nogil=True)
-def _advance(e: Array, B: Array, middle: Array, dt: float, gravity: float) -> None:
+def _advance(e: Array, B: Array, push: Array, dt: float, gravity: float) -> None:
     """Replace e by F e, in place: position first, since it needs the others as they were."""
     down_x = gravity * e[1]
     down_y = -gravity * e[0]
     for i in range(3):
-        push = 0.0
+        gained = 0.0
         for k in range(3):
-            push -= dt * middle[i, k] * e[12 + k]
-        e[3 + i] += dt * e[6 + i] + 0.5 * dt * push
-        e[6 + i] += push
+            gained -= dt * push[i, k] * e[12 + k]
+        e[3 + i] += dt * e[6 + i] + 0.5 * dt * gained
+        e[6 + i] += gained
         for k in range(3):
             e[3 + i] += B[3 + i, k] * e[9 + k]
             e[6 + i] += B[6 + i, k] * e[9 + k]
@@ -148,10 +163,12 @@ def run(
     track: Array,
     sigmas: Array,
     gravity: float,
+    to_first: Array,
 ) -> None:
     """Step through samples [N, 6] at `t_ns` [N], the state being at the first; store x[:10] of each in `track`.
 
-    `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
+    `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0; for
+    the last three see `step`.
     """
     before, after = np.empty(6), np.empty(6)
     store(x, track[0])
@@ -160,11 +177,11 @@ def run(
         pieces = pieces_of(dt, gaps_s[k])
         for j in range(pieces):
             if pieces == 1:  # not even rounding may tell this from a single `step`
-                step(x, Phi, Q, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity)
+                step(x, Phi, Q, samples[k - 1], samples[k], dt, gaps_s[k], sigmas, gravity, to_first)
                 break
             between(samples[k - 1], samples[k], j / pieces, before)
             between(samples[k - 1], samples[k], (j + 1) / pieces, after)
-            step(x, Phi, Q, before, after, dt / pieces, gaps_s[k], sigmas, gravity)
+            step(x, Phi, Q, before, after, dt / pieces, gaps_s[k], sigmas, gravity, to_first)
         store(x, track[k])
 
 

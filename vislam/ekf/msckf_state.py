@@ -30,6 +30,21 @@ def _none(*shape: int) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rest:
+    """Where a rest began, and the first estimate of attitude there.
+
+    At rest, tilt and the accelerometer's bias are one: whatever turns the body by e and changes the bias by
+    R^T (g x e) leaves no trace. That direction depends on R. Linearised at each new estimate it is a little different
+    each time, and what lies between passes for information (Huang, Mourikis and Roumeliotis, IJRR 2010): tilt follows
+    noise. One R for all of a rest keeps it free.
+    """
+
+    t_ns: int  # stamp of the frame at which it began
+    R: Array  # [3, 3] R_odom_body as estimated then
+    to_first: Array  # [3, 3] takes the attitude estimated now to that
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """Covariance of everything, calibration, clones with the tracks seen there, and points in the state."""
 
@@ -44,12 +59,17 @@ class Window:
     point_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # [S] track ids
     points: Array = field(default_factory=lambda: _none(0, 3))  # [S, 3] m, odom
     misses: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # [S] frames in a row
-    rest_t_ns: int | None = None  # stamp of the frame at which the body came to rest; None: it moves
+    rest: Rest | None = None  # None: the body moves
     rested_t_ns: int = 0  # stamp of the newest frame at which it still rested
     rejects: int = 0  # frames in a row whose tracks contradict the state
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0
     noise: NoiseScale = AS_MODELLED  # white noise of the IMU from here on
+
+    @property
+    def to_first(self) -> Array:
+        """Return what takes the estimated attitude to that at which the accelerometer's bias is linearised [3, 3]."""
+        return np.eye(3) if self.rest is None else self.rest.to_first
 
     @property
     def first_point(self) -> int:

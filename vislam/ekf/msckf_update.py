@@ -16,6 +16,7 @@ from vislam.ekf.kernels import pose
 from vislam.ekf.msckf_kernels import from_nav_error
 from vislam.ekf.msckf_state import (
     CLONES,
+    Rest,
     Window,
     cloned,
     compressed,
@@ -130,7 +131,7 @@ class Updater:
         """
         R = np.ascontiguousarray(pose(x, 0, 6)[:3, :3])
         if frame.t_ns - window.rested_t_ns > REST_PAUSE_NS:
-            window = replace(window, rest_t_ns=None)
+            window = replace(window, rest=None)
         prior = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
         leaving = self._leaving(prior)
         before = x.copy()
@@ -168,11 +169,11 @@ class Updater:
         kept, candidate = window.frames[-3], window.frames[-2]
         still = image_motion_px(kept, candidate) < self._config.tight_still_px
         still = still or candidate.t_ns - kept.t_ns < self._config.tight_min_interval_s * 1e9
-        rests = window.rest_t_ns is not None and window.rested_t_ns >= candidate.t_ns
-        if (still or rests) and candidate.t_ns != window.rest_t_ns:
+        rests = window.rest is not None and window.rested_t_ns >= candidate.t_ns
+        began_t_ns = None if window.rest is None else window.rest.t_ns
+        if (still or rests) and candidate.t_ns != began_t_ns:
             return count - 2
-        oldest = 0 if window.frames[0].t_ns != window.rest_t_ns else 1
-        return oldest
+        return 0 if window.frames[0].t_ns != began_t_ns else 1
 
     def _rows(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
         """Return what the newest frame says of its points of the state, and the tracks that are ripe with it.
@@ -330,13 +331,17 @@ class Updater:
         H[3:, 9:12] = np.eye(3) / rate_sigma
         r = np.concatenate((-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / rate_sigma))
         if not self._passes("zero_velocity", window, H, r, out):
-            return replace(window, rest_t_ns=None), out
+            return replace(window, rest=None), out
         window = replace(corrected(window, x, H, r), rested_t_ns=t_ns)
         stamps = [frame.t_ns for frame in window.frames]
-        if window.rest_t_ns in stamps:
-            window = self._hold(window, x, stamps.index(window.rest_t_ns), out)
+        if window.rest is not None and window.rest.t_ns in stamps:
+            window = self._hold(window, x, stamps.index(window.rest.t_ns), out)
         elif t_ns in stamps:
-            window = replace(window, rest_t_ns=t_ns)
+            R = pose(x, 0, 6)[:3, :3]
+            window = replace(window, rest=Rest(t_ns, R, np.eye(3)))
+        if window.rest is not None:
+            to_first = np.ascontiguousarray(window.rest.R @ pose(x, 0, 6)[:3, :3].T)
+            window = replace(window, rest=replace(window.rest, to_first=to_first))
         return window, out
 
     def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
@@ -352,7 +357,7 @@ class Updater:
         turned = so3_log(window.R[index] @ np.ascontiguousarray(T[:3, :3].T))
         r = np.concatenate((turned, window.p[index] - T[:3, 3])) / sigmas
         if not self._passes("hold", window, H, r, out):
-            return replace(window, rest_t_ns=None)
+            return replace(window, rest=None)
         return corrected(window, x, H, r)
 
     def _passes(self, kind: str, window: Window, H: Array, r: Array, out: Outcome) -> bool:

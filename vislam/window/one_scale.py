@@ -7,7 +7,8 @@ scale wanders within its sigma, so newer states are at another scale, the step b
 acceleration, and acceleration shows scale. The newer ones are therefore linearised where they would be had they been
 estimated together with the held ones: at their scale, place and attitude (tilt wanders too, against the bias of force).
 Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010;
-for scale under constant acceleration: Wu et al., "VINS on wheels", ICRA 2017.
+for scale under constant acceleration: Wu et al., "VINS on wheels", ICRA 2017. At rest the same goes for tilt and the
+bias of force, which are one there.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ class SlidingWindow:
         self._last_edges: list[WindowEdge] = []
         self._sure = False
         self._at_rest = False
-        self._shows_scale = True
+        self._hides_something = False  # the motion: scale, or which part of gravity is the accelerometer's bias
 
     # ---- what comes in
 
@@ -217,9 +217,9 @@ class SlidingWindow:
         assert self._prior is not None
         keyframes = self._keyframes
         self._links.refresh(keyframes.X[:, 15:])
-        self._shows_scale = self._measures_scale or not self._is_uniform()
+        self._hides_something = self._rests() or (not self._measures_scale and self._is_uniform())
         first, held = keyframes.X_first, keyframes.held
-        if not self._shows_scale and held.any():
+        if self._hides_something and held.any():
             first, held = at_first_scale(keyframes.X, first, held), np.ones(len(keyframes), dtype=np.bool_)
         problem = Problem(
             keyframes.X, first, held, self._tracks.points[selection.slots],
@@ -228,6 +228,10 @@ class SlidingWindow:
         )  # fmt: skip
         iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
         return optimise(problem, iterations, self._config.tolerance, self._room)
+
+    def _rests(self) -> bool:
+        """Whether nothing moved in all of the window."""
+        return bool(self._links.arrays.rest_weight[1:].all())
 
     def _is_uniform(self) -> bool:
         """Whether the window is full of motion without the change of acceleration that shows scale."""
@@ -307,7 +311,7 @@ class SlidingWindow:
         selection = tracks.arrange(given, keyframes.ids)
         leaving = Leaving(selection.views, tracks.points[selection.slots])
         X_linear = np.where(keyframes.held[:, None], keyframes.X_first, keyframes.X)
-        if not self._shows_scale:
+        if self._hides_something:
             X_linear = at_first_scale(keyframes.X, keyframes.X_first, keyframes.held)
         self._prior = marginalise(
             keyframes.X, X_linear, self._calibration.values, leaving, self._camera(), self._links.arrays, self._prior,
