@@ -16,7 +16,7 @@ RATE = 200
 
 
 def rested(seed: int, duration_s: float) -> tuple[Array, Array, Array, Array]:
-    """Return tilt error [N, 2] (deg, in the world), its sigma [N], and NEES [N] of tilt and of the bias of level force."""
+    """Return tilt error [N, 2] (deg, in the world), its sigma [N], NEES [N] of tilt and of the bias of level force."""
     rng = np.random.default_rng(seed)
     motion = still(*rng.uniform(-0.2, 0.2, 2))
     T = motion.pose(0.0)
