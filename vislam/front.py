@@ -166,6 +166,7 @@ class Front:
             self.ekf_coupling = self._filter.coupling
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
+        self._graph_state: NavState | None = None  # at the newest keyframe that the graph has told of
         self._last_frame_t_ns: int | None = None
         self._keyframe_t_ns = 0
         self._keyframe_id = -1
@@ -288,6 +289,7 @@ class Front:
 
     def feed_back(self, update: GraphUpdate) -> None:
         """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
+        self._graph_state = update.newest
         if self._filter is not None:
             self._filter.feed_back(update)
 
@@ -557,11 +559,27 @@ class Front:
         if state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
         # a correction may enter with a later sample only, so what the filter was told is no measure of it
-        before = pose_after(last, span, self._config.imu.gravity_m_s2)
+        gyro_bias, sigma_rad_s = self._gyro_bias(last)
+        turning = replace(last, gyro_bias_rad_s=gyro_bias)
+        before = pose_after(turning, span, self._config.imu.gravity_m_s2)
         way_m = float(np.linalg.norm(before[:3, 3] - last.T_world_body[:3, 3]))
         if at_rest and way_m < _SWAY_M_S * (int(span.t_ns[-1]) - int(span.t_ns[0])) * 1e-9:
             before = last.T_world_body
-        return Estimate(before, after, float(np.sqrt(np.diag(state.covariance)[9:12].max()))), state
+        return Estimate(before, after, sigma_rad_s), state
+
+    def _gyro_bias(self, state: NavState) -> tuple[Array, float]:
+        """Return the gyroscope's bias [3] and its largest sigma, of the filter or of the graph: whoever is surer.
+
+        For what is published only: the graph has seen the same images longer, and the filter stays what it is alone.
+        """
+        graph, sigma_rad_s = self._graph_state, float(np.sqrt(np.diag(state.covariance)[9:12].max()))
+        if graph is None or self.noise is None:
+            return state.gyro_bias_rad_s, sigma_rad_s
+        walked = self.noise.gyro_bias_walk**2 * max(state.t_ns - graph.t_ns, 0) * 1e-9
+        graph_rad_s = float(np.sqrt(np.diag(graph.covariance)[9:12].max() + walked))
+        if graph_rad_s < sigma_rad_s:
+            return graph.gyro_bias_rad_s, graph_rad_s
+        return state.gyro_bias_rad_s, sigma_rad_s
 
     def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:
         """Return the pose in `odom`, where it is to be continuous without the jumps of corrections."""
