@@ -158,7 +158,7 @@ def test_the_published_pose_is_still_the_estimate(steps: list[tuple[Step, Array]
 def turns_published(graph_sigma_rad_s: float) -> tuple[Array, Array]:
     """Return attitudes [N, 3, 3] of a body that has set off, as inertial data carry them on, and as estimated.
 
-    The graph says all the time, with this sigma, that the gyroscope's bias about x is 0.01 rad/s more than the filter's.
+    The graph says all the time, with this sigma, that the gyro bias about x is 0.01 rad/s more than the filter's.
     """
     recording = open_points("stop-and-go", 0, rig="stereo", start_s=2.0, duration_s=2.5, tracks=60)
     slam = Slam(load(None, {"map.enabled": False, "loop.enabled": False}), recording.rig, recording.imu_noise)
@@ -171,7 +171,7 @@ def turns_published(graph_sigma_rad_s: float) -> tuple[Array, Array]:
             update = step.keyframes[-1].update if step.keyframes else update
             if update is not None and step.front.state is not None:
                 state, P = step.front.state, np.eye(15) * graph_sigma_rad_s**2
-                wrong = replace(state, gyro_bias_rad_s=state.gyro_bias_rad_s + [0.01, 0.0, 0.0], covariance=P)
+                wrong = replace(state, gyro_bias_rad_s=state.gyro_bias_rad_s + np.array([0.01, 0.0, 0.0]), covariance=P)
                 slam.front.feed_back(replace(update, newest=wrong))
     return np.array(before), np.array(after)
 
