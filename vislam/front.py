@@ -145,8 +145,7 @@ class Front:
         self._lost_since_ns: int | None = None
         self._config = config
         self._clock = clock
-        self.noise = noise  # as told; spans and the filter hear what the samples show
-        self._has_imu = noise is not None
+        self.noise, self._has_imu = noise, noise is not None  # as told; spans and the filter hear what samples show
         self.camera_clock = CameraClock(config.init)
         self.uniform = UniformMotion(config.init)
         self.feed = CameraFeed()

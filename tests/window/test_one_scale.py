@@ -88,9 +88,7 @@ def test_a_minute_and_a_half_at_rest_tells_nothing_of_tilt() -> None:
         sigmas.append(np.rad2deg(np.sqrt(0.5 * np.trace(P))))
         tests.append(tilt @ np.linalg.solve(P, tilt))
     wander_deg = np.linalg.norm(np.array(tilts) - tilts[0], axis=1)
-    print(
-        f"wander {wander_deg.max():.3f} deg, sigma {sigmas[0]:.3f} to {sigmas[-1]:.3f}, NEES up to {max(tests):.2f}"
-    )
+    print(f"wander {wander_deg.max():.3f} deg, sigma {sigmas[0]:.3f} to {sigmas[-1]:.3f}, NEES up to {max(tests):.2f}")
     assert sigmas[-1] > 0.95 * sigmas[0]
     assert wander_deg.max() < 0.4
     assert max(tests) < 13.8  # 99.9 % of chi-square with 2 degrees of freedom
