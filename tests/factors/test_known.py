@@ -128,10 +128,12 @@ def test_a_loop_tied_to_an_anchor_says_no_more_than_as_measured() -> None:
         known, loop = chain.known([4, 6, newest]), chain.loop(0, 6, newest, has_scale)
         as_measured = known.gain([loop])
         T_4_6, T_6_newest = invert(chain.poses[4]) @ chain.poses[6], invert(chain.poses[6]) @ chain.poses[newest]
-        assert loop.tie_to(4, T_4_6, known.relative(4, 6), T_6_newest)
+        assert loop.tie_to(4, T_4_6, known.relative(4, 6), T_6_newest, most=4.0)
         assert loop.tie is not None
         np.testing.assert_allclose(loop.tie.T_from_to, invert(chain.poses[4]) @ chain.poses[newest], atol=1e-6)
         tied = known.gain([loop])
         print(f"as measured {as_measured:.3f}, tied {tied:.3f} nats")
         assert 0.0 < tied <= as_measured * 1.02
-        assert not chain.loop(1, 6, newest, has_scale).tie_to(4, T_4_6, np.eye(6), T_6_newest), "nobody knows the way"
+        assert not chain.loop(1, 6, newest, has_scale).tie_to(4, T_4_6, np.eye(6), T_6_newest, most=4.0), (
+            "nobody knows the way"
+        )

@@ -201,8 +201,8 @@ class GraphConfig:
     )
     anchor_reach: int = 10  # ... is so many keyframes from one that is, ties to that older one, the place's anchor ...
     anchor_variance_max: float = 4.0  # ... if the way there adds at most so many times the loop's own variance
-    freeze_keyframes: int = 20  # where loops are many, what so many keyframes know of others is summed up in one of ...
-    freeze_after: int = 200  # ... them once they are so many keyframes old, and the rest keep their place beside it
+    freeze_keyframes: int = 20  # where loops are many, so many keyframes leave the solver together, once they are ...
+    freeze_after: int = 200  # ... so many keyframes old, and stand from then on beside one that it keeps
     vo_scale_max: float = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
 
     # the link to a keyframe with which a new piece of trajectory begins: nothing is known, but equations stay solvable.

@@ -11,14 +11,15 @@ Work comes in small steps (generators), so that a live run can spread it over ke
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence, Set
+from bisect import insort
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from vislam.config import GraphConfig
-from vislam.factors.keys import X
+from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.factors.noise import gaussian
 from vislam.factors.solver import FAILURES, Factorization, IncrementalSolver
@@ -97,11 +98,11 @@ class Consensus:
         self._doubts += 1
         self._doubted = True
 
-    def step(self, travel: Travel, scale_left: float, held: Set[int]) -> Verdict | None:
+    def step(self, travel: Travel, scale_left: float, held: Callable[[int], bool]) -> Verdict | None:
         """Do some work; return a verdict when a review has come to its end.
 
-        `scale_left` is by how much the sigmas of odometry may still be inflated, `held` are the ids of the loops that
-        the graph holds. Without a loop in doubt there is nothing to review.
+        `scale_left` is by how much the sigmas of odometry may still be inflated, `held` tells of the id of a loop
+        whether the graph holds it. Without a loop in doubt there is nothing to review.
         """
         config = self._config
         if self._steps is None:
@@ -111,7 +112,7 @@ class Consensus:
             self._begin(travel, scale_left, held)
         return self._work(config.review_steps)
 
-    def finish(self, travel: Travel, scale_left: float, held: Set[int]) -> Verdict | None:
+    def finish(self, travel: Travel, scale_left: float, held: Callable[[int], bool]) -> Verdict | None:
         """Review everything there is, at once."""
         self._steps = None
         if not self._doubted:
@@ -119,9 +120,9 @@ class Consensus:
         self._begin(travel, scale_left, held)
         return self._work(None)
 
-    def _begin(self, travel: Travel, scale_left: float, held: Set[int]) -> None:
+    def _begin(self, travel: Travel, scale_left: float, held: Callable[[int], bool]) -> None:
         self._fresh = self._doubts = 0
-        case = Case(self._witnesses.loops(), travel.chain(), self._config, frozenset(held))
+        case = Case(self._witnesses.loops(), travel.chain(), self._config, held)
         scales = [s for s in _SCALES if s <= scale_left]
         self._steps = review(case, dict(self._trusted), set(self._lost), scales)
 
@@ -150,7 +151,7 @@ class Case:
     witnesses: list[list[LoopModel]]
     chain: Chain
     config: GraphConfig
-    held: frozenset[int]  # ids of loops that are in the graph
+    held: Callable[[int], bool]  # whether a loop is in the graph, by id
 
     @property
     def speakers(self) -> list[LoopModel]:
@@ -196,8 +197,8 @@ def _believe(case: Case, scale: float, trusted: dict[int, float] | None = None, 
 
 
 def _climb(case: Case, graph: _SmallGraph, scale: float, trusted: dict[int, float], first: Sequence[int]) -> Steps:
-    yield from graph.build({k for loops in case.witnesses for m in loops for k in _ends(m)})
     speakers, volume = case.speakers, log_volume(case.chain)
+    yield from graph.build({k for m in speakers for k in _ends(m)})
     kept, refused = dict(trusted), dict[int, float]()
     graph.take([speakers[n] for n in trusted])
     for n in first:
@@ -243,12 +244,12 @@ def _consequences(
     let_in: list[LoopModel] = []
     put_out: list[tuple[LoopModel, float]] = []
     for n in sorted(kept):
-        for loop in (m for m in case.witnesses[n] if m.id not in case.held):
+        for loop in (m for m in case.witnesses[n] if not case.held(m.id)):
             if graph.test(loop)[0] <= loop.threshold:
                 let_in.append(loop)
             yield
     for n in sorted(refused):
-        for loop in (m for m in case.witnesses[n] if m.id in case.held):
+        for loop in (m for m in case.witnesses[n] if case.held(m.id)):
             chi2, _ = graph.test(loop)
             if chi2 > loop.threshold:
                 put_out.append((loop, chi2))
@@ -269,12 +270,17 @@ def _density(loop: LoopModel, T_from_to: Array, covariance: Array, scale: float 
 
 
 class _SmallGraph:
-    """Only the keyframes that loops touch, with the odometry between them summed up."""
+    """Only keyframes that loops touch, with the odometry between them summed up.
+
+    It begins with those of the loops that stand for witnesses. Others, of which a long run has ever more, come when
+    they are asked for, and hang on the nearest that is there.
+    """
 
     def __init__(self, chain: Chain, config: GraphConfig, scale: float, factorization: Factorization) -> None:
         self._chain, self._config, self._scale = chain, config, scale
         self._solver = IncrementalSolver(config, factorization)
         self._slots: dict[int, int] = {}  # of loops, by id
+        self._nodes: list[int] = []  # keyframes in the graph, ascending
 
     def build(self, touched: set[int]) -> Generator[None]:
         """Put keyframes into the graph."""
@@ -292,9 +298,24 @@ class _SmallGraph:
             if count % _NODES == _NODES - 1:
                 yield
         self._solver.update(factors, values, [])
+        self._nodes = sorted(touched)
+
+    def _reach(self, loops: Sequence[LoopModel]) -> None:
+        """Put the ends of loops into the graph where they are not."""
+        for k in sorted({k for loop in loops for k in _ends(loop)}.difference(self._nodes)):
+            nearest = min(self._nodes, key=lambda n: abs(n - k))
+            a, b = min(nearest, k), max(nearest, k)
+            T, covariance = self._chain.motion(a, b)
+            factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            factors.add(pose_factor(X(a), X(b), T, gaussian(self._scale**2 * covariance, _RATIO_MAX)))
+            T_map_nearest = self._solver.estimate([X(nearest)]).atPose3(X(nearest)).matrix()
+            values.insert(X(k), gtsam.Pose3(nearest_rigid(T_map_nearest @ (T if k == b else invert(T)))))
+            self._solver.update(factors, values, [])
+            insort(self._nodes, k)
 
     def test(self, loop: LoopModel) -> tuple[float, float]:
         """Return the chi-square of a loop's innovation and the logarithm of its density at zero."""
+        self._reach([loop])
         a, b = _ends(loop)
         values = self._solver.estimate([X(a), X(b)])
         T_a, T_b = values.atPose3(X(a)).matrix(), values.atPose3(X(b)).matrix()

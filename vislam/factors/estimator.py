@@ -8,6 +8,7 @@ loops because the usual cause is a long drift that a true loop ends.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
 import gtsam
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from vislam.config import GraphConfig
 from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
 from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
-from vislam.factors.known import Known
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
-from vislam.factors.segments import Segment, shape_factors, summarised
+from vislam.factors.segments import Link, Segment, Stand, summarised
 from vislam.factors.solver import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
+from vislam.geometry import invert, se3_adjoint
 from vislam.messages import Array
 
 _BATCH_ITERATIONS = 50
@@ -63,7 +64,10 @@ class Estimator(Generic[L]):
         self._next_old = 0  # where the next block of older poses begins
         self._read: list[NDArray[np.int64]] = []  # ids since `take_read`
         self._held: dict[int, Array] = {}  # poses that stay, by keyframe id
-        self.frozen: set[int] = set()  # first keyframes of summed up segments; none after a new start
+        self._stands: dict[int, Stand] = {}  # keyframes that left the solver; none after a new start
+        self._links: dict[tuple[int, int], tuple[Link, int]] = {}  # between anchors, with their slots
+        self.frozen: set[int] = set()  # first keyframes of summed up segments
+        self.pinned: set[int] = set()  # keyframes on which hangs what summed up segments know
         self.loops: dict[int, L] = {}  # in the graph, by loop id
         self.spare: dict[int, L] = {}  # accepted without a factor, which only `converge` takes
         self.vo_scale = 1.0  # on the sigma of visual odometry, learnt from loops that it contradicted
@@ -88,6 +92,15 @@ class Estimator(Generic[L]):
         """Return whether there are too many keyframes to look at all of them with each."""
         return self._count > self._config.read_newest + self._config.read_block and not self._solver.reads_all
 
+    def host(self, k: int) -> int:
+        """Return the keyframe beside which keyframe k stands; k itself where the solver has it."""
+        stand = self._stands.get(k)
+        return k if stand is None else stand.host
+
+    def solved_loops(self) -> Iterator[L]:
+        """Yield the loops whose factors are in the solver: those of summed up segments are not."""
+        return (self.loops[n] for kind, n in self._slots if kind == "loop")
+
     def look_at(self, ids: list[int]) -> None:
         """Read back some poses now, where a long run may not have for a while."""
         if self.is_long and ids:
@@ -109,7 +122,7 @@ class Estimator(Generic[L]):
         That of poses alone has in it what their odometry is wrong by in common.
         """
         try:
-            joint = self._solver.joint_covariance(keys)
+            joint = self._joint(keys)
         except FAILURES:
             return None
         ids = [key - X(0) for key in keys]
@@ -117,6 +130,21 @@ class Estimator(Generic[L]):
             shared = self._odometry.shared_error(ids, self.poses)
             joint = joint if shared is None else joint + shared @ shared.T
         return joint if np.all(np.isfinite(joint)) else None
+
+    def _joint(self, keys: list[int]) -> Array:
+        """Return the joint marginal of variables; how one stands beside another errs independently of all else."""
+        stands = [self._stands.get(key - X(0)) for key in keys]
+        if not any(stands):
+            return self._solver.joint_covariance(keys)
+        hosts = [key if stand is None else X(stand.host) for key, stand in zip(keys, stands, strict=True)]
+        unique = sorted(set(hosts))
+        solved = self._solver.joint_covariance(unique)
+        carry, own = np.zeros((6 * len(keys), 6 * len(unique))), np.zeros((6 * len(keys), 6 * len(keys)))
+        for n, (host, stand) in enumerate(zip(hosts, stands, strict=True)):
+            rows, columns = slice(6 * n, 6 * n + 6), slice(6 * unique.index(host), 6 * unique.index(host) + 6)
+            carry[rows, columns] = np.eye(6) if stand is None else se3_adjoint(invert(stand.T_host_self))
+            own[rows, rows] = 0.0 if stand is None else stand.covariance
+        return np.asarray(carry @ solved @ carry.T + own)
 
     def begin(self) -> str:
         """Take the first keyframe; return what went wrong, normally nothing."""
@@ -198,9 +226,9 @@ class Estimator(Generic[L]):
 
         For what no factor holds back but weak ones: no step of Gauss-Newton would find so far a way.
         """
-        values = gtsam.Values(self._values)
+        values = self._completed(self._values)
         for k in ids.tolist():
-            values.update(X(k), gtsam.Pose3(nearest_rigid(T @ self._values.atPose3(X(k)).matrix())))
+            values.update(X(k), gtsam.Pose3(nearest_rigid(T @ values.atPose3(X(k)).matrix())))
             if self.has_imu:
                 values.update(V(k), T[:3, :3] @ self._values.atVector(V(k)))
         try:
@@ -219,38 +247,56 @@ class Estimator(Generic[L]):
         return ""
 
     def can_freeze(self, segment: Segment) -> bool:
-        """Return whether named factors alone tie these keyframes, which are of one piece and free to move."""
-        inside = range(segment.first, segment.end)
-        if any(k in self._held for k in inside) or not np.all(np.isfinite(self._reach_m[segment.first : segment.end])):
+        """Return whether loops and odometry alone tie these keyframes, which are of one piece and free to move."""
+        inside = segment.keyframes
+        if self._solver.reads_all or any(k in self._held for k in inside):
             return False
-        labels: list[Label] = [("edge", k) for k in inside[1:]]
-        return all(label in self._slots for label in (*labels, *(("loop", n) for n in segment.loops)))
+        return bool(np.all(np.isfinite(self._reach_m[segment.first : segment.end])))
 
     def freeze(self, segment: Segment) -> str:
-        """Let keyframes stand in the shape that they have now around one of them; return what went wrong.
+        """Let keyframes leave the solver, with their loops and odometry; return what went wrong.
 
-        Their loops and the odometry between them, back to the keyframe before, leave the solver. What these say of the
-        anchors goes to the central keyframe. Records stay as they are: a new start of the solver has all of it again.
+        What these say of the keyframes around goes into links between these, one for each pair of anchors however often
+        it is seen; the keyframes stand from now on beside anchors as they do. Records stay as they are: a new start of
+        the solver has all of it again.
         """
         self.frozen.add(segment.first)
-        inside = range(segment.first, segment.end)
-        self.look_at([*inside, *segment.anchors])
-        joint = self.joint_covariance([X(k) for k in inside])
-        labels: list[Label] = [("edge", k) for k in inside[1:]]
-        labels += [("loop", n) for n in segment.loops]
+        inside, keys = segment.keyframes, [X(k) for k in segment.keyframes]
+        slots = self._solver.around(keys)
+        factors = self._solver.factors(slots)
+        touched = [factors.at(n).keys() for n in range(factors.size())]
+        around = sorted({key - X(0) for own in touched for key in own}.difference(inside))
+        self.look_at([*inside, *around])
+        relative = [slot for slot, own in zip(slots, touched, strict=True) if len(own) > 1]
+        poses = {k: self.poses[k] for k in (*inside, *around)}
         try:
-            ties = summarised(self._solver.factors([self._slots[label] for label in labels]), segment, self._values)
-        except FAILURES:
+            linear = self._solver.factors(relative).linearize(self._values)
+            known = self._solver.joint_covariance([X(k) for k in around])
+            summary = summarised(linear, segment, poses, around, known)
+        except (*FAILURES, np.linalg.LinAlgError):
             return ""
-        if joint is None:
-            return ""
-        shape = shape_factors(Known({k: self.poses[k] for k in inside}, joint), segment)
-        slots = [self._slots.pop(label) for label in (("edge", segment.first), *labels) if label in self._slots]
+        links = {pair: self._with_older(pair, link) for pair, link in summary.links.items()}
+        slots += [self._links[pair][1] for pair in links if pair in self._links]
         try:
-            self._solver.update(_graph([*ties, *shape]), gtsam.Values(), slots, X(self._count - 1))
+            graph = _graph([link.factor(*pair) for pair, link in links.items()])
+            fresh = self._solver.update(graph, gtsam.Values(), slots, X(self._count - 1))
         except FAILURES as error:
             return self._recover(self._values, [], error)
+        self._links = {pair: own for pair, own in self._links.items() if not {*pair} & {*inside}}
+        self._links |= {pair: (link, slot) for (pair, link), slot in zip(links.items(), fresh, strict=True)}
+        self._stands |= summary.stands
+        self.pinned |= {*segment.anchors}
+        for label in [("edge", segment.end), *(("loop", n) for n in segment.loops)]:
+            self._slots.pop(label, None)
+        for k in inside:
+            self._slots.pop(("edge", k), None)
+            self._slots.pop(("tilt", k), None)
+            self._values.erase(X(k))
         return ""
+
+    def _with_older(self, pair: tuple[int, int], link: Link) -> Link:
+        """Return what a link says together with those of earlier segments between the same anchors."""
+        return self._links[pair][0].with_another(link) if pair in self._links else link
 
     def drop(self, edges: list[L]) -> str:
         """Take loops out again; return what went wrong."""
@@ -293,10 +339,11 @@ class Estimator(Generic[L]):
                 note = self._recover(self._values, [], error) + "; "
             if float(np.max(np.abs(self.poses - before))) < _CONVERGED_M:
                 break
-        graph, _ = self._whole(self._values, self.loops | self.spare, as_measured=True)
-        cost = float(graph.error(self._values))
+        now = self._completed(self._values)
+        graph, _ = self._whole(now, self.loops | self.spare, as_measured=True)
+        cost = float(graph.error(now))
         try:
-            values = optimize(graph, self._values, _BATCH_ITERATIONS)
+            values = optimize(graph, now, _BATCH_ITERATIONS)
             batch_cost = float(graph.error(values))
             if not batch_cost < cost:
                 return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch reached {batch_cost:.6g}"
@@ -304,7 +351,7 @@ class Estimator(Generic[L]):
             return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch failed: {_short(error)}"
         try:
             self._restart(values, [], self._new_solver(), from_batch=False)
-            self._adopt(values, np.arange(self._count))
+            self._adopt(values, np.arange(self._count), self._stands)
         except FAILURES as error:
             note += self._recover(self._values, [], error) + "; "
         return f"{note}batch at cost {batch_cost:.6g}, {self.solver_name} had {cost:.6g}"
@@ -334,7 +381,7 @@ class Estimator(Generic[L]):
 
     def _take(self) -> None:
         """Read back the whole estimate."""
-        self._adopt(self._solver.estimate(), np.arange(self._count))
+        self._adopt(self._solver.estimate(), np.arange(self._count), self._stands)
 
     def _take_some(self) -> None:
         """Read back the newest poses and the next block of older ones: all of them while they are few."""
@@ -349,16 +396,26 @@ class Estimator(Generic[L]):
         self._next_old = end
 
     def _read_back(self, ids: NDArray[np.int64]) -> None:
-        keys = [X(k) for k in ids.tolist()]
+        solved = sorted({self.host(k) for k in ids.tolist()})
+        keys = [X(k) for k in solved]
         if self.has_imu:
-            keys += [key for k in ids.tolist() for key in (V(k), B(k))]
-        self._adopt(self._solver.estimate(keys), ids)
+            keys += [key for k in solved for key in (V(k), B(k))]
+        self._adopt(self._solver.estimate(keys), ids, self._stands)
 
-    def _adopt(self, values: gtsam.Values, ids: NDArray[np.int64]) -> None:
-        """Adopt an estimate of keyframes; RuntimeError when it is not complete, not finite or diverged."""
-        poses = poses_of(values)
-        if len(poses) != len(ids) or not np.all(np.isfinite(poses)):
+    def _adopt(self, values: gtsam.Values, ids: NDArray[np.int64], stands: Mapping[int, Stand]) -> None:
+        """Adopt an estimate of keyframes, or of the hosts beside which they stand.
+
+        RuntimeError when it is not complete, not finite or diverged.
+        """
+        beside = [n for n, k in enumerate(ids.tolist()) if k in stands]
+        hosts = ids.copy()
+        hosts[beside] = [stands[k].host for k in ids[beside].tolist()]
+        solved, found = np.unique(hosts), poses_of(values)
+        if len(found) != len(solved) or not np.all(np.isfinite(found)):
             raise RuntimeError("the solver's estimate is not finite or not complete")
+        poses = found[np.searchsorted(solved, hosts)]
+        if beside:
+            poses[beside] = poses[beside] @ np.stack([stands[k].T_host_self for k in ids[beside].tolist()])
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         beyond = (steps_m > self._reach_m[ids[1:]]) & (np.diff(ids) == 1)
         if np.any(beyond):
@@ -370,10 +427,24 @@ class Estimator(Generic[L]):
         self._buffer[ids] = poses
         self._read.append(ids)
 
+    def _completed(self, values: gtsam.Values) -> gtsam.Values:
+        """Return values with the poses of the keyframes, too, that left the solver."""
+        out = gtsam.Values(values)
+        for k in self._stands:
+            if not out.exists(X(k)):
+                out.insert(X(k), gtsam.Pose3(self._buffer[k]))
+        return out
+
+    def _begin_anew(self, solver: Solver, labels: list[Label | None], slots: list[int]) -> None:
+        """Work with a solver that has all factors."""
+        self._solver, self._slots = solver, _named(labels, slots)
+        self._stands, self._links, self.frozen, self.pinned = {}, {}, set(), set()
+
     def _recover(self, values: gtsam.Values, fresh: list[L], error: Exception) -> str:
         """Go down the ladder until a solver takes the records; always ends with a usable one."""
         cause = f"gtsam failed ({_short(error)}); "
         self._factorization = "QR"
+        values = self._completed(values)
         rungs = [(fresh, False), ([], False), ([], True)] if fresh else [([], False), ([], True)]
         for loops, from_batch in rungs:
             try:
@@ -384,9 +455,7 @@ class Estimator(Generic[L]):
             return cause + what + (" without the new loops" if fresh and not loops else "")
         solver = BatchSolver()
         graph, labels = self._whole(values, self.loops)
-        slots = solver.update(graph, values, [])
-        self._solver, self._slots = solver, _named(labels, slots)
-        self.frozen = set()
+        self._begin_anew(solver, labels, solver.update(graph, values, []))
         try:
             self._take()
         except FAILURES:  # nothing converges: keep what was there, with the guess of the newest keyframe
@@ -411,15 +480,16 @@ class Estimator(Generic[L]):
         `steps` are those between the keyframes where they are at hand.
         """
         loops = self.loops | {edge.id: edge for edge in fresh}
+        values = self._completed(values)
         if from_batch:
             plain = {edge.id for edge in fresh}
             values = optimize(self._whole(values, loops, plain)[0], values, _BATCH_ITERATIONS)
         graph, labels = self._whole(values, loops, steps=steps)
         slots = solver.update(graph, values, [])
         solver.iterate(self._config.loop_iterations)
-        self._adopt(solver.estimate(), np.arange(self._count))
-        self._solver, self.loops, self._slots = solver, loops, _named(labels, slots)
-        self.frozen = set()
+        self._adopt(solver.estimate(), np.arange(self._count), {})
+        self.loops = loops
+        self._begin_anew(solver, labels, slots)
 
     def _whole(
         self,

@@ -50,17 +50,16 @@ class LoopModel:
         """Return the id of the loop."""
         return self.record.id
 
-    def tie_to(self, anchor_id: int, T_anchor_from: Array, covariance: Array, T_from_to: Array) -> bool:
+    def tie_to(self, anchor_id: int, T_anchor_from: Array, covariance: Array, T_from_to: Array, *, most: float) -> bool:
         """Let another keyframe stand for the older one: T_anchor_from [4, 4] is where that is, known to `covariance`.
 
         T_from_to [4, 4] is how the graph has the loop now: without scale, the loop takes the length of the way from it,
         and keeps a variance along the way that says that it did not measure it. Returns False, and changes nothing,
-        where that would add too much to the loop's own variance in rotation or translation.
+        where that would add more than `most` times the loop's own variance in rotation or translation.
         """
         T, own = self._as_pose(T_from_to)
         carry = se3_adjoint(invert(T))
         added = carry @ covariance @ carry.T
-        most = self._config.anchor_variance_max
         if any(np.trace(added[n, n]) > most * np.trace(own[n, n]) for n in (slice(3), slice(3, 6))):
             return False
         self.tie = Tie(anchor_id, nearest_rigid(T_anchor_from @ T), own + added)

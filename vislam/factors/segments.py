@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
 from vislam.factors.keys import X, nearest_rigid
-from vislam.factors.known import Known
-from vislam.factors.loop import LoopModel
+from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.factors.noise import gaussian
 from vislam.factors.visual import pose_factor
+from vislam.geometry import invert, se3_exp, se3_log
+from vislam.messages import Array
 
-_DENSE = 0.25  # loops per keyframe that let a segment do without its neighbours; without scale three count as one
-_FIXED = 1e-4  # sigma, rad and m, of the central keyframe while its segment is summed up: far below any measured one
+_DENSE = 0.25  # loops per keyframe of a segment whose place anchors know; without scale three count as one
 _RATIO_MAX = 1e6  # eigenvalues of a tie's covariance, as of other factors
 
 
@@ -29,9 +29,45 @@ class Segment:
     anchors: tuple[int, ...]  # keyframes at the older ends, ascending
 
     @property
-    def centre(self) -> int:
-        """Return the keyframe in the middle."""
-        return (self.first + self.end) // 2
+    def keyframes(self) -> range:
+        """Return its keyframes."""
+        return range(self.first, self.end)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stand:
+    """Where a keyframe stands that left the solver."""
+
+    host: int  # keyframe that the solver has
+    T_host_self: Array  # [4, 4]
+    covariance: Array  # [6, 6] of that, perturbed at the keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """What segments that left the solver say of the way from one keyframe to another, most of them anchors."""
+
+    T_from_to: Array  # [4, 4]
+    covariance: Array  # [6, 6] of that, perturbed at the end
+
+    def with_another(self, other: Link) -> Link:
+        """Return what both say together, each independent of the other: their information adds up."""
+        step = se3_log(invert(self.T_from_to) @ other.T_from_to)
+        gain = self.covariance @ np.linalg.inv(self.covariance + other.covariance)
+        left = self.covariance - gain @ self.covariance
+        return Link(nearest_rigid(self.T_from_to @ se3_exp(gain @ step)), 0.5 * (left + left.T))
+
+    def factor(self, a: int, b: int) -> gtsam.NonlinearFactor:
+        """Return the factor between keyframes a and b."""
+        return pose_factor(X(a), X(b), self.T_from_to, gaussian(self.covariance, _RATIO_MAX))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Summary:
+    """What is left of a segment."""
+
+    links: dict[tuple[int, int], Link]  # between the keyframes around it
+    stands: dict[int, Stand]  # of its keyframes
 
 
 @dataclass(slots=True)
@@ -40,14 +76,16 @@ class _Ties:
 
     loops: list[LoopModel] = field(default_factory=list)
     weight: float = 0.0
-    is_anchor: bool = False  # loops tie to one of its keyframes
+    is_anchor: bool = False  # loops or segments tie to one of its keyframes
 
 
-def segments(loops: Iterable[LoopModel], size: int, last: int) -> Iterator[Segment]:
+def segments(
+    loops: Iterable[LoopModel], size: int, last: int, *, frozen: Collection[int] = (), pinned: Collection[int] = ()
+) -> Iterator[Segment]:
     """Yield the segments of `size` keyframes up to `last`, oldest first, that loops tie to older keyframes.
 
-    Their neighbours are tied as well, so that none comes loose when the odometry between them is cut, and no loop ties
-    to them.
+    No loop ties to them. Segments that begin with one of `frozen` are summed up already, and beside the keyframes
+    `pinned` stand others: none of these is yielded.
     """
     ties: dict[int, _Ties] = {}
     for model in loops:
@@ -57,56 +95,84 @@ def segments(loops: Iterable[LoopModel], size: int, last: int) -> Iterator[Segme
         own.loops.append(model)
         if a < b:
             own.weight += 1.0 if model.record.has_scale else 1.0 / 3.0
-    held = {0} | {n for n, own in ties.items() if own.weight >= _DENSE * size}
-    for n in sorted(held - {0}):
+    apart = {0, *(k // size for k in frozen), *(k // size for k in pinned)}
+    for n in sorted(ties.keys() - apart):
         own = ties[n]
-        if own.is_anchor or (n + 1) * size > last or not {n - 1, n + 1} <= held:
-            continue
-        anchors = tuple(sorted({_older(m) for m in own.loops}))
-        yield Segment(n * size, (n + 1) * size, tuple(m.id for m in own.loops), anchors)
+        if own.weight >= _DENSE * size and not own.is_anchor and (n + 1) * size <= last:
+            anchors = tuple(sorted({_older(m) for m in own.loops}))
+            yield Segment(n * size, (n + 1) * size, tuple(m.id for m in own.loops), anchors)
 
 
 def summarised(
-    factors: gtsam.NonlinearFactorGraph, segment: Segment, values: gtsam.Values
-) -> list[gtsam.NonlinearFactor]:
-    """Return what a segment's own factors say of its anchors, as relative poses to its central keyframe.
+    graph: gtsam.GaussianFactorGraph, segment: Segment, poses: Mapping[int, Array], around: list[int], known: Array
+) -> Summary:
+    """Return what a segment's own factors say of the keyframes around it, and where its keyframes stand beside anchors.
 
-    One for each anchor: what they err in common, the odometry between the places where their loops end, is taken for
-    independent, as in the tree of Chow and Liu that Carlevaris-Bianco et al. keep ("Generic node removal for
-    factor-graph SLAM", T-RO 2014). `values` has all poses, near the solution.
+    Args:
+        graph: these factors, linearised at `poses`.
+        segment: the keyframes, which leave the solver.
+        poses: T_map_body [4, 4] of the segment's keyframes and those around.
+        around: ids of all others that the factors touch, among them the anchors.
+        known: joint covariance [6 A, 6 A] of these as the solver has it, with the segment.
 
     Raises:
-        RuntimeError: the factors do not determine where the anchors are.
+        numpy.linalg.LinAlgError: the factors do not determine where the keyframes are.
     """
-    local, centre = gtsam.Values(), X(segment.centre)
-    for k in (*range(segment.first, segment.end), *segment.anchors):
-        local.insert(X(k), values.atPose3(X(k)))
-    graph = gtsam.NonlinearFactorGraph(factors)
-    fixed = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
-    graph.add(gtsam.PriorFactorPose3(centre, local.atPose3(centre), fixed))
-    steps, marginals = graph.linearize(local).optimize(), gtsam.Marginals(graph, local)
-    out: list[gtsam.NonlinearFactor] = []
-    T_centre_map = local.atPose3(centre).inverse()
-    for k in segment.anchors:
-        T = T_centre_map.compose(local.atPose3(X(k)).retract(steps.at(X(k))))
-        model = gaussian(np.asarray(marginals.marginalCovariance(X(k))), _RATIO_MAX)
-        out.append(pose_factor(centre, X(k), nearest_rigid(T.matrix()), model))
+    order = gtsam.Ordering()
+    for k in (*segment.keyframes, *around):
+        order.push_back(X(k))
+    H, eta = (np.asarray(part) for part in graph.hessian(order))
+    own = 6 * len(segment.keyframes)
+    spread = np.linalg.inv(H[:own, :own])
+    carry = -spread @ H[:own, own:]
+    cross = carry @ known
+    joint = np.block([[spread + cross @ carry.T, cross], [cross.T, known]])
+    told, shift = H[own:, own:] + H[own:, :own] @ carry, eta[own:] + carry.T @ eta[:own]
+    return Summary(_tree(told, shift, around, poses), _stands(joint, segment, around, poses))
+
+
+def _tree(told: Array, shift: Array, ids: list[int], poses: Mapping[int, Array]) -> dict[tuple[int, int], Link]:
+    """Return relative poses between keyframes, by the information `told` [6 A, 6 A] on them and its vector `shift`.
+
+    They make the tree of the surest ones. What two of them err in common is lost, as in the tree of Chow and Liu that
+    Carlevaris-Bianco et al. keep ("Generic node removal for factor-graph SLAM", T-RO 2014).
+    """
+    covariance = np.zeros(told.shape)  # where the first stays
+    covariance[6:, 6:] = np.linalg.inv(told[6:, 6:])
+    steps = covariance @ shift
+    moved = {k: poses[k] @ se3_exp(steps[6 * n : 6 * n + 6]) for n, k in enumerate(ids)}
+    pairs: dict[tuple[int, int], tuple[float, Array]] = {}
+    for n, a in enumerate(ids):
+        for m, b in enumerate(ids[n + 1 :], n + 1):
+            own = _relative(moved[a], moved[b], covariance, n, m)
+            pairs[a, b] = float(np.linalg.slogdet(own)[1]), own
+    out: dict[tuple[int, int], Link] = {}
+    reached = {ids[0]}
+    while len(reached) < len(ids):
+        open_ = [pair for pair in pairs if (pair[0] in reached) != (pair[1] in reached)]
+        a, b = min(open_, key=lambda pair: pairs[pair][0])
+        out[a, b] = Link(nearest_rigid(invert(moved[a]) @ moved[b]), pairs[a, b][1])
+        reached |= {a, b}
     return out
 
 
-def shape_factors(known: Known, segment: Segment) -> list[gtsam.NonlinearFactor]:
-    """Return factors that keep a segment's keyframes where they are, as well as that is known.
-
-    They stand around a hub beside the central keyframe: gtsam asks all that stand around a keyframe tied to anchors
-    whether they moved, with each update.
-    """
-    centre, hub = segment.centre, segment.centre + 1
-    pairs = [(centre, hub)] + [(hub, k) for k in range(segment.first, segment.end) if k not in (centre, hub)]
-    out: list[gtsam.NonlinearFactor] = []
-    for a, b in pairs:
-        model = gaussian(known.relative(a, b), _RATIO_MAX)
-        out.append(pose_factor(X(a), X(b), nearest_rigid(known.motion(a, b)), model))
+def _stands(joint: Array, segment: Segment, around: list[int], poses: Mapping[int, Array]) -> dict[int, Stand]:
+    """Let each of a segment's keyframes stand beside the nearest anchor; `joint` is of keyframes and those around."""
+    places = np.stack([poses[k][:3, 3] for k in segment.anchors])
+    out: dict[int, Stand] = {}
+    for n, k in enumerate(segment.keyframes):
+        nearest = int(np.argmin(np.linalg.norm(places - poses[k][:3, 3], axis=1)))
+        host = segment.anchors[nearest]
+        at = len(segment.keyframes) + around.index(host)
+        covariance = _relative(poses[host], poses[k], joint, at, n)
+        out[k] = Stand(host, nearest_rigid(invert(poses[host]) @ poses[k]), covariance)
     return out
+
+
+def _relative(T_a: Array, T_b: Array, joint: Array, a: int, b: int) -> Array:
+    """Return the covariance [6, 6] of T_a_b from the joint one, in which the poses are number a and b."""
+    rows = np.r_[6 * a : 6 * a + 6, 6 * b : 6 * b + 6]
+    return relative_covariance(T_a, T_b, joint[np.ix_(rows, rows)])
 
 
 def _older(model: LoopModel) -> int:

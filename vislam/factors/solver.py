@@ -34,6 +34,9 @@ class Solver(Protocol):
         `last` is the variable to which the next factors will come, by default those of these factors.
         """
 
+    def around(self, keys: list[int]) -> list[int]:
+        """Return the slots of the factors that touch any of some variables, ascending."""
+
     def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
         """Return the factors in some slots."""
 
@@ -77,6 +80,11 @@ class IncrementalSolver:
         result = self._isam.update(graph, values, remove, groups)
         return [int(slot) for slot in result.getNewFactorsIndices()]
 
+    def around(self, keys: list[int]) -> list[int]:
+        """See Solver."""
+        index = self._isam.getVariableIndex()
+        return sorted({int(slot) for key in keys for slot in index.at(key)})
+
     def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
         """See Solver."""
         return _some(self._isam.getFactorsUnsafe(), slots)
@@ -116,6 +124,11 @@ class BatchSolver:
         self._graph.push_back(graph)
         self.iterate(_BATCH_ITERATIONS)
         return list(range(first, self._graph.size()))
+
+    def around(self, keys: list[int]) -> list[int]:
+        """See Solver."""
+        wanted, graph = set(keys), self._graph
+        return [n for n in range(graph.size()) if graph.exists(n) and not wanted.isdisjoint(graph.at(n).keys())]
 
     def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
         """See Solver."""

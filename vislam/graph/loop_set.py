@@ -17,7 +17,7 @@ from vislam.factors.journal import loop_record
 from vislam.factors.keys import X
 from vislam.factors.known import Known, worth_a_factor
 from vislam.factors.loop import LoopModel, relative_covariance
-from vislam.factors.segments import segments
+from vislam.factors.segments import Segment, segments
 from vislam.factors.travel import Travel
 from vislam.geometry import invert
 from vislam.memory import LoopPlace, LoopState, OfferedLoop, Tied
@@ -44,6 +44,7 @@ class LoopSet:
         self._consensus = Consensus(config)
         self._beyond_help: set[int] = set()  # loops that a review brought in and the graph contradicted
         self._anchors = Anchors(config)
+        self._next_freeze = 0  # keyframe with which to look again for a segment to sum up
         self._next_doubt = 0  # where the next block of loops begins that are looked at again
         self._reports: dict[int, EdgeReport] = {}
         self._changed: dict[int, None] = {}  # ids of reports since `take_states`
@@ -89,7 +90,7 @@ class LoopSet:
             self._park.park(model)
         apart = {model.id for place in (LoopPlace.WAITING, LoopPlace.UNDONE) for model in by_place[place]}
         for model in (m for m in models if m.id not in apart):
-            self._consensus.offer(model, model.id not in self._held_ids, self._travel)
+            self._consensus.offer(model, not self._hold(model.id), self._travel)
 
     def restore_reports(self, loops: Sequence[OfferedLoop]) -> None:
         """Take over what was reported of the loops of an earlier run."""
@@ -130,26 +131,43 @@ class LoopSet:
 
     def freeze(self) -> str:
         """Sum up the oldest segment of keyframes that many loops tie, now and then; return what went wrong."""
-        size, newest = self._config.freeze_keyframes, len(self._estimator.poses) - 1
-        if not self._are_many or newest % (size // 4 or 1):
+        newest = len(self._estimator.poses) - 1
+        if newest < self._next_freeze:
             return ""
-        last = newest - self._config.freeze_after
-        for segment in segments(self._estimator.loops.values(), size, last):
-            if segment.first not in self._estimator.frozen and self._estimator.can_freeze(segment):
-                return self._estimator.freeze(segment)
-        return ""
+        segment = self._next_segment()
+        if segment is None:
+            self._next_freeze = newest + self._config.freeze_keyframes // 4
+            return ""
+        return self._estimator.freeze(segment)
+
+    def freeze_all(self) -> str:
+        """Sum up all old segments at once, as after a restart; return what went wrong."""
+        notes: list[str] = []
+        while not any(notes) and (segment := self._next_segment()) is not None:
+            notes.append(self._estimator.freeze(segment))
+        return "; ".join(note for note in notes if note)
+
+    def _next_segment(self) -> Segment | None:
+        """Return the oldest segment that can be summed up."""
+        config, estimator = self._config, self._estimator
+        if not self._are_many:
+            return None
+        last = len(estimator.poses) - 1 - config.freeze_after
+        loops, frozen, pinned = estimator.solved_loops(), estimator.frozen, estimator.pinned
+        found = segments(loops, config.freeze_keyframes, last, frozen=frozen, pinned=pinned)
+        return next((segment for segment in found if estimator.can_freeze(segment)), None)
 
     def review(self, notes: list[str]) -> list[int]:
         """Let the review of all loops work for a while; return the ids about which it decided."""
         if self._consensus.is_due:
             self._look_for_doubts()
-        verdict = self._consensus.step(self._travel, self._scale_left, self._held_ids)
+        verdict = self._consensus.step(self._travel, self._scale_left, self._hold)
         return [] if verdict is None else self._apply(verdict, notes)
 
     def finish(self, notes: list[str]) -> list[int]:
         """Review all loops to the end; return the ids about which it decided."""
         self._look_for_doubts(everywhere=True)
-        verdict = self._consensus.finish(self._travel, self._scale_left, self._held_ids)
+        verdict = self._consensus.finish(self._travel, self._scale_left, self._hold)
         return [] if verdict is None else self._apply(verdict, notes)
 
     def relative_covariance(self, i: int, j: int) -> Array:
@@ -207,10 +225,9 @@ class LoopSet:
         """Return by how much the sigmas of odometry may still be inflated."""
         return self._config.vo_scale_max / self._estimator.vo_scale
 
-    @property
-    def _held_ids(self) -> set[int]:
-        """Return the ids of the loops that the graph holds, with a factor or in spare."""
-        return self._estimator.loops.keys() | self._estimator.spare.keys()
+    def _hold(self, loop_id: int) -> bool:
+        """Return whether the graph holds a loop, with a factor or in spare."""
+        return loop_id in self._estimator.loops or loop_id in self._estimator.spare
 
     def _ends(self, edge: LoopModel) -> tuple[Array, Array]:
         poses = self._estimator.poses
@@ -228,12 +245,14 @@ class LoopSet:
     @property
     def _are_many(self) -> bool:
         """Return whether there are so many loops that the work of an update has to be kept from growing with them."""
-        return self._estimator.is_long or len(self._estimator.loops) >= self._config.anchor_after
+        estimator = self._estimator
+        return estimator.is_long or bool(estimator.frozen) or len(estimator.loops) >= self._config.anchor_after
 
     def _known(self, models: Sequence[LoopModel]) -> Known | None:
         """Return what the graph knows of all ends of loops, and of the anchors near to them: one joint marginal."""
         ends = {k for m in models for k in (m.record.from_id, m.record.to_id)}
         near = [self._anchors.near(m.record.from_id) for m in models]
+        ends |= {self._estimator.host(k) for k in ends}
         ids = sorted(ends | {tied.anchor_id for tied in near if tied is not None})
         joint = self._estimator.joint_covariance([X(k) for k in ids])
         if joint is None:
@@ -296,7 +315,8 @@ class LoopSet:
         groups: dict[int, list[LoopModel]] = {}
         for model, own in zip(models, anchors, strict=True):
             model.tie = None
-            held = next((k for k in (often[0], own) if self._tie(model, k, known)), model.record.from_id)
+            held = next((k for k in (often[0], own) if self._tie(model, k, known)), None)
+            held = self._tie_to_host(model, known) if held is None else held
             groups.setdefault(held, []).append(model)
         worth = worth_a_factor([groups[k] for k in sorted(groups)], known, self._config.loop_gain_min)
         chosen = {model.id for group in worth for model in group}
@@ -316,11 +336,23 @@ class LoopSet:
     def _tie(self, model: LoopModel, anchor: int, known: Known) -> bool:
         """Let an anchor stand for the older end of a loop; return whether it does, or is that end itself."""
         older, newer = model.record.from_id, model.record.to_id
+        if self._estimator.host(anchor) != anchor:
+            return False
         if anchor in (older, newer) or len(self._estimator.loops) < self._config.anchor_after:
             return anchor == older
         T_map_anchor, T_map_older, T_map_newer = (self._estimator.poses[k] for k in (anchor, older, newer))
         T_anchor_older, T_older_newer = invert(T_map_anchor) @ T_map_older, invert(T_map_older) @ T_map_newer
-        return model.tie_to(anchor, T_anchor_older, known.relative(anchor, older), T_older_newer)
+        way = known.relative(anchor, older)
+        return model.tie_to(anchor, T_anchor_older, way, T_older_newer, most=self._config.anchor_variance_max)
+
+    def _tie_to_host(self, model: LoopModel, known: Known) -> int:
+        """Tie a loop to the keyframe that the solver has for its older end; return it."""
+        older, newer = model.record.from_id, model.record.to_id
+        host = self._estimator.host(older)
+        if host != older:
+            T_older_newer = known.motion(older, newer)
+            model.tie_to(host, known.motion(host, older), known.relative(host, older), T_older_newer, most=np.inf)
+        return host
 
     def _is_far(self, model: LoopModel) -> bool:
         """Return whether a loop asks for a correction beyond what incremental steps should try."""
@@ -330,14 +362,14 @@ class LoopSet:
 
     def _apply(self, verdict: Verdict, notes: list[str]) -> list[int]:
         """Do as a review of all loops says; return the ids about which it decided something else than before."""
-        estimator, newest, held = self._estimator, len(self._estimator.poses) - 1, self._held_ids
-        out = [m for m, _ in verdict.put_out if m.id in held]
-        back = [m for m in verdict.let_in if m.id not in held and m.id not in self._beyond_help]
-        for model, chi2 in verdict.put_out:
-            if model.id in held:
-                estimator.spare.pop(model.id, None)
-                says = f"{verdict.places} place{'s say' if verdict.places > 1 else ' says'} otherwise, chi2 {chi2:.1f}"
-                self.report(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {says}")
+        estimator, newest = self._estimator, len(self._estimator.poses) - 1
+        contradicted = [(m, chi2) for m, chi2 in verdict.put_out if self._hold(m.id)]
+        out = [m for m, _ in contradicted]
+        back = [m for m in verdict.let_in if not self._hold(m.id) and m.id not in self._beyond_help]
+        for model, chi2 in contradicted:
+            estimator.spare.pop(model.id, None)
+            says = f"{verdict.places} place{'s say' if verdict.places > 1 else ' says'} otherwise, chi2 {chi2:.1f}"
+            self.report(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {says}")
         if verdict.scale > 1.0 and back:  # several witnesses against the odometry say that it knows less than it says
             estimator.distrust_odometry(verdict.scale)
             self._travel.scale(verdict.scale)

@@ -146,6 +146,7 @@ class PoseGraph:
             self._waiting.add(model)
         self._count_joined()
         self._loops.restore_reports(memory.loops)
+        note = "; ".join(n for n in (note, self._loops.freeze_all()) if n)
         self._revision, self._T_odom_last = memory.revision, memory.T_odom_body
         self._T_map_odom = poses[-1] @ invert(memory.T_odom_body)
         update = self._publish([], [], note, everything=True)
