@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from fake_window import FakeWindow
 from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
+from session_entries import start_facts
 from test_graph_faults import Failing
 
 from vislam.config import GraphConfig, WindowConfig
@@ -22,8 +23,9 @@ from vislam.factors.window import WindowOdometry
 from vislam.geometry import invert, so3_log
 from vislam.graph import PoseGraph
 from vislam.graph.source import in_map
-from vislam.memory import WindowRecord
+from vislam.memory import KeyframeEntry, WindowRecord
 from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision
+from vislam.session import Session, SessionWriter, recall
 from vislam.window.messages import WindowUpdate
 
 TIGHT = GraphConfig(
@@ -461,3 +463,56 @@ def test_yaw_is_free_under_tilts(world: World, make) -> None:
     world_axes = R @ covariance[:3, :3] @ R.T
     assert np.sqrt(world_axes[2, 2]) > 1.5 * np.sqrt(max(world_axes[0, 0], world_axes[1, 1]))
     assert np.linalg.norm(so3_log(np.ascontiguousarray(R.T @ world.truth[109, :3, :3]))) < 0.05
+
+
+def test_the_solver_holds_what_is_new_however_often_a_place_is_seen(make) -> None:
+    """Old keyframes leave it and stand beside anchors; loops to them tie to these, and covariances stay honest."""
+    world = World(62.0, seed=12)
+    graph, _ = make(world, config=replace(TIGHT, loop_gain_min=0.0, freeze_keyframes=20, freeze_after=40))
+    whole, _ = make(world, config=replace(TIGHT, loop_gain_min=0.0, freeze_after=10**6))
+    solved = []
+    for k in range(world.count):
+        edges = [world.loop(k, k - 100 * (1 + k // 20 % (k // 100)), k)] if k >= 100 else []
+        for each in (graph, whole):
+            update = each.add(world.packet(k), edges)
+            assert update.note == "" and update.accepted_loop_ids == tuple(edge.id for edge in edges)
+        solver = graph._estimator._solver
+        solved.append(solver.estimate().size())
+    estimator = graph._estimator
+    left = [k for k in range(world.count) if estimator.host(k) != k]
+    print(
+        f"{len(left)} of {world.count} keyframes left the solver, links {len(estimator._links)}, sizes {solved[::40]}"
+    )
+    assert solved[-1] == world.count - len(left) and max(solved[200:]) < solved[200] + 25
+    assert all(estimator.host(estimator.host(k)) == estimator.host(k) for k in left)
+    models = [model for model in estimator.loops.values() if model.record.from_id in left]
+    assert models and all(model.tie is not None for model in models)
+    for i, j in [(left[3], left[90]), (left[10], world.count - 1), (0, left[50])]:
+        ratio = np.trace(graph.relative_covariance(i, j)) / np.trace(whole.relative_covariance(i, j))
+        assert 0.7 < ratio < 3.0, (i, j)
+    errors = [rmse_m(each.poses(), world.truth) for each in (whole, graph)]
+    print("rmse [m] with all in the solver, and with the newest", errors)
+    assert errors[1] < 1.15 * errors[0]
+
+
+def test_a_restored_graph_has_no_more_in_its_solver(make, tmp_path) -> None:
+    """A resumed run goes on as bounded as it was."""
+    world = World(50.0, seed=12)
+    config = replace(TIGHT, loop_gain_min=0.0, freeze_keyframes=20, freeze_after=40)
+    old, _ = make(world, config=config)
+    writer = SessionWriter(tmp_path / "session.db", {}, RIG, world.noise, GRAVITY_M_S2)
+    for k in range(world.count):
+        edges = [world.loop(k, k - 100, k)] if k >= 100 else []
+        start = start_facts(world.initial_state(), world.noise) if k == 0 else None
+        update = old.add(world.packet(k), edges, world.truth[k])
+        entry = KeyframeEntry(world.packet(k), world.truth[k], update, old.take_news(), edges, start=start)
+        writer.add(entry)
+    writer.close()
+    memory = recall(Session(tmp_path / "session.db"))
+    assert memory is not None
+    new, _ = make(world, config=config)
+    new.restore(memory.graph)
+    sizes = [graph._estimator._solver.estimate().size() for graph in (old, new)]
+    print("variables in the solver", sizes)
+    assert len(old._estimator.frozen) > 3 and sizes[1] <= sizes[0] + 20
+    assert np.abs(new.poses() - old.poses()).max() < 1e-2

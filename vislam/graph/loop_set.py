@@ -279,7 +279,7 @@ class LoopSet:
         """Report on loops that were put into the graph; return those that the optimised graph contradicts."""
         contradicted = []
         for model in fresh:
-            if model.record.id not in self._estimator.loops:
+            if not self._hold(model.id):
                 self.report(model, LoopDecision.REJECTED, "the solver refused it")
             elif self._is_torn(model):
                 contradicted.append(model)
@@ -374,12 +374,32 @@ class LoopSet:
             estimator.distrust_odometry(verdict.scale)
             self._travel.scale(verdict.scale)
         self._park.remove(back)
-        self._rebuild(out, back, notes)
+        if out or verdict.scale > 1.0 or not self._let_in(back, notes):
+            self._rebuild(out, back, notes)
         torn = self._judge(back, f"let in at keyframe {newest}: it agrees with {verdict.places} places", True)
         self._beyond_help |= {m.id for m in torn}
         if torn:
             notes.append(estimator.drop(torn))
         return [m.id for m in (*out, *back)]
+
+    def _let_in(self, back: list[LoopModel], notes: list[str]) -> bool:
+        """Put loops that fit into a solver that old keyframes have left; return False, and do nothing, where none has.
+
+        What ends with a keyframe that left is kept in spare.
+        """
+        estimator = self._estimator
+        if not estimator.frozen or any(m.weight(*self._ends(m)) < _FITS for m in back):
+            return False
+        known = self._known(back) if back else None
+        if known is None:
+            return not back
+        late = [m for m in back if estimator.host(m.record.to_id) != m.record.to_id]
+        fresh = [m for m in back if m not in late]
+        for model in fresh:
+            self._tie_to_host(model, known)
+        estimator.spare |= {model.id: model for model in late}
+        notes.append(estimator.close(fresh, batch=False) if fresh else "")
+        return True
 
     def _look_for_doubts(self, everywhere: bool = False) -> None:
         """Tell the next review if loops that were let in do not fit any more: the kernel keeps them without a say.
