@@ -143,6 +143,7 @@ def _write_json(folder: Path, accuracy: dict, loops: dict[str, int], keyframes: 
 
     metrics = {
         "name": "workshop-cart",
+        "track_noise": {"measured_px": 0.53, "graph": {"told_px": 1.0, "used_px": 2.1}},
         "mode": "rgbd",
         "has_imu": True,
         "frames": FRAMES,

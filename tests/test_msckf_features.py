@@ -21,7 +21,7 @@ SIGMAS = np.array([0.8, 0.4, 2e-3])
 CLONE_TIMES_S = np.array([1.0, 1.3, 1.7, 2.2])
 POINT = np.array([5.0, 0.6, 0.3])
 NO_IDS: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
-NOBODY = FrameTracks(0, NO_IDS, np.zeros((0, 2)), np.zeros((0, 14)), np.zeros(0, dtype=np.bool_))
+NOBODY = FrameTracks(0, NO_IDS, np.zeros((0, 2)), np.zeros((0, features.COLUMNS)), np.zeros(0, dtype=np.bool_))
 
 
 def rig_parts(rig: Rig) -> tuple[Array, Array, Array, Array]:
@@ -36,7 +36,7 @@ def a_window(motion: Motion, points: int = 0) -> tuple[Window, Array]:
     n = CLONES + 6 * len(at) + 3 * points
     A = np.random.default_rng(3).normal(size=(n, n)) * 1e-3
     NOBODY = FrameTracks(
-        0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 14)), np.zeros(0, dtype=np.bool_)
+        0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, features.COLUMNS)), np.zeros(0, dtype=np.bool_)
     )
     window = Window(
         A @ A.T + 1e-8 * np.eye(n),
@@ -56,7 +56,9 @@ def a_window(motion: Motion, points: int = 0) -> tuple[Window, Array]:
     return window, x
 
 
-def seen_from(window: Window, rig: Rig, readout_s: float, point: Array) -> tuple[NDArray[np.int64], Array]:
+def seen_from(
+    window: Window, rig: Rig, readout_s: float, point: Array, noise: float = 1.0
+) -> tuple[NDArray[np.int64], Array]:
     """Return an observation of the point from every clone, somewhat beside where it is."""
     rows = []
     for i in range(len(window.frames)):
@@ -70,7 +72,8 @@ def seen_from(window: Window, rig: Rig, readout_s: float, point: Array) -> tuple
             right = rig.cameras[1].project(y1[None]) + np.array([0.2, 0.3])
         if rig.has_depth:
             depth = np.array([y[2] * 1.01])
-        rows.append(prepare(0, Observations(np.array([4]), pixel, right, depth), rig, readout_s).seen)
+        seen = Observations(np.array([4]), pixel, right, depth, noise=noise)
+        rows.append(prepare(0, seen, rig, readout_s).seen)
     return np.arange(len(rows)), np.concatenate(rows)
 
 
@@ -109,6 +112,19 @@ def test_derivatives_of_a_track(rig: Rig, readout_s: float) -> None:
         np.testing.assert_allclose(H_f[:, j], -(ahead - behind) / (2 * h), rtol=2e-5, atol=2e-4)
 
 
+@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
+def test_tracks_that_scatter_twice_as_much_count_as_if_told_so(rig: Rig) -> None:
+    window, _ = a_window(Motion.random(5))
+    at, seen = seen_from(window, rig, 0.0, POINT)
+    _, noisy = seen_from(window, rig, 0.0, POINT, noise=2.0)
+    R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
+    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
+    told = features.linearise(POINT, at, seen, *poses, 2.0 * SIGMAS, R10, t10, len(at))
+    shown = features.linearise(POINT, at, noisy, *poses, SIGMAS, R10, t10, len(at))
+    for one, other in zip(told, shown, strict=True):
+        np.testing.assert_allclose(one, other)
+
+
 def test_a_clone_depends_on_the_time_offset() -> None:
     """Its derivative against clones made a little later on the true motion; then what pixels make of it."""
     motion = Motion.random(6)
@@ -123,7 +139,7 @@ def test_a_clone_depends_on_the_time_offset() -> None:
     P = np.zeros((CLONES, CLONES))
     P[15, 15] = 4.0  # only the time offset is unknown: its column of the clone shows in the covariance
     NOBODY = FrameTracks(
-        0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 14)), np.zeros(0, dtype=np.bool_)
+        0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, features.COLUMNS)), np.zeros(0, dtype=np.bool_)
     )
     R = np.ascontiguousarray(T[:3, :3])
     after = cloned(Window(P, 0.0, np.eye(3)), x, R, rate, 0.0, GRAVITY_M_S2, NOBODY)
@@ -140,7 +156,7 @@ def test_a_clone_of_the_near_past() -> None:
     x = np.concatenate((T[:3, 3], v, quaternion_wxyz(T[:3, :3].copy()), np.zeros(6)))
     R = np.ascontiguousarray(T[:3, :3])
     NOBODY = FrameTracks(
-        0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 14)), np.zeros(0, dtype=np.bool_)
+        0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, features.COLUMNS)), np.zeros(0, dtype=np.bool_)
     )
     after = cloned(Window(np.eye(CLONES), 0.0, np.eye(3)), x, R, rate, 0.004, GRAVITY_M_S2, NOBODY)
     then = motion.pose(1.996)

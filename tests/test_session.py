@@ -59,7 +59,7 @@ def packet(i, rng):
     )
     depth = np.array([1.5, np.nan, 2.25, 0.5])
     right = None if i == 0 else pixels[:4] - 3.5
-    seen = Observations(np.array([3, 2**40, 7, 8], np.int64) + i, pixels[:4], right, None if i == 1 else depth)
+    seen = Observations(np.array([3, 2**40, 7, 8], np.int64) + i, pixels[:4], right, None if i == 1 else depth, noise=1.0 + 0.3 * i)
     span = None if i == 0 else ImuSpan(1000 * i - np.arange(5)[::-1], rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
     mag = MagSample(1000 * i - 3, rng.normal(size=3)) if i == 2 else None
     return KeyframePacket(keyframe, vo, seen, span, mag, i == 1, 0.0125 * i)
@@ -296,7 +296,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
     database = sqlite3.connect(tmp_path / "session.db")
     database.execute("PRAGMA user_version=1")
     database.close()
-    with pytest.raises(DataError, match="format 1, this vislam reads 6; run the recording again"):
+    with pytest.raises(DataError, match="format 1, this vislam reads 7; run the recording again"):
         Session(tmp_path / "session.db")
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from vislam.frontend import TrackResult, lasting_scale_sigma, make_frontend, mod
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.feed import CameraFeed
 from vislam.frontend.initialisation import Initialisation, Initialiser, level_at_once, moved_to
+from vislam.frontend.pixel_noise import NoiseUsed
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.stillness import Stillness
@@ -102,6 +104,7 @@ class FrontReport:
     noise_ratios: NoiseRatios | None = None  # white noise seen over that of the model; None without an IMU
     condition: InertialCondition | None = None  # of the IMU; None without one
     told_noise: ImuNoise | None = None  # of the IMU
+    track_noise: dict[str, Any] = field(default_factory=dict)  # of pixels: what tracks showed, and what was used for it
 
     @property
     def alignment(self) -> Alignment:
@@ -148,7 +151,7 @@ class Front:
         self.noise, self._has_imu = noise, noise is not None  # as told; spans and the filter hear what samples show
         self.camera_clock = CameraClock(config.init)
         self.uniform = UniformMotion(config.init)
-        self.feed = CameraFeed()
+        self.feed, self._track_noise = CameraFeed(), NoiseUsed()
         self._filter: Filtering | None = None
         if noise is not None:
             self._buffer = ImuBuffer(config.imu, noise)
@@ -261,6 +264,7 @@ class Front:
             track = self.frontend.track(frame, *self._without_bias(span, before), self._predicted(frame.t_ns, before))
             track = self._linked(frame, track)
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, before))
+        self._track_noise.add(track.sigma_px, track.observations)
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
         at_rest = self._has_imu and self._rest.add(span) and self._stillness.resting
         self.feed.moved(at_rest)
@@ -320,7 +324,16 @@ class Front:
             None if self._floor is None else self._floor.ratios,
             self.condition.condition() if self.noise is not None else None,
             self.noise,
+            self._track_noise.summary(self._told_px),
         )  # fmt: skip
+
+    @property
+    def _told_px(self) -> dict[str, float]:
+        """What estimators that see the tracks themselves are told of their pixels' noise."""
+        config = self._config
+        graph = {"graph": config.window.sigma_px} if config.graph.coupling == "tight" else {}
+        is_tight = self._has_imu and self.ekf_coupling == "tight"
+        return graph | ({"filter": config.ekf.tight_pixel_sigma_px} if is_tight else {})
 
     @property
     def calibration(self) -> dict[str, float]:

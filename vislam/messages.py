@@ -94,6 +94,7 @@ class Observations:
     depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
     instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
+    noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are told
 
 
 def no_observations() -> Observations:

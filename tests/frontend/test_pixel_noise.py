@@ -11,8 +11,8 @@ from test_frontends import recording, run
 from vislam.camera import Camera
 from vislam.config import FrontEndConfig
 from vislam.frontend import make_frontend
-from vislam.frontend.pixel_noise import PixelNoise
-from vislam.messages import Frame
+from vislam.frontend.pixel_noise import NoiseUsed, PixelNoise
+from vislam.messages import Frame, Observations, no_observations
 from vislam.sim import open_points
 
 UNIT = Camera(100, 100, 1.0, 1.0, 50.0, 50.0)  # a pixel is as long as a distance on z = 1
@@ -42,9 +42,12 @@ def test_drawn_corners_scatter_little_and_more_in_noisier_images(kind: str) -> N
         grey = [np.clip(i + rng.normal(0.0, 12.0, i.shape), 0, 255).astype(np.uint8) for i in frame.images]
         return replace(frame, images=tuple(grey))
 
-    clean = run(kind, frames)[-1].sigma_px
-    assert 0.02 < clean < 0.35
-    assert run(kind, [noisy(f) for f in frames])[-1].sigma_px > 1.3 * clean
+    clean = run(kind, frames)[-1]
+    assert 0.02 < clean.sigma_px < 0.25
+    assert clean.observations.noise == 1.0
+    worse = run(kind, [noisy(f) for f in frames])[-1]
+    assert worse.sigma_px > 1.3 * clean.sigma_px
+    assert worse.observations.noise == max(1.0, worse.sigma_px / 0.25)
     assert world is not None
 
 
@@ -78,3 +81,31 @@ def test_a_frame_tells_its_own_noise_where_it_shows_enough_tracks() -> None:
     assert noise.frame_px == pytest.approx(1.2, rel=0.2) and noise.sigma_px < 0.4
     noise.learn(np.full(200, np.nan), UNIT, NOWHERE)
     assert noise.frame_px == noise.sigma_px
+
+
+@pytest.mark.parametrize(("scatter_px", "over"), [(0.1, 1.0), (0.25, 1.0), (0.75, 3.0)])
+def test_tracks_count_as_noisier_than_told_when_they_scatter_more_than_usual(scatter_px: float, over: float) -> None:
+    rng, noise = np.random.default_rng(7), PixelNoise(1.0)
+    assert noise.over_usual == 1.0  # nothing seen yet
+    for _ in range(60):
+        noise.learn(rng.normal(0.0, scatter_px, 200), UNIT, NOWHERE)
+    assert noise.over_usual == pytest.approx(over, rel=0.1)
+
+
+@pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])
+def test_given_tracks_count_as_told(rig: str) -> None:
+    points = open_points("handheld-room", seed=1, rig=rig, duration_s=4.0, pixel_sigma_px=1.0)
+    front_end = make_frontend(FrontEndConfig(), points.rig, 0)
+    results = [front_end.track(event, None) for event in points.events() if isinstance(event, Frame)]
+    assert results[-1].sigma_px > 0.7
+    assert {result.observations.noise for result in results} == {1.0}
+
+
+def test_what_was_used_is_told_beside_what_was_told() -> None:
+    used = NoiseUsed()
+    assert used.summary({"graph": 1.0}) == {}
+    for noise in (1.0, 2.0, 3.0):
+        used.add(0.5, Observations(np.arange(2), np.zeros((2, 2)), noise=noise))
+    used.add(0.5, no_observations())
+    used.add(float("nan"), Observations(np.arange(2), np.zeros((2, 2)), noise=9.0))
+    assert used.summary({"graph": 1.5}) == {"measured_px": 0.5, "graph": {"told_px": 1.5, "used_px": 3.0}}

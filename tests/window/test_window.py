@@ -48,6 +48,22 @@ def test_drift_is_small_against_distance(rig: Rig) -> None:
         assert updates[-1].scale_sigma == 0.0
 
 
+@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
+def test_tracks_that_scatter_twice_as_much_count_as_if_told_so(rig: Rig) -> None:
+    packets, truths = World(Motion.random(3), rig, 3, duration_s=2.0, tracks=50).packets()
+    config = replace(HONEST, sigma_px=0.5, right_sigma_px=0.7, depth_sigma_rho=3e-3)
+    told = replace(config, sigma_px=1.0, right_sigma_px=1.4, depth_sigma_rho=6e-3)
+    ends = []
+    for settings, noise in ((told, 1.0), (config, 2.0)):
+        window = SlidingWindow(settings, rig, EUROC_NOISE, GRAVITY_M_S2)
+        window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1003)))
+        for p in packets:
+            update = window.add(replace(p, observations=replace(p.observations, noise=noise)))
+        ends.append(update.newest)
+    np.testing.assert_allclose(ends[0].T_world_body, ends[1].T_world_body, atol=1e-9)
+    np.testing.assert_allclose(ends[0].covariance, ends[1].covariance, rtol=1e-6, atol=1e-12)
+
+
 def test_error_of_the_newest_state_fits_its_covariance() -> None:
     """NEES over runs: within the band that a correct filter leaves once in a thousand, pose, velocity and biases."""
     dof, total, count = 15, 0.0, 0

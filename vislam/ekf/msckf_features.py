@@ -1,7 +1,8 @@
 """Compiled arithmetic of tracks: where a point is, what its pixels say about the poses they were seen from.
 
-One observation is a row [14]: direction x, y on z = 1; d(pixel)/d(x, y) [2, 2] by rows; the same six numbers for the
-right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read. NaN where not measured.
+One observation is a row [15]: direction x, y on z = 1; d(pixel)/d(x, y) [2, 2] by rows; the same six numbers for the
+right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read; its standard deviations
+over those told. NaN where not measured.
 Residuals are whitened: left pixels; right minus left pixels (matching left to right is better than following a corner
 over time, and both share the error of the corner); inverse depth.
 """
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from vislam.geometry import skew, so3_exp
 from vislam.messages import Array
 
-COLUMNS = 14
+COLUMNS = 15
 ROWS_MAX = 5  # of one observation
 _STEPS = 10
 _CONVERGED = 1e-4  # of the cost
@@ -34,6 +35,7 @@ def observe(y: Array, seen: Array, sigmas: Array, R_cam1_cam0: Array, t_cam1_cam
     """
     if not y[2] > 1e-6:
         return 0
+    pixel, disparity, depth = sigmas[0] * seen[14], sigmas[1] * seen[14], sigmas[2] * seen[14]
     z = 1.0 / y[2]
     ex = seen[0] - y[0] * z
     ey = seen[1] - y[1] * z
@@ -43,7 +45,7 @@ def observe(y: Array, seen: Array, sigmas: Array, R_cam1_cam0: Array, t_cam1_cam
         r[i] = a * ex + b * ey
         D[i, 0], D[i, 1], D[i, 2] = a * z, b * z, -(a * y[0] + b * y[1]) * z * z
         for k in range(3):
-            J[i, k] = D[i, k] / sigmas[0]
+            J[i, k] = D[i, k] / pixel
     rows = 2
     if np.isfinite(seen[6]):
         y1 = R_cam1_cam0 @ y + t_cam1_cam0
@@ -53,18 +55,18 @@ def observe(y: Array, seen: Array, sigmas: Array, R_cam1_cam0: Array, t_cam1_cam
         ex, ey = seen[6] - y1[0] * z1, seen[7] - y1[1] * z1
         for i in range(2):
             a, b = seen[8 + 2 * i], seen[9 + 2 * i]
-            r[rows] = (a * ex + b * ey - r[i]) / sigmas[1]
+            r[rows] = (a * ex + b * ey - r[i]) / disparity
             d0, d1, d2 = a * z1, b * z1, -(a * y1[0] + b * y1[1]) * z1 * z1
             for k in range(3):
                 right = d0 * R_cam1_cam0[0, k] + d1 * R_cam1_cam0[1, k] + d2 * R_cam1_cam0[2, k]
-                J[rows, k] = (right - D[i, k]) / sigmas[1]
+                J[rows, k] = (right - D[i, k]) / disparity
             rows += 1
     if np.isfinite(seen[12]):
-        r[rows] = (seen[12] - z) / sigmas[2]
-        J[rows, 0], J[rows, 1], J[rows, 2] = 0.0, 0.0, -z * z / sigmas[2]
+        r[rows] = (seen[12] - z) / depth
+        J[rows, 0], J[rows, 1], J[rows, 2] = 0.0, 0.0, -z * z / depth
         rows += 1
-    r[0] /= sigmas[0]
-    r[1] /= sigmas[0]
+    r[0] /= pixel
+    r[1] /= pixel
     return rows
 
 
@@ -79,7 +81,7 @@ def camera_poses(
     R_body_cam: Array,
     p_body_cam: Array,
 ) -> tuple[Array, Array]:
-    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 14] made from the clones `at` [M].
+    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 15] made from the clones `at` [M].
 
     Clones: R [C, 3, 3], p [C, 3], body rate [C, 3], world velocity [C, 3]; the last two carry the pose to the time at
     which a rolling shutter read the row.

@@ -22,7 +22,7 @@ class FrameTracks:
     t_ns: int  # stamp of the frame
     ids: NDArray[np.int64]  # [N] ascending
     pixels_px: Array  # [N, 2]
-    seen: Array  # [N, 14] rows of `msckf_features`
+    seen: Array  # [N, 15] rows of `msckf_features`
     unused: NDArray[np.bool_]  # [N] each observation is used once
     shows_scale: bool = True  # False: the motion before it was too uniform for one camera to see how large things are
 
@@ -55,6 +55,7 @@ def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float, s
         seen[good, 12] = 1.0 / depth[good]
     rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
     seen[:, 13] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
+    seen[:, 14] = observations.noise
     fit = np.isfinite(seen[:, :6]).all(axis=1) & np.isfinite(seen[:, 13])
     return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_), shows_scale)
 

@@ -99,7 +99,7 @@ class MonoFrontEnd:
     ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         result = self._track(frame, imu, gyro_sigma_rad_s, T_last_now)
-        return replace(result, sigma_px=self._noise.sigma_px)
+        return result.with_scatter(self._noise.sigma_px, 1.0 if frame.tracks is not None else self._noise.over_usual)
 
     def _track(
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float, T_last_now: Array | None

@@ -8,10 +8,12 @@ the run noisy.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vislam.camera import Camera
-from vislam.messages import Array
+from vislam.messages import Array, Observations
 
 _MEDIAN_ABS = 0.6745  # of a normal distribution, in standard deviations
 _TRIM = 2.0  # standard deviations
@@ -22,6 +24,7 @@ _MIN_FRAMES = 10  # before what was measured goes before what was told
 _MEMORY_FRAMES = 200  # over which is averaged: blur and light change within seconds
 _MIN_PX = 0.02  # of a frame: simulated pixels without any noise
 _PARAMETERS = 5  # of the motion that the same tracks were fitted with
+USUAL_PX = 0.25  # scatter of tracks in sharp images, for which what is told of pixels and depths holds
 
 
 def _spread_px(lengths: Array) -> float:
@@ -60,6 +63,14 @@ class PixelNoise:
         return float(np.exp(self._log_px)) if self.is_learnt else self._told_px
 
     @property
+    def over_usual(self) -> float:
+        """By how much tracks scatter more than usual, at least 1: what blurs or bends images spoils depth alike.
+
+        Less scatter is no promise: what neighbouring tracks have in common leaves no residual.
+        """
+        return max(1.0, self.sigma_px / USUAL_PX) if self.is_learnt else 1.0
+
+    @property
     def frame_px(self) -> float:
         """The standard deviation in the newest frame alone; where it shows too few tracks, that of the run."""
         return self.sigma_px if self._frame_px is None else self._frame_px
@@ -83,3 +94,27 @@ class PixelNoise:
         self._frame_px = measured_px
         self._frames += 1
         self._log_px += (np.log(measured_px) - self._log_px) / min(self._frames, _MEMORY_FRAMES)
+
+
+@dataclass(slots=True)
+class NoiseUsed:
+    """What a run showed of its tracks, and by how much more than told estimators were to take them for noisy."""
+
+    measured_px: float = float("nan")  # scatter, as the newest frame knows it
+    factors: float = 0.0  # sum over frames, see `Observations.noise`
+    frames: int = 0  # that saw something
+
+    def add(self, measured_px: float, seen: Observations) -> None:
+        """Take what a front end said with a frame."""
+        if len(seen.track_ids) and np.isfinite(measured_px):
+            self.measured_px = measured_px
+            self.factors += seen.noise
+            self.frames += 1
+
+    def summary(self, told_px: dict[str, float]) -> dict[str, float | dict[str, float]]:
+        """Return the scatter and, by estimator, the noise `told_px` and used, a mean over frames; {}: not measured."""
+        if not self.frames:
+            return {}
+        factor = self.factors / self.frames
+        used = {name: {"told_px": told, "used_px": factor * told} for name, told in told_px.items()}
+        return {"measured_px": self.measured_px, **used}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +24,10 @@ class TrackResult:
     median_parallax_px: float  # since the keyframe that `vo` refers to, rotation taken out; 0 when nothing was followed
     reason: str  # why tracking is not ok, or why the frame became a keyframe; empty otherwise
     sigma_px: float = float("nan")  # of a track's pixel, as this run showed it up to now; told until enough was seen
+
+    def with_scatter(self, sigma_px: float, noise: float) -> TrackResult:
+        """Return the result with what the run shows of its tracks; `noise` as in `Observations`."""
+        return replace(self, sigma_px=sigma_px, observations=replace(self.observations, noise=noise))
 
 
 class FrontEnd(Protocol):

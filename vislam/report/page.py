@@ -103,10 +103,21 @@ def _head(run: RunFiles) -> str:
         if noise:
             told, seen = number(noise.get("told"), 5), number(noise.get("typical"), 5)
             parts.append(f"{sensor}: white noise of {seen} in motion, {told} told (SI units per √Hz).")
+    parts += _track_noise(as_dict(m, "track_noise"))
     source = run.manifest.get("source")
     if source:
         parts.append(f"Source: {source}.")
     return f'<h1>{escape(_name(run))}</h1><p class="lead">{escape(" ".join(parts))}</p>'
+
+
+def _track_noise(noise: dict[str, Any]) -> list[str]:
+    parts = []
+    for name in ("graph", "filter"):
+        pixel = as_dict(noise, name)
+        if pixel:
+            used, told = number(pixel.get("used_px"), 2), number(pixel.get("told_px"), 2)
+            parts.append(f"the {name} goes by {used} px, {told} told")
+    return [f"Tracks scatter by {number(noise.get('measured_px'), 2)} px; {', '.join(parts)}."] if parts else []
 
 
 def _tiles(run: RunFiles, scene: Scene) -> str:

@@ -333,6 +333,7 @@ class Run:
             "initialisation": initialisation(front, int(stamps[0]) if len(stamps) else None),
             "calibration": front.calibration,
             "imu_noise": front.imu_noise,
+            "track_noise": front.track_noise,
             "accuracy": errors,
             "timing_ms": self.slam.clock.summary_ms(),
             "counters": counters,

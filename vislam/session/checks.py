@@ -18,7 +18,7 @@ from vislam.session.schema import APPLICATION_ID, SCHEMA, SCHEMA_VERSION, readab
 _COVERED: dict[str, tuple[tuple[int, ...], ...]] = {
     "info": ((0, 1),),
     "keyframes": ((0, 1, 3, 4, 5, 6), (0, 2)),
-    "packets": (tuple(range(22)),),
+    "packets": (tuple(range(23)),),
     "windows": (tuple(range(5)),),
     "states": (tuple(range(4)),),
     "edges": (tuple(range(10)), (0, *range(10, 17)), (0, 17, 18)),

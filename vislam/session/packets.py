@@ -23,7 +23,7 @@ from vislam.session.schema import DESCRIPTOR_BYTES, integers, maybe_bytes, maybe
 # without observations, where only the graph is to be built again
 LIGHT_COLUMNS = (
     "id, vo_t_ns, vo_keyframe_id, vo_T, vo_covariance, vo_has_scale, vo_tracking, vo_inliers, x'', x'', NULL, NULL, "
-    "imu_t_ns, imu_gyro, imu_accel, mag_t_ns, mag_field, at_rest, time_offset_s, begins_piece, NULL, imu_noise"
+    "1.0, imu_t_ns, imu_gyro, imu_accel, mag_t_ns, mag_field, at_rest, time_offset_s, begins_piece, NULL, imu_noise"
 )
 
 
@@ -37,7 +37,7 @@ def packet_row(packet: KeyframePacket, newest: NavState | None) -> tuple[Any, ..
         packet.keyframe.id, vo.t_ns, vo.keyframe_id, maybe_bytes(vo.T_keyframe_body, "<f8"),
         to_bytes(vo.covariance, "<f8"), int(vo.has_scale), str(vo.tracking), int(vo.inliers),
         to_bytes(seen.track_ids, "<i8"), to_bytes(seen.pixels_px, "<f4"), maybe_bytes(seen.right_px, "<f4"),
-        maybe_bytes(seen.depth_m, "<f4"), None if imu is None else to_bytes(imu.t_ns, "<i8"),
+        maybe_bytes(seen.depth_m, "<f4"), float(seen.noise), None if imu is None else to_bytes(imu.t_ns, "<i8"),
         None if imu is None else to_bytes(imu.gyro_rad_s, "<f8"),
         None if imu is None else to_bytes(imu.accel_m_s2, "<f8"), None if mag is None else mag.t_ns,
         None if mag is None else to_bytes(mag.field_ut, "<f8"), int(packet.at_rest), packet.time_offset_s,
@@ -53,15 +53,19 @@ def packet_of(t_ns: int, row: tuple[Any, ...]) -> KeyframePacket:
     ids = integers(row[8])
     n = len(ids)
     observations = Observations(
-        ids, numbers(row[9], "<f4", (n, 2)), maybe_numbers(row[10], "<f4", (n, 2)), maybe_numbers(row[11], "<f4", (n,))
+        ids,
+        numbers(row[9], "<f4", (n, 2)),
+        maybe_numbers(row[10], "<f4", (n, 2)),
+        maybe_numbers(row[11], "<f4", (n,)),
+        noise=float(row[12]),
     )
     imu = None
-    if row[12] is not None:
-        stamps = integers(row[12])
+    if row[13] is not None:
+        stamps = integers(row[13])
         shape = (len(stamps), 3)
-        scale = NoiseScale(*numbers(row[21], "<f8", (2,)).tolist())
-        imu = ImuSpan(stamps, numbers(row[13], "<f8", shape), numbers(row[14], "<f8", shape), scale)
-    mag = None if row[15] is None else MagSample(row[15], numbers(row[16], "<f8", (3,)))
+        scale = NoiseScale(*numbers(row[22], "<f8", (2,)).tolist())
+        imu = ImuSpan(stamps, numbers(row[14], "<f8", shape), numbers(row[15], "<f8", shape), scale)
+    mag = None if row[16] is None else MagSample(row[16], numbers(row[17], "<f8", (3,)))
     features = np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
     keyframe = Keyframe(row[0], t_ns, Frame(t_ns, row[0], ()), *features, None)
-    return KeyframePacket(keyframe, vo, observations, imu, mag, bool(row[17]), float(row[18]), bool(row[19]))
+    return KeyframePacket(keyframe, vo, observations, imu, mag, bool(row[18]), float(row[19]), bool(row[20]))

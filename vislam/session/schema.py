@@ -16,7 +16,7 @@ from vislam.memory import EdgeRecord, TiltRecord, WindowRecord
 from vislam.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": tells our files from other SQLite files
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -35,7 +35,7 @@ CREATE TABLE packets (
     id INTEGER PRIMARY KEY,
     vo_t_ns INTEGER NOT NULL, vo_keyframe_id INTEGER NOT NULL, vo_T BLOB, vo_covariance BLOB NOT NULL,
     vo_has_scale INTEGER NOT NULL, vo_tracking TEXT NOT NULL, vo_inliers INTEGER NOT NULL,
-    track_ids BLOB NOT NULL, pixels_px BLOB NOT NULL, right_px BLOB, depth_m BLOB,
+    track_ids BLOB NOT NULL, pixels_px BLOB NOT NULL, right_px BLOB, depth_m BLOB, track_noise REAL NOT NULL,
     imu_t_ns BLOB, imu_gyro BLOB, imu_accel BLOB, mag_t_ns INTEGER, mag_field BLOB,
     at_rest INTEGER NOT NULL, time_offset_s REAL NOT NULL, begins_piece INTEGER NOT NULL, state BLOB, imu_noise BLOB,
     crc INTEGER NOT NULL

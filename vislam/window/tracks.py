@@ -60,7 +60,7 @@ class TrackTable:
         slots = self._slots(seen.track_ids[usable])
         self._append(slots, keyframe_id, 0, values[usable])
         if seen.right_px is not None and self._rig.is_stereo:
-            right = _whitened(self._rig.cameras[1], seen.right_px, self._config.right_sigma_px)
+            right = _whitened(self._rig.cameras[1], seen.right_px, seen.noise * self._config.right_sigma_px)
             both = usable & np.isfinite(right).all(axis=1)
             if both.any():
                 place = np.cumsum(usable) - 1
@@ -142,11 +142,11 @@ class TrackTable:
     def _measure(self, seen: Observations) -> tuple[Array, NDArray[np.bool_]]:
         at_once = seen.instant_px is not None
         pixels = seen.pixels_px if seen.instant_px is None else seen.instant_px
-        values = _whitened(self._rig.cameras[0], pixels, self._config.sigma_px, at_once)
+        values = _whitened(self._rig.cameras[0], pixels, seen.noise * self._config.sigma_px, at_once)
         if seen.depth_m is not None:
             known = np.isfinite(seen.depth_m) & (seen.depth_m > 0.0)
             values[known, 7] = 1.0 / seen.depth_m[known]
-            values[known, 8] = 1.0 / self._config.depth_sigma_rho
+            values[known, 8] = 1.0 / (seen.noise * self._config.depth_sigma_rho)
         return values, np.asarray(np.isfinite(values).all(axis=1))
 
 
