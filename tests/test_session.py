@@ -59,7 +59,8 @@ def packet(i, rng):
     )
     depth = np.array([1.5, np.nan, 2.25, 0.5])
     right = None if i == 0 else pixels[:4] - 3.5
-    seen = Observations(np.array([3, 2**40, 7, 8], np.int64) + i, pixels[:4], right, None if i == 1 else depth, noise=1.0 + 0.3 * i)
+    ids = np.array([3, 2**40, 7, 8], np.int64) + i
+    seen = Observations(ids, pixels[:4], right, None if i == 1 else depth, noise=1.0 + 0.3 * i)
     span = None if i == 0 else ImuSpan(1000 * i - np.arange(5)[::-1], rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
     mag = MagSample(1000 * i - 3, rng.normal(size=3)) if i == 2 else None
     return KeyframePacket(keyframe, vo, seen, span, mag, i == 1, 0.0125 * i)

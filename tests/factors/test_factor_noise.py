@@ -2,8 +2,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from vislam.config import GraphConfig
 from vislam.errors import DataError
-from vislam.factors.noise import cauchy, checked_covariance, conditioned, gaussian, huber, inflated
+from vislam.factors.journal import KeyframeRecord
+from vislam.factors.noise import cauchy, checked_covariance, conditioned, gaussian, huber, inflated, of_vision
 
 
 @pytest.mark.parametrize(
@@ -58,3 +60,15 @@ def test_robust_kernels_weigh_as_their_formulas() -> None:
     assert factor.error(values) == pytest.approx(0.5 * 4.0 * np.log1p(r**2 / 4.0))
     factor = gtsam.PriorFactorPose3(0, gtsam.Pose3(), huber(unit, 3.0))
     assert factor.error(values) == pytest.approx(3.0 * (r - 1.5))
+
+
+@pytest.mark.parametrize(
+    ("has_scale", "degraded", "factor"), [(True, False, 1.0), (True, True, 3.0), (False, False, 4.0)]
+)
+def test_a_metric_motion_is_as_sure_as_it_says_and_one_camera_less(
+    has_scale: bool, degraded: bool, factor: float
+) -> None:
+    config = GraphConfig(vo_inflation=4.0, vo_degraded_inflation=3.0, vo_floor_deg=0.0, vo_floor_m=0.0)
+    record = KeyframeRecord(1, 0, np.eye(4), 1e-4 * np.eye(6), has_scale, degraded, None, None)
+    np.testing.assert_allclose(of_vision(record, config), factor**2 * 1e-4 * np.eye(6))
+    np.testing.assert_allclose(of_vision(record, config, 2.0), 4.0 * factor**2 * 1e-4 * np.eye(6))

@@ -34,7 +34,8 @@ def test_the_noise_of_given_tracks_is_found_whatever_was_told(rig: str, pixel_si
 
 
 @pytest.mark.parametrize("kind", ["mono", "stereo", "rgbd"])
-def test_drawn_corners_scatter_little_and_more_in_noisier_images(kind: str) -> None:
+def test_drawn_corners_scatter_little_and_more_in_noisier_images(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vislam.frontend.pixel_noise.USUAL_PX", 0.04)  # as if no image had ever been noisier
     world, frames, _ = recording(kind)
     rng = np.random.default_rng(3)
 
@@ -42,12 +43,12 @@ def test_drawn_corners_scatter_little_and_more_in_noisier_images(kind: str) -> N
         grey = [np.clip(i + rng.normal(0.0, 12.0, i.shape), 0, 255).astype(np.uint8) for i in frame.images]
         return replace(frame, images=tuple(grey))
 
-    clean = run(kind, frames)[-1]
-    assert 0.02 < clean.sigma_px < 0.25
-    assert clean.observations.noise == 1.0
-    worse = run(kind, [noisy(f) for f in frames])[-1]
-    assert worse.sigma_px > 1.3 * clean.sigma_px
-    assert worse.observations.noise == max(1.0, worse.sigma_px / 0.25)
+    clean, worse = run(kind, frames), run(kind, [noisy(f) for f in frames])
+    assert 0.02 < clean[-1].sigma_px < 0.35
+    assert worse[-1].sigma_px > 1.3 * clean[-1].sigma_px
+    factors = [np.mean([result.observations.noise for result in results]) for results in (clean, worse)]
+    print(f"{kind}: {factors[0]:.2f} and {factors[1]:.2f} times the noise told")
+    assert factors[1] > 1.2 * factors[0]
     assert world is not None
 
 
@@ -89,7 +90,12 @@ def test_tracks_count_as_noisier_than_told_when_they_scatter_more_than_usual(sca
     assert noise.over_usual == 1.0  # nothing seen yet
     for _ in range(60):
         noise.learn(rng.normal(0.0, scatter_px, 200), UNIT, NOWHERE)
-    assert noise.over_usual == pytest.approx(over, rel=0.1)
+    learnt = noise.over_usual
+    assert learnt == pytest.approx(over, rel=0.2)
+    noise.learn(rng.normal(0.0, 4.0 * scatter_px, 200), UNIT, NOWHERE)
+    assert noise.over_usual == pytest.approx(16.0 * scatter_px, rel=0.2)  # a blurred frame says so itself
+    noise.learn(rng.normal(0.0, scatter_px, 20), UNIT, NOWHERE[:20])
+    assert noise.over_usual == pytest.approx(noise.sigma_px / 0.25 if over > 1.0 else 1.0, rel=0.3)
 
 
 @pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])

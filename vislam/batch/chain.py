@@ -15,7 +15,7 @@ from vislam.factors import motion
 from vislam.factors.imu import Preintegrator
 from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
-from vislam.factors.noise import gaussian, huber, inflated
+from vislam.factors.noise import gaussian, huber, of_vision
 from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.geometry import invert
@@ -146,9 +146,7 @@ class Chain:
         assert record.T_previous_body is not None
         assert record.covariance is not None
         config, T = self._config, record.T_previous_body
-        factor = config.vo_inflation * (config.vo_degraded_inflation if record.degraded else 1.0)
-        floor_m = config.vo_floor_m if record.has_scale else 0.0
-        covariance = inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)
+        covariance = of_vision(record, config)
         if record.has_scale:
             return T, covariance
         lever = self._lever_m

@@ -148,7 +148,7 @@ class GraphConfig:
     accel_bias_walk_floor: float = 3e-4  # m/s^3/sqrt(Hz)
     covariance_ratio_max: float = 1e6  # eigenvalue ratio of any factor; gtsam 4.3.0 throws above 1e7
 
-    vo_inflation: float = 4.0  # on sigma; against truth, motion between keyframes errs 4 to 8 times what residuals say
+    vo_inflation: float = 4.0  # mono, on sigma: against truth, motions err 4 to 8 times what residuals say
     vo_degraded_inflation: float = 3.0  # further, when the front end says degraded
     vo_floor_deg: float = 0.05  # no camera and calibration is better than this between keyframes
     vo_floor_m: float = 0.001

@@ -12,7 +12,7 @@ from vislam.factors import motion
 from vislam.factors.imu import Preintegrated, Preintegrator
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
-from vislam.factors.noise import gaussian, huber, inflated
+from vislam.factors.noise import gaussian, huber, of_vision
 from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.geometry import invert, transform
@@ -126,12 +126,7 @@ class Builder:
 
     def _visual_covariance(self, record: KeyframeRecord, vo_scale: float) -> Array:
         assert record.covariance is not None
-        config = self._config
-        if record.begins_piece:
-            return record.covariance
-        factor = vo_scale * config.vo_inflation * (config.vo_degraded_inflation if record.degraded else 1.0)
-        floor_m = config.vo_floor_m if record.has_scale else 0.0
-        return inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)
+        return record.covariance if record.begins_piece else of_vision(record, self._config, vo_scale)
 
     def _visual(self, record: KeyframeRecord, before: Guess, guess: Guess, vo_scale: float) -> gtsam.NonlinearFactor:
         assert record.T_previous_body is not None

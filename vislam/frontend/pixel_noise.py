@@ -64,11 +64,13 @@ class PixelNoise:
 
     @property
     def over_usual(self) -> float:
-        """By how much tracks scatter more than usual, at least 1: what blurs or bends images spoils depth alike.
+        """By how much tracks of the newest frame scatter more than usual, at least 1.
 
-        Less scatter is no promise: what neighbouring tracks have in common leaves no residual.
+        It grows with blur and with the way since the keyframe, and what causes it spoils depth alike. Less scatter is
+        no promise: what neighbouring tracks have in common leaves no residual.
         """
-        return max(1.0, self.sigma_px / USUAL_PX) if self.is_learnt else 1.0
+        known = self._frame_px is not None or self.is_learnt
+        return max(1.0, float(self.frame_px) / USUAL_PX) if known else 1.0
 
     @property
     def frame_px(self) -> float:

@@ -284,8 +284,7 @@ class WindowSource:
         config = self._config
         if record.T_previous_body is not None and record.covariance is not None and record.has_scale:
             weak = record.begins_piece
-            covariance = record.covariance * (1.0 if weak else config.vo_inflation**2)
-            return EdgeRecord(record.id, record.T_previous_body, covariance, weak, weak)
+            return EdgeRecord(record.id, record.T_previous_body, record.covariance, weak, weak)
         last = self._odometry.edge(record.id - 1)
         T = np.eye(4) if last is None else last.T_previous_body
         rad, m = np.deg2rad(config.lost_rate_sigma_deg_s), config.lost_speed_sigma_m_s  # of a second, the usual gap
