@@ -53,7 +53,7 @@ class EkfConfig:
     tight_max_tracks: int = 60  # used per frame; bounds its time
     tight_iterations: int = 5  # of one update at most; more than one only while velocity is badly known
     tight_min_observations: int = 3  # of a track; two leave one equation
-    tight_pixel_sigma_px: float = 1.0  # of a corner followed over many frames
+    tight_pixel_sigma_px: float = 1.0  # of a corner followed over many frames; more where tracks scatter by over 0.4 px
     tight_stereo_sigma_px: float = 0.5  # right minus left pixel: matching, without the error of the corner
     tight_depth_sigma_rho: float = 3e-3  # 1/m, of the inverse of a depth image
     tight_outlier_sigmas: float = 5.0  # one observation of a track; the test of the track follows
@@ -77,7 +77,7 @@ class WindowConfig:
     keyframes: int = 15  # states in the window; the oldest one is marginalised when another comes
     iterations: int = 6  # most Gauss-Newton steps per keyframe; two or three are usual
     tolerance: float = 5e-3  # relative decrease of the cost that ends them; 1e-3 costs a step more and gains nothing
-    sigma_px: float = 1.0  # of a tracked corner between keyframes
+    sigma_px: float = 1.0  # of a tracked corner between keyframes; more where the frame's tracks scatter by over 0.4 px
     right_sigma_px: float = 1.0  # of the match in the right image
     depth_sigma_rho: float = 4e-3  # 1/m: sigma of 1/z of a depth image; a Kinect's own is 1.4e-3, then registration
     huber_k: float = 2.0  # of a reprojection error, in standard deviations

@@ -15,7 +15,7 @@ from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
 from vislam.frontend.landmarks import Landmarks, fuse, move
 from vislam.frontend.locate import pnp_ransac, recognise
-from vislam.frontend.pixel_noise import USUAL_PX, PixelNoise
+from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor, body_motion
 from vislam.frontend.refine import PoseEstimate, extra_parameter, pose_covariance, refine_pose
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
@@ -32,6 +32,7 @@ _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the land
 # times what tracks scatter by: the noise of independent tracks that would move a pose as much. What neighbours have in
 # common (patch, lens, registered depth) leaves no residual, since a pose can follow it; it is as if 16 of them were one
 _ALIKE = 4.0
+_USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is told: what blurs or bends images spoils both
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _ASTRAY_PX = 6.0  # from where a filter that knows its motion expects a track: it belongs to something that moves
@@ -404,7 +405,7 @@ class MetricFrontEnd:
         """Return the covariance [6, 6] of the camera's motion, by the noise that was measured instead of told."""
         measured_px = self._noise.frame_px
         # tracks that were followed elsewhere are independent, and the noise of their depth is told
-        pixel_px, scale = (measured_px, 1.0) if given else (_ALIKE * USUAL_PX, measured_px / USUAL_PX)
+        pixel_px, scale = (measured_px, 1.0) if given else (_ALIKE * _USUAL_PX, measured_px / _USUAL_PX)
         ratio = pixel_px / self._config.track_sigma_px
         by_pixel = np.array([ratio, ratio, 1.0])
         mean, covariance = self._landmarks.mean, self._landmarks.covariance * by_pixel[:, None] * by_pixel

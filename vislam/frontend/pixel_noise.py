@@ -24,7 +24,7 @@ _MIN_FRAMES = 10  # before what was measured goes before what was told
 _MEMORY_FRAMES = 200  # over which is averaged: blur and light change within seconds
 _MIN_PX = 0.02  # of a frame: simulated pixels without any noise
 _PARAMETERS = 5  # of the motion that the same tracks were fitted with
-USUAL_PX = 0.25  # scatter of tracks in sharp images, for which what is told of pixels and depths holds
+_USUAL_PX = 0.4  # of keyframes in sharp images (EuRoC MH_01), for which what estimators are told was found to hold
 
 
 def _spread_px(lengths: Array) -> float:
@@ -70,7 +70,7 @@ class PixelNoise:
         no promise: what neighbouring tracks have in common leaves no residual.
         """
         known = self._frame_px is not None or self.is_learnt
-        return max(1.0, float(self.frame_px) / USUAL_PX) if known else 1.0
+        return max(1.0, float(self.frame_px) / _USUAL_PX) if known else 1.0
 
     @property
     def frame_px(self) -> float:
