@@ -15,6 +15,7 @@ from test_graph_faults import Failing
 from vislam.config import GraphConfig, WindowConfig
 from vislam.errors import DataError
 from vislam.factors import estimator
+from vislam.factors.consensus import Verdict
 from vislam.factors.estimator import Estimator
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.known import Known
@@ -516,3 +517,28 @@ def test_a_restored_graph_has_no_more_in_its_solver(make, tmp_path) -> None:
     print("variables in the solver", sizes)
     assert len(old._estimator.frozen) > 3 and sizes[1] <= sizes[0] + 20
     assert np.abs(new.poses() - old.poses()).max() < 1e-2
+
+
+def test_what_a_review_lets_in_stands_beside_what_left_the_solver(make) -> None:
+    """No new start: of two loops that fit, the one between keyframes that left it is kept in spare."""
+    world = World(40.0, seed=12)
+    graph, _ = make(world, config=replace(TIGHT, loop_gain_min=0.0, freeze_keyframes=20, freeze_after=40))
+    for k in range(world.count):
+        graph.add(world.packet(k), [world.loop(k, k - 100, k)] if k >= 100 else [])
+    estimator, loops, newest = graph._estimator, graph._loops, world.count - 1
+    frozen = set(estimator.frozen)
+    left = next(k for k in range(105, newest) if estimator.host(k) != k)
+    models = []
+    for edge in (world.loop(1000, left - 101, left), world.loop(1001, 20, newest)):
+        model = loops.admit(edge, newest)
+        assert model is not None
+        loops.wait(model)
+        models.append(model)
+    notes: list[str] = []
+    decided = loops._apply(Verdict(models, [], places=3, scale=1.0), notes)
+    print("notes", notes)
+    assert frozen and frozen <= estimator.frozen and not any(notes)
+    assert decided == [1000, 1001]
+    assert 1000 in estimator.spare and 1001 in estimator.loops
+    assert {r.decision for r in loops.reports() if r.loop_id in decided} == {LoopDecision.ACCEPTED}
+    assert rmse_m(graph.poses(), world.truth) < 0.2
