@@ -206,12 +206,12 @@ def test_transition_is_the_derivative_of_the_motion() -> None:
         x = start.copy()
         moved(Window(np.zeros((CLONES, CLONES)), 0.0, np.eye(3)), x, np.append(change, np.zeros(4)))
         track = np.empty((26, 10))
-        kernels.run(x, Phi.copy(), Q.copy(), stamps, values, np.zeros(26), track, sigmas, GRAVITY_M_S2)
+        kernels.run(x, Phi.copy(), Q.copy(), stamps, values, np.zeros(26), track, sigmas, GRAVITY_M_S2, np.eye(3))
         return x
 
     Phi, Q = np.eye(15), np.zeros((15, 15))
     x = start.copy()
-    kernels.run(x, Phi, Q, stamps, values, np.zeros(26), np.empty((26, 10)), sigmas, GRAVITY_M_S2)
+    kernels.run(x, Phi, Q, stamps, values, np.zeros(26), np.empty((26, 10)), sigmas, GRAVITY_M_S2, np.eye(3))
     Phi_run, Phi, Q_run, Q = Phi, np.eye(15), Q, np.zeros((15, 15))
     M = kernels.to_nav_error(x)
     np.testing.assert_allclose(M @ kernels.from_nav_error(x), np.eye(15), atol=1e-12)
@@ -244,7 +244,8 @@ def test_yaw_and_position_stay_unobservable() -> None:
     Phi, Q = np.eye(15), np.zeros((15, 15))
     values = np.tile([0.3, -0.2, 0.4, 1.0, 2.0, 9.0], (20, 1))
     stamps = np.arange(20) * 5_000_000
-    kernels.run(x, Phi, Q, stamps, values, np.zeros(20), np.empty((20, 10)), np.ones(6) * 1e-3, GRAVITY_M_S2)
+    track, sigmas = np.empty((20, 10)), np.full(6, 1e-3)
+    kernels.run(x, Phi, Q, stamps, values, np.zeros(20), track, sigmas, GRAVITY_M_S2, np.eye(3))
     still = np.zeros((15, 4))
     still[2, 0] = 1.0
     still[3:6, 1:] = np.eye(3)

@@ -234,7 +234,7 @@ def edit_session(out: Path, statement: str) -> None:
         (edit_config, 2, "was changed since the run began"),
         (edit_manifest, 3, "is not the recording"),
         (lambda out: (out / "session.db").write_bytes(b"no database at all " * 400), 3, "cannot be read"),
-        (lambda out: edit_session(out, "PRAGMA user_version=2"), 3, "format 2, this vislam reads 6"),
+        (lambda out: edit_session(out, "PRAGMA user_version=2"), 3, "format 2, this vislam reads 7"),
         (lambda out: edit_session(out, "DELETE FROM windows WHERE id = 3"), 3, "run the recording again"),
         (lambda out: edit_session(out, "DELETE FROM keyframes WHERE id = 3"), 3, "run the recording again"),
         (lambda out: edit_session(out, "UPDATE states SET state = x'00'"), 3, "run the recording again"),

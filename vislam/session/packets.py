@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -50,15 +51,14 @@ def packet_of(t_ns: int, row: tuple[Any, ...]) -> KeyframePacket:
     """Return the packet of a row; ValueError or TypeError when it is damaged."""
     T = maybe_numbers(row[3], "<f8", (4, 4))
     vo = VoMeasurement(row[1], row[2], T, numbers(row[4], "<f8", (6, 6)), bool(row[5]), Tracking(row[6]), row[7])
-    ids = integers(row[8])
+    ids, noise = integers(row[8]), float(row[12])
     n = len(ids)
+    if not 1.0 <= noise < math.inf:
+        raise ValueError(f"tracks cannot have {noise:g} times the noise that is told")
     observations = Observations(
-        ids,
-        numbers(row[9], "<f4", (n, 2)),
-        maybe_numbers(row[10], "<f4", (n, 2)),
-        maybe_numbers(row[11], "<f4", (n,)),
-        noise=float(row[12]),
-    )
+        ids, numbers(row[9], "<f4", (n, 2)), maybe_numbers(row[10], "<f4", (n, 2)), maybe_numbers(row[11], "<f4", (n,)),
+        noise=noise,
+    )  # fmt: skip
     imu = None
     if row[13] is not None:
         stamps = integers(row[13])
