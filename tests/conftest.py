@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 from hypothesis import settings
+
 from needs import missing
 
 REPOSITORY = Path(__file__).resolve().parent.parent

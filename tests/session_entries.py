@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from vislam.core.memory import LoopPlace, LoopState, StartFacts
+from vislam.core.messages import LoopDecision, NavState
 from vislam.imu import ImuNoise
-from vislam.memory import LoopPlace, LoopState, StartFacts
-from vislam.messages import LoopDecision, NavState
-from vislam.session.checks import checksums
+from vislam.run.session.checks import checksums
 
 
 @contextmanager

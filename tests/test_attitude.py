@@ -6,16 +6,17 @@ from pathlib import Path
 import imufusion
 import numpy as np
 import pytest
-from broad import Trial, errors_deg, rms, started
-from carts import GRAVITY_M_S2, Cart
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needs import missing
 
+from needs import missing
 from vislam.config import AttitudeConfig
-from vislam.geometry import so3_exp
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import Array, ImuSample, ImuSpan, MagSample
 from vislam.imu.attitude import AttitudeFilter
-from vislam.messages import Array, ImuSample, ImuSpan, MagSample
+from worlds.broad import Trial, errors_deg, rms, started
+from worlds.cart import Cart
+from worlds.parts import GRAVITY_M_S2
 
 VQF, COMPLEMENTARY = AttitudeConfig(), AttitudeConfig(method="complementary")
 BOTH = pytest.mark.parametrize("config", [VQF, COMPLEMENTARY], ids=["vqf", "complementary"])

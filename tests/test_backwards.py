@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2, T0_NS, state_error
-from msckf_world import CHEAP, SIGMAS, Flight
 
 from vislam.config import EkfConfig
-from vislam.ekf.backwards import EarlyFrames, known_from
-from vislam.geometry import so3_exp, transform
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.messages import NavState
+from vislam.ekf.tight.backwards import EarlyFrames, known_from
 from vislam.imu.series import ImuSeries
-from vislam.messages import NavState
+from worlds.flight import CHEAP, SIGMAS, Flight
+from worlds.motion import T0_NS, state_error
+from worlds.parts import GRAVITY_M_S2
 
 CONFIG = EkfConfig()
 _SAMPLE = 1600  # the state is found 8 s into the flight

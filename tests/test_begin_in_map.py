@@ -11,12 +11,12 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import load
-from vislam.geometry import invert
+from vislam.core.geometry import invert
 from vislam.loop.table import read_loops
 from vislam.run import execute
-from vislam.runfolder import MapChoice, prepare
-from vislam.session import Session
-from vislam.sources import open_source
+from vislam.run.folder import MapChoice, prepare
+from vislam.run.session import Session
+from vislam.run.sources import open_source
 from vislam.trajectory import read_tum
 
 # the same way and the same landmarks, seen by other noise at other times

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.config import PublishConfig, load
-from vislam.continuity import Continuity
-from vislam.geometry import invert, se3_exp, so3_log
-from vislam.messages import Array
-from vislam.sim.points import open_points
-from vislam.slam import Slam, Step
+from vislam.core.geometry import invert, se3_exp, so3_log
+from vislam.core.messages import Array
+from vislam.pipeline.steps import Step
+from vislam.sim.points.points import open_points
+from vislam.slam import Slam
+from vislam.trajectory.continuity import Continuity
 
 _NS = 1_000_000_000
 _FRAME_NS = 50_000_000

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vislam.config import load
-from vislam.frontend.epipolar import from_epipolar_segment
-from vislam.geometry import so3_exp, transform
+from vislam.core.geometry import so3_exp, transform
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.sources import open_source
+from vislam.run.folder import prepare
+from vislam.run.sources import open_source
 from vislam.trajectory import anees, associate, evaluate, read_trajectory
 from vislam.trajectory.states import read_states_csv
+from vislam.vision.two_view import from_epipolar_segment
 
 SEED = 0
 QUICK = {"map.enabled": False, "view.enabled": False, "loop.enabled": False, "seed": SEED}

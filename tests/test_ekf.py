@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, SimulatedVision, to_span
 
-from vislam.chi_square import chi_square_limit
 from vislam.config import EkfConfig
-from vislam.ekf import Correction, Ekf, kernels, visual_motion
-from vislam.ekf.visual_motion import relative_motion, shared_error, why_unusable
-from vislam.geometry import (
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import (
     quaternion_wxyz,
     se3_exp,
     skew,
@@ -25,9 +22,15 @@ from vislam.geometry import (
     so3_right_jacobian,
     transform,
 )
+from vislam.core.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
+from vislam.core.small import write_right_jacobian
+from vislam.ekf import Correction, Ekf
+from vislam.ekf.loose import kernels, visual_motion
+from vislam.ekf.loose.visual_motion import relative_motion, shared_error, why_unusable
 from vislam.imu import preintegrate
-from vislam.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
-from vislam.relative_motion import camera_displacement, direction_residual, metric_residual
+from vislam.vision.relative_motion import camera_displacement, direction_residual, metric_residual
+from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, SimulatedVision, to_span
+from worlds.parts import GRAVITY_M_S2
 
 LEVER = np.array([0.1, -0.05, 0.2])
 NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
@@ -803,12 +806,12 @@ def test_covariance_stays_positive(seed: int) -> None:
             ekf.update_vo(VoMeasurement(t_ns, int(rng.integers(0, 3)), T, covariance, True, Tracking.OK, 9))
         if rng.random() < 0.02:
             ekf.update_zero_velocity(s.t_ns)
-        P = ekf._P
+        P = ekf._state.P
         assert np.linalg.eigvalsh(P)[0] > -1e-12 * np.trace(P)
     np.testing.assert_array_equal(P, P.T)
 
 
 def test_right_jacobian_of_one_step() -> None:
     J = np.empty((3, 3))
-    kernels._right_jacobian(0.01, -0.02, 0.015, 0.005, J)
+    write_right_jacobian(0.01, -0.02, 0.015, 0.005, J)
     np.testing.assert_allclose(J, 0.005 * so3_right_jacobian(np.array([0.01, -0.02, 0.015])), atol=1e-8)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from vislam.config import EkfConfig
-from vislam.ekf import Correction, Ekf, kernels
-from vislam.ekf.measurements import on_wheels
-from vislam.geometry import invert, so3_exp, transform
+from vislam.core.geometry import invert, so3_exp, transform
+from vislam.core.messages import Array, ImuSample, NavState, NoiseScale, Observations, Tracking, VoMeasurement
+from vislam.ekf import Correction, Ekf
+from vislam.ekf.loose import kernels
+from vislam.ekf.loose.measurements import on_wheels
 from vislam.imu import ImuNoise, SeenNoise
-from vislam.messages import Array, ImuSample, NavState, NoiseScale, Observations, Tracking, VoMeasurement
 
 NOISE = ImuNoise(5e-4, 6e-3, 3e-5, 4e-4, 200.0)
 GRAVITY_M_S2 = 9.81

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import ekf_monte_carlo as mc
 import numpy as np
 import pytest
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, RealMotion, SimulatedVision
 from scipy.stats import chi2
 
 from vislam.config import EkfConfig
+from vislam.core.geometry import align_points, so3_exp, transform_points
+from vislam.core.messages import NavState, Tracking
 from vislam.ekf import Ekf
-from vislam.geometry import align_points, so3_exp, transform_points
 from vislam.imu import NoiseFloor
-from vislam.messages import NavState, Tracking
+from worlds import monte_carlo as mc
+from worlds.motion import EUROC_NOISE, RealMotion, SimulatedVision
+from worlds.parts import GRAVITY_M_S2
 
 RUNS, FIRST_SEED = 10, 5000
 SCENARIOS = {scenario.name: scenario for scenario in mc.SCENARIOS}
@@ -106,7 +107,7 @@ def test_accumulated_vision_starts_over_where_it_was_lost() -> None:
     assert ekf.counters["vo_accepted"] > 0.95 * 10 * 35 - 2
     assert ekf.dead_reckoning_s < 0.2
     assert np.linalg.norm(way.error(k, ekf.state())[3:6]) < 1.0
-    assert not ekf._P[15:].any()  # no clone
+    assert not ekf._state.P[15:].any()  # no clone
 
 
 def test_accumulated_vision_needs_scale() -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import ekf_monte_carlo as mc
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2, NS
 
 from vislam.config import EkfConfig
+from vislam.core.messages import Array, ImuSample, NavState, VoMeasurement
 from vislam.ekf import Ekf, UpdateResult
-from vislam.messages import Array, ImuSample, NavState, VoMeasurement
+from worlds import monte_carlo as mc
+from worlds.motion import NS
+from worlds.parts import GRAVITY_M_S2
 
 SCENARIO = mc.Scenario("3 s", duration_s=3.0)
 SEED = 77

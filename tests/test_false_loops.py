@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_world import GRAVITY_M_S2, RIG, World, rmse_m, with_vo
 
 from vislam.config import GraphConfig, WindowConfig
-from vislam.geometry import transform
+from vislam.core.geometry import transform
+from vislam.core.messages import GraphUpdate, LoopDecision
 from vislam.graph import PoseGraph
 from vislam.loop.injection import FIRST_ID, FalseLoops
-from vislam.messages import GraphUpdate, LoopDecision
+from worlds.lap import RIG, World, rmse_m, with_vo
+from worlds.parts import GRAVITY_M_S2
 
 CONFIG = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.features import FlowSettings, describe, detect_corners, follow, match
+from vislam.vision.features import FlowSettings, describe, detect_corners, follow, match
 
 
 @pytest.fixture(scope="module")

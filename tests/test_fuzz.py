@@ -8,23 +8,23 @@ import time
 from pathlib import Path
 
 import pytest
+
 from needs import missing
 from run_folder import make_run
-
 from vislam.cli import run_verb
 from vislam.config import load
+from vislam.core.errors import DataError, UsageError, VislamError, printable
+from vislam.core.reading import parse_json, read_bytes
 from vislam.datasets.calibration import load_yaml
-from vislam.errors import DataError, UsageError, VislamError, printable
 from vislam.experiment.plan import load_plan
-from vislam.loop.orbslam import read_orbslam
 from vislam.loop.table import read_loops
-from vislam.loop.vocabulary import Vocabulary
-from vislam.mapping.octomap_io import read_octree
-from vislam.mapping.pcd import read_pcd
-from vislam.mapping.ply import read_ply
-from vislam.reading import parse_json, read_bytes
-from vislam.runfolder import read_metrics
-from vislam.session import Session
+from vislam.loop.words.orbslam import read_orbslam
+from vislam.loop.words.vocabulary import Vocabulary
+from vislam.mapping.formats.pcd import read_pcd
+from vislam.mapping.formats.ply import read_ply
+from vislam.mapping.octree.octomap_io import read_octree
+from vislam.run.folder import read_metrics
+from vislam.run.session import Session
 from vislam.trajectory import evaluate, read_trajectory
 
 _PATH = Path(__file__).resolve().parent.parent / "experiments" / "fuzz.py"

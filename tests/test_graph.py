@@ -7,14 +7,15 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from graph_world import GRAVITY_M_S2, RIG, World, packet_of, rmse_m, with_vo
 
 from vislam.config import GraphConfig, WindowConfig
-from vislam.errors import UsageError
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_exp, so3_log, transform
+from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Tracking, VoMeasurement
 from vislam.factors.journal import KeyframeRecord, LoopRecord, StartRecord
-from vislam.geometry import invert, se3_exp, so3_log, transform
 from vislam.graph import PoseGraph
-from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Tracking, VoMeasurement
+from worlds.lap import RIG, World, packet_of, rmse_m, with_vo
+from worlds.parts import GRAVITY_M_S2
 
 EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)  # the simulation tells its sigmas honestly
 
@@ -153,11 +154,11 @@ def test_half_of_the_loops_false(imu: bool) -> None:
     assert all(reports[n].weight == 0.0 and "beyond" in reports[n].reason for n in false)
 
 
-def test_parked_loops_that_agree_are_promoted_when_odometry_is_overconfident() -> None:
+def test_pending_loops_that_agree_are_promoted_when_odometry_is_overconfident() -> None:
     world = World(60.0, seed=3, vo_sigma_rad=np.deg2rad(0.9), vo_sigma_m=0.024)
     claimed = world.vo_covariance / 36.0
     graph = graph_of(world, imu=False)
-    odometry, promoted, parked_first, false = [np.eye(4)], set(), False, set()
+    odometry, promoted, pending_first, false = [np.eye(4)], set(), False, set()
     for k in range(world.count):
         packet = with_vo(world.packet(k, imu=False), covariance=claimed)
         if k:
@@ -167,9 +168,9 @@ def test_parked_loops_that_agree_are_promoted_when_odometry_is_overconfident() -
             edges = [world.loop(k, k - 100, k), world.false_loop(1000 + k, k - 60, k)]
             false.add(1000 + k)
         update = graph.add(packet, edges)
-        parked_first |= k in update.rejected_loop_ids
+        pending_first |= k in update.rejected_loop_ids
         promoted |= {n for n in update.accepted_loop_ids if n != k}
-    assert parked_first and promoted
+    assert pending_first and promoted
     assert update.details is not None and update.details["vo_scale"] > 2.0
     accepted = {r.loop_id for r in graph.edge_reports() if r.decision is LoopDecision.ACCEPTED}
     assert not accepted & false

@@ -8,15 +8,16 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from graph_world import GRAVITY_M_S2, RIG, World, rmse_m, with_vo
 
 from vislam.config import GraphConfig, WindowConfig
-from vislam.errors import DataError
-from vislam.factors import solver as solver_module
-from vislam.factors.known import Known
+from vislam.core.errors import DataError
+from vislam.core.messages import ImuSpan, KeyframePacket, LoopDecision, LoopEdge
+from vislam.factors import solvers as solver_module
 from vislam.factors.loop import LoopModel
 from vislam.graph import PoseGraph
-from vislam.messages import ImuSpan, KeyframePacket, LoopDecision, LoopEdge
+from vislam.graph.belief.known import Known
+from worlds.lap import RIG, World, rmse_m, with_vo
+from worlds.parts import GRAVITY_M_S2
 
 EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)
 POISON = RuntimeError("\nIndeterminate linear system detected while working near variable\n8646911284551352321")

@@ -1,4 +1,4 @@
-"""Pieces of trajectory that no odometry ties: how the graph keeps them apart, joins them, and what it refuses."""
+"""Submaps that no odometry ties: how the graph keeps them apart, joins them, and what it refuses."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
 from hypothesis import given
 from hypothesis import strategies as st
-from test_graph_tight import TIGHT, make  # noqa: F401  a fixture
 
+from test_graph_tight import TIGHT, make  # noqa: F401  a fixture
 from vislam.config import GraphConfig, WindowConfig
-from vislam.errors import UsageError
-from vislam.geometry import invert, so3_exp, transform
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, so3_exp, transform
+from vislam.core.messages import Array, GraphUpdate, LoopDecision, LoopEdge, Submaps
 from vislam.graph import PoseGraph
-from vislam.messages import Array, GraphUpdate, LoopDecision, LoopEdge, Pieces
+from worlds.lap import RIG, World, rmse_m
+from worlds.parts import GRAVITY_M_S2
 
 LOST = 150  # the first keyframe after the loss
 COUNT = 190
@@ -37,7 +38,7 @@ def run(
     for k in range(count):
         packet = world.packet(k, lost=k == LOST, imu=imu and k != LOST)
         T_odom_body = world.truth[k] if k < LOST else away @ world.truth[k]
-        packet = replace(packet, begins_piece=k == LOST)
+        packet = replace(packet, begins_submap=k == LOST)
         updates.append(graph.add(packet, edges.get(k, []), T_odom_body))
     return updates
 
@@ -53,18 +54,18 @@ def world() -> World:
 
 @pytest.mark.parametrize("imu", [True, False])
 @pytest.mark.parametrize("coupling", ["loose", "tight"])
-def test_a_piece_joins_where_two_frames_say_that_it_belongs(world: World, make, coupling: str, imu: bool) -> None:  # noqa: F811
+def test_a_submap_joins_where_two_frames_say_that_it_belongs(world: World, make, coupling: str, imu: bool) -> None:  # noqa: F811
     graph = loose(world, imu) if coupling == "loose" else make(world, imu, replace(TIGHT))[0]
     updates = run(graph, world, loops(world, 160, 163), imu, AWAY if imu else TILTED)
-    assert updates[LOST - 1].pieces == Pieces()
-    assert {u.pieces.groups for u in updates[LOST:163]} == {(0, 1)}
-    assert {u.pieces for u in updates[163:]} == {Pieces((0, LOST), (0, 0))}
+    assert updates[LOST - 1].submaps == Submaps()
+    assert {u.submaps.groups for u in updates[LOST:163]} == {(0, 1)}
+    assert {u.submaps for u in updates[163:]} == {Submaps((0, LOST), (0, 0))}
     assert updates[160].rejected_loop_ids == (0,)  # waits
     assert updates[163].accepted_loop_ids == (0, 1)
     before, after = updates[162].T_map_odom, updates[163].T_map_odom
     np.testing.assert_allclose(before, updates[0].T_map_odom, atol=0.3)  # odom goes on meanwhile, wherever it is
     assert np.linalg.norm(before - after) > 5.0
-    assert LOST in updates[163].ids  # the whole piece moved, and its consumers hear of it
+    assert LOST in updates[163].ids  # the whole submap moved, and its consumers hear of it
     graph.finish()
     assert rmse_m(graph.poses()[:LOST], world.truth[:LOST]) < 0.2
     relative = invert(graph.poses()[60]) @ graph.poses()[160]
@@ -76,15 +77,15 @@ def test_one_image_is_one_witness_however_many_old_keyframes_it_resembles(world:
     graph = loose(world, imu=False)
     edges = {160: [world.loop(n, i, 160) for n, i in enumerate((59, 60, 61, 62))]}
     updates = run(graph, world, edges, False, TILTED)
-    assert updates[-1].pieces.groups == (0, 1)
-    assert all(r.decision is LoopDecision.PARKED and "other frames" in r.reason for r in graph.edge_reports())
+    assert updates[-1].submaps.groups == (0, 1)
+    assert all(r.decision is LoopDecision.PENDING and "other frames" in r.reason for r in graph.edge_reports())
     assert not graph._estimator.loops
 
 
 def test_frames_that_contradict_each_other_join_nothing(world: World) -> None:
     graph = loose(world, imu=False)
     edges = {k: [world.false_loop(k, k - 100, k)] for k in (158, 160, 162, 164)}
-    assert run(graph, world, edges, False, TILTED)[-1].pieces.groups == (0, 1)
+    assert run(graph, world, edges, False, TILTED)[-1].submaps.groups == (0, 1)
 
 
 def test_loops_that_ask_for_places_far_apart_wait_without_a_marginal(
@@ -97,7 +98,7 @@ def test_loops_that_ask_for_places_far_apart_wait_without_a_marginal(
         away = transform(np.eye(3), np.array([20.0 * n, 0.0, 0.0]))
         true = world.loop(k, k - 100, k)
         edges[k] = [replace(true, T_from_to=true.T_from_to @ away)]
-    assert run(graph, world, edges, False, TILTED, 170)[-1].pieces.groups == (0, 1)
+    assert run(graph, world, edges, False, TILTED, 170)[-1].submaps.groups == (0, 1)
     assert asked == []
 
 
@@ -106,39 +107,39 @@ def test_a_lie_among_true_loops_is_left_out(world: World) -> None:
     edges = loops(world, 158, 160, 162, 164)
     edges[156] = [world.false_loop(9, 56, 156)]
     updates = run(graph, world, edges, False, TILTED)
-    assert updates[-1].pieces.groups == (0, 0)
+    assert updates[-1].submaps.groups == (0, 0)
     decisions = {r.loop_id: r.decision for r in graph.edge_reports()}
     assert decisions.pop(9) is not LoopDecision.ACCEPTED
     assert set(decisions.values()) == {LoopDecision.ACCEPTED}
 
 
-def test_pieces_that_met_come_together_to_the_oldest(world: World) -> None:
-    """Piece 2 finds piece 1 first, and both come to piece 0 when a loop of 2 finds that."""
+def test_submaps_that_met_come_together_to_the_oldest(world: World) -> None:
+    """Submap 2 finds submap 1 first, and both come to submap 0 when a loop of 2 finds that."""
     graph = loose(world, imu=False)
     begins = {60: TILTED, 110: AWAY @ TILTED}
     edges = {115: (70, 0), 118: (73, 1), 125: (25, 2), 128: (28, 3)}
     away = np.eye(4)
     for k in range(140):
         away = begins.get(k, away)
-        packet = replace(world.packet(k, lost=k in begins, imu=False), begins_piece=k in begins)
+        packet = replace(world.packet(k, lost=k in begins, imu=False), begins_submap=k in begins)
         offered = [world.loop(edges[k][1], edges[k][0], k)] if k in edges else []
         update = graph.add(packet, offered, away @ world.truth[k])
-        assert update.pieces.groups == ((0, 1, 2)[: len(update.pieces.groups)] if k < 118 else
+        assert update.submaps.groups == ((0, 1, 2)[: len(update.submaps.groups)] if k < 118 else
                                         (0, 1, 1) if k < 128 else (0, 0, 0))  # fmt: skip
     graph.finish()
     assert rmse_m(graph.poses(), world.truth[:140]) < 0.3
 
 
-def test_a_piece_goes_its_own_way_again_when_its_loops_are_taken_out(world: World) -> None:
+def test_a_submap_goes_its_own_way_again_when_its_loops_are_taken_out(world: World) -> None:
     graph = loose(world, imu=False)
     run(graph, world, loops(world, 160, 163), False, TILTED, 170)
     graph._estimator.drop(list(graph._estimator.loops.values()))
     update = graph.add(world.packet(170, imu=False), [], TILTED @ world.truth[170])
-    assert update.pieces.groups == (0, 1)
+    assert update.submaps.groups == (0, 1)
     assert rmse_m(graph.poses()[LOST:], world.truth[LOST:171]) < 0.5  # it stays where it was found
 
 
-def test_directions_of_one_camera_join_a_piece_where_they_meet(world: World) -> None:
+def test_directions_of_one_camera_join_a_submap_where_they_meet(world: World) -> None:
     graph = loose(world, imu=True)
     offered, n = {}, 0
     for k in (158, 162, 166, 170):
@@ -149,7 +150,7 @@ def test_directions_of_one_camera_join_a_piece_where_they_meet(world: World) -> 
             world.mono = False
             n += 1
     updates = run(graph, world, offered, True, AWAY)
-    assert updates[-1].pieces.groups == (0, 0)
+    assert updates[-1].submaps.groups == (0, 0)
     assert rmse_m(graph.poses()[LOST:], world.truth[LOST:COUNT]) < 0.3
 
 
@@ -164,12 +165,12 @@ def test_another_recording_is_found_in_a_map_that_does_not_move(world: World, ma
     for k in range(100, 140):
         packet = world.packet(k)
         if k == 100:
-            packet = replace(packet, begins_piece=True, imu=None)
+            packet = replace(packet, begins_submap=True, imu=None)
         old_clock = replace(packet.keyframe, t_ns=packet.keyframe.t_ns - world.t_ns(100))
         packet = replace(packet, keyframe=old_clock, imu=None)
         edges = [world.loop(k, k - 100, k)] if k in (105, 108, 120) else []
         update = graph.add(packet, edges, AWAY @ world.truth[k])
-        assert update.pieces == Pieces((0, 100), (0, 0 if k >= 108 else 1))
+        assert update.submaps == Submaps((0, 100), (0, 0 if k >= 108 else 1))
     np.testing.assert_allclose(graph.poses()[:100], before, atol=2e-3)
     errors = [invert(graph.poses()[k - 100]) @ graph.poses()[k] for k in (105, 108, 120)]
     truths = [invert(world.truth[k - 100]) @ world.truth[k] for k in (105, 108, 120)]
@@ -201,14 +202,14 @@ def test_two_runs_give_the_same_bytes() -> None:
 def test_joined_is_an_equivalence_and_groups_are_named_by_their_oldest(
     begins: list[int], pairs: list[tuple[int, int]]
 ) -> None:
-    pieces = Pieces()
+    submaps = Submaps()
     for k in begins:
-        pieces = pieces.begun(k)
-    pieces = pieces.joined_by(pairs)
+        submaps = submaps.begun(k)
+    submaps = submaps.joined_by(pairs)
     ids = np.arange(71)
-    groups = pieces.groups_of(ids)
-    assert [pieces.group(int(k)) for k in ids] == groups.tolist()
-    assert all(pieces.are_joined(a, b) for a, b in pairs)
-    assert all(group == min(p for p, g in enumerate(pieces.groups) if g == group) for group in pieces.groups)
-    assert len(set(pieces.groups)) >= len(pieces.groups) - len(pairs)
-    assert pieces.joined_by([]).groups == tuple(range(len(begins) + 1))
+    groups = submaps.groups_of(ids)
+    assert [submaps.group(int(k)) for k in ids] == groups.tolist()
+    assert all(submaps.are_joined(a, b) for a, b in pairs)
+    assert all(group == min(p for p, g in enumerate(submaps.groups) if g == group) for group in submaps.groups)
+    assert len(set(submaps.groups)) >= len(submaps.groups) - len(pairs)
+    assert submaps.joined_by([]).groups == tuple(range(len(begins) + 1))

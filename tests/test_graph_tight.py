@@ -7,27 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_window import FakeWindow
-from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
+
 from session_entries import start_facts
 from test_graph_faults import Failing
-
 from vislam.config import GraphConfig, WindowConfig
-from vislam.errors import DataError
-from vislam.factors import estimator
-from vislam.factors.consensus import Verdict
-from vislam.factors.estimator import Estimator
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert, so3_log
+from vislam.core.memory import KeyframeEntry, WindowRecord
+from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision
 from vislam.factors.journal import KeyframeRecord, StartRecord
-from vislam.factors.known import Known
 from vislam.factors.loop import LoopModel
 from vislam.factors.window import WindowOdometry
-from vislam.geometry import invert, so3_log
-from vislam.graph import PoseGraph
+from vislam.graph import PoseGraph, estimator
+from vislam.graph.belief.consensus import Verdict
+from vislam.graph.belief.known import Known
+from vislam.graph.estimator import Estimator
 from vislam.graph.source import in_map
-from vislam.memory import KeyframeEntry, WindowRecord
-from vislam.messages import GraphUpdate, KeyframePacket, LoopDecision
-from vislam.session import Session, SessionWriter, recall
+from vislam.run.session import Session, SessionWriter, recall
 from vislam.window.messages import WindowUpdate
+from worlds.fake_window import FakeWindow
+from worlds.lap import RIG, World, rmse_m
+from worlds.parts import GRAVITY_M_S2
 
 TIGHT = GraphConfig(
     coupling="tight", window_inflation=1.0, window_floor_deg=0.0, window_floor_m=0.0, tilt_floor_deg=0.0
@@ -73,7 +73,7 @@ def test_every_provisional_edge_makes_room_for_the_settled_one(world: World, mak
     feed(graph, world, 0, 80)
     factors = graph._estimator._solver._isam.getFactorsUnsafe()
     alive = [factors.at(n) for n in range(factors.size()) if factors.exists(n)]
-    tilts = sum(k % TIGHT.tilt_every == 0 for k in range(80 - window.keyframes)) if imu else 0
+    tilts = sum(k % TIGHT.gravity_every == 0 for k in range(80 - window.keyframes)) if imu else 0
     assert len(alive) == 1 + 79 + tilts
     if not imu:  # without tilts and loops the graph is the chain of settled edges
         settled = 80 - window.keyframes
@@ -145,7 +145,7 @@ def test_tilts_level_the_map(world: World, make) -> None:
 
 
 def _rotation(w: list[float]) -> np.ndarray:
-    from vislam.geometry import so3_exp
+    from vislam.core.geometry import so3_exp
 
     return so3_exp(np.array(w))
 
@@ -250,7 +250,7 @@ def test_long_runs_accept_the_same_loops(make) -> None:
 def test_a_loop_that_a_long_run_knows_already_is_accepted_without_a_factor(
     make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Odometry far better than loops; false ones are parked all the same, and the end takes all true ones."""
+    """Odometry far better than loops; false ones are pending all the same, and the end takes all true ones."""
     world = World(26.0, seed=4, vo_sigma_rad=np.deg2rad(0.005), vo_sigma_m=0.0001)
     graph, _ = make(world, config=replace(TIGHT, read_newest=25, read_block=15))
     for k in range(world.count):
@@ -259,7 +259,7 @@ def test_a_loop_that_a_long_run_knows_already_is_accepted_without_a_factor(
     true = [r for r in graph.edge_reports() if r.loop_id < 1000]
     redundant = {r.loop_id for r in true if "redundant" in r.reason}
     assert all(r.decision is LoopDecision.ACCEPTED for r in true) and len(redundant) > 3
-    assert all(r.decision is LoopDecision.PARKED for r in graph.edge_reports() if r.loop_id >= 1000)
+    assert all(r.decision is LoopDecision.PENDING for r in graph.edge_reports() if r.loop_id >= 1000)
     assert redundant == set(graph._estimator.spare) and not redundant & set(graph._estimator.loops)
     before = graph._estimator._whole(graph._estimator._values, graph._estimator.loops)[0].size()
     sizes = []
@@ -271,7 +271,7 @@ def test_a_loop_that_a_long_run_knows_already_is_accepted_without_a_factor(
 
 
 def test_where_loops_are_many_work_does_not_grow_with_their_number(make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four loops with every keyframe: one joint marginal for all, few pairs tied, none lost; a false one is parked."""
+    """Four loops with every keyframe: one joint marginal for all, few pairs tied, none lost; a false one is pending."""
     world = World(36.0, seed=12, vo_sigma_rad=np.deg2rad(0.005), vo_sigma_m=0.0001)
     graph, _ = make(world)
     asked: list[int] = []

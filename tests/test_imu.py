@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, RealMotion, to_span
 
 from vislam.config import ImuConfig, InitConfig
-from vislam.errors import DataError
-from vislam.geometry import so3_exp, so3_log
+from vislam.core.errors import DataError
+from vislam.core.geometry import so3_exp, so3_log
+from vislam.core.messages import ImuSample, ImuSpan
 from vislam.imu import ImuBuffer, ImuCalibration, RestDetector, join, preintegrate, subtract_bias
-from vislam.messages import ImuSample, ImuSpan
+from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, RealMotion, to_span
+from worlds.parts import GRAVITY_M_S2
 
 GRAVITY = np.array([0.0, 0.0, -GRAVITY_M_S2])
 

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from session_entries import editing
 
-from vislam.batch.graph_files import read_pose_graph
-from vislam.batch.graph_gnc import reject_suspects
+from session_entries import editing
+from vislam.batch.posegraph.files import read_pose_graph
+from vislam.batch.posegraph.gnc import reject_suspects
 from vislam.cli import run_verb
 from vislam.config import PoseGraphConfig, load
-from vislam.geometry import invert, se3_exp, transform
-from vislam.offline.join_sessions import join_sessions
-from vislam.offline.session_graph import Edges, problem_of
+from vislam.core.geometry import invert, se3_exp, transform
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.sources import open_source
+from vislam.run.folder import prepare
+from vislam.run.offline.join_sessions import join_sessions
+from vislam.run.offline.session_graph import Edges, problem_of
+from vislam.run.sources import open_source
 from vislam.trajectory import Trajectory, read_tum
 
 # one way and the same landmarks (both hang on the duration), seen by other noise at other times

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from vislam.core.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
 from vislam.loop.injection import FIRST_ID, as_candidate
 from vislam.loop.table import LoopRow, caption
-from vislam.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
 from vislam.run import loop_gallery
+from vislam.run.folder import RunLog
 from vislam.run.loop_gallery import LoopGallery, chosen
-from vislam.runfolder import RunLog
 
 
 def row(from_id, to_id, decision="rejected", reason="9 inliers, needs 12", **changes):
@@ -44,11 +44,11 @@ def test_accepted_ones_that_moved_the_map_come_first_and_others_by_what_they_had
         row(1, 30, "accepted", moved_max_m=0.1),
         row(2, 30, "accepted", moved_max_m=0.5),  # the same keyframe: only the one that moved more
         row(3, 31, "accepted", moved_max_m=0.3),
-        row(3, 31, "parked"),  # is told with its acceptance
+        row(3, 31, "pending"),  # is told with its acceptance
         row(4, 32, supporters=10.0),
         row(5, 33, supporters=99.0, reason="only 20% agree in depth, needs 50%"),
         row(6, 34, supporters=50.0),
-        row(7, 35, "parked", supporters=70.0, reason="5 neighbours disagree"),
+        row(7, 35, "pending", supporters=70.0, reason="5 neighbours disagree"),
     ]
     assert chosen(rows, range(len(rows))) == [1, 2, 5, 7, 6, 4]
     assert chosen(rows, [0, 4]) == [0, 4]  # only what there are pictures of
@@ -149,9 +149,9 @@ def test_a_false_loop_made_up_between_the_ends_of_a_true_one_is_told_apart():
     log.add_keyframe(told)
     reports = {
         7: SimpleNamespace(chi2=3.0, weight=0.9, decision=LoopDecision.ACCEPTED, reason="inside the gate"),
-        FIRST_ID: SimpleNamespace(chi2=99.0, weight=0.0, decision=LoopDecision.PARKED, reason="beyond the gate"),
+        FIRST_ID: SimpleNamespace(chi2=99.0, weight=0.0, decision=LoopDecision.PENDING, reason="beyond the gate"),
     }
     assert [(row.source, row.decision) for row in log.loop_rows(reports)] == [
         (candidate(0, 2).source, "accepted"),
-        ("injected", "parked"),
+        ("injected", "pending"),
     ]

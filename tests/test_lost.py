@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from vislam.config import load
-from vislam.geometry import invert, so3_log
+from vislam.core.geometry import invert, so3_log
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.sim.points import open_points
+from vislam.run.folder import prepare
+from vislam.sim.points.points import open_points
 from vislam.trajectory import read_tum
 
 BLIND = {"rig": "rgbd", "camera_hz": 10.0, "outage_begin_s": 10.0, "outage_length_s": 3.0}
@@ -48,16 +48,16 @@ def without_imu(tmp_path_factory):
     return out, run(out, **{"imu.enabled": False})
 
 
-def test_without_an_imu_a_new_piece_begins_and_is_joined_within_half_a_second(without_imu):
+def test_without_an_imu_a_new_submap_begins_and_is_joined_within_half_a_second(without_imu):
     out, metrics = without_imu
-    assert metrics["counters"]["front"]["pieces"] == 2
+    assert metrics["counters"]["front"]["submaps"] == 2
     assert metrics["counters"]["localisation"]["relocalised"] == 1
     rows = tracking(out)
     states = [(key, len(list(group))) for key, group in groupby(row["localisation"] for row in rows)]
     assert [state for state, _ in states] == ["tracking", "lost", "relocalised", "tracking"]
     assert 30 <= states[1][1] <= 36  # the three seconds, and what it takes to recognise the place
-    assert [row["piece"] for row in rows] == ["0"] * rows.index(next(r for r in rows if r["piece"] == "1")) + [
-        "1" for row in rows if row["piece"] == "1"
+    assert [row["submap"] for row in rows] == ["0"] * rows.index(next(r for r in rows if r["submap"] == "1")) + [
+        "1" for row in rows if row["submap"] == "1"
     ]
     assert worst_turn_deg(out) < 1.0
     assert metrics["accuracy"]["graph"]["ate_max_m"] < 0.05
@@ -65,15 +65,15 @@ def test_without_an_imu_a_new_piece_begins_and_is_joined_within_half_a_second(wi
 
 def test_the_imu_bridges_the_same_loss(tmp_path):
     metrics = run(tmp_path / "run")
-    assert metrics["counters"]["front"]["pieces"] == 1
-    assert {row["piece"] for row in tracking(tmp_path / "run")} == {"0"}
+    assert metrics["counters"]["front"]["submaps"] == 1
+    assert {row["submap"] for row in tracking(tmp_path / "run")} == {"0"}
     assert "lost" in {row["localisation"] for row in tracking(tmp_path / "run")}
     assert worst_turn_deg(tmp_path / "run") < 1.0
 
 
 def test_a_bound_of_nothing_lets_no_dead_reckoning_pass(tmp_path):
-    metrics = run(tmp_path / "run", **{"ekf.piece_sigma_m": 1e-6})
-    assert metrics["counters"]["front"]["pieces"] == 2
+    metrics = run(tmp_path / "run", **{"ekf.submap_sigma_m": 1e-6})
+    assert metrics["counters"]["front"]["submaps"] == 2
     assert metrics["counters"]["localisation"]["relocalised"] == 1
     assert worst_turn_deg(tmp_path / "run") < 1.0
 

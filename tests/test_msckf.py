@@ -6,19 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS
-from msckf_world import CHEAP, MONO, RGBD, SIGMAS, STEREO, Flight, motion_of
 
-from vislam.camera import Rig
-from vislam.clock import StageClock
 from vislam.config import EkfConfig, load
+from vislam.core.camera import Rig
+from vislam.core.clock import StageClock
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.messages import Frame, ImuSample, NavState, Observations
 from vislam.datasets import open_dataset
 from vislam.ekf import Ekf, MsckfEkf, make_ekf
-from vislam.front import Front
-from vislam.geometry import so3_exp, transform
-from vislam.messages import Frame, ImuSample, NavState, Observations
-from vislam.sim.points import open_points
+from vislam.pipeline.front import Front
+from vislam.sim.points.points import open_points
 from vislam.trajectory import Trajectory, align, associate, ate
+from worlds.flight import CHEAP, MONO, RGBD, SIGMAS, STEREO, Flight, motion_of
+from worlds.motion import EUROC_NOISE, NS, T0_NS
+from worlds.parts import GRAVITY_M_S2
 
 NOTHING = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 

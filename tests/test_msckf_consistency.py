@@ -9,12 +9,12 @@ import os
 
 import numpy as np
 import pytest
-from inertial_world import NS, T0_NS
-from msckf_world import Flight
 from scipy.stats import chi2
 
 from vislam.config import EkfConfig
-from vislam.messages import Array
+from vislam.core.messages import Array
+from worlds.flight import Flight
+from worlds.motion import NS, T0_NS
 
 RUNS = int(os.environ.get("VISLAM_RUNS", "4"))
 NAMES = ("orientation", "position", "velocity", "gyro bias", "accel bias")

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2, Motion
-from msckf_world import MONO, RGBD, STEREO
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
-from vislam.ekf import msckf_features as features
-from vislam.ekf import msckf_kernels as kernels
-from vislam.ekf.kernels import pose
-from vislam.ekf.msckf_state import CLONES, Window, cloned, moved, propagated, with_points, without_clone, without_points
-from vislam.ekf.msckf_tracks import FrameTracks, prepare, ripe_tracks
-from vislam.geometry import invert, quaternion_wxyz, so3_log
-from vislam.messages import Array, Observations
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert, quaternion_wxyz, so3_log
+from vislam.core.messages import Array, Observations
+from vislam.ekf.loose.kernels import pose
+from vislam.ekf.stretch import Stretch
+from vislam.ekf.tight import features, kernels
+from vislam.ekf.tight.features import Sensor, Views
+from vislam.ekf.tight.kernels import Inertial
+from vislam.ekf.tight.state import CLONES, Window, cloned, moved, propagated, with_points, without_clone, without_points
+from vislam.ekf.tight.tracks import FrameTracks, prepare, ripe_tracks
+from worlds.flight import MONO, RGBD, STEREO
+from worlds.motion import Motion
+from worlds.parts import GRAVITY_M_S2
 
 SIGMAS = np.array([0.8, 0.4, 2e-3])
 CLONE_TIMES_S = np.array([1.0, 1.3, 1.7, 2.2])
@@ -80,10 +83,8 @@ def seen_from(
 def residuals(window: Window, rig: Rig, at: NDArray[np.int64], seen: Array, point: Array) -> Array:
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
     R_body_cam = np.ascontiguousarray(window.R_body_cam)
-    R_cam, centres = features.camera_poses(
-        at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam
-    )
-    A, _, _ = features.linearise(point, at, seen, R_cam, centres, SIGMAS, R10, t10, len(window.frames))
+    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
+    A, _, _ = features.linearise(point, Views(at, seen, *poses), Sensor(SIGMAS, R10, t10), len(window.frames))
     return A[:, -1]
 
 
@@ -94,10 +95,8 @@ def test_derivatives_of_a_track(rig: Rig, readout_s: float) -> None:
     window, x = a_window(Motion.random(5))
     at, seen = seen_from(window, rig, readout_s, POINT)
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
-    R_cam, centres = features.camera_poses(
-        at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam
-    )
-    A, H_f, rows = features.linearise(POINT, at, seen, R_cam, centres, SIGMAS, R10, t10, len(at))
+    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
+    A, H_f, rows = features.linearise(POINT, Views(at, seen, *poses), Sensor(SIGMAS, R10, t10), len(at))
     assert rows == len(at) * (2 + 2 * rig.is_stereo + rig.has_depth)
     h = 1e-6
     for j in range(16, len(window.P)):
@@ -119,8 +118,8 @@ def test_tracks_that_scatter_twice_as_much_count_as_if_told_so(rig: Rig) -> None
     _, noisy = seen_from(window, rig, 0.0, POINT, noise=2.0)
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    told = features.linearise(POINT, at, seen, *poses, 2.0 * SIGMAS, R10, t10, len(at))
-    shown = features.linearise(POINT, at, noisy, *poses, SIGMAS, R10, t10, len(at))
+    told = features.linearise(POINT, Views(at, seen, *poses), Sensor(2.0 * SIGMAS, R10, t10), len(at))
+    shown = features.linearise(POINT, Views(at, noisy, *poses), Sensor(SIGMAS, R10, t10), len(at))
     for one, other in zip(told, shown, strict=True):
         np.testing.assert_allclose(one, other)
 
@@ -182,15 +181,13 @@ def test_triangulation_in_spite_of_an_outlier(rig: Rig) -> None:
     at, seen = seen_from(window, rig, 0.0, POINT)
     seen[:, :2] += rng.normal(size=(4, 2)) * 1e-3
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
-    R_cam, centres = features.camera_poses(
-        at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam
-    )
-    point, rho, sigma = features.triangulate(seen, R_cam, centres, SIGMAS, R10, t10)
+    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
+    point, rho, sigma = features.triangulate(Views(at, seen, *poses), Sensor(SIGMAS, R10, t10))
     assert np.linalg.norm(point - POINT) < 0.15
     assert 0.0 < sigma < 0.3 * rho
     spoilt = seen.copy()
     spoilt[2, :2] += 0.08
-    robust, _, _ = features.triangulate(spoilt, R_cam, centres, SIGMAS, R10, t10)
+    robust, _, _ = features.triangulate(Views(at, spoilt, *poses), Sensor(SIGMAS, R10, t10))
     assert np.linalg.norm(robust - point) < 0.3
 
 
@@ -199,19 +196,20 @@ def test_transition_is_the_derivative_of_the_motion() -> None:
     samples, _ = Motion.random(9).samples(0.2)
     values = np.array([np.concatenate((s.gyro_rad_s, s.accel_m_s2)) for s in samples])[:26]
     stamps = np.array([s.t_ns for s in samples])[:26]
+    piece = Stretch(stamps, values, np.zeros(26), 0, 26)
     sigmas = np.array([1e-3, 1e-2, 1e-4, 1e-3, 0.0, 0.0])
     _, start = a_window(Motion.random(9))
 
     def end_of(change: Array) -> Array:
         x = start.copy()
         moved(Window(np.zeros((CLONES, CLONES)), 0.0, np.eye(3)), x, np.append(change, np.zeros(4)))
-        track = np.empty((26, 10))
-        kernels.run(x, Phi.copy(), Q.copy(), stamps, values, np.zeros(26), track, sigmas, GRAVITY_M_S2, np.eye(3))
+        moving = Inertial(x, Phi.copy(), Q.copy())
+        kernels.run(moving, piece, np.empty((26, 10)), sigmas, GRAVITY_M_S2, np.eye(3))
         return x
 
     Phi, Q = np.eye(15), np.zeros((15, 15))
     x = start.copy()
-    kernels.run(x, Phi, Q, stamps, values, np.zeros(26), np.empty((26, 10)), sigmas, GRAVITY_M_S2, np.eye(3))
+    kernels.run(Inertial(x, Phi, Q), piece, np.empty((26, 10)), sigmas, GRAVITY_M_S2, np.eye(3))
     Phi_run, Phi, Q_run, Q = Phi, np.eye(15), Q, np.zeros((15, 15))
     M = kernels.to_nav_error(x)
     np.testing.assert_allclose(M @ kernels.from_nav_error(x), np.eye(15), atol=1e-12)
@@ -231,10 +229,8 @@ def test_yaw_and_position_stay_unobservable() -> None:
     window, x = a_window(Motion.random(10), points=2)
     at, seen = seen_from(window, MONO, 0.0, POINT)
     R_body_cam, p_body_cam, R10, t10 = rig_parts(MONO)
-    R_cam, centres = features.camera_poses(
-        at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam
-    )
-    A, H_f, _ = features.linearise(POINT, at, seen, R_cam, centres, SIGMAS, R10, t10, len(at))
+    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
+    A, H_f, _ = features.linearise(POINT, Views(at, seen, *poses), Sensor(SIGMAS, R10, t10), len(at))
     features.project_out(A, H_f)
     blind = np.zeros((len(window.P) - 3 * 2 - 16, 4))
     for i in range(len(at)):
@@ -245,7 +241,8 @@ def test_yaw_and_position_stay_unobservable() -> None:
     values = np.tile([0.3, -0.2, 0.4, 1.0, 2.0, 9.0], (20, 1))
     stamps = np.arange(20) * 5_000_000
     track, sigmas = np.empty((20, 10)), np.full(6, 1e-3)
-    kernels.run(x, Phi, Q, stamps, values, np.zeros(20), track, sigmas, GRAVITY_M_S2, np.eye(3))
+    piece = Stretch(stamps, values, np.zeros(20), 0, 20)
+    kernels.run(Inertial(x, Phi, Q), piece, track, sigmas, GRAVITY_M_S2, np.eye(3))
     still = np.zeros((15, 4))
     still[2, 0] = 1.0
     still[3:6, 1:] = np.eye(3)

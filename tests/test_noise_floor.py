@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inertial_world import NS, Motion
 
-from vislam.calibration.noise import driving_floor
-from vislam.calibration.tables import read_inertial
+from vislam.calibration.inertial.noise import driving_floor
+from vislam.calibration.inertial.tables import read_inertial
 from vislam.config import ImuConfig
+from vislam.core.messages import AS_MODELLED, ImuSample
 from vislam.datasets import open_dataset
 from vislam.imu import ImuBuffer, ImuNoise, NoiseFloor, join, preintegrate
-from vislam.messages import AS_MODELLED, ImuSample
+from worlds.motion import NS, Motion
 
 SEED = 3
 RATE_HZ = 200.0

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.geometry import invert, se3_exp
-from vislam.messages import Array
+from vislam.core.geometry import invert, se3_exp
+from vislam.core.messages import Array
 from vislam.trajectory import Trajectory
 
 SIGMAS = np.repeat([0.002, 0.003], 3)

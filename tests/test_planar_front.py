@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vislam.clock import StageClock
 from vislam.config import Config, from_data
-from vislam.front import Front, FrontStep
-from vislam.geometry import invert, se3_log
-from vislam.messages import Array, Frame, ImuSample
-from vislam.sim.sensors import GY85_IMU, GY85_TURN_ON, sense_imu
-from vislam.sim.spline import BodySpline
+from vislam.core.clock import StageClock
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Array, Frame, ImuSample
+from vislam.pipeline.front import Front
+from vislam.pipeline.steps import FrontStep
+from vislam.sim.motion.spline import BodySpline
+from vislam.sim.sensing import GY85_IMU, GY85_TURN_ON, sense_imu
+from vislam.slam import Slam
 from vislam.trajectory import Trajectory
 from vislam.trajectory.consistency import anees
-
-sys.path.insert(0, str(Path(__file__).parent / "frontend"))
-from floor_world import HEIGHT_M, FloorWorld, rig, stamp_ns
+from worlds.floor import HEIGHT_M, FloorWorld, rig, stamp_ns
 
 CAMERA_HZ = 10.0
 LATE_S = 0.03
@@ -191,3 +189,17 @@ def test_a_late_camera_is_found_out() -> None:
     front, _ = run(made, config())
     print(f"found {front.camera_clock.applied_s * 1e3:.1f} ms of {-LATE_S * 1e3:.0f}")
     assert front.camera_clock.applied_s == pytest.approx(-LATE_S, abs=0.006)
+
+
+@pytest.mark.parametrize("imu", ["none", "too short"])
+def test_a_graph_over_a_floor_needs_no_gravity(imu: str) -> None:
+    made = cart(5.0, 0.6)
+    slam = Slam(config(), rig(), GY85_IMU if imu == "too short" else None)
+    for value in [*(made.samples[:5] if imu == "too short" else ()), *made.frames]:
+        slam.feed(value)
+    finished = slam.finish()
+    assert slam.front.start is None and finished.update is not None
+    T = finished.update.T_map_body
+    assert len(T) >= 3
+    way_m = np.linalg.norm(T[-1][:3, 3] - T[0][:3, 3])
+    assert 0.7 < way_m / np.linalg.norm(made.T_world_body[-1, :3, 3] - made.T_world_body[0, :3, 3]) < 1.1

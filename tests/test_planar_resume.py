@@ -12,9 +12,9 @@ import pytest
 from vislam.cli import run_verb
 from vislam.config import load
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.session import Session, recall
-from vislam.sources import open_source
+from vislam.run.folder import prepare
+from vislam.run.session import Session, recall
+from vislam.run.sources import open_source
 from vislam.trajectory import read_tum
 
 SOURCE = "sim:cart-drive,image_width_px=320,camera_hz=10,exposure_s=0,duration_s=12"
@@ -66,6 +66,6 @@ def test_a_stopped_run_goes_on_with_tilt_and_clock(stopped: Path, capsys: pytest
     apart_m = np.linalg.norm(trajectories[0].positions_m[-1] - trajectories[1].positions_m[-1])
     assert apart_m < 0.08
     counters = metrics["counters"]
-    assert counters["front"]["frames_lost"] <= 2 and counters["front"]["pieces"] == 1
+    assert counters["front"]["frames_lost"] <= 2 and counters["front"]["submaps"] == 1
     assert counters["ekf"]["vo_no_keyframe"] == 0 and counters["ekf"]["soft_resets"] == 0
     assert counters["ekf"]["vo_accepted"] >= 0.8 * (whole["frames"] - STOPPED_AT)

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.config import PowerUpConfig
-from vislam.errors import DataError, StorageError
-from vislam.geometry import so3_exp
+from vislam.core.errors import DataError, StorageError
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import Array, ImuSpan
 from vislam.imu.bias_memory import BiasMemory
 from vislam.imu.power_up import PowerUp, Refusal, power_up
-from vislam.messages import Array, ImuSpan
 
 GRAVITY_M_S2 = 9.81
 CONFIG = PowerUpConfig()

@@ -19,7 +19,8 @@ METRICS = {
     "has_imu": True,
     "keyframes": 85,
     "realtime_factor": 1.337,
-    "loops": {"candidates": 40, "accepted": 7, "parked": 1, "rejected": 32},
+    "cost": {"cpu_ms_per_frame": 41.7, "peak_memory_mb": 803.2, "first_pose_s": 0.0, "first_pose_cpu_s": 1.26},
+    "loops": {"candidates": 40, "accepted": 7, "pending": 1, "rejected": 32},
     "accuracy": {
         "ekf": {"ate_rmse_m": 0.1234, "coverage": 1.0, "scale": 1.0},
         "batch": {"ate_rmse_m": 0.0191, "coverage": 1.0, "scale": 1.0},
@@ -34,7 +35,8 @@ def cells(metrics):
 
 def test_row_holds_the_measured_numbers():
     assert cells(METRICS) == [
-        "TUM fr1_desk, 20 s", "stereo, inertial", "0.019", "0.022", "0.123", "85", "7 of 40", "1.34", "100 %",
+        "TUM fr1_desk, 20 s", "stereo, inertial", "0.019", "0.022", "0.123", "85", "7 of 40", "1.34", "42",
+        "803", "0.00 (1.3 CPU)", "100 %",
     ]  # fmt: skip
 
 
@@ -44,7 +46,7 @@ def test_row_without_imu_or_truth_and_with_wrong_scale():
     assert cells(METRICS | {"accuracy": {}})[2:5] == ["–", "–", "–"]
     drifted = {"graph": METRICS["accuracy"]["graph"] | {"scale": 1.08}}
     assert cells(METRICS | {"accuracy": drifted})[3] == "0.022 (scale 1.080)"
-    assert cells({})[5:] == ["–", "– of –", "–", "–"]
+    assert cells({})[5:] == ["–", "– of –", "–", "–", "–", "– (– CPU)", "–"]
 
 
 def test_table_keeps_rows_that_failed():

@@ -8,9 +8,9 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from run_folder import DEGRADED, LOST, make_run
 
-from vislam.errors import DataError, StorageError
+from run_folder import DEGRADED, LOST, make_run
+from vislam.core.errors import DataError, StorageError
 from vislam.report import write_report
 from vislam.report.run_files import read_run
 from vislam.report.scene import build_scene, loop_segments
@@ -92,11 +92,14 @@ def test_a_whole_run_becomes_one_self_contained_page(run):
     for name in ("ekf", "live", "graph"):
         assert f"{metrics['accuracy'][name]['ate_rmse_m']:.3f}" in page.texts
     assert "Tracks scatter by 0.53 px; the graph goes by 2.10 px, 1.00 told." in page.text
-    assert "60 candidates: 12 accepted, 12 parked, 36 rejected." in page.text
+    assert "60 candidates: 12 accepted, 12 pending, 36 rejected." in page.text
     assert "scene <looks> alike, but 2.4 m apart" in page.texts  # escaped in the file, whole on the page
     assert "<looks>" not in text
     assert str(len(LOST)) in page.texts
     assert "frames lost, in 1 outage" in page.texts
+    assert {"of CPU per frame", "of memory at most", "of recording until the first pose", "3.15"} <= set(page.texts)
+    assert re.search(r"24\s*ms", page.text) and re.search(r"812\s*MB", page.text) and re.search(r"1\.25\s*s", page.text)
+    assert "28.7 s of CPU in all, beside 0.0 s of compilation; 0.4 s of it until the first pose." in page.text
     assert f"degraded: … inliers {len(DEGRADED)}" in re.sub(r"\s+", " ", page.text)
     assert "unreadable image" in page.texts
     assert "vislam run sim:workshop-cart --out runs/cart" in page.texts
@@ -165,7 +168,7 @@ def test_a_run_that_never_started_says_why(tmp_path):
                 "initialisation": {"status": "failed", "reason": "too little parallax", "t_s": None},
                 "accuracy": {},
                 "timing_ms": {},
-                "loops": {"candidates": 0, "accepted": 0, "parked": 0, "rejected": 0},
+                "loops": {"candidates": 0, "accepted": 0, "pending": 0, "rejected": 0},
             }
         )
     )
@@ -217,6 +220,7 @@ def test_damaged_files_are_named_and_the_rest_is_still_there(copy, damages):
 def test_metrics_of_the_wrong_types_do_not_break_the_page(copy):
     nonsense = {"name": None, "frames": "many", "accuracy": {"graph": 3, "ekf": {"ate_rmse_m": None}}, "loops": []}
     nonsense |= {"timing_ms": {"ekf": {"p50": "fast"}, "x": 1}, "warnings": "none", "counters": {"a": {"b": "c"}}}
+    nonsense |= {"cost": {"cpu_ms_per_frame": "dear", "stages_cpu_ms_per_frame": {"ekf": "much", "map": 0.0}}}
     (copy / "metrics.json").write_text(json.dumps(nonsense))
     assert "Trajectories" in Page(write_report(copy).read_text()).headings
 

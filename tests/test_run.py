@@ -13,11 +13,11 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import load
+from vislam.core.messages import Frame, ImuSample
 from vislam.datasets.recorder import record
-from vislam.messages import Frame, ImuSample
 from vislam.report.run_files import read_run
 from vislam.run import execute
-from vislam.runfolder import prepare
+from vislam.run.folder import prepare
 from vislam.sim import open_world
 from vislam.trajectory import read_tum
 
@@ -85,6 +85,22 @@ def test_a_run_leaves_the_documented_folder(small_room, tmp_path):
     assert metrics["frames"] == small_room.frame_count
     assert len(read_tum(tmp_path / "run" / "trajectory_graph.tum")) == small_room.frame_count
     assert metrics["initialisation"]["status"] == "static"
+    cost, stages_ms = metrics["cost"], metrics["cost"]["stages_cpu_ms_per_frame"]
+    assert sum(stages_ms.values()) == pytest.approx(cost["cpu_ms_per_frame"])
+    assert {
+        "read",
+        "track",
+        "ekf",
+        "ekf predict",
+        "loop",
+        "graph",
+        "map",
+        "view",
+        "pictures",
+        "other",
+    } <= stages_ms.keys()
+    assert cost["first_pose_s"] == pytest.approx(metrics["initialisation"]["t_s"], abs=1.0)
+    assert 0.0 < cost["first_pose_cpu_s"] < cost["cpu_s"]
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
     assert metrics["accuracy"]["ekf"]["ate_rmse_m"] < 0.03
     assert json.loads((tmp_path / "run" / "config.json").read_text())["view"]["enabled"] is True

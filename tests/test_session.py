@@ -9,15 +9,14 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
-from session_entries import decided, editing, start_facts
 
-from vislam.camera import Camera, Rig
-from vislam.database import connect
-from vislam.errors import DataError, StorageError
-from vislam.geometry import se3_exp
-from vislam.imu import ImuNoise
-from vislam.memory import FrameEntry, GraphNews, KeyframeEntry
-from vislam.messages import (
+from session_entries import decided, editing, start_facts
+from vislam.core.camera import Camera, Rig
+from vislam.core.database import connect
+from vislam.core.errors import DataError, StorageError
+from vislam.core.geometry import se3_exp
+from vislam.core.memory import FrameEntry, GraphNews, KeyframeEntry
+from vislam.core.messages import (
     Frame,
     GraphUpdate,
     ImuSpan,
@@ -30,7 +29,8 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.session import Session, SessionWriter
+from vislam.imu import ImuNoise
+from vislam.run.session import Session, SessionWriter
 
 SEED = 11
 NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9393e-5, 3.0e-3, 200.0)
@@ -297,7 +297,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
     database = sqlite3.connect(tmp_path / "session.db")
     database.execute("PRAGMA user_version=1")
     database.close()
-    with pytest.raises(DataError, match="format 1, this vislam reads 7; run the recording again"):
+    with pytest.raises(DataError, match="format 1, this vislam reads 8; run the recording again"):
         Session(tmp_path / "session.db")
 
 

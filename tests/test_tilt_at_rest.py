@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2, levelled, state_error, still
-from msckf_world import MONO, Landmarks, motion_of
 
 from vislam.config import EkfConfig
+from vislam.core.messages import Array
 from vislam.ekf import MsckfEkf
-from vislam.messages import Array
-from vislam.sim.sensors import CONSUMER_IMU
+from vislam.sim.sensing import CONSUMER_IMU
+from worlds.flight import MONO, Landmarks, motion_of
+from worlds.motion import levelled, state_error, still
+from worlds.parts import GRAVITY_M_S2
 
 RATE = 200
 

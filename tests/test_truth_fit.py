@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.needs import missing
-from tests.sim.point_recordings import real
-from vislam.geometry import transform
-from vislam.messages import Array
-from vislam.sim.path import wander
-from vislam.sim.spline import BodySpline
-from vislam.sources import measured_inertial
+from vislam.core.geometry import transform
+from vislam.core.messages import Array
+from vislam.run.sources import measured_inertial
+from vislam.sim.motion.path import wander
+from vislam.sim.motion.spline import BodySpline
 from vislam.trajectory import Trajectory
-from vislam.truth_fit import TruthFit, fit_truth
+from vislam.trajectory.truth_fit import TruthFit, fit_truth
+from worlds.recordings import real
 
 TURN_RAD = np.deg2rad([0.2, -0.1, 0.2])  # 0.3 deg
 LEVER_M = np.array([0.006, -0.004, 0.007])  # 1 cm

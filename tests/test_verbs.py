@@ -1,12 +1,18 @@
 """Every verb of the command line is there, explains itself, and is not imported before it is asked for."""
 
+import json
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
 from vislam.cli import run_verb
-from vislam.verbs import VERBS
+from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.brief import said_of
+from vislam.cli.verbs.completion import known_options, script
+from vislam.config.ranges import settings_of
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -29,3 +35,71 @@ def test_help_lists_every_verb_and_imports_nothing_heavy() -> None:
 def test_an_unknown_verb_is_a_wrong_usage_that_names_the_verbs(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_verb(["fly"]) == 2
     assert "no verb 'fly'; there are: demo, run" in capsys.readouterr().err
+
+
+def help_of(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as end:
+        run_verb([verb, "--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", ["run", "live"])
+def test_the_short_help_fits_two_screens_and_explains_whatever_it_lists(
+    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    lines = help_of(verb, capsys).splitlines()
+    assert len(lines) <= 2 * 45
+    assert max(map(len, lines)) <= 100
+    module = import_module(f"vislam.cli.verbs.{verb}")
+    settings = {".".join(setting.path): setting for cls in module.OPTIONS for setting in settings_of(cls)}
+    assert all(said_of(settings[name]) for name in module.BRIEF.often)
+    assert all(said_of(setting) for setting in settings.values() if setting.owner in module.OPTIONS)
+
+
+def test_every_example_of_the_short_help_names_existing_options(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ("run", "live"):
+        known = known_options(verb)[0]
+        for example in import_module(f"vislam.cli.verbs.{verb}").BRIEF.examples:
+            assert {word for word in example.split() if word.startswith("--")} <= {*known}
+
+
+def test_the_long_help_has_all_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        run_verb(["run", "--help-all"])
+    assert end.value.code == 0
+    said = capsys.readouterr().out
+    assert "--graph.freeze-after" in said and "--window.rho-sigma-1-m" in said
+
+
+def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_verb(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("vislam ")
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("pose", {"posegraph"}),
+        ("run --graph.coup", {"--graph.coupling"}),
+        ("run --graph.coupling t", {"tight"}),
+        ("calibrate camera-", {"camera-imu"}),
+        ("completion z", {"zsh"}),
+    ],
+)
+def test_bash_completes_what_was_begun(typed: str, offered: set[str]) -> None:
+    words = ["vislam", *typed.split()]
+    call = f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _vislam; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", f"{script()}\n{call}"], capture_output=True, text=True, check=True)
+    assert {*done.stdout.split()} == offered
+
+
+def test_a_pose_graph_given_to_optimize_is_handed_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "one.g2o"
+    path.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n", encoding="utf-8")
+    answers = []
+    for verb in ("posegraph", "optimize"):
+        assert run_verb([verb, str(path), "--out", str(tmp_path / verb), "--no-report", "--no-certify", "--json"]) == 0
+        answers.append(json.loads(capsys.readouterr().out))
+    assert answers[0]["poses"] == answers[1]["poses"] == 2

@@ -5,12 +5,12 @@ import sys
 import numpy as np
 import pytest
 
-from vislam.camera import Camera, Rig
 from vislam.config import ViewConfig
-from vislam.errors import StorageError
-from vislam.geometry import se3_exp, transform_points
-from vislam.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, Observations, Tracking
-from vislam.viewer import NullViewer, open_viewer
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import StorageError
+from vislam.core.geometry import se3_exp, transform_points
+from vislam.core.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, Observations, Tracking
+from vislam.run.viewer import NullViewer, open_viewer
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
@@ -215,7 +215,7 @@ def test_long_paths_grow_linearly(tmp_path):
 def test_without_rerun_or_when_off_nothing_is_written(tmp_path, monkeypatch):
     off = open_viewer(tmp_path / "run.rrd", enabled=False)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "vislam.viewer.recording", raising=False)
+    monkeypatch.delitem(sys.modules, "vislam.run.viewer.recording", raising=False)
     absent = open_viewer(tmp_path / "run.rrd")
     assert isinstance(absent, NullViewer)
     assert "vislam[view]" in absent.reason
@@ -233,7 +233,7 @@ def test_without_rerun_or_when_off_nothing_is_written(tmp_path, monkeypatch):
 
 
 def test_null_viewer_has_every_method_of_the_real_one():
-    from vislam.viewer.recording import RunViewer
+    from vislam.run.viewer.recording import RunViewer
 
     public = {name for name in vars(RunViewer) if not name.startswith("_")}
     assert public <= set(vars(NullViewer))

@@ -3,13 +3,14 @@
 import gtsam
 import numpy as np
 import pytest
-from session_world import simulate
 
-from vislam.batch import adjust, optimize_run
-from vislam.batch.adjust import solve
+from vislam.batch import optimize_run
+from vislam.batch.bundle import adjust
+from vislam.batch.bundle.adjust import solve
 from vislam.config import BatchConfig, Config
-from vislam.errors import DataError
+from vislam.core.errors import DataError
 from vislam.factors.keys import X
+from worlds.session import simulate
 
 QUICK = Config(batch=BatchConfig(rounds=2, covariances=False))
 

@@ -5,18 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from needs import missing
 from test_graph_gnc import _with_false_loops
 from test_graph_optimize import world
 
-from vislam.batch.graph_files import read_pose_graph
-from vislam.batch.graph_noise import covariances_of_edges, noise_of_kinds, rescaled
-from vislam.batch.graph_optimize import optimize_pose_graph
-from vislam.batch.graph_robust import kernel_weights
-from vislam.batch.graph_structure import Structure
-from vislam.batch.graph_worlds import simulate_graph
+from needs import missing
+from vislam.batch.posegraph.files import read_pose_graph
+from vislam.batch.posegraph.noise import covariances_of_edges, noise_of_kinds, rescaled
+from vislam.batch.posegraph.optimize import optimize_pose_graph
+from vislam.batch.posegraph.robust import kernel_weights
+from vislam.batch.posegraph.structure import Structure
+from vislam.batch.posegraph.worlds import simulate_graph
 from vislam.config import GraphWorldConfig, PoseGraphConfig
-from vislam.geometry import align_points
+from vislam.core.geometry import align_points
 
 AUTO = PoseGraphConfig(robust="auto")
 

@@ -9,18 +9,18 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from vislam.batch import graph_isotropic
-from vislam.batch.graph_certificate import bounding_weights, certify, isotropic_weights
-from vislam.batch.graph_files import read_pose_graph
-from vislam.batch.graph_g2o import write_g2o
-from vislam.batch.graph_isotropic import IsotropicGraph
-from vislam.batch.graph_kernels import retract_3d
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.graph_solver import levenberg_marquardt
-from vislam.batch.graph_starts import chordal_start, odometry_start
-from vislam.batch.graph_structure import Structure
-from vislam.batch.graph_uncertainty import Uncertainty
-from vislam.batch.graph_worlds import Shape, SimulatedGraph, simulate_graph
+from vislam.batch.posegraph import isotropic as graph_isotropic
+from vislam.batch.posegraph.arithmetic import retract_3d
+from vislam.batch.posegraph.certificate import bounding_weights, certify, isotropic_weights
+from vislam.batch.posegraph.files import read_pose_graph
+from vislam.batch.posegraph.g2o import write_g2o
+from vislam.batch.posegraph.isotropic import IsotropicGraph
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.solver import levenberg_marquardt
+from vislam.batch.posegraph.starts import chordal_start, odometry_start
+from vislam.batch.posegraph.structure import Structure
+from vislam.batch.posegraph.uncertainty import Uncertainty
+from vislam.batch.posegraph.worlds import Shape, SimulatedGraph, simulate_graph
 from vislam.cli import run_verb
 from vislam.config import GraphWorldConfig
 

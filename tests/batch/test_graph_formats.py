@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vislam.batch.graph_files import graph_format, read_pose_graph, write_pose_graph
-from vislam.batch.graph_isam import read_isam, write_isam
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.graph_toro import read_toro, write_toro
-from vislam.batch.graph_worlds import Shape, simulate_graph
+from vislam.batch.posegraph.files import graph_format, read_pose_graph, write_pose_graph
+from vislam.batch.posegraph.isam import read_isam, write_isam
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.toro import read_toro, write_toro
+from vislam.batch.posegraph.worlds import Shape, simulate_graph
 from vislam.config import GraphWorldConfig
-from vislam.errors import DataError, StorageError, UsageError, VislamError
+from vislam.core.errors import DataError, StorageError, UsageError, VislamError
 
 Array = np.ndarray
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vislam.batch.graph_g2o import read_g2o, write_g2o
-from vislam.batch.tagged_lines import read_tagged_lines
-from vislam.errors import DataError
+from vislam.batch.posegraph.g2o import read_g2o, write_g2o
+from vislam.batch.posegraph.tagged_lines import read_tagged_lines
+from vislam.core.errors import DataError
 
 _INFO_3D = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4"
 _SPACE = [

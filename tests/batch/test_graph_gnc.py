@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_graph_optimize import world
 
-from vislam.batch.graph_optimize import optimize_pose_graph
+from vislam.batch.posegraph.optimize import optimize_pose_graph
 from vislam.config import PoseGraphConfig
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.batch.graph_files import read_pose_graph, write_pose_graph
-from vislam.batch.graph_optimize import optimize_pose_graph
-from vislam.batch.graph_uncertainty import Uncertainty
+from vislam.batch.posegraph.files import read_pose_graph, write_pose_graph
+from vislam.batch.posegraph.optimize import optimize_pose_graph
+from vislam.batch.posegraph.uncertainty import Uncertainty
 from vislam.cli import run_verb
 from vislam.config import PoseGraphConfig
-from vislam.errors import DataError, UsageError
+from vislam.core.errors import DataError, UsageError
 
 FULL = np.linalg.inv(np.cov(np.random.default_rng(3).normal(size=(6, 40))))
 

@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.batch.graph_cholesky import Factor
-from vislam.batch.graph_clusters import ClusteredSolver, Clusters
-from vislam.batch.graph_kernels import linearise_2d, linearise_3d, retract_2d, retract_3d
-from vislam.batch.graph_ordering import adjacency, minimum_degree
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.graph_symbolic import analyse
-from vislam.geometry import se3_exp
+from vislam.batch.posegraph.arithmetic import Edges, Normal, linearise_2d, linearise_3d, retract_2d, retract_3d
+from vislam.batch.posegraph.cholesky import Factor
+from vislam.batch.posegraph.clusters import ClusteredSolver, Clusters
+from vislam.batch.posegraph.ordering import adjacency, minimum_degree
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.symbolic import analyse
+from vislam.core.geometry import se3_exp
 
 
 def _system(rng, n, a, b, d):
@@ -133,7 +133,8 @@ def test_derivatives_are_exact(d, size):
     diagonal, off, gradient = np.empty((2, k, k)), np.empty((1, k, k)), np.empty((2, k))
     weight, out = np.array([1.7]), np.empty_like(poses)
     later = np.array([True])
-    cost = linearise(problem.edges, np.arange(2), later, poses, Z, problem.information, weight, diagonal, off, gradient)
+    measured = Edges(problem.edges, later, Z, problem.information)
+    cost = linearise(measured, np.arange(2), poses, weight, Normal(diagonal, off, gradient))
     assert cost == pytest.approx(problem.chi2(poses, weight), rel=1e-12)
     differences = []
     for step in 1e-6 * np.eye(2 * k).reshape(2 * k, 2, k):
@@ -148,12 +149,11 @@ def test_derivatives_are_exact(d, size):
     assert np.sum(eigenvalues > 1e-9 * eigenvalues[-1]) == k
     assert np.all(np.abs(eigenvalues[:k]) < 1e-9 * eigenvalues[-1])
     off_turned = np.empty_like(off)
-    linearise(
-        problem.edges, np.arange(2), ~later, poses, Z, problem.information, weight, diagonal, off_turned, gradient
-    )
+    turned = measured._replace(later_is_to=~later)
+    linearise(turned, np.arange(2), poses, weight, Normal(diagonal, off_turned, gradient))
     assert np.allclose(off_turned[0], off[0].T)
     fixed = np.array([0, -1])
-    only = np.empty((1, k, k)), np.empty((1, k, k)), np.empty((1, k))
-    linearise(problem.edges, fixed, later, poses, Z, problem.information, weight, *only)
+    only = Normal(np.empty((1, k, k)), np.empty((1, k, k)), np.empty((1, k)))
+    linearise(measured, fixed, poses, weight, only)
     assert np.allclose(only[0][0], diagonal[0])
     assert np.allclose(only[2][0], gradient[0])

@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vislam.batch import graph_certificate, graph_structure
-from vislam.batch.graph_g2o import read_g2o
-from vislam.batch.graph_optimize import optimize_pose_graph
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.graph_uncertainty import Uncertainty
-from vislam.batch.graph_worlds import simulate_graph
+from vislam.batch.posegraph import certificate as graph_certificate
+from vislam.batch.posegraph import structure as graph_structure
+from vislam.batch.posegraph.g2o import read_g2o
+from vislam.batch.posegraph.optimize import optimize_pose_graph
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.uncertainty import Uncertainty
+from vislam.batch.posegraph.worlds import simulate_graph
 from vislam.config import GraphWorldConfig, PoseGraphConfig
-from vislam.errors import UsageError
-from vislam.geometry import invert, se3_exp
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_exp
 
 BEST = {  # chi2; gtsam's Levenberg-Marquardt from certified optima
     "intel": 45.0042331, "MIT": 41.2069469, "manhattan": 3549.04107, "M3500": 137.914878,

@@ -6,14 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.graph_solver import levenberg_marquardt
-from vislam.batch.graph_starts import chordal_start
-from vislam.batch.graph_structure import Structure
-from vislam.batch.graph_uncertainty import Uncertainty, ellipses
-from vislam.batch.graph_worlds import Shape, simulate_graph
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.solver import levenberg_marquardt
+from vislam.batch.posegraph.starts import chordal_start
+from vislam.batch.posegraph.structure import Structure
+from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
+from vislam.batch.posegraph.worlds import Shape, simulate_graph
 from vislam.config import GraphWorldConfig
-from vislam.errors import DataError, UsageError
+from vislam.core.errors import DataError, UsageError
 
 Array = np.ndarray
 SHAPES: tuple[Shape, ...] = ("sphere", "manhattan")

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vislam.batch.graph_g2o import read_g2o
-from vislam.batch.graph_worlds import Shape, SimulatedGraph, simulate_graph
+from vislam.batch.posegraph.g2o import read_g2o
+from vislam.batch.posegraph.worlds import Shape, SimulatedGraph, simulate_graph
 from vislam.cli import run_verb
 from vislam.config import GraphWorldConfig
-from vislam.errors import UsageError
-from vislam.geometry import invert_many
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert_many
 from vislam.trajectory import read_tum
 
 SHAPES: tuple[Shape, ...] = ("grid3d", "torus", "sphere", "manhattan")

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_world import position, rotation
-from session_world import simulate
 
 from vislam.batch import optimize_run
 from vislam.config import BatchConfig, Config
-from vislam.errors import DataError
-from vislam.frames import LoggedFrames
-from vislam.geometry import invert, so3_log
-from vislam.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert, so3_log
+from vislam.core.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
+from vislam.trajectory.frames import LoggedFrames
+from worlds.lap import position, rotation
+from worlds.session import simulate
 
 NO_VIBRATION = BatchConfig()  # the simulated IMU is as white as its model says
 CONFIG = Config(batch=NO_VIBRATION)

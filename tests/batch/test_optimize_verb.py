@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from needs import missing
 from session_entries import editing
-from session_world import simulate, store
-
 from vislam.cli import run_verb
 from vislam.config import BatchConfig, Config, load
-from vislam.errors import DataError, UsageError
-from vislam.offline.optimize import optimize
+from vislam.core.errors import DataError, UsageError
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.sources import open_source
+from vislam.run.folder import prepare
+from vislam.run.offline.optimize_run import optimize
+from vislam.run.sources import open_source
 from vislam.trajectory import Trajectory, read_states_csv, read_tum, write_tum
+from worlds.session import simulate, store
 
 QUICK = BatchConfig(rounds=2)
 
@@ -87,8 +87,8 @@ def test_a_killed_run_can_be_optimised_up_to_its_last_keyframe(tmp_path):
     script = textwrap.dedent(f"""
         import sys, time; sys.path[:0] = [{str(here)!r}, {str(here.parent)!r}]
         from pathlib import Path
-        from session_world import simulate, store
-        from vislam.memory import FrameEntry
+        from worlds.session import simulate, store
+        from vislam.core.memory import FrameEntry
         log = simulate("stereo", duration_s=8.0, true_loops=0).log
         writer = store(log, Path({str(path)!r}), upto=20)
         writer.add_frame(FrameEntry(10**12, 19, None))
@@ -128,7 +128,7 @@ def test_a_failed_optimisation_leaves_the_folder_as_it_was(folder, monkeypatch, 
     def fail(*_):
         raise DataError("the run cannot be optimised: for this test")
 
-    monkeypatch.setattr("vislam.batch.optimize.solve", fail)
+    monkeypatch.setattr("vislam.batch.bundle.bundle_adjustment.solve", fail)
     before = digests(folder)
     assert run_verb(["optimize", str(folder)]) == 3
     assert "cannot be optimised" in capsys.readouterr().err

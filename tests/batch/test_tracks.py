@@ -3,15 +3,15 @@
 import gtsam
 import numpy as np
 import pytest
-from session_world import BASELINE_M, CAMERA, rig_of, simulate
 
-from vislam.batch.adjust import L, VisualNoise, visual_factors
-from vislam.batch.shutter import ReadoutSearch, camera_twists, flow_basis
-from vislam.batch.tracks import Tracks, collect, residuals, stereo_inverse_depth, triangulate
+from vislam.batch.bundle.adjust import L, VisualNoise, visual_factors
+from vislam.batch.bundle.rays import Tracks, collect, residuals, stereo_inverse_depth, triangulate
+from vislam.batch.bundle.shutter import ReadoutSearch, camera_twists, flow_basis
 from vislam.config import FrontEndConfig
+from vislam.core.geometry import invert, se3_exp, transform_points
 from vislam.factors.keys import X
-from vislam.geometry import invert, se3_exp, transform_points
 from vislam.trajectory import Trajectory
+from worlds.session import BASELINE_M, CAMERA, rig_for, simulate
 
 SEED = 5
 
@@ -38,7 +38,7 @@ def some_cameras(rng, count=6, step_m=0.2):
 
 
 def test_stereo_pairs_give_the_inverse_depth(rng):
-    rig = rig_of("stereo")
+    rig = rig_for("stereo")
     points = np.column_stack([rng.uniform(-1, 1, 200), rng.uniform(-0.8, 0.8, 200), rng.uniform(1, 8, 200)])
     left = rig.cameras[0].project(points)
     right = rig.cameras[1].project(transform_points(invert(rig.T_cam0_cam1), points))

@@ -8,19 +8,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_world import BOARD, CHESSBOARD, FISHEYE, WEBCAM, pose, see
-from calibration_worlds import calibrate, refusal
 from PIL import Image
 
-from vislam.calibration.board import Board, View
-from vislam.calibration.lens import Model, direction_sigma_px, fit_lens, parameters_of
-from vislam.calibration.views import choose, live_images
-from vislam.camera import Camera
+from vislam.calibration.cameras.board import Board, View
+from vislam.calibration.cameras.lens import Model, direction_sigma_px, fit_lens, parameters_of
+from vislam.calibration.cameras.views import choose, live_images
+from vislam.core.camera import Camera
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array
 from vislam.datasets.camera_files import read_cameras
-from vislam.errors import DataError, UsageError
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
-from vislam.messages import Array
+from worlds.board import BOARD, CHESSBOARD, FISHEYE, WEBCAM, pose, see
+from worlds.calibration import calibrate, refusal
 
 SIGMA_PX = 0.2
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_worlds import calibrate, refusal
 from scipy.spatial.transform import Rotation
 
-from vislam.calibration.hand_eye import HandEye, solve_hand_eye
-from vislam.calibration.visual_rotation import RotationPair
+from vislam.calibration.extrinsics.hand_eye import HandEye, solve_hand_eye
+from vislam.calibration.extrinsics.visual_rotation import RotationPair
 from vislam.datasets import open_dataset
 from vislam.datasets.camera_files import read_cameras
+from worlds.calibration import calibrate, refusal
 
 R_BODY_CAM = Rotation.from_rotvec([1.2, -1.1, 1.3])
 OFFSET_S, BIAS = 0.037, np.array([0.01, -0.02, 0.03])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,20 +12,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.calibration import floor
-from vislam.calibration.floor import calibrate_floor, fit_floor
+from vislam.calibration.cameras import floor
+from vislam.calibration.cameras.floor import calibrate_floor, fit_floor
 from vislam.calibration.options import FloorOptions
-from vislam.camera import Rig
 from vislam.config import PlanarConfig, load
-from vislam.errors import DataError, UsageError
-from vislam.frontend.planar_floor import make_mount
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.frontend.planar.floor import make_mount
 from vislam.imu import ImuNoise
-from vislam.messages import Frame, ImuSample, MagSample
 from vislam.sim import open_world
 from vislam.trajectory import Trajectory
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "frontend"))
-from floor_world import Drive, FloorWorld, rig, stamp_ns
+from worlds.floor import Drive, FloorWorld, rig, stamp_ns
 
 BIAS = np.array([0.01, -0.02, 0.015])
 

@@ -7,7 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibration_worlds import (
+
+from vislam.calibration.inertial.imu import ImuResult, solve_imu
+from vislam.calibration.inertial.stillness import movement
+from vislam.calibration.inertial.tables import Table
+from vislam.calibration.options import ImuOptions
+from vislam.core.messages import Array
+from vislam.datasets.imu_files import read_imu_calibration
+from worlds.calibration import (
     ACCEL_BIAS,
     ACCEL_MATRIX,
     GYRO_BIAS,
@@ -20,13 +27,6 @@ from calibration_worlds import (
     ups,
     write_table,
 )
-
-from vislam.calibration.imu import ImuResult, solve_imu
-from vislam.calibration.options import ImuOptions
-from vislam.calibration.stillness import movement
-from vislam.calibration.tables import Table
-from vislam.datasets.imu_files import read_imu_calibration
-from vislam.messages import Array
 
 OPTIONS = ImuOptions(Path("recording"))
 

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_worlds import T0_NS, calibrate, refusal, write_table
 from scipy.spatial.transform import Rotation
 
-from vislam.calibration.field import fit_iron
-from vislam.calibration.mag import MagResult, solve_mag
+from vislam.calibration.inertial.field import fit_iron
+from vislam.calibration.inertial.mag import MagResult, solve_mag
+from vislam.calibration.inertial.tables import Table
 from vislam.calibration.options import MagOptions
-from vislam.calibration.tables import Table
+from vislam.core.messages import Array
 from vislam.datasets.imu_files import read_mag_calibration
-from vislam.messages import Array
+from worlds.calibration import T0_NS, calibrate, refusal, write_table
 
 HARD_UT = np.array([12.0, -20.0, 30.0])
 SOFT = np.array([[1.1, 0.05, 0.02], [0.05, 0.9, -0.03], [0.02, -0.03, 1.0]])

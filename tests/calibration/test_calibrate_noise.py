@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibration_worlds import calibrate, refusal, still_imu, write_table
 
-from vislam.calibration.allan import allan_curve, fit_noise
+from vislam.calibration.inertial.allan import allan_curve, fit_noise
 from vislam.datasets.imu_files import read_noise
+from worlds.calibration import calibrate, refusal, still_imu, write_table
 
 WHITE = np.array([5e-4, 5e-4, 6e-4, 3e-3, 3e-3, 4e-3])
 WALK = np.array([2e-5, 2e-5, 2e-5, 2e-4, 2e-4, 2e-4])

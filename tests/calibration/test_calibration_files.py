@@ -9,13 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibration_worlds import T0_NS, write_table
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.camera import Camera, Rig
 from vislam.cli import run_verb
 from vislam.config import CalibrationConfig, Config, load
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import se3_exp
+from vislam.core.messages import ImuSample, MagSample
 from vislam.datasets import open_dataset
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.calibration import camera_text, imu_text
@@ -28,11 +30,9 @@ from vislam.datasets.imu_files import (
     read_mag_calibration,
     read_noise,
 )
-from vislam.errors import DataError, UsageError
-from vislam.geometry import se3_exp
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.messages import ImuSample, MagSample
-from vislam.sources import open_source
+from vislam.run.sources import open_source
+from worlds.calibration import T0_NS, write_table
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 50.0)
 CAMERA = Camera(64, 48, 50.0, 51.0, 31.5, 23.5, 0.0, "radtan", (-0.1, 0.01, 1e-4, 2e-4))

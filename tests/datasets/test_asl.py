@@ -8,13 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from mini_recording import (
+
+from vislam.core.errors import DataError
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.datasets import open_dataset
+from worlds.mini_recording import (
     BEGIN_NS,
     FRAME_NS,
     HEIGHT,
     IMU_NS,
     IMU_YAML,
-    R_BODY_CAM,
     WIDTH,
     camera_yaml,
     edit_lines,
@@ -24,10 +27,7 @@ from mini_recording import (
     write_camera,
     write_imu,
 )
-
-from vislam.datasets import open_dataset
-from vislam.errors import DataError
-from vislam.messages import Frame, ImuSample, MagSample
+from worlds.parts import R_BODY_CAM
 
 
 def frames_of(recording) -> list[Frame]:

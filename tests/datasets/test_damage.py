@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from mini_recording import HEIGHT, IMU_YAML, WIDTH, camera_yaml, imu_rows, write_asl
 from test_other_formats import write_kitti, write_tum, write_video
 
+from vislam.core.errors import VislamError
 from vislam.datasets import open_dataset
 from vislam.datasets.inspect import inspect
-from vislam.errors import VislamError
+from worlds.mini_recording import HEIGHT, IMU_YAML, WIDTH, camera_yaml, imu_rows, write_asl
 
 SEED, ROUNDS = 20260101, 40
 INSERTS = [b"nan", b"1e999", b"\n", b",", b"\0" * 50, b"9" * 400, b"[", b"{", b": "]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mini_recording import HEIGHT, WIDTH, picture
 
-from vislam.camera import Camera
+from vislam.core.camera import Camera
+from vislam.core.errors import DataError
 from vislam.datasets.images import (
     UnreadableImageError,
     decode_ahead,
@@ -20,7 +20,7 @@ from vislam.datasets.images import (
     read_depth,
     read_grey_or_color,
 )
-from vislam.errors import DataError
+from worlds.mini_recording import HEIGHT, WIDTH, picture
 
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 50.0, 31.5, 23.5)
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
 from test_other_formats import write_kitti, write_tum, write_video
 
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import so3_exp, so3_log
 from vislam.datasets.inspect import Inspection, inspect
 from vislam.datasets.plausibility import epipolar_facts, gyro_turns, turn_disagreement
-from vislam.errors import DataError, UsageError
-from vislam.geometry import so3_exp, so3_log
+from worlds.mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
 
 
 def told(inspection: Inspection, severity: str, what: str) -> bool:

@@ -4,10 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
-from mini_recording import write_asl
 
+from vislam.core.errors import DataError, UsageError
 from vislam.datasets import READERS, open_dataset
-from vislam.errors import DataError, UsageError
+from worlds.mini_recording import write_asl
 
 
 def test_unknown_format_lists_the_known_ones(tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from mini_recording import HEIGHT, IMU_YAML, WIDTH, camera_yaml, imu_rows, picture
 
+from vislam.core.errors import DataError
+from vislam.core.messages import Frame, ImuSample
 from vislam.datasets import open_dataset
-from vislam.errors import DataError
-from vislam.messages import Frame, ImuSample
+from worlds.mini_recording import HEIGHT, IMU_YAML, WIDTH, camera_yaml, imu_rows, picture
 
 SIZE = (640, 480)  # of the benchmark's published cameras
 

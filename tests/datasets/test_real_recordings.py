@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
+from vislam.core.messages import Frame, ImuSample
 from vislam.datasets import open_dataset
 from vislam.datasets.inspect import inspect
-from vislam.messages import Frame, ImuSample
 
 pytestmark = pytest.mark.data
 

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mini_recording import HEIGHT, R_BODY_CAM, WIDTH, picture, write_asl
 
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError, StorageError, UsageError
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import Recorder, record
-from vislam.errors import DataError, StorageError, UsageError
 from vislam.imu import ImuNoise
-from vislam.messages import Frame, ImuSample, MagSample
+from worlds.mini_recording import HEIGHT, WIDTH, picture, write_asl
+from worlds.parts import R_BODY_CAM
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 0.0, 200.0)
 
@@ -162,10 +163,10 @@ def test_no_space_is_told_in_words(tmp_path: Path) -> None:
 def test_a_killed_recorder_leaves_a_recording(tmp_path: Path) -> None:
     script = f"""
 import os, numpy as np
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
 from vislam.datasets.recorder import Recorder
 from vislam.imu import ImuNoise
-from vislam.messages import Frame, ImuSample
+from vislam.core.messages import Frame, ImuSample
 T = np.eye(4)
 rig = Rig((Camera({WIDTH}, {HEIGHT}, 50.0, 50.0, 31.0, 23.0),), (T,))
 recorder = Recorder(__import__("pathlib").Path({str(tmp_path / "r")!r}), rig, ImuNoise(1e-4, 1e-3, 1e-5, 1e-4, 200.0))

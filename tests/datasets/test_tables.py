@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vislam.core.errors import DataError
 from vislam.datasets.tables import (
     MAX_LINE_BYTES,
     Problems,
@@ -18,7 +19,6 @@ from vislam.datasets.tables import (
     read_names,
     read_numbers,
 )
-from vislam.errors import DataError
 
 
 def write(path: Path, data: bytes) -> Path:

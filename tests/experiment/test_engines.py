@@ -13,7 +13,7 @@ import psutil
 import pytest
 from tiny import write_plan
 
-from vislam.errors import UsageError
+from vislam.core.errors import UsageError
 from vislam.experiment.engines import run_locally, run_on_dask
 from vislam.experiment.isolated import run_isolated
 from vislam.experiment.jobs import expand

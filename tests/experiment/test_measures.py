@@ -11,11 +11,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.geometry import transform
+from vislam.core.messages import Frame, ImuSample, NavState
 from vislam.experiment.measures import nis_measures, output_measures
 from vislam.experiment.recordings import TimedRecording
-from vislam.geometry import transform
-from vislam.messages import Frame, ImuSample, NavState
 from vislam.trajectory import Trajectory, write_tum
 from vislam.trajectory.consistency import anees, chi_square_mean, nees, stated_scale_sigma
 
@@ -240,7 +240,7 @@ def test_time_per_frame_belongs_to_the_value_that_finished_it():
 
 def test_memory_is_that_of_this_process():
     code = (
-        "import numpy as np; from vislam.experiment.measures import peak_memory_mb; before = peak_memory_mb(); "
+        "import numpy as np; from vislam.core.cpu import peak_memory_mb; before = peak_memory_mb(); "
         "block = np.ones(2**25); print(peak_memory_mb() - before)"  # 256 MB, in a process that never had more
     )
     grown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout

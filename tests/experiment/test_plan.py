@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from vislam.errors import UsageError
+from vislam.core.errors import UsageError
 from vislam.experiment.identity import code_sha256, source_identity
 from vislam.experiment.jobs import JITTER, expand, unique, variants
 from vislam.experiment.plan import load_plan, plan_from_data
-from vislam.experiment.tables import runs_csv
+from vislam.experiment.report.exports import runs_csv
 from vislam.experiment.trials import estimates, trials
-from vislam.sources import is_world, open_source, recorded_path, split_source
+from vislam.run.sources import is_world, open_source, recorded_path, split_source
 
 FAILED = {"status": "failed", "reason": "lost", "run": {}, "outputs": {}}
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -10,8 +10,8 @@ from scipy.stats import wilcoxon
 
 from vislam.experiment.jobs import Job
 from vislam.experiment.plan import Estimator, Plan, Sequence
+from vislam.experiment.report.exports import latex, runs_csv, shown_spread, summary_csv
 from vislam.experiment.statistics import compare, groups, holm, spread
-from vislam.experiment.tables import latex, runs_csv, shown_spread, summary_csv
 from vislam.experiment.trials import BY_NAME, Trial
 
 

@@ -7,7 +7,7 @@ import sqlite3
 
 import pytest
 
-from vislam.errors import DataError, StorageError
+from vislam.core.errors import DataError, StorageError
 from vislam.experiment.store import ResultStore
 
 RESULT = {"status": "ok", "reason": "", "run": {"frames": 3}, "outputs": {}}

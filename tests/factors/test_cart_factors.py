@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 
 from vislam.config import GraphConfig, WindowConfig
+from vislam.core.geometry import se3_exp
+from vislam.core.messages import KeyframePacket
 from vislam.factors import motion
 from vislam.factors.keys import V, X
-from vislam.geometry import se3_exp
 from vislam.graph import PoseGraph
-from vislam.messages import KeyframePacket
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
-from graph_world import GRAVITY_M_S2, RIG, World, rmse_m
+from worlds.lap import RIG, World, rmse_m
+from worlds.parts import GRAVITY_M_S2
 
 EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)
 

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
-from graph_world import T_BODY_CAM0, World
 
 from vislam.config import GraphConfig
-from vislam.factors.gate import CarPark
+from vislam.core.geometry import invert, se3_adjoint, se3_exp
+from vislam.core.messages import LoopEdge
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
-from vislam.factors.travel import Travel
-from vislam.factors.witnesses import Witnesses, confirming, log_volume
-from vislam.geometry import invert, se3_adjoint, se3_exp
-from vislam.messages import LoopEdge
+from vislam.graph.belief.gate import PendingLoops
+from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
+from vislam.graph.travel import Travel
+from worlds.lap import T_BODY_CAM0, World
 
 
 @pytest.fixture
@@ -95,11 +95,11 @@ def test_travel_takes_better_variances_of_the_newest_motions() -> None:
 
 
 def test_full_park_gives_up_its_oldest(world: World) -> None:
-    park = CarPark(GraphConfig(parked_max=2))
+    pending = PendingLoops(GraphConfig(pending_max=2))
     models = [_model(world.false_loop(n, n, 100 + n)) for n in range(3)]
-    assert park.park(models[0]) is None
-    assert park.park(models[1]) is None
-    assert park.park(models[2]) is models[0]
-    assert park.edges == models[1:]
-    park.remove([models[1], models[0]])
-    assert park.edges == models[2:]
+    assert pending.add(models[0]) is None
+    assert pending.add(models[1]) is None
+    assert pending.add(models[2]) is models[0]
+    assert pending.edges == models[1:]
+    pending.remove([models[1], models[0]])
+    assert pending.edges == models[2:]

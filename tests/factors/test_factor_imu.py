@@ -3,12 +3,13 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from graph_world import EUROC_NOISE, GRAVITY_M_S2, World
 
 from vislam.config import GraphConfig
-from vislam.factors.imu import Preintegrator
+from vislam.core.messages import ImuSpan
+from vislam.factors.preintegration import Preintegrator
 from vislam.imu import ImuNoise
-from vislam.messages import ImuSpan
+from worlds.lap import EUROC_NOISE, World
+from worlds.parts import GRAVITY_M_S2
 
 SILENT = ImuNoise(1e-12, 1e-12, 1e-12, 1e-12, 200.0)
 NO_BIAS = gtsam.imuBias.ConstantBias()

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from vislam.config import GraphConfig
-from vislam.errors import DataError
+from vislam.core.errors import DataError
 from vislam.factors.journal import KeyframeRecord
-from vislam.factors.noise import cauchy, checked_covariance, conditioned, gaussian, huber, inflated, of_vision
+from vislam.factors.noise_models import cauchy, checked_covariance, conditioned, gaussian, huber, inflated, of_vision
 
 
 @pytest.mark.parametrize(

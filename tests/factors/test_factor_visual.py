@@ -4,14 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.factors.noise import gaussian
+from vislam.core.geometry import invert, se3_exp, tangent_basis, transform
+from vislam.factors.noise_models import gaussian
 from vislam.factors.visual import (
     direction_as_pose,
     direction_factor,
     direction_measurement,
     direction_residual,
 )
-from vislam.geometry import invert, se3_exp, tangent_basis, transform
 
 LEVER_M = np.array([0.08, 0.03, -0.02])
 SOFT_M = 0.005

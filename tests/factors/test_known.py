@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from vislam.config import GraphConfig
+from vislam.core.geometry import invert, se3_exp
 from vislam.factors.journal import LoopRecord
 from vislam.factors.keys import X
-from vislam.factors.known import Known, worth_a_factor
 from vislam.factors.loop import LoopModel, relative_covariance
-from vislam.factors.noise import gaussian
+from vislam.factors.noise_models import gaussian
 from vislam.factors.visual import pose_factor
-from vislam.geometry import invert, se3_exp
+from vislam.graph.belief.known import Known, worth_a_factor
 
 Array = NDArray[np.float64]
 COUNT = 30

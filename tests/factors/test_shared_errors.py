@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.memory import EdgeRecord, GravityRecord
 from vislam.factors.shared import SharedErrors
-from vislam.geometry import so3_exp, transform
-from vislam.memory import EdgeRecord, TiltRecord
 
 
 def drive(sigma: float, count: int = 50) -> tuple[SharedErrors, np.ndarray]:
@@ -47,7 +47,7 @@ def test_an_edge_that_replaces_another_takes_its_part_and_a_weak_link_has_none()
 def test_level_is_known_as_at_the_best_keyframe_and_turns_the_way() -> None:
     shared, poses = drive(0.0)
     for k, sigma_rad in ((10, 0.02), (20, 0.005), (30, 0.01)):
-        shared.level(TiltRecord(k, np.array([0.0, 0.0, 1.0]), sigma_rad))
+        shared.level(GravityRecord(k, np.array([0.0, 0.0, 1.0]), sigma_rad))
     effect = shared.effect([49], poses)
     turned = so3_exp(np.array([0.005, 0.0, 0.0])) @ poses[49, :3, 3] - poses[49, :3, 3]
     np.testing.assert_allclose(poses[49, :3, :3] @ effect[3:, 1], turned, atol=1e-3)

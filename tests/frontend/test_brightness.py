@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from test_frontends import motions, recording, run
 
 from vislam.config import FrontEndConfig
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Frame, ImageU8, Tracking
 from vislam.datasets import open_dataset
 from vislam.frontend import make_frontend
-from vislam.frontend.brightness import matched
-from vislam.geometry import invert, se3_log
-from vislam.messages import Frame, ImageU8, Tracking
+from vislam.vision.brightness import matched
 
 _STEPS = (1.0, 0.4, 1.6, 0.7)  # factors of exposure, one after the other
 _PLACES = np.stack(np.meshgrid(np.arange(20.0, 300.0, 15.0), np.arange(20.0, 220.0, 15.0)), axis=-1).reshape(-1, 2)

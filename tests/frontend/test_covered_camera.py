@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_frontends import motions, recording, run
 
-from vislam.geometry import invert, se3_log, transform_points
-from vislam.messages import Array, Frame, Tracking
+from vislam.core.geometry import invert, se3_log, transform_points
+from vislam.core.messages import Array, Frame, Tracking
 
 _COVERED = range(12, 40)
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from wall_world import World
 
 from vislam.config import FrontEndConfig
-from vislam.features import detect_corners
+from vislam.core.messages import Array, Frame
 from vislam.frontend.keyframes import Departure, keyframe_reason
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth, _triangulate
-from vislam.messages import Array, Frame
+from vislam.vision.features import detect_corners
+from worlds.corner import World
 
 CONFIG = FrontEndConfig()
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from vislam.config import FrontEndConfig
+from vislam.core.geometry import align_points, invert
+from vislam.core.messages import Array, Frame, Tracking
+from vislam.core.recording import Recording
 from vislam.datasets import open_dataset
 from vislam.frontend import make_frontend
-from vislam.geometry import align_points, invert
-from vislam.messages import Array, Frame, Tracking
-from vislam.recording import Recording
 
 pytestmark = pytest.mark.data
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from vislam.config import FrontEndConfig
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert, se3_log, so3_log
+from vislam.core.messages import Array, Frame, Observations, Tracking
 from vislam.frontend import TrackResult, make_frontend
-from vislam.frontend.epipolar import RotationPrior, direction_given_rotation, refine_two_view
 from vislam.frontend.intake import Intake
 from vislam.frontend.metric import MetricFrontEnd
 from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.stereo import StereoDepth
 from vislam.frontend.tracker import Tracker, given_rows
-from vislam.geometry import invert, se3_log, so3_log
-from vislam.messages import Array, Frame, Observations, Tracking
 from vislam.sim import PointRecording, open_points
+from vislam.vision.two_view import RotationPrior, direction_given_rotation, refine_two_view
 
 CONFIG = FrontEndConfig()
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vislam.frontend.epipolar import RotationPrior, direction_given_rotation, refine_two_view
-from vislam.geometry import so3_exp, so3_log
+from vislam.core.geometry import so3_exp, so3_log
+from vislam.vision.two_view import RotationPrior, direction_given_rotation, refine_two_view
 
 SEED = 5
 SIGMA = 0.3 / 450.0

@@ -6,22 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from inertial_world import (
-    EUROC_NOISE,
-    GRAVITY_M_S2,
-    NS,
-    T0_NS,
-    Motion,
-    RealMotion,
-    SimulatedVision,
-    state_error,
-)
 
 from vislam.config import ImuConfig, InitConfig
-from vislam.frontend.initialisation import Initialisation, Initialiser
-from vislam.geometry import invert, level_rotation, so3_exp, so3_log, transform
+from vislam.core.geometry import invert, level_rotation, so3_exp, so3_log, transform
+from vislam.core.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
+from vislam.frontend.start.initialisation import Initialisation, Initialiser
 from vislam.imu import ImuBuffer, ImuNoise
-from vislam.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
+from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, RealMotion, SimulatedVision, state_error
+from worlds.parts import GRAVITY_M_S2
 
 QUIET = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
 HONEST = InitConfig()

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from test_frontends import recording, run
 
-from vislam.camera import Camera
 from vislam.config import FrontEndConfig
+from vislam.core.camera import Camera
+from vislam.core.messages import Frame, Observations, no_observations
 from vislam.frontend import make_frontend
 from vislam.frontend.pixel_noise import NoiseUsed, PixelNoise
-from vislam.messages import Frame, Observations, no_observations
 from vislam.sim import open_points
 
 UNIT = Camera(100, 100, 1.0, 1.0, 50.0, 50.0)  # a pixel is as long as a distance on z = 1

@@ -8,15 +8,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-from floor_world import FRAME_NS, HEIGHT_M, Drive, FloorWorld, rig
 
-from vislam.camera import Rig
 from vislam.config import FrontEndConfig, PlanarConfig
-from vislam.errors import UsageError
+from vislam.core.camera import Rig
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Array, Frame, Tracking
 from vislam.frontend import TrackResult, make_frontend, mode_for
-from vislam.frontend.planar import PlanarFrontEnd
-from vislam.geometry import invert, se3_log
-from vislam.messages import Array, Frame, Tracking
+from vislam.frontend.planar.odometry import PlanarFrontEnd
+from worlds.floor import FRAME_NS, HEIGHT_M, Drive, FloorWorld, rig
 
 PLANAR = PlanarConfig(height_m=HEIGHT_M)
 CONFIG = FrontEndConfig(mode="planar", planar=PLANAR, described_features=300)

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from floor_world import rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.config import PlanarConfig
-from vislam.errors import UsageError
-from vislam.frontend.planar_fit import (
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_log, so3_exp, transform
+from vislam.core.messages import Array
+from vislam.frontend.planar.fit import (
     FloorPair,
     _equations,
     _turned,
+    _Views,
     camera_motion,
     floor_points,
     joint_fit,
     scale_sigma,
     split_fit,
 )
-from vislam.frontend.planar_floor import make_mount
-from vislam.geometry import invert, se3_log, so3_exp, transform
-from vislam.messages import Array
+from vislam.frontend.planar.floor import make_mount
+from worlds.floor import rig
 
 H = 0.6
 HEAVE_M = 0.002
@@ -84,7 +85,7 @@ def test_derivatives_are_those_of_the_residuals() -> None:
     def gradient(x: Array) -> tuple[Array, float]:
         A, g, squares = np.empty((8, 8)), np.empty(8), np.empty(len(points.rays))
         key, now = _turned(R0, x[3], x[4]), _turned(R0, x[3] + x[5], x[4] + x[6])
-        _equations(points.rays, points.seen, key, now, x[[0, 1, 2, 7]], H, PX, 1e6, A, g, squares)
+        _equations(_Views(points.rays, points.seen, H, PX, 1e6), key, now, x[[0, 1, 2, 7]], A, g, squares)
         return -2.0 * g, float(squares.sum())
 
     exact, _ = gradient(at)

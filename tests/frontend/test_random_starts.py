@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2
-from point_world import KINDS, Start, initialiser
 
 from vislam.config import ImuConfig, InitConfig
-from vislam.frontend.initialisation import Initialisation, Phase
+from vislam.core.messages import ImuSample
+from vislam.frontend.start.initialisation import Initialisation, Phase
 from vislam.imu import ImuBuffer
-from vislam.messages import ImuSample
+from worlds.parts import GRAVITY_M_S2
+from worlds.start import KINDS, Start, initialiser
 
 _STARTS = {"static": 4, "moving": 10, "gentle": 2, "rotation": 3, "uniform": 3, "accelerating": 3}
 

@@ -8,11 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from vislam.clock import StageClock
 from vislam.config import Config
-from vislam.front import Front, FrontStep
-from vislam.geometry import invert
-from vislam.messages import Frame
+from vislam.core.clock import StageClock
+from vislam.core.geometry import invert
+from vislam.core.messages import Frame
+from vislam.pipeline.front import Front
+from vislam.pipeline.steps import FrontStep
 from vislam.sim import PointRecording, open_points
 from vislam.trajectory import Trajectory
 

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vislam.camera import Camera
 from vislam.config import InitConfig
+from vislam.core.camera import Camera
+from vislam.core.geometry import so3_exp, transform, transform_points
+from vislam.core.messages import Array, Observations
 from vislam.frontend.stillness import Stillness
-from vislam.geometry import so3_exp, transform, transform_points
-from vislam.messages import Array, Observations
 
 CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0)
 FRAME_NS = 50_000_000

@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from inertial_world import NS, T0_NS
-from point_world import Start
 
 from vislam import open_dataset
-from vislam.clock import StageClock
 from vislam.config import ImuConfig, InitConfig, from_data
-from vislam.front import Front
+from vislam.core.clock import StageClock
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.messages import Frame, VoMeasurement
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.time_offset import TimeOffset
-from vislam.geometry import so3_exp, transform
 from vislam.imu import ImuBuffer
-from vislam.messages import Frame, VoMeasurement
+from vislam.pipeline.front import Front
+from worlds.motion import NS, T0_NS
+from worlds.start import Start
 
 
 def estimate(start: Start, config: InitConfig, motions: list[VoMeasurement] | None = None) -> TimeOffset:

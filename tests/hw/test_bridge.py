@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from vislam.config import BridgeClockConfig, SensorCalibration, SerialConfig
-from vislam.errors import HardwareError
-from vislam.hw import bridge_protocol as protocol
-from vislam.hw.bridge import SerialBridge, _why_not_open
+from vislam.core.errors import HardwareError
+from vislam.core.messages import ImuSample, MagSample
+from vislam.hw.bridge import protocol
+from vislam.hw.bridge.bridge import SerialBridge, why_not_open
 from vislam.hw.emulator import SensorError
 from vislam.hw.emulator import bridge as emulator
 from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults, at_rest
 from vislam.hw.health import Health
-from vislam.messages import ImuSample, MagSample
 
 EXACT = (SensorError(), SensorError(), SensorError())
 PERIOD_NS = 2_500_000
@@ -290,7 +290,7 @@ def test_a_file_is_no_port(config: SerialConfig) -> None:
 
 
 def test_a_port_without_permission_says_which_group(config: SerialConfig) -> None:
-    assert "dialout" in _why_not_open(config, OSError(errno.EACCES, "Permission denied"))
+    assert "dialout" in why_not_open(config, OSError(errno.EACCES, "Permission denied"))
 
 
 def test_without_pyserial_it_says_what_to_install(config: SerialConfig, monkeypatch: pytest.MonkeyPatch) -> None:

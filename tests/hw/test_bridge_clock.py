@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.config import BridgeClockConfig
-from vislam.hw.bridge_clock import DeviceClock
+from vislam.hw.bridge.clock import DeviceClock
 
 PERIOD_NS = 2_500_000
 HOST_BEGIN_NS = 5_000_000_000_000

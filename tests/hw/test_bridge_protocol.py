@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.hw import bridge_protocol as protocol
-from vislam.hw.bridge_protocol import Chips, FrameDecoder, Hello, OtherVersion, RawSample, Status, encode
+from vislam.hw.bridge import protocol
+from vislam.hw.bridge.protocol import Chips, FrameDecoder, Hello, OtherVersion, RawSample, Status, encode
 
 int16 = st.integers(-(2**15), 2**15 - 1)
 triples = st.tuples(int16, int16, int16)

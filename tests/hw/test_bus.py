@@ -4,12 +4,12 @@ import errno
 import sys
 
 import pytest
-from boards import driving
 
-from vislam.errors import HardwareError
-from vislam.hw.bus import MAX_READS, BusError, I2cBus, kernel_driver
+from vislam.core.errors import HardwareError
+from vislam.hw.chips.bus import MAX_READS, BusError, I2cBus, kernel_driver
 from vislam.hw.emulator import EmulatedBus, SteppedClock, emulated_bus, emulated_gy85
 from vislam.hw.emulator.chips import Chip
+from worlds.gy85 import driving
 
 
 class Memory(Chip):
@@ -17,7 +17,7 @@ class Memory(Chip):
 
 
 def memory_bus(**options: object) -> EmulatedBus:
-    chip = Memory()
+    chip = Memory(driving, lambda: 0)
     chip.registers[:] = bytes(range(256))
     return EmulatedBus({0x50: chip}, **options)  # type: ignore[arg-type]
 

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
-from boards import FIELD_UT, driving, still
 
-from vislam.errors import HardwareError
-from vislam.hw.adxl345 import Adxl345, self_test_limits_lsb
-from vislam.hw.bus import I2cBus, SettingsLostError
+from vislam.core.errors import HardwareError
+from vislam.hw.chips.adxl345 import Adxl345, self_test_limits_lsb
+from vislam.hw.chips.bus import I2cBus, SettingsLostError
+from vislam.hw.chips.hmc5883l import Hmc5883l
+from vislam.hw.chips.itg3205 import Itg3205
+from vislam.hw.chips.magnetometer import find_magnetometer
 from vislam.hw.emulator import (
     EmulatedBus,
     SensorError,
@@ -17,9 +19,7 @@ from vislam.hw.emulator import (
     VirtualQmc5883,
     emulated_bus,
 )
-from vislam.hw.hmc5883l import Hmc5883l
-from vislam.hw.itg3205 import Itg3205
-from vislam.hw.magnetometer import find_magnetometer
+from worlds.gy85 import FIELD_UT, driving, still
 
 ACCEL_DENSITY = (0.004, 0.004, 0.006)
 

@@ -10,11 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from boards import driving, still
 
 from vislam.cli import run_verb
 from vislam.hw.doctor import HardwareReport, Wanted, examine
 from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualAdxl345, emulated_bus, emulated_gy85
+from worlds.gy85 import driving, still
 
 
 def examined(bus: EmulatedBus, clock: SteppedClock, seconds: float = 2.0, **options: Any) -> HardwareReport:

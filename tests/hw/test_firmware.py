@@ -7,9 +7,9 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from needs import missing
 
-from vislam.hw.bridge_protocol import SAMPLE_WIRE_BYTES, Chips, FrameDecoder, Hello, RawSample, Status, encode
+from needs import missing
+from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Chips, FrameDecoder, Hello, RawSample, Status, encode
 
 SKETCH = Path(str(files("vislam.hw"))) / "firmware" / "vislam_bridge"
 FAKE = Path(__file__).parent / "fake_arduino"

@@ -2,20 +2,20 @@
 
 import numpy as np
 import pytest
-from boards import FIELD_UT, board, collect, driving, errors, still
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.config import Gy85Config, PowerUpConfig, SensorCalibration
-from vislam.errors import HardwareError, UsageError
+from vislam.core.errors import HardwareError, UsageError
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import ImuSample, ImuSpan
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.hw.timing import SampleClock
 from vislam.hw.track import SampleTrack
 from vislam.imu import NoiseFloor, PowerUp, Refusal, power_up
-from vislam.imu.noise import ImuNoise
-from vislam.messages import ImuSample, ImuSpan
+from worlds.gy85 import FIELD_UT, board, collect, driving, errors, still
 
 
 @pytest.mark.parametrize("rate_error", [-0.02, 0.0, 0.02])

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from boards import FIELD_UT, board, collect, driving, errors, still
 
 from vislam.config import Gy85Config
 from vislam.hw.health import Health
+from worlds.gy85 import FIELD_UT, board, collect, driving, errors, still
 
 IMU = Health.IMU_MISSING | Health.IMU_GAP | Health.ACCEL_FAULT | Health.GYRO_FAULT | Health.BUS_FAULT
 

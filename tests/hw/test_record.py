@@ -18,13 +18,13 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import BridgeClockConfig, Gy85Config, RecordConfig, SensorCalibration, SensorsConfig, SerialConfig
+from vislam.core.errors import HardwareError, StorageError, UsageError
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import Recorder
-from vislam.errors import HardwareError, StorageError, UsageError
 from vislam.hw.emulator import emulated_bus, emulated_gy85
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
-from vislam.messages import Frame, ImuSample, MagSample
-from vislam.record import Recorded, record
+from vislam.run.record import Recorded, record
 
 LONG_S = 60.0  # how long a test waits for what must come; never how long it takes
 WIDTH, HEIGHT = 320, 240

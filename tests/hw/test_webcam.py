@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from vislam.config import WebcamConfig
-from vislam.errors import HardwareError
+from vislam.core.errors import HardwareError
+from vislam.hw.cameras.mailbox import Mailbox
+from vislam.hw.cameras.video import VideoCamera
+from vislam.hw.cameras.webcam import Webcam, _Stamper
 from vislam.hw.health import Health
-from vislam.hw.mailbox import Mailbox
 from vislam.hw.source import CapturedImage
-from vislam.hw.video_camera import VideoCamera
-from vislam.hw.webcam import Webcam, _Stamper
 
 LONG_S = 30.0  # how long a test waits for what must come; never how long it takes
 AGE_NS = 20_000_000

@@ -11,19 +11,20 @@ from multiprocessing import Pipe
 
 import numpy as np
 import pytest
-from inertial_world import GRAVITY_M_S2, T0_NS
-from vision_world import CART_IMU, CONFIG, VisionWorld
 
 from vislam.config import Config
+from vislam.core.geometry import invert, se3_exp, so3_log, transform
+from vislam.core.messages import ImuSample
 from vislam.ekf import Correction, Ekf, Hint
 from vislam.frontend.result import lost_motion
-from vislam.geometry import invert, se3_exp, so3_log, transform
 from vislam.hw.health import Health
 from vislam.live.fast import FastPath
-from vislam.live.fast_process import Messages
-from vislam.live.messages import CameraHealth, Doubted, MapMoved, ToFast
-from vislam.live.published_pose import PublishedPose
-from vislam.messages import ImuSample
+from vislam.live.notices import CameraHealth, Doubted, MapMoved, ToFast
+from vislam.live.processes.fast import Messages
+from vislam.live.wire.published_pose import PublishedPose
+from worlds.corrections import CART_IMU, CONFIG, VisionWorld
+from worlds.motion import T0_NS
+from worlds.parts import GRAVITY_M_S2
 
 _WELL = lambda: Health(0)  # noqa: E731
 _LATE_NS = 90_000_000
@@ -250,7 +251,7 @@ def test_messages_are_taken_one_at_a_time_until_their_sender_ends() -> None:
 
 def test_the_fast_process_loads_no_heavy_package() -> None:
     code = (
-        "import vislam.live.fast_process, sys; "
+        "import vislam.live.processes.fast, sys; "
         "print([m for m in ('gtsam', 'open3d', 'cv2', 'rerun', 'matplotlib') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -18,13 +18,14 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import Config, SensorsConfig, load
-from vislam.errors import DataError, HardwareError, UsageError
+from vislam.core.errors import DataError, HardwareError, UsageError
+from vislam.core.files import write_json
 from vislam.hw.health import Health
 from vislam.live.beginning import in_map, resumed
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
-from vislam.runfolder import MapChoice, prepare, write_json
-from vislam.session import Session
+from vislam.run.folder import MapChoice, prepare
+from vislam.run.session import Session
 from vislam.trajectory import read_tum
 
 WORLD = "points:corridor-loop,camera_hz=10,tracks=150"

@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vision_world import CART_IMU, VisionWorld
 
-from tests.hw.boards import board
 from vislam.config import Config, Gy85Config, SensorsConfig, load
-from vislam.errors import DataError, TrackingLostError
+from vislam.core.errors import DataError, TrackingLostError
 from vislam.hw.emulator import EmulatedBus, SteppedClock, Truth
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory
 from vislam.live.fast import FastPath
-from vislam.live.fast_process import power_up
-from vislam.live.published_pose import PublishedPose, pack, unpack
+from vislam.live.processes.fast import power_up
 from vislam.live.run_live import LiveRun
-from vislam.live.sensors import open_live
-from vislam.runfolder import prepare
+from vislam.live.sources import open_live
+from vislam.live.wire.published_pose import PublishedPose, pack, unpack
+from vislam.run.folder import prepare
+from worlds.corrections import CART_IMU, VisionWorld
+from worlds.gy85 import board
 
 RATE_HZ = 200.0
 CONFIG = Config()

@@ -14,16 +14,17 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.live.test_published_pose import random_pose
 from tests.needs import missing
 from vislam.config import LiveConfig
-from vislam.errors import UsageError
-from vislam.geometry import roll_pitch_yaw_rad, rotation_from_quaternion_xyzw, transform
+from vislam.core.errors import UsageError
+from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.hw.health import Health
-from vislam.live import bridge
-from vislam.live.child import Flag, Signals, guarded
-from vislam.live.publisher import PosePublisher
+from vislam.live.bridges import translator
+from vislam.live.processes.child import Flag, Signals, guarded
+from vislam.live.wire.publisher import PosePublisher
 
 _DOMAIN = 100 + os.getpid() % 100  # not the domain of whatever else runs here
 _TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # 90 degrees to the left
@@ -65,7 +66,7 @@ def known_pose(**changes: object):
 
 @needs_dds
 def test_odometry_is_in_ros_frames_units_and_order() -> None:
-    from vislam.live.ros2 import odometry
+    from vislam.live.bridges.ros2 import odometry
 
     pose = known_pose()
     message = odometry(pose, 1_700_000_000_250_000_000)
@@ -87,7 +88,7 @@ def test_odometry_is_in_ros_frames_units_and_order() -> None:
 
 @needs_dds
 def test_tf_says_where_odom_is_in_map_and_base_in_odom() -> None:
-    from vislam.live.ros2 import transforms
+    from vislam.live.bridges.ros2 import transforms
 
     pose = known_pose()
     links = transforms(pose, 1).transforms
@@ -123,7 +124,7 @@ class Bridge:
 
     def __init__(self, live: LiveConfig, role: str) -> None:
         context = get_context("spawn")
-        self.at, body = bridge.asked(live)[role]
+        self.at, body = translator.asked(live)[role]
         self._signals = Signals(Flag(), Flag())
         self.report, says = context.Pipe(duplex=False)
         self._process = context.Process(target=guarded, args=(role, says, self._signals, body))
@@ -143,7 +144,7 @@ def test_a_ros_reader_gets_the_pose_from_the_process_beside() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live import ros2
+    from vislam.live.bridges import ros2
 
     name = f"vislam-test-{uuid.uuid4().hex[:8]}"
     translator = Bridge(LiveConfig(name=name, ros2_domain=_DOMAIN, bridge_rate_hz=1000.0), "ros2")
@@ -181,7 +182,7 @@ def test_ros_hears_nothing_of_a_pose_not_to_steer_by(changes: dict) -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live import ros2
+    from vislam.live.bridges import ros2
 
     wire = ros2.Ros2(_DOMAIN + 30)
     try:
@@ -199,7 +200,7 @@ def test_ros_hears_the_health_word_of_every_pose() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live import ros2
+    from vislam.live.bridges import ros2
 
     wire = ros2.Ros2(_DOMAIN + 31)
     words = [Health.LEVELLED | Health.INVALID, Health.LEVELLED | Health.VISION_OK | Health.DOUBTFUL]
@@ -217,7 +218,7 @@ def test_ros_hears_the_health_word_of_every_pose() -> None:
 def test_mavlink_odometry_is_in_forward_right_down() -> None:
     from pymavlink.dialects.v20 import common
 
-    from vislam.live.mavlink import odometry
+    from vislam.live.bridges.mavlink import odometry
 
     link = common.MAVLink(None, 1, 197)
     message = common.MAVLink(None).parse_char(odometry(known_pose()).pack(link))
@@ -244,19 +245,18 @@ def test_mavlink_odometry_is_in_forward_right_down() -> None:
 
 @needs_mavlink
 def test_roll_keeps_its_sign_and_pitch_turns_over() -> None:
-    from vislam.live.mavlink import odometry
+    from vislam.live.bridges.mavlink import odometry
 
     rolled = transform(rotation_from_quaternion_xyzw(np.array([math.sin(0.1), 0.0, 0.0, math.cos(0.1)])), np.zeros(3))
     pitched = transform(rotation_from_quaternion_xyzw(np.array([0.0, math.sin(0.1), 0.0, math.cos(0.1)])), np.zeros(3))
     for T, expected in ((rolled, [0.2, 0.0, 0.0]), (pitched, [0.0, -0.2, 0.0])):
         w, x, y, z = odometry(known_pose(T_odom_base=T)).q
-        R = rotation_from_quaternion_xyzw(np.array([x, y, z, w]))
-        np.testing.assert_allclose(roll_pitch_yaw_rad(R), expected, atol=1e-12)
+        np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_euler("xyz"), expected, atol=1e-12)
 
 
 @needs_mavlink
 def test_what_is_unknown_is_nan_and_quality_follows_the_health() -> None:
-    from vislam.live.mavlink import odometry, quality
+    from vislam.live.bridges.mavlink import odometry, quality
 
     message = odometry(known_pose(health=Health.INVALID, **_NO_STATE))
     assert np.isnan(message.pose_covariance[0])
@@ -299,7 +299,7 @@ def test_an_autopilot_gets_the_pose_from_the_process_beside() -> None:
 
 
 def test_poses_beyond_the_rate_are_left_out() -> None:
-    from vislam.live.child import Life
+    from vislam.live.processes.child import Life
 
     sent: list[int] = []
 
@@ -330,13 +330,13 @@ def test_poses_beyond_the_rate_are_left_out() -> None:
     signals.go.set()
     _, says = context.Pipe(duplex=False)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bridge, "PoseListener", Poses)
-        bridge.run(Life("kept", says, signals), "unix:never", 50.0, Kept)
+        patch.setattr(translator, "PoseListener", Poses)
+        translator.run(Life("kept", says, signals), "unix:never", 50.0, Kept)
     assert sent == [*range(1, 401, 8), -1, -2]
 
 
 def test_nothing_is_started_unasked() -> None:
-    assert bridge.asked(LiveConfig()) == {}
+    assert translator.asked(LiveConfig()) == {}
 
 
 @needs_dds
@@ -353,7 +353,7 @@ def test_nothing_is_started_unasked() -> None:
 )
 def test_what_cannot_be_is_refused_before_anything_starts(live: LiveConfig, says: str) -> None:
     with pytest.raises(UsageError, match=says):
-        bridge.asked(live)
+        translator.asked(live)
 
 
 @pytest.mark.parametrize(
@@ -362,14 +362,14 @@ def test_what_cannot_be_is_refused_before_anything_starts(live: LiveConfig, says
 def test_a_missing_package_is_named_with_what_installs_it(
     live: LiveConfig, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridge, "find_spec", lambda package: None)
+    monkeypatch.setattr(translator, "find_spec", lambda package: None)
     with pytest.raises(UsageError, match=rf"pip install 'vislam\[{extra}\]'"):
-        bridge.asked(live)
+        translator.asked(live)
 
 
 def test_neither_package_is_loaded_beside_the_pose() -> None:
     code = (
-        "import sys, vislam.cli, vislam.live.run_live, vislam.live.fast_process; "
+        "import sys, vislam.cli, vislam.live.run_live, vislam.live.processes.fast; "
         "print(sorted({name.partition('.')[0] for name in sys.modules} & {'cyclonedds', 'pymavlink'}))"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

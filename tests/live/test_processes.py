@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
-from needs import missing
 
+from needs import missing
 from vislam.config import Config, load
-from vislam.errors import HardwareError, TrackingLostError, UsageError, VislamError
+from vislam.core.errors import HardwareError, TrackingLostError, UsageError, VislamError
+from vislam.core.log import log_to
+from vislam.hw.chips import BusError
 from vislam.hw.health import Health
+from vislam.hw.source import InertialSource
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
-from vislam.runfolder import prepare
-from vislam.session import Session
+from vislam.run.folder import prepare
+from vislam.run.session import Session
 
 _WORLD = "points:laps,rig=rgbd,camera_hz=10,duration_s=12"
 _FILES = {
@@ -85,6 +90,9 @@ def test_no_sample_is_lost_on_the_way_to_vision(finished) -> None:
     _, metrics, told = finished
     assert metrics["counters"]["imu"]["samples"] == metrics["live"]["counters"]["sensor_samples"] > 500
     assert metrics["live"]["latency_ms"]["count"] == metrics["live"]["counters"]["samples"]
+    assert set(metrics["cost"]["processes"]) == {"fast", "front", "back", "map"}
+    assert metrics["cost"]["cpu_s"] == pytest.approx(sum(c["cpu_s"] for c in metrics["cost"]["processes"].values()))
+    assert metrics["cost"]["stages_cpu_ms_per_frame"]["other"] > 0.0
     assert metrics["counters"]["imu"]["gaps"] == 0
     health = Health(told[-1]["status"]["health"])
     assert Health.LEVELLED in health
@@ -171,6 +179,37 @@ def test_what_a_process_raises_comes_home_whole(tmp_path: Path) -> None:
         live.execute(duration_s=20.0)
     assert "in the front process" in "".join(caught.value.__notes__)
     assert left_behind("mono") == []
+
+
+def no_board() -> InertialSource:
+    raise BusError("/dev/i2c-7: it cannot be opened", OSError(errno.ENOENT, "No such file or directory"))
+
+
+class Boardless(ReplaySource):
+    """A cart whose board does not answer, which shows when it is opened."""
+
+    def inertial(self) -> Callable[[], InertialSource]:
+        return no_board
+
+
+def test_a_sensor_that_is_missing_ends_the_run_before_it_began_and_the_next_try_is_not_refused(tmp_path: Path) -> None:
+    out = tmp_path / "boardless"
+    prepare(out, overwrite=False)
+    live = LiveRun(Boardless(_WORLD), settings("boardless"), out, _WORLD, ["vislam", "live"])
+    with log_to(out, ["vislam", "live"]), pytest.raises(BusError, match="it cannot be opened") as caught:
+        live.execute()
+    assert caught.value.exit_code == HardwareError.exit_code and caught.value.kind == "gone"
+    assert not live.is_going
+    assert left_behind("boardless") == []
+    prepare(out, overwrite=False)
+
+
+def test_an_interrupt_before_the_sensors_are_read_ends_it_at_once(tmp_path: Path) -> None:
+    live, _ = start(tmp_path, "early")
+    with pytest.raises(KeyboardInterrupt):
+        live.execute(lambda run: os.kill(os.getpid(), signal.SIGTERM))
+    assert not live.is_going
+    assert left_behind("early") == []
 
 
 def test_a_setting_for_recordings_is_refused(tmp_path: Path) -> None:

@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.errors import DataError, UsageError
-from vislam.geometry import se3_exp, so3_exp, so3_log, transform
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import se3_exp, so3_exp, so3_log, transform
+from vislam.core.messages import NavState
 from vislam.hw.health import Health
-from vislam.live.published_pose import HEADER, LAYOUT, SIZE, PublishedPose, of_base, pack, unpack
-from vislam.live.publisher import PoseListener, PosePublisher, PoseReader
-from vislam.live.slot import SlotReader, SlotWriter
-from vislam.messages import NavState
+from vislam.live.wire.published_pose import HEADER, LAYOUT, SIZE, PublishedPose, of_base, pack, unpack
+from vislam.live.wire.publisher import PoseListener, PosePublisher, PoseReader
+from vislam.live.wire.slot import SlotReader, SlotWriter
 
 
 def random_pose(seed: int = 3, **changes: object) -> PublishedPose:

@@ -6,7 +6,7 @@ from vislam.config import load
 from vislam.live import rehearsal
 from vislam.live.virtual.cart import NOISE
 from vislam.live.virtual.place import PlaceOptions, virtual_rig
-from vislam.loop import database
+from vislam.loop.words import database
 from vislam.slam import Slam
 
 PLANAR = {"frontend.mode": "planar", "frontend.planar.height_m": 0.6}

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 
 from vislam.config import Config, SensorsConfig, load
-from vislam.errors import DataError, UsageError, VislamError
+from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
 from vislam.live.run_live import LiveRun
-from vislam.live.sensors import open_live
-from vislam.live.slot import SlotWriter
+from vislam.live.sources import open_live
 from vislam.live.status import status_line
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.imu import _truth
 from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
 from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
 from vislam.live.virtual.place import course
-from vislam.runfolder import prepare
-from vislam.session import Session
+from vislam.live.wire.slot import SlotWriter
+from vislam.run.folder import prepare
+from vislam.run.session import Session
 
 
 def test_a_segment_is_the_exact_integral_of_its_accelerations() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 _CODE = """
 import numpy as np
-from vislam.ekf import kernels
+from vislam.ekf.loose import kernels
 rng = np.random.default_rng(4)
 x = np.zeros(23)
 x[6] = x[19] = 1.0

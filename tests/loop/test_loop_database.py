@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import vislam.loop.database as database_module
+import vislam.loop.words.database as database_module
 from vislam.config import LoopConfig
-from vislam.errors import DataError
-from vislam.loop.database import PlaceDatabase, seed_vocabulary
+from vislam.core.errors import DataError
 from vislam.loop.view import View
-from vislam.loop.vocabulary import train
+from vislam.loop.words.database import PlaceDatabase, seed_vocabulary
+from vislam.loop.words.vocabulary import train
 
 CONFIG = LoopConfig()
 NOTHING = np.empty(0, dtype=np.int64)

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_world import LandmarkWorld, body_pose, lap_poses, make_rig, room
 
 from vislam.config import LoopConfig
-from vislam.geometry import invert, se3_exp, se3_log
+from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
 from vislam.loop.detector import LoopDetector
-from vislam.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
+from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, make_rig, room
 
 PER_LAP = 40
 CONFIG = replace(LoopConfig(), appearance_skip_keyframes=12, appearance_skip_s=1.0)

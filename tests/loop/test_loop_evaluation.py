@@ -11,11 +11,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from landmark_world import LandmarkWorld, lap_poses, room
 
 from vislam.config import LoopConfig, LoopTruthConfig
-from vislam.errors import DataError
-from vislam.geometry import interpolate, invert, se3_exp
+from vislam.core.errors import DataError
+from vislam.core.geometry import interpolate, invert, se3_exp
+from vislam.core.memory import GraphNews, KeyframeEntry
+from vislam.core.messages import (
+    GraphUpdate,
+    KeyframePacket,
+    LoopDecision,
+    Observations,
+    RetrievedKeyframe,
+    Tracking,
+    VoMeasurement,
+)
 from vislam.loop.detector import LoopDetector
 from vislam.loop.evaluation import (
     DOUBTFUL,
@@ -27,19 +36,10 @@ from vislam.loop.evaluation import (
     true_places,
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
-from vislam.memory import GraphNews, KeyframeEntry
-from vislam.messages import (
-    GraphUpdate,
-    KeyframePacket,
-    LoopDecision,
-    Observations,
-    RetrievedKeyframe,
-    Tracking,
-    VoMeasurement,
-)
-from vislam.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
-from vislam.session import SessionWriter
+from vislam.run.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
+from vislam.run.session import SessionWriter
 from vislam.trajectory import Trajectory, read_tum, write_tum
+from worlds.landmarks import LandmarkWorld, lap_poses, room
 
 PER_LAP = 30
 RULE = replace(LoopTruthConfig(), min_apart_s=3.0, min_apart_keyframes=20)  # keyframes come every 0.2 s here

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.loop.index import InvertedIndex
-from vislam.loop.vocabulary import BagOfWords
+from vislam.loop.words.index import InvertedIndex
+from vislam.loop.words.vocabulary import BagOfWords
 
 WORDS = 40
 IDF = np.random.default_rng(0).uniform(0.01, 5.0, WORDS)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from vislam.errors import UsageError
-from vislam.geometry import invert, se3_exp, se3_log
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.messages import LoopEdge
 from vislam.loop.injection import FIRST_ID, FalseLoops, as_candidate
-from vislam.messages import LoopEdge
 
 COUNT = 300
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from landmark_world import make_rig
 
 from vislam.config import LoopConfig
-from vislam.geometry import se3_exp, transform_points
-from vislam.loop.likeness import compare, rigid_count
-from vislam.loop.verifier import Verifier
+from vislam.core.geometry import se3_exp, transform_points
+from vislam.core.messages import Array
+from vislam.loop.verification.likeness import compare, rigid_count
+from vislam.loop.verification.verifier import Verifier
 from vislam.loop.view import View
-from vislam.messages import Array
+from worlds.landmarks import make_rig
 
 CONFIG = LoopConfig()
 PX = 1.0 / 500.0

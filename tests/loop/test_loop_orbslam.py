@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.cli import run_verb
-from vislam.errors import DataError
-from vislam.loop.index import InvertedIndex
-from vislam.loop.orbslam import read_orbslam
-from vislam.loop.vocabulary import Vocabulary
+from vislam.core.errors import DataError
+from vislam.loop.words.index import InvertedIndex
+from vislam.loop.words.orbslam import read_orbslam
+from vislam.loop.words.vocabulary import Vocabulary
 
 BRANCHING, DEPTH = 5, 3
 
@@ -124,7 +124,7 @@ def test_weights_and_scores_are_dbow2s(tmp_path_factory: pytest.TempPathFactory,
 
 
 def test_training_weighs_words_as_dbow2() -> None:
-    from vislam.loop.vocabulary import train
+    from vislam.loop.words.vocabulary import train
 
     text = make_text(3)
     images = [image_near(text, i) for i in range(8)]

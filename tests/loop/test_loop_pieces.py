@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_world import LandmarkWorld, body_pose, lap_poses, room
 
 from vislam.config import LoopConfig
-from vislam.geometry import invert, se3_log
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge, Submaps
 from vislam.loop.detector import LoopDetector
-from vislam.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge, Pieces
+from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, room
 
 PER_LAP = 40
 LOST = PER_LAP + 6  # the keyframe after the loss, of the second lap
@@ -34,12 +34,12 @@ def go_on(
     detector: LoopDetector, keyframes: list[Keyframe], estimates: list[Array]
 ) -> list[tuple[list[LoopEdge], list[LoopCandidate]]]:
     return [
-        detector.detect(keyframe, pose, begins_piece=n == 0)
+        detector.detect(keyframe, pose, begins_submap=n == 0)
         for n, (keyframe, pose) in enumerate(zip(keyframes, estimates, strict=True))
     ]
 
 
-def test_a_new_piece_offers_what_looks_alike_from_its_first_keyframe_on(
+def test_a_new_submap_offers_what_looks_alike_from_its_first_keyframe_on(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
     world, poses, keyframes = laps
@@ -60,7 +60,7 @@ def test_poses_count_again_once_the_graph_has_joined(
     detector = begin(world, keyframes, poses, replace(CONFIG, island_gap=0))  # odometry's are not left out for others
     go_on(detector, keyframes[LOST : LOST + 2], [AWAY @ pose for pose in poses[LOST : LOST + 2]])
     ids = np.arange(LOST + 2)
-    detector.move(GraphUpdate(1, ids, np.stack(poses[: LOST + 2]), np.eye(4), None, pieces=Pieces((0, LOST), (0, 0))))
+    detector.move(GraphUpdate(1, ids, np.stack(poses[: LOST + 2]), np.eye(4), None, submaps=Submaps((0, LOST), (0, 0))))
     edges, candidates = detector.detect(keyframes[LOST + 2], poses[LOST + 2])
     assert edges
     assert "odometry" in {c.source for c in candidates if c.decision is LoopDecision.ACCEPTED}

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from vislam.config import FrontEndConfig, LoopConfig
+from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.messages import Array, Frame, Keyframe, LoopDecision
 from vislam.datasets import open_dataset
 from vislam.frontend import make_frontend
-from vislam.geometry import invert, se3_exp, se3_log
 from vislam.loop.detector import LoopDetector
-from vislam.messages import Array, Frame, Keyframe, LoopDecision
 
 EVERY = 6  # frames from keyframe to keyframe
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from landmark_world import body_pose, make_rig
 
 from vislam.config import LoopConfig
-from vislam.geometry import invert, se3_exp, transform_points
+from vislam.core.geometry import invert, se3_exp, transform_points
+from vislam.core.messages import Array, LoopDecision
 from vislam.loop.candidates import AppearanceCandidates, islands, odometry_candidates, view_bounds
-from vislam.loop.checks import judge, tilt_error_rad
-from vislam.loop.likeness import Likeness
 from vislam.loop.pose_table import PoseTable
-from vislam.loop.verifier import Verification
-from vislam.messages import Array, LoopDecision
+from vislam.loop.verification.checks import judge, tilt_error_rad
+from vislam.loop.verification.likeness import Likeness
+from vislam.loop.verification.verifier import Verification
+from worlds.landmarks import body_pose, make_rig
 
 CONFIG = LoopConfig()
 GOOD = Verification(

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.loop.landmark_world import body_pose, make_rig
 from vislam.config import load
-from vislam.features import find_tags
-from vislam.geometry import invert, se3_log
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Frame, Keyframe
 from vislam.loop.detector import LoopDetector
 from vislam.loop.tags import TagBook, sight_tags
-from vislam.messages import Frame, Keyframe
+from vislam.vision.features import find_tags
+from worlds.landmarks import body_pose, make_rig
 
 SEED = 5
 SIZE_M = 0.2

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_world import LandmarkWorld, body_pose, room
 from scipy.stats import chi2
 
 from vislam.config import LoopConfig
-from vislam.errors import DataError
-from vislam.geometry import invert, se3_exp, se3_log
-from vislam.loop.relative_pose import Matched, errors, refine
-from vislam.loop.verifier import Verifier
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.messages import Array
+from vislam.loop.verification.relative_pose import Matched, errors, refine
+from vislam.loop.verification.verifier import Verifier
 from vislam.loop.view import View, make_view
-from vislam.messages import Array
+from worlds.landmarks import LandmarkWorld, body_pose, room
 
 PAIRS = 40
 BARE = replace(LoopConfig(), covariance_inflation=1.0, sigma_floor_m=0.0, sigma_floor_deg=0.0)

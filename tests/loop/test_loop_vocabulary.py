@@ -9,8 +9,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from vislam.errors import DataError, StorageError
-from vislam.loop.vocabulary import BagOfWords, Vocabulary, train
+from vislam.core.errors import DataError, StorageError
+from vislam.loop.words.vocabulary import BagOfWords, Vocabulary, train
 
 
 def some_images(seed: int, images: int = 12, per_image: int = 150, sources: int = 600) -> list[np.ndarray]:

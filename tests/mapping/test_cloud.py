@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from needs import missing
 
-from vislam.errors import DataError, StorageError
+from needs import missing
+from vislam.core.errors import DataError, StorageError
 from vislam.mapping._open3d import load_open3d
-from vislam.mapping.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
-from vislam.mapping.ply import read_ply, write_ply
+from vislam.mapping.cloud.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
+from vislam.mapping.formats.ply import read_ply, write_ply
 
 
 def random_cloud(count, seed=0, reach=1.0):
@@ -148,7 +148,7 @@ def test_a_full_disk_is_a_storage_error_and_leaves_the_old_file(tmp_path, monkey
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("vislam.mapping.files.os.fsync", full)
+    monkeypatch.setattr("vislam.core.files.os.fsync", full)
     with pytest.raises(StorageError, match="No space left"):
         write_ply(path, first.points_m[:5], first.colors[:5])
     assert path.read_bytes() == before

@@ -3,16 +3,16 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from box_world import CAMERA, CONFIG, RIG, T_BODY_CAM0, depth_image, pose
 
-from vislam.camera import Camera, Rig
 from vislam.config import MapConfig
-from vislam.errors import DataError
-from vislam.geometry import so3_exp, transform, transform_points
-from vislam.mapping.depth import filter_depth, rgbd_view, scan_points, surface_points
-from vislam.mapping.stereo import DenseStereo
-from vislam.mapping.store import KeyframeStore, Scan
-from vislam.memory import PackedScan
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError
+from vislam.core.geometry import so3_exp, transform, transform_points
+from vislam.core.memory import PackedScan
+from vislam.mapping.cloud.store import KeyframeStore, Scan
+from vislam.mapping.depth.image import filter_depth, rgbd_view, scan_points, surface_points
+from vislam.mapping.depth.stereo import DenseStereo
+from worlds.box import CAMERA, CONFIG, RIG, T_BODY_CAM0, depth_image, pose
 
 VIEW = rgbd_view(RIG, CONFIG)
 FLAT = np.full((120, 160), 2.0, np.float32)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from vislam.config import DriveConfig, MapConfig
-from vislam.errors import DataError
-from vislam.mapping.drive import Drive, DriveMap
-from vislam.mapping.occupancy import OccupancyMap
+from vislam.core.errors import DataError
+from vislam.mapping.drive.drive import Drive, DriveMap
+from vislam.mapping.octree.occupancy import OccupancyMap
 
 CELL = 0.1
 DRIVE = DriveConfig(body_length_m=0.6, body_width_m=0.4, max_step_m=0.1, max_slope_deg=15.0, slope_window_m=1.0)

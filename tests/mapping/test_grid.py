@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import yaml
 
-from vislam.mapping.grid import floor_height_m, navigation_grid, write_grid
-from vislam.mapping.occupancy import OccupancyMap
+from vislam.mapping.drive.grid import floor_height_m, navigation_grid, write_grid
+from vislam.mapping.octree.occupancy import OccupancyMap
 
 
 def room():
@@ -66,7 +68,7 @@ def test_large_leaves_fill_all_their_cells():
     octree = room().octree()
     assert octree.levels.max() >= 1  # pruned
     grid = navigation_grid(octree, 0.2, 0.1, 1.5)
-    free = octree.free_voxels()
+    free = replace(octree, log_odds=-octree.log_odds).occupied_voxels()
     z = (free[:, 2] + 0.5) * 0.1
     band = free[(z >= 0.3) & (z <= 1.7)]
     rows, columns = (band[:, 1] - round(grid.origin_m[1] / 0.1)), (band[:, 0] - round(grid.origin_m[0] / 0.1))

@@ -5,21 +5,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from box_world import CONFIG, RIG, keyframe, pose
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from needs import missing
 
-from vislam.errors import DataError
+from needs import missing
+from vislam.core.errors import DataError
 from vislam.mapping import _open3d
 from vislam.mapping._open3d import load_open3d
-from vislam.mapping.map_pictures import write_pictures
+from vislam.mapping.cloud.mesh import Mesh
+from vislam.mapping.formats.mesh_files import write_glb, write_obj
+from vislam.mapping.formats.pcd import read_pcd, write_pcd
+from vislam.mapping.formats.ply import read_ply, read_ply_mesh, write_ply
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.mesh import Mesh
-from vislam.mapping.mesh_files import write_glb, write_obj
-from vislam.mapping.octomap_io import read_octree
-from vislam.mapping.pcd import read_pcd, write_pcd
-from vislam.mapping.ply import read_ply, read_ply_mesh, write_ply
+from vislam.mapping.octree.octomap_io import read_octree
+from vislam.mapping.pictures.of_map import write_pictures
+from worlds.box import CONFIG, RIG, keyframe, pose
 
 
 def some_points(count, seed=0):

@@ -5,20 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from box_world import CAMERA, CONFIG, RIG, ROOM_HIGH, ROOM_LOW, T_BODY_CAM0, depth_image, keyframe, pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needs import missing
 
-from vislam.camera import Rig
-from vislam.errors import DataError, StorageError
-from vislam.geometry import se3_exp, transform
+from needs import missing
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, StorageError
+from vislam.core.geometry import se3_exp, transform
+from vislam.core.messages import Frame, GraphUpdate, Keyframe, Submaps
 from vislam.mapping import _open3d
+from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.occupancy import Occupancy
-from vislam.mapping.octomap_io import encode_ot, read_octree
-from vislam.mapping.ply import read_ply
-from vislam.messages import Frame, GraphUpdate, Keyframe, Pieces
+from vislam.mapping.octree.occupancy import Occupancy
+from vislam.mapping.octree.octomap_io import encode_ot, read_octree
+from worlds.box import CAMERA, CONFIG, RIG, ROOM_HIGH, ROOM_LOW, T_BODY_CAM0, depth_image, keyframe, pose
 
 
 def mapper_at(poses, config=CONFIG):
@@ -72,63 +72,63 @@ def test_a_corrected_map_is_the_map_made_from_scratch_at_the_final_poses():
     assert mapper.cloud().points_m.tobytes() == fresh.cloud().points_m.tobytes()
 
 
-APART = Pieces((0, 6), (0, 1))
+APART = Submaps((0, 6), (0, 1))
 JOINED = replace(APART, groups=(0, 0))
 ELSEWHERE = [transform(np.eye(3), np.array([1.0, 0.7, 0.3])) @ T for T in TRUE]  # as dead reckoning has it
 
 
-def mapper_with_a_piece_apart(config=CONFIG):
+def mapper_with_a_submap_apart(config=CONFIG):
     mapper = mapper_at(TRUE[:6], config)
     for k in range(6, 10):
-        mapper.move(replace(update([], []), pieces=APART))
+        mapper.move(replace(update([], []), submaps=APART))
         mapper.add(SEEN[k], ELSEWHERE[k])
     return mapper
 
 
-def test_a_piece_that_is_not_joined_stays_out_of_the_map_until_it_is():
-    mapper = mapper_with_a_piece_apart(replace(CONFIG, rebuild_keyframes_per_call=1))
+def test_a_submap_that_is_not_joined_stays_out_of_the_map_until_it_is():
+    mapper = mapper_with_a_submap_apart(replace(CONFIG, rebuild_keyframes_per_call=1))
     without, whole = mapper_at(TRUE[:6]), mapper_at(TRUE)
     mapper.finish()
     assert digest(mapper) == digest(without) != digest(whole)
     assert mapper.cloud().points_m.tobytes() == without.cloud().points_m.tobytes()
-    mapper.move(replace(update(range(6, 10), TRUE[6:]), pieces=JOINED))
+    mapper.move(replace(update(range(6, 10), TRUE[6:]), submaps=JOINED))
     assert digest(mapper) == digest(without)  # it comes in as corrections do, little by little
     for _ in range(20):
-        mapper.move(replace(update([], []), pieces=JOINED))
+        mapper.move(replace(update([], []), submaps=JOINED))
     assert digest(mapper) == digest(whole)
     assert mapper.cloud().points_m.tobytes() == whole.cloud().points_m.tobytes()
-    mapper.move(replace(update(range(6, 10), ELSEWHERE[6:]), pieces=APART))  # the loop was false
+    mapper.move(replace(update(range(6, 10), ELSEWHERE[6:]), submaps=APART))  # the loop was false
     mapper.finish()
     assert digest(mapper) == digest(without)
     assert mapper.counters["marks_bytes"] == without.counters["marks_bytes"]
     assert len(mapper.surfels()) == len(without.surfels())
 
 
-def test_the_oldest_piece_takes_a_joined_one_in_in_the_middle_of_a_correction():
-    mapper = mapper_with_a_piece_apart()
-    mapper.move(replace(update(range(6), DRIFTED[:6]), pieces=APART))
-    mapper.move(replace(update(range(10), DRIFTED), pieces=JOINED))
-    mapper.move(replace(update(range(8), TRUE[:8]), pieces=JOINED))
-    mapper.move(replace(update([8, 9], TRUE[8:]), pieces=JOINED))
+def test_the_oldest_submap_takes_a_joined_one_in_in_the_middle_of_a_correction():
+    mapper = mapper_with_a_submap_apart()
+    mapper.move(replace(update(range(6), DRIFTED[:6]), submaps=APART))
+    mapper.move(replace(update(range(10), DRIFTED), submaps=JOINED))
+    mapper.move(replace(update(range(8), TRUE[:8]), submaps=JOINED))
+    mapper.move(replace(update([8, 9], TRUE[8:]), submaps=JOINED))
     mapper.finish()
     assert digest(mapper) == digest(mapper_at(TRUE))
 
 
-def test_a_piece_apart_is_written_into_a_folder_of_its_own(tmp_path):
-    mapper = mapper_with_a_piece_apart()
+def test_a_submap_apart_is_written_into_a_folder_of_its_own(tmp_path):
+    mapper = mapper_with_a_submap_apart()
     written = mapper.export(tmp_path)
     own = Mapper(CONFIG, RIG)
     for k in range(6, 10):
         own.add(SEEN[k], ELSEWHERE[k])
     own.export(tmp_path / "own")
-    assert written["piece_1_cloud"] == tmp_path / "piece_1" / "cloud.ply"
+    assert written["submap_1_cloud"] == tmp_path / "submap_1" / "cloud.ply"
     for path in (tmp_path / "own").iterdir():
-        assert path.read_bytes() == (tmp_path / "piece_1" / path.name).read_bytes(), path
-    assert "4 keyframes" in mapper.notes["piece_1 in the map"]
-    mapper.move(replace(update(range(6, 10), TRUE[6:]), pieces=JOINED))
+        assert path.read_bytes() == (tmp_path / "submap_1" / path.name).read_bytes(), path
+    assert "4 keyframes" in mapper.notes["submap_1 in the map"]
+    mapper.move(replace(update(range(6, 10), TRUE[6:]), submaps=JOINED))
     mapper.finish()
     mapper.export(tmp_path)
-    assert not (tmp_path / "piece_1").exists() and "piece_1 in the map" not in mapper.notes
+    assert not (tmp_path / "submap_1").exists() and "submap_1 in the map" not in mapper.notes
 
 
 def test_a_correction_below_the_limit_is_still_exact_at_the_end():

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from table_world import camera, frame, motion, pose, scene, view
 
 from vislam.config import MonoDepthConfig
-from vislam.errors import DataError
-from vislam.geometry import so3_exp, transform
-from vislam.mapping.monodepth import DepthFilter
-from vislam.mapping.monodepth.matching import CODES
-from vislam.mapping.monodepth.prior import flat_prior, points_prior
-from vislam.mapping.monodepth.update import CONVERGED, FAILED, FLAT
+from vislam.core.errors import DataError
+from vislam.core.geometry import so3_exp, transform
+from vislam.mapping.depth.mono import DepthFilter
+from vislam.mapping.depth.mono.matching import CODES
+from vislam.mapping.depth.mono.prior import flat_prior, points_prior
+from vislam.mapping.depth.mono.update import CONVERGED, FAILED, FLAT
+from worlds.table import camera, frame, motion, pose, scene, view
 
 WIDTH = 200
 K = camera(WIDTH).K

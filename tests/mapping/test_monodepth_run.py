@@ -12,23 +12,24 @@ import numpy as np
 import pytest
 
 from vislam.cli import run_verb
-from vislam.clock import StageClock
 from vislam.config import load
+from vislam.core.clock import StageClock
 from vislam.datasets.recorder import record
-from vislam.live.child import Flag, Life, Signals
-from vislam.live.front_process import light
 from vislam.live.handover import BackEnded, FrontEnded, Seen
-from vislam.live.mail import Inbox, Outbox
-from vislam.live.map_process import FollowedPipeline
-from vislam.mapping.octomap_io import read_octree
-from vislam.mapping.ply import read_ply
-from vislam.offline.rebuild import map_settings, rebuild
+from vislam.live.processes.child import Flag, Life, Signals
+from vislam.live.processes.front import light
+from vislam.live.processes.map import FollowedPipeline
+from vislam.live.wire.mail import Inbox, Outbox
+from vislam.mapping.formats.ply import read_ply
+from vislam.mapping.octree.octomap_io import read_octree
+from vislam.pipeline.back import map_stage
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.session import Session
+from vislam.run.folder import prepare
+from vislam.run.offline.rebuild import map_settings, rebuild
+from vislam.run.session import Session
+from vislam.run.sources import open_source
 from vislam.sim import open_world
-from vislam.slam import Slam, map_stage
-from vislam.sources import open_source
+from vislam.slam import Slam
 
 PRODUCTS = ("cloud", "octomap", "grid", "drive", "mesh")
 SETTINGS = {
@@ -44,7 +45,7 @@ import os, pathlib, signal, sys
 sys.path.insert(0, sys.argv[1])
 from test_monodepth_run import run
 def stop(done, total, note):
-    if done == 7 * total // 10:
+    if done == total // 2:
         os.kill(os.getpid(), signal.SIGKILL)
 run(sys.argv[2], pathlib.Path(sys.argv[3]), stop)
 """

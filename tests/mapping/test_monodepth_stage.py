@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from table_world import camera, frame, pose
 
-from vislam.camera import Rig
 from vislam.config import MapConfig, MonoDepthConfig
-from vislam.errors import DataError
-from vislam.geometry import se3_exp
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.geometry import se3_exp
+from vislam.core.messages import Frame, Keyframe, KeyframePacket, Observations, Tracking, VoMeasurement
+from vislam.mapping.depth.mono import MonoDepth, SeenFrame
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.monodepth import MonoDepth, SeenFrame
-from vislam.mapping.occupancy import Occupancy
-from vislam.messages import Frame, Keyframe, KeyframePacket, Observations, Tracking, VoMeasurement
-from vislam.odometry_keyframe import OdometryKeyframe
+from vislam.mapping.octree.occupancy import Occupancy
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe
+from worlds.table import camera, frame, pose
 
 WIDTH = 320
 T_BODY_CAM = se3_exp(np.array([0.3, -0.2, 1.1, 0.05, 0.02, -0.03]))
@@ -28,7 +28,7 @@ def _body(i):
     return pose(i) @ np.linalg.inv(T_BODY_CAM)
 
 
-def _keyframe(n, begins_piece=False, drift=None):
+def _keyframe(n, begins_submap=False, drift=None):
     """The n-th keyframe with its image; on each way between two, odometry drifts by `drift`."""
     i = n * EVERY
     image = Frame(i * 50_000_000, i, (frame(i, WIDTH)[0],))
@@ -42,7 +42,7 @@ def _keyframe(n, begins_piece=False, drift=None):
             @ _body((k + 1) * EVERY)
             @ se3_exp(np.zeros(6) if drift is None else drift)
         )
-    return OdometryKeyframe(KeyframePacket(keyframe, vo, NOTHING, None, begins_piece=begins_piece), T)
+    return OdometryKeyframe(KeyframePacket(keyframe, vo, NOTHING, None, begins_submap=begins_submap), T)
 
 
 def _between(n, drift=None):
@@ -84,11 +84,11 @@ def test_odometry_between_keyframes_is_bent_to_what_the_graph_found():
     assert np.median(np.abs(bent[3].depth_m[both] / straight[3].depth_m[both] - 1.0)) < 0.0005
 
 
-def test_a_new_piece_of_trajectory_begins_anew_and_keeps_what_was_found():
+def test_a_new_submap_of_trajectory_begins_anew_and_keeps_what_was_found():
     stage = MonoDepth(CONFIG, RIG)
     assert stage.add(_keyframe(0), _body(0), []) is None
     assert stage.add(_keyframe(1), _body(EVERY), _between(1)) is None
-    stage.add(_keyframe(2, begins_piece=True), np.eye(4), _between(2))
+    stage.add(_keyframe(2, begins_submap=True), np.eye(4), _between(2))
     assert stage.reference_id == 2
 
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from box_world import CAMERA, CONFIG, RIG, T_BODY_CAM0, depth_image, keyframe, pose
 
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.occupancy import Occupancy
-from vislam.sim.figure import figure_depth
+from vislam.mapping.octree.occupancy import Occupancy
+from vislam.sim.scene.figure import figure_depth
+from worlds.box import CAMERA, CONFIG, RIG, T_BODY_CAM0, depth_image, keyframe, pose
 
 SPEED_M_S = 1.0
 STANDS_S = 2.0

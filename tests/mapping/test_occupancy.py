@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.errors import DataError
-from vislam.mapping.occupancy import Occupancy, OccupancyMap
-from vislam.mapping.octomap_io import encode_bt, encode_ot
+from vislam.core.errors import DataError
+from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
 
 
 class SlowOctoMap:

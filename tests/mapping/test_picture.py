@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from vislam.mapping.cloud import Cloud
-from vislam.mapping.mesh import Mesh
-from vislam.mapping.occupancy import OccupancyMap
-from vislam.mapping.picture import Line, Style, render_cloud, render_mesh, render_octree
+from vislam.mapping.cloud.cloud import Cloud
+from vislam.mapping.cloud.mesh import Mesh
+from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.pictures.picture import Line, Style, render_cloud, render_mesh, render_octree
 
 SIZE = (320, 180)
 RED, BLUE, GREEN = (200, 0, 0), (0, 0, 200), (0, 160, 0)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from vislam.config import DriveConfig, MapConfig
-from vislam.errors import DataError
-from vislam.mapping.columns import MAX_RUNS, NEVER, Columns
-from vislam.mapping.drive import Drive, drive_grid
-from vislam.mapping.picture import Line
-from vislam.mapping.plan_picture import render_drive
+from vislam.core.errors import DataError
+from vislam.mapping.drive.drive import Drive, drive_grid
+from vislam.mapping.octree.columns import MAX_RUNS, NEVER, Columns
+from vislam.mapping.pictures.picture import Line
+from vislam.mapping.pictures.plan import render_drive
 
 _PATH = Path(__file__).resolve().parents[2] / "experiments" / "plan_path.py"
 _SPEC = importlib.util.spec_from_file_location("plan_path", _PATH)
@@ -83,8 +83,8 @@ def test_the_picture_shows_the_grid_with_north_up():
 
 
 def test_the_experiment_needs_only_a_run_folder(tmp_path, capsys):
-    from vislam.mapping.occupancy import OccupancyMap
-    from vislam.mapping.octomap_io import encode_bt
+    from vislam.mapping.octree.occupancy import OccupancyMap
+    from vislam.mapping.octree.octomap_io import encode_bt
 
     occupancy = OccupancyMap(CELL)
     x, y = np.meshgrid(np.arange(0.05, 4.0, CELL), np.arange(0.05, 3.0, CELL))

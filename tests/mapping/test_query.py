@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from vislam.errors import DataError
-from vislam.mapping.occupancy import Occupancy, OccupancyMap
-from vislam.mapping.octomap_io import encode_ot, read_octree
-from vislam.mapping.query import (
+from vislam.core.errors import DataError
+from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.octomap_io import encode_ot, read_octree
+from vislam.mapping.octree.query import (
     box_state,
     footprint_state,
     nearest_frontier,

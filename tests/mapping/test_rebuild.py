@@ -4,20 +4,20 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from session_entries import editing
 
+from session_entries import editing
 from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
+from vislam.core.errors import DataError, UsageError
 from vislam.datasets.recorder import record
-from vislam.errors import DataError, UsageError
-from vislam.mapping.octomap_io import read_octree
-from vislam.mapping.pcd import read_pcd
-from vislam.mapping.ply import read_ply
-from vislam.offline.rebuild import map_settings, rebuild
+from vislam.mapping.formats.pcd import read_pcd
+from vislam.mapping.formats.ply import read_ply
+from vislam.mapping.octree.octomap_io import read_octree
 from vislam.run import execute
-from vislam.runfolder import prepare
+from vislam.run.folder import prepare
+from vislam.run.offline.rebuild import map_settings, rebuild
+from vislam.run.sources import open_source
 from vislam.sim import open_world
-from vislam.sources import open_source
 
 PRODUCTS = ("cloud", "octomap", "grid", "drive")
 

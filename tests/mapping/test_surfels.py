@@ -1,14 +1,14 @@
 from dataclasses import replace
 
 import numpy as np
-from box_world import CONFIG, RIG, ROOM_HIGH, ROOM_LOW, keyframe, pose
 from scipy.spatial import cKDTree
 
-from vislam.geometry import se3_exp, so3_exp, transform
-from vislam.mapping.extract import ScanExtractor
+from vislam.core.geometry import se3_exp, so3_exp, transform
+from vislam.core.messages import GraphUpdate
+from vislam.mapping.cloud.surfels import SurfelMap
+from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.surfels import SurfelMap
-from vislam.messages import GraphUpdate
+from worlds.box import CONFIG, RIG, ROOM_HIGH, ROOM_LOW, keyframe, pose
 
 SPACING = 0.05
 EXTRACTOR = ScanExtractor(replace(CONFIG, pixel_step=1), RIG)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from vislam.config import PlanarConfig
-from vislam.errors import UsageError
-from vislam.frontend.planar_floor import make_mount
+from vislam.core.errors import UsageError
+from vislam.frontend.planar.floor import make_mount
 from vislam.sim import Simulation, open_world
-from vislam.sim.sensors import GY85_IMU
+from vislam.sim.sensing import GY85_IMU
 
 
 def test_a_hundred_metres_with_stops_and_turns() -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vislam.errors import UsageError
-from vislam.features import FlowSettings, detect_corners, follow
+from vislam.core.errors import UsageError
 from vislam.sim import open_world
-from vislam.sim.disturbance import in_window, person_box
+from vislam.sim.faults.disturbance import in_window, person_box
+from vislam.vision.features import FlowSettings, detect_corners, follow
 
 SMALL = {"duration_s": 6.0, "camera_hz": 10.0, "image_width_px": 160}
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from tests.needs import missing
-from tests.sim.point_recordings import angles_rad, frames, real, samples
-from vislam.errors import DataError, UsageError
-from vislam.features import match
-from vislam.geometry import transform_points
-from vislam.messages import Array, Frame, ImuSample
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import transform_points
+from vislam.core.messages import Array, Frame, ImuSample
+from vislam.run.sources import open_source
 from vislam.sim import PointRecording, open_points
-from vislam.sim.followed import scramble
-from vislam.sim.sensors import CONSUMER_IMU
-from vislam.sources import open_source
+from vislam.sim.points.followed import scramble
+from vislam.sim.sensing import CONSUMER_IMU
+from vislam.vision.features import match
+from worlds.recordings import angles_rad, frames, real, samples
 
 PERFECT = {"pixel_sigma_px": 0.0, "outlier_share": 0.0, "dropout_share": 0.0, "stereo_sigma_px": 0.0}
 

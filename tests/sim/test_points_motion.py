@@ -9,15 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.needs import missing
-from tests.sim.point_recordings import angles_rad, real
-from vislam.errors import DataError
-from vislam.geometry import so3_exp
-from vislam.messages import Array
+from vislam.core.errors import DataError
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import Array
+from vislam.run.sources import measured_inertial
 from vislam.sim import MeasuredInertial
-from vislam.sim.measured import MeasuredMotion
-from vislam.sim.motions import laps, straight, turn_in_place
-from vislam.sources import measured_inertial
+from vislam.sim.motion.measured import MeasuredMotion
+from vislam.sim.motion.motions import laps, straight, turn_in_place
 from vislam.trajectory import Trajectory
+from worlds.recordings import angles_rad, real
 
 RECORDINGS = {"v101": 40.0, "v201": 40.0}  # seconds that are looked at
 FX_PX = 458.0

@@ -2,15 +2,15 @@ import cv2
 import numpy as np
 import pytest
 
-from vislam.camera import Camera
-from vislam.errors import UsageError
-from vislam.geometry import invert, transform_points
-from vislam.sim import paint
-from vislam.sim.bake import bake
-from vislam.sim.render import Renderer
-from vislam.sim.scene import SceneBuilder
-from vislam.sim.shell import ceiling, floor, wall
-from vislam.sim.worlds import camera
+from vislam.core.camera import Camera
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, transform_points
+from vislam.sim.scene import paint
+from vislam.sim.scene.bake import bake
+from vislam.sim.scene.render import Renderer
+from vislam.sim.scene.scene import SceneBuilder
+from vislam.sim.scene.shell import ceiling, floor, wall
+from vislam.sim.worlds.table import camera
 
 SEED = np.random.SeedSequence(3)
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x
@@ -202,3 +202,49 @@ def test_blur_softens_moving_images_and_not_resting_ones(painted):
     fast = int(np.argmax(rates))
     assert sharpness(blurred.render(fast).images[0]) < 0.8 * sharpness(sharp.render(fast).images[0])
     assert np.abs(blurred.render(0).images[0].astype(int) - sharp.render(0).images[0]).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("cart-drive", {}),
+        ("handheld-room", {"exposure_s": 0.03, "rig": "mono"}),
+        ("handheld-room", {"exposure_s": 0.02, "readout_s": 0.02, "rig": "mono"}),
+    ],
+)
+def test_blur_is_that_of_sharp_images_averaged_over_the_exposure(painted, name, options):
+    world = painted(name, image_width_px=320, image_noise=False, exposure_changes=False, **options)
+    renderer, T_body_cam, moments = Renderer(world.rig.cameras[0]), world.rig.T_body_cams[0], 24
+    errors, sharp_errors = [], []
+    for index in np.linspace(20, world.frame_count - 20, 8).astype(int):
+        t_s = world._frame_s[index]
+        rows_s = t_s + world.options.readout_s * ((np.arange(240) + 0.5) / 240 - 0.5)
+        light = np.zeros((240, 320, 3))
+        for moment in (np.arange(moments) + 0.5) / moments - 0.5:
+            poses = world.spline.at(rows_s + moment * world._exposure_s).T_world_body @ T_body_cam
+            light += renderer.render(world.scene, poses)[0].astype(float) ** 2 / moments
+        sharp = renderer.render(world.scene, world.spline.at(rows_s).T_world_body @ T_body_cam)[0]
+        expected = np.sqrt(light)
+        errors.append(np.abs(world.render(int(index)).color - expected).mean())
+        sharp_errors.append(np.abs(sharp - expected).mean())
+    assert np.mean(errors) < 0.7 and max(errors) < 1.0  # grey levels; rounding to bytes alone makes a quarter of one
+    assert max(sharp_errors) > 3.0 * errors[int(np.argmax(sharp_errors))]  # without blur, as a control
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_an_outline_is_blurred_as_far_as_it_moves(side):
+    builder = SceneBuilder(ambient=1.0)
+    builder.rectangle(
+        (2.0, 0.0, 2.0), (0.0, -1.0, 0.0), (0.0, 0.0, -2.0), lambda rng, h, w, ppm: np.full((h, w, 3), 200, np.uint8)
+    )
+    scene, cam, moments = bake(builder, SEED), camera(320), 8
+    shift_m = side * 10.0 * 2.0 / cam.fx  # ten pixels at two metres
+    shutter = np.stack([looking((0.0, shift_m * ((k + 0.5) / moments - 0.5), 1.0), 0.0) for k in range(moments)])
+    color, depth = Renderer(cam).render(scene, looking((0.0, 0.0, 1.0), 0.0), shutter)
+    row, column = int(cam.cy), int(cam.cx)
+    light = (color[row, :, 1].astype(float) / color[row, column + 30, 1]) ** 2
+    width_px = np.interp([0.1, 0.9], light[column - 15 : column + 16], np.arange(31))
+    assert np.diff(width_px)[0] == pytest.approx(0.8 * 10.0, abs=1.0)
+    assert light[column - 15 : column + 16].sum() == pytest.approx(
+        (depth[row, column - 15 : column + 16] > 0).sum(), abs=0.6
+    )

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from vislam.imu import ImuNoise
-from vislam.sim.sensors import (
+from vislam.sim.motion.spline import BodySpline
+from vislam.sim.sensing import (
     CONSUMER_IMU,
     EARTH_FIELD_UT,
     DepthNoise,
@@ -12,7 +13,6 @@ from vislam.sim.sensors import (
     sense_field,
     sense_imu,
 )
-from vislam.sim.spline import BodySpline
 
 SEED = 20240611
 

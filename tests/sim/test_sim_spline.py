@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from vislam.errors import UsageError
-from vislam.geometry import se3_log, so3_exp, so3_log, transform
+from vislam.core.errors import UsageError
+from vislam.core.geometry import se3_log, so3_exp, so3_log, transform
 from vislam.sim import WORLD_NAMES, open_world
-from vislam.sim.path import Travel, rounded_path
-from vislam.sim.spline import BodySpline
+from vislam.sim.motion.path import Travel, rounded_path
+from vislam.sim.motion.spline import BodySpline
 
 
 @pytest.mark.parametrize("name", WORLD_NAMES)

@@ -2,7 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vislam.sim import WORLD_DESCRIPTIONS, WORLD_NAMES
+from vislam.sim import WORLD_NAMES
+from vislam.sim.worlds.table import WORLDS
 
 LIMITS = {  # speed m/s, acceleration m/s2, rate rad/s, length m, seconds, rest at the start s
     "workshop-cart": (1.2, 2.0, 1.4, (50.0, 60.0), (60.0, 80.0), 2.0),
@@ -14,8 +15,8 @@ LIMITS = {  # speed m/s, acceleration m/s2, rate rad/s, length m, seconds, rest 
 
 
 def test_every_world_has_a_description():
-    assert set(WORLD_NAMES) == set(WORLD_DESCRIPTIONS) == set(LIMITS)
-    assert all(20 < len(text) < 120 and "\n" not in text for text in WORLD_DESCRIPTIONS.values())
+    assert set(WORLD_NAMES) == set(WORLDS) == set(LIMITS)
+    assert all(20 < len(world.description) < 120 and "\n" not in world.description for world in WORLDS.values())
 
 
 @pytest.mark.parametrize("name", WORLD_NAMES)

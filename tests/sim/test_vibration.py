@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.sim.point_recordings import samples
 from vislam.config import VibrationConfig, load
-from vislam.errors import DataError, UsageError
-from vislam.messages import Array, ImuSample
-from vislam.recording import Recording
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array, ImuSample
+from vislam.core.recording import Recording
 from vislam.run import execute
-from vislam.runfolder import prepare
+from vislam.run.folder import prepare
+from vislam.run.sources import shaken
 from vislam.sim import open_points
-from vislam.sim.vibration import ShakenRecording, Vibration
-from vislam.sources import shaken
+from vislam.sim.faults.vibration import ShakenRecording, Vibration
+from worlds.recordings import samples
 
 RATE_HZ, HUM_HZ, HUM_M_S2, HUM_RAD_S = 200.0, 40.0, 1.5, 0.2
 

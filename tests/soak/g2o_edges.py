@@ -7,8 +7,8 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from vislam.factors.replay import Between, EdgeGraph
-from vislam.messages import Array
+from vislam.core.messages import Array
+from vislam.graph.replay import Between, EdgeGraph
 
 # chi-square (2 x gtsam's error) of the best known solution
 BEST_CHI2 = {

@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from g2o_edges import BEST_CHI2, EdgeFile
-from graph_world import GRAVITY_M_S2, RIG, packet_of
-from lap_world import STEREO, LapWorld, window_of_truth
 
 import vislam.window
 from vislam.config import GraphConfig, WindowConfig
-from vislam.errors import DataError
-from vislam.factors.replay import Between, EdgeGraph
-from vislam.geometry import se3_exp, transform
+from vislam.core.errors import DataError
+from vislam.core.geometry import se3_exp, transform
+from vislam.core.messages import LoopDecision, LoopEdge, Tracking, VoMeasurement
 from vislam.graph import PoseGraph
-from vislam.messages import LoopDecision, LoopEdge, Tracking, VoMeasurement
+from vislam.graph.replay import Between, EdgeGraph
+from worlds.endless_lap import STEREO, LapWorld, window_of_truth
+from worlds.lap import RIG, packet_of
+from worlds.parts import GRAVITY_M_S2
 
 
 @pytest.mark.data

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.geometry import so3_exp
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import ImuSpan
 from vislam.imu import preintegrate
-from vislam.messages import ImuSpan
-from vislam.verdict import TurnStep, force_agreement, turn_agreement
+from vislam.run.verdict import TurnStep, force_agreement, turn_agreement
 
 _G = 9.81
 _RATE_HZ = 200.0

@@ -2,17 +2,17 @@
 
 import math
 
-from vislam.factors.gate import EdgeReport
-from vislam.messages import LoopDecision
+from vislam.core.memory import EdgeReport
+from vislam.core.messages import LoopDecision
 from vislam.run.evidence import contradicting
 
 
-def test_a_loop_that_waits_for_its_piece_contradicts_nothing():
+def test_a_loop_that_waits_for_its_submap_contradicts_nothing():
     told = [
         (LoopDecision.ACCEPTED, 3.0),
-        (LoopDecision.ACCEPTED, math.nan),  # joined two pieces
-        (LoopDecision.PARKED, 80.0),  # beyond the gate
-        (LoopDecision.PARKED, math.nan),  # between pieces that are not joined
+        (LoopDecision.ACCEPTED, math.nan),  # joined two submaps
+        (LoopDecision.PENDING, 80.0),  # beyond the gate
+        (LoopDecision.PENDING, math.nan),  # between submaps that are not joined
         (LoopDecision.REJECTED, math.nan),  # though it was to join two
         (LoopDecision.REJECTED, 5.0),  # taken out again
     ]

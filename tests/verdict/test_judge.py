@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vislam.config import VerdictConfig
-from vislam.verdict import (
+from vislam.run.verdict import (
     Apart,
     Evidence,
     ForceAgreement,
@@ -50,7 +50,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),
         ({"frames_missing": 100}, "100 of 500 frames never arrived"),
         ({"frames_repeated": 40}, "40 images repeat the one before"),
-        ({"pieces_apart": 2}, "2 pieces of the trajectory"),
+        ({"submaps_apart": 2}, "2 submaps"),
         ({"is_started": False, "start_reason": "gravity norm 1.00"}, "gravity was not found"),
         ({"start_failures": 5}, "contradicted each other in 5 attempts"),
         ({"soft_resets": 2}, "gave up its certainty 2 times"),
@@ -120,3 +120,25 @@ def test_the_sentence_is_the_same_from_a_verdict_that_was_stored():
     stored = {"state": str(found.state), "reasons": list(found.reasons)}
     assert verdict_sentence(stored).startswith("Doubtful: inertial samples come at 50 Hz")
     assert verdict_sentence({"state": "trusted", "reasons": []}) == "Trusted: nothing in the run contradicts itself"
+
+
+SLOW = {"frames_offered": 593, "frames_dropped": 424, "frames_left_out": 100, "samples": 9000, "samples_missed": 17829}
+
+
+def test_that_the_machine_is_too_slow_is_said_before_everything_else():
+    found = verdict(**SLOW, late_s=0.8, busy=0.97, coverage=0.1, frames_lost=60, frames_missing=500)
+    assert found.state is Trust.LOST
+    assert found.reasons[0].startswith("the machine is too slow for its sensors: 524 of 593 frames")
+    assert "17829 of 26829 inertial samples" in found.reasons[0]
+    assert "--map.no-enabled" in found.reasons[0]
+    assert not any("never arrived" in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize("changes", [{"samples_missed": 0}, {"frames_dropped": 0, "frames_left_out": 0}])
+def test_frames_or_samples_alone_make_a_machine_too_slow(changes):
+    found = verdict(**{**SLOW, **changes})
+    assert found.state is Trust.DOUBTFUL and "too slow" in found.reasons[0]
+
+
+def test_a_machine_that_misses_little_is_not_too_slow():
+    assert verdict(frames_offered=600, frames_dropped=20, samples=9000, samples_missed=90).state is Trust.TRUSTED

@@ -4,15 +4,15 @@ import json
 
 import pytest
 
+from vislam.cli.verbs.results import print_metrics
 from vislam.config import load
-from vislam.errors import UsageError, VislamError
-from vislam.messages import Frame, ImuSample
+from vislam.core.errors import UsageError, VislamError
+from vislam.core.messages import Frame, ImuSample
 from vislam.report import write_report
 from vislam.run import execute
-from vislam.runfolder import prepare
-from vislam.sim.faults import FAULTS, FaultyRecording
-from vislam.sources import open_source
-from vislam.verbs.results import print_metrics
+from vislam.run.folder import prepare
+from vislam.run.sources import open_source
+from vislam.sim.faults.faults import FAULTS, FaultyRecording
 
 _URI = "points:laps,rig=stereo,duration_s=12,camera_hz=10,tracks=80"
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from vislam.core.messages import Frame, ImuSample
 from vislam.frontend.feed import CameraFeed
 from vislam.imu import ConditionWatch
-from vislam.messages import Frame, ImuSample
 
 _NS = 1_000_000_000
 

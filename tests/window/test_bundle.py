@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, Motion
-from window_world import MONO, World
 
 from vislam.config import WindowConfig
-from vislam.geometry import so3_exp
+from vislam.core.geometry import so3_exp
 from vislam.imu import preintegrate
 from vislam.window.bundle import BundleProblem, solve
+from worlds.motion import EUROC_NOISE, Motion
+from worlds.parts import GRAVITY_M_S2
+from worlds.room import MONO, World
 
 
 def rough_problem(seed: int, scale: float) -> tuple[BundleProblem, list]:

@@ -4,15 +4,16 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, Motion
-from window_world import RGBD, STEREO, World, start_state
 
 from vislam.config import WindowConfig
-from vislam.messages import Array
-from vislam.window import inertial, linear, schur, visual
-from vislam.window.layout import CALIBRATION, Camera, Links, Views, positions, retract
+from vislam.core.messages import Array
+from vislam.window.equations import inertial, linear, schur, visual
+from vislam.window.equations.layout import CALIBRATION, Camera, Links, Normal, States, Views, positions, retract
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import TrackTable
+from worlds.motion import EUROC_NOISE, Motion
+from worlds.parts import GRAVITY_M_S2
+from worlds.room import RGBD, STEREO, World, start_state
 
 
 class Scene(NamedTuple):
@@ -67,8 +68,8 @@ def normal_equations(scene: Scene) -> tuple[Array, Array]:
     landmarks = schur.room_for(len(scene.points), 6 * count + CALIBRATION)
     held = np.zeros(count, dtype=np.bool_)
     visual.linearise(
-        scene.X, scene.X, held, scene.points, scene.calibration, scene.views, scene.camera, 9 * count,
-        A, g, landmarks,
+        States(scene.X, scene.X, held), scene.points, scene.calibration, scene.views, scene.camera, 9 * count,
+        Normal(A, g), landmarks,
     )  # fmt: skip
     return g, landmarks.gradients
 
@@ -129,7 +130,8 @@ def test_gradient_of_links_is_that_of_their_cost() -> None:
     A, g = np.zeros((D, D)), np.zeros(D)
     where = positions(count, True)
     held = np.zeros(count, dtype=np.bool_)
-    inertial.linearise(scene.X, scene.X, held, scene.links, GRAVITY_M_S2, where, count - 1, count, A, g)
+    states = States(scene.X, scene.X, held)
+    inertial.linearise(states, scene.links, GRAVITY_M_S2, where, count - 1, count, Normal(A, g))
     for k in range(count):
         for i in range(15):
             step = 1e-6

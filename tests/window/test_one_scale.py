@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from inertial_world import GRAVITY_M_S2, Motion, levelled, state_error, still
-from window_world import MONO, World, start_state
 
 from vislam.config import WindowConfig
-from vislam.geometry import so3_exp, transform
-from vislam.messages import Array
-from vislam.sim.sensors import CONSUMER_IMU
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.messages import Array
+from vislam.sim.sensing import CONSUMER_IMU
 from vislam.window import SlidingWindow
 from vislam.window.one_scale import at_first_scale
+from worlds.motion import Motion, levelled, state_error, still
+from worlds.parts import GRAVITY_M_S2
+from worlds.room import MONO, World, start_state
 
 _SPEED_UP_S = 2.0
 

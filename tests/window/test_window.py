@@ -5,16 +5,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from inertial_world import EUROC_NOISE, GRAVITY_M_S2, NS, T0_NS, Motion, state_error
 from scipy.stats import chi2
-from window_world import MONO, RGBD, STEREO, World, packet, start_state
 
-from vislam.camera import Rig
 from vislam.config import WindowConfig
-from vislam.errors import DataError, UsageError
-from vislam.geometry import invert, se3_log
-from vislam.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
 from vislam.window import SlidingWindow, WindowUpdate, gate
+from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
+from worlds.parts import GRAVITY_M_S2
+from worlds.room import MONO, RGBD, STEREO, World, packet, start_state
 
 HONEST = replace(WindowConfig(), keyframes=8)  # the simulated sensor has no vibration
 

@@ -1,0 +1,59 @@
+"""Nothing compiles in front of a user without saying so, and what is compiled already is not talked about."""
+
+import numba
+import pytest
+
+from vislam.cli.verbs import arguments
+from vislam.core.compiling import _Listener
+
+
+class Event:
+    def __init__(self, is_start: bool) -> None:
+        self.is_start, self.is_end = is_start, not is_start
+
+
+START, END = Event(True), Event(False)
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch):
+    """Return what notifies a listener at times in s, and what it said."""
+    said: list[float] = []
+    now = [0.0]
+    monkeypatch.setattr("vislam.core.compiling.time.process_time", lambda: now[0])
+    listener = _Listener(lambda: said.append(now[0]))
+
+    def tell(*events: tuple[float, Event]) -> list[float]:
+        for at_s, event in events:
+            now[0] = at_s
+            listener.notify(event)
+        return said
+
+    return tell
+
+
+def test_it_is_said_once_after_a_second_of_compilation(told) -> None:
+    assert told((10.0, START), (10.1, START), (10.9, END)) == []
+    assert told((11.2, START)) == [11.2]  # not only when the outermost ends
+    assert told((15.0, END), (16.0, END), (20.0, START), (30.0, END)) == [11.2]
+
+
+def test_time_between_compilations_does_not_count(told) -> None:
+    assert told((0.0, START), (0.6, END), (100.0, START), (100.3, END)) == []
+    assert told((200.0, START), (200.2, END)) == [200.2]
+
+
+def test_a_verb_says_how_long_it_takes(capsys, monkeypatch) -> None:
+    monkeypatch.setattr("vislam.core.compiling._WORTH_SAYING_S", 0.0)
+    arguments._announce_compilation.cache_clear()
+    arguments._announce_compilation("posegraph")
+    numba.njit(lambda x: x + 1)(1)
+    said = [
+        line for line in capsys.readouterr().err.splitlines() if "posegraph" in line
+    ]  # other tests' verbs speak, too
+    seconds = arguments.VERBS["posegraph"].compile_s
+    assert seconds > 0
+    assert len(said) == 1
+    assert f"about {seconds} s" in said[0]
+    numba.njit(lambda x: x + 2)(1)
+    assert capsys.readouterr().err == ""

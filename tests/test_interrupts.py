@@ -1,0 +1,174 @@
+"""A signal ends whatever runs, at any moment; nothing hangs, and nothing left behind is in the way of the next try."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from vislam.core.interrupts import EXIT_CODE, SIGNALS
+from vislam.run.folder import prepare
+
+HUNG_S = 60.0  # a generous ceiling: how long it takes is measured by hand
+SEED = 9
+
+
+@dataclass(frozen=True)
+class Ended:
+    code: int
+    said: str
+    before_signal: bool  # it had come to its end by itself
+
+
+def interrupted(arguments: list[str], delay_s: float, number: signal.Signals, to_group: bool = True) -> Ended:
+    """Start vislam, signal it after a while as a terminal does, and wait for its end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "vislam", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        # children of a background job ignore the signal unless told otherwise
+        preexec_fn=lambda: [signal.signal(n, signal.SIG_DFL) for n in SIGNALS],  # noqa: PLW1509
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        process.wait(delay_s)
+        before_signal = True
+    except subprocess.TimeoutExpired:
+        before_signal = False
+        (os.killpg if to_group else os.kill)(process.pid, number)
+    try:
+        _, said = process.communicate(timeout=HUNG_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        pytest.fail(f"{' '.join(arguments)} hung after {number.name} at {delay_s:.2f} s")
+    return Ended(process.returncode, said, before_signal)
+
+
+def processes_of(name: str) -> list[int]:
+    """Return what runs with a word in its arguments, after those that end had a moment for it."""
+    deadline = time.monotonic() + HUNG_S
+    while True:
+        found = [p.pid for p in psutil.process_iter() if p.pid != os.getpid() and name in " ".join(_words(p))]
+        if not found or time.monotonic() > deadline:
+            return found
+        time.sleep(0.2)
+
+
+def _words(process: psutil.Process) -> list[str]:
+    try:
+        return [] if process.status() == psutil.STATUS_ZOMBIE else process.cmdline()
+    except psutil.Error:
+        return []
+
+
+def check(ended: Ended, number: signal.Signals, moment: str) -> None:
+    """130, or killed by the signal: before anything was set up, or where Python says so to its parent."""
+    print(moment, number.name, ended.code)
+    if ended.before_signal:
+        assert ended.code == 0, ended.said
+        return
+    assert ended.code in (EXIT_CODE, -number), f"{moment}: {ended.code}\n{ended.said}"
+    if ended.code == EXIT_CODE:
+        assert "Traceback" not in ended.said and "interrupted" in ended.said, f"{moment}:\n{ended.said}"
+
+
+def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: Path) -> None:
+    rng = random.Random(SEED)
+    print("seed", SEED)
+    out = tmp_path / "corridor"
+    hit = 0
+    for k in range(14):
+        number = SIGNALS[k % 3]
+        delay_s = rng.uniform(0.3, 4.0)
+        ended = interrupted(["simulate", "corridor-loop", "--out", str(out)], delay_s, number, to_group=k % 2 == 0)
+        check(ended, number, f"moment {k}, {delay_s:.2f} s")
+        hit += not ended.before_signal
+        assert (out / "mav0").exists() == ended.before_signal  # whole or not at all, and in no other try's way
+        out = tmp_path / f"corridor{k}" if ended.before_signal else out
+    assert hit >= 7
+
+
+def test_a_live_run_ends_at_random_moments_and_can_be_started_again(tmp_path: Path) -> None:
+    rng = random.Random(SEED + 1)
+    print("seed", SEED + 1)
+    name = f"vislam-test-int-{os.getpid()}"
+    arguments = ["live", "--source", "virtual-cart,rig=none", "--out", str(tmp_path / "run"), "--live.name", name]
+    for k in range(6):
+        number = SIGNALS[k % 3]
+        delay_s = rng.uniform(0.5, 25.0)
+        ended = interrupted([*arguments, "--view.no-enabled"], delay_s, number)
+        assert not ended.before_signal, ended.said
+        if ended.code != 0:  # 0: it was going, and this is how it ends
+            check(ended, number, f"moment {k}, {delay_s:.2f} s")
+        assert processes_of(name) == []
+        assert [p.name for p in Path("/dev/shm").iterdir() if name in p.name] == []
+        (tmp_path / "run").mkdir(exist_ok=True)
+        prepare(tmp_path / "run", overwrite=ended.code == 0)
+
+
+STUCK = """
+import os, signal, sys, threading, time
+from vislam.core import interrupts
+with interrupts.bounded():
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    {what}
+"""
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        # a lock that is never given back: the system does not break such a call off, as it would a sleep
+        "import ctypes; lock = (ctypes.c_char * 64)(); [ctypes.CDLL(None).pthread_mutex_lock(lock) for _ in 'ab']",
+        "\n    while True:\n        try: time.sleep(100)\n        except KeyboardInterrupt: pass",
+    ],
+    ids=["in a call", "swallowed"],
+)
+def test_what_does_not_end_is_ended(what: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STUCK.format(what=what)], timeout=HUNG_S, capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGTERM, signal.SIG_DFL),
+    )  # fmt: skip
+    assert done.returncode == EXIT_CODE
+    assert done.stderr.split("\n") == ["", "vislam: interrupted; what was written by then is kept", ""]
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    script = """
+import os, signal
+from vislam.core import interrupts
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+with interrupts.bounded():
+    os.kill(os.getpid(), signal.SIGHUP)
+    with interrupts.counted() as asked:
+        os.kill(os.getpid(), signal.SIGHUP)
+    print(asked.count)
+"""
+    done = subprocess.run([sys.executable, "-c", script], timeout=HUNG_S, capture_output=True, text=True, check=True)
+    assert done.stdout == "0\n"
+
+
+def test_a_closed_terminal_is_an_interrupt_like_any_other(tmp_path: Path) -> None:
+    pid, master = os.forkpty()
+    if pid == 0:
+        os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        command = [sys.executable, "-m", "vislam", "simulate", "corridor-loop", "--out", str(tmp_path / "world")]
+        os.execv(sys.executable, command)
+    time.sleep(3.0)
+    os.close(master)
+    deadline = time.monotonic() + HUNG_S
+    while (status := os.waitpid(pid, os.WNOHANG))[0] == 0:
+        if time.monotonic() > deadline:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            pytest.fail("it hung")
+        time.sleep(0.1)
+    assert os.waitstatus_to_exitcode(status[1]) in (EXIT_CODE, -signal.SIGHUP)

@@ -1,0 +1,104 @@
+"""Numbers among the settings have ranges: defaults lie inside, what lies outside is refused in one line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from importlib import import_module
+from typing import Any
+
+import pytest
+
+from vislam.cli import run_verb
+from vislam.cli.verbs import VERBS
+from vislam.config import (
+    BatchConfig,
+    Config,
+    GraphWorldConfig,
+    LoopTruthConfig,
+    PoseGraphConfig,
+    RecordConfig,
+    SensorsConfig,
+    from_data,
+)
+from vislam.config.ranges import Range, Setting, check_ranges, settings_of
+from vislam.core.errors import UsageError
+
+TREES = (Config, SensorsConfig, RecordConfig, PoseGraphConfig, GraphWorldConfig, LoopTruthConfig, BatchConfig)
+NUMBERS = [(tree, setting) for tree in TREES for setting in settings_of(tree) if setting.range is not None]
+
+
+def outside(allowed: Range) -> list[float]:
+    """Return numbers just below and above an interval, and those that are none."""
+    ends = ((allowed.low, allowed.without_low, -math.inf), (allowed.high, allowed.without_high, math.inf))
+    return [math.nan, -math.inf, math.inf] + [
+        end if without else math.nextafter(end, far) for end, without, far in ends if math.isfinite(end)
+    ]
+
+
+def changed(tree: Any, path: tuple[str, ...], value: Any) -> Any:
+    """Return a tree of settings with one of them changed."""
+    name, *rest = path
+    return replace(tree, **{name: changed(getattr(tree, name), tuple(rest), value) if rest else value})
+
+
+def wrong(setting: Setting, number: float) -> Any:
+    """Return the number as the setting takes it: alone, or first in its tuples."""
+    value = setting.value
+    if not isinstance(value, tuple):
+        return number
+    return ((number, *value[0][1:]), *value[1:]) if isinstance(value[0], tuple) else (number, *value[1:])
+
+
+def is_numeric(hint: Any) -> bool:
+    return hint in (int, float) or any(is_numeric(part) for part in getattr(hint, "__args__", ()))
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_every_number_has_a_range_and_its_default_lies_inside(tree: type) -> None:
+    assert [s.path for s in settings_of(tree) if is_numeric(s.type) and s.range is None] == []
+    check_ranges(tree())
+
+
+def test_below_and_above_its_range_every_setting_is_refused_by_name() -> None:
+    for tree, setting in NUMBERS:
+        assert setting.range is not None
+        for number in outside(setting.range):
+            with pytest.raises(UsageError) as refused:
+                check_ranges(changed(tree(), setting.path, wrong(setting, number)))
+            assert str(refused.value) == f"{setting.option} is {number:g}; allowed is {setting.range}"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_number_among_the_options_of_a_verb_has_a_range(verb: str) -> None:
+    options = import_module(f"vislam.cli.verbs.{verb}").OPTIONS
+    found = [s.option for cls in options for s in settings_of(cls) if is_numeric(s.type) and s.range is None]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        ("run tum:X --out OUT --frontend.max-tracks -5", "--frontend.max-tracks is -5; allowed is 1 or more"),
+        ("posegraph X.g2o --iterations -1", "--iterations is -1; allowed is 1 or more"),
+        ("optimize X.g2o --iterations -1", "--iterations is -1; allowed is 1 or more"),
+        ("optimize X --iterations -1", "--iterations is -1; allowed is 1 or more"),
+        ("run tum:X --out OUT --ekf.gate-probability 2", "is 2; allowed is more than 0 and less than 1"),
+        ("run tum:X --out OUT --imu.gravity-m-s2 nan", "--imu.gravity-m-s2 is nan; allowed is more than 0"),
+        ("live --out OUT --sensors.webcam.width-px 0", "--sensors.webcam.width-px is 0; allowed is 1 or more"),
+        ("calibrate camera X --rows -2", "--rows is -2; allowed is 1 or more"),
+        ("map X --query nan 0 0", "--query is nan; allowed is any finite number"),
+    ],
+)
+def test_a_number_out_of_range_is_a_wrong_usage_of_one_line(
+    command: str, complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_verb(command.split()) == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert said.count("\n") == 1
+
+
+def test_a_number_out_of_range_in_a_file_is_refused_with_the_file() -> None:
+    with pytest.raises(UsageError, match=r"cart\.toml: window\.keyframes is 0; allowed is 1 or more"):
+        from_data({"window": {"keyframes": 0}}, "cart.toml")

@@ -1,0 +1,87 @@
+"""The configuration that is written down is the one that ran: what sensors and modes imply is in it."""
+
+import json
+from dataclasses import asdict, replace
+
+import pytest
+
+from vislam.config import Config, load
+from vislam.core.errors import UsageError
+from vislam.ekf.filtering import Filtering
+from vislam.graph import PoseGraph
+from vislam.pipeline import back, front
+from vislam.pipeline.settings import derived
+from vislam.run import execute
+from vislam.run.folder import prepare
+from vislam.run.sources import open_source
+
+FLOOR = {"frontend.mode": "planar", "frontend.planar.height_m": 0.3}
+
+
+def recording(rig="mono"):
+    return open_source(f"points:stop-and-go,rig={rig},duration_s=4")
+
+
+@pytest.mark.parametrize(("rig", "coupling"), [("mono", "tight"), ("stereo", "loose"), ("rgbd", "loose")])
+def test_the_stages_get_what_config_json_says(tmp_path, monkeypatch, rig, coupling):
+    got = {}
+
+    class SpiedFilter(Filtering):
+        def __init__(self, config, *rest):
+            got["ekf"] = config
+            super().__init__(config, *rest)
+
+    class SpiedGraph(PoseGraph):
+        def __init__(self, graph, noise, gravity_m_s2, rig, window):
+            got["graph"], got["window"] = graph, window
+            super().__init__(graph, noise, gravity_m_s2, rig, window)
+
+    def spied_frontend(config, rig, seed):
+        got["frontend"] = config
+        return make_frontend(config, rig, seed)
+
+    make_frontend = front.make_frontend
+    monkeypatch.setattr(front, "Filtering", SpiedFilter)
+    monkeypatch.setattr(back, "PoseGraph", SpiedGraph)
+    monkeypatch.setattr(front, "make_frontend", spied_frontend)
+    out = tmp_path / "run"
+    prepare(out, overwrite=False)
+    config = load(None, {"view.enabled": False, "map.enabled": False, "frontend.readout_s": 0.001})
+    execute(recording(rig), config, out, "test", [])
+    written = json.loads((out / "config.json").read_text())
+    assert written["ekf"]["coupling"] == coupling and written["frontend"]["mode"] == rig
+    assert set(got) == {"ekf", "graph", "window", "frontend"}
+    for section, settings in got.items():
+        assert json.loads(json.dumps(asdict(settings))) == written[section], section
+
+
+@pytest.mark.parametrize("settings", [{}, {"ekf.coupling": "loose"}, {"ekf.scale_sigma": 0.02}, FLOOR])
+@pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])
+def test_deriving_twice_changes_nothing(settings, rig):
+    source = recording(rig)
+    once = derived(load(None, settings), source.rig, source.imu_noise)
+    assert derived(once, source.rig, source.imu_noise) == once
+
+
+def test_over_a_floor_the_height_says_how_sure_metres_are():
+    source = recording()
+    config = derived(load(None, FLOOR), source.rig, source.imu_noise)
+    planar = config.frontend.planar
+    assert config.ekf.vo_inflation == planar.vo_inflation
+    assert config.ekf.scale_sigma == config.graph.scale_sigma == planar.height_sigma_m / 0.3
+    assert config.ekf.coupling == "loose"
+
+
+def test_what_is_told_is_not_made_surer():
+    source = recording()
+    noise = replace(source.imu_noise, accel_scale_sigma=0.01)
+    config = Config()
+    assert derived(config, source.rig, noise).graph.scale_sigma == 0.01
+    told = replace(config, graph=replace(config.graph, scale_sigma=0.05))
+    assert derived(told, source.rig, noise).graph.scale_sigma == 0.05
+
+
+def test_wheels_without_slip_need_the_loose_filter():
+    source = recording()
+    with pytest.raises(UsageError, match="nonholonomic"):
+        derived(load(None, {"ekf.nonholonomic": True}), source.rig, source.imu_noise)

@@ -1,0 +1,45 @@
+"""What is heavy is not imported before it is needed."""
+
+import subprocess
+import sys
+
+import pytest
+
+from vislam.cli.verbs import VERBS
+
+HEAVY = {"numpy", "scipy", "numba", "cv2", "gtsam", "matplotlib", "open3d", "rerun"}
+
+
+def modules_after(script: str) -> set[str]:
+    """Return the modules that a fresh interpreter has loaded when the script has run."""
+    tail = "import sys; print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", f"{script}\n{tail}"], capture_output=True, text=True, check=True)
+    return set(done.stderr.splitlines()[-1].split())
+
+
+def test_the_pipeline_loads_no_statistics_pictures_or_viewers() -> None:
+    loaded = modules_after("import vislam.slam")
+    assert "gtsam" in loaded
+    strangers = {"scipy.stats", "scipy.interpolate", "matplotlib", "rerun", "open3d", "pydantic", "tyro", "rich"}
+    assert not strangers & loaded
+
+
+def test_the_package_itself_loads_nothing_heavy() -> None:
+    assert not HEAVY & modules_after("import vislam")
+
+
+def test_no_kernel_is_compiled_or_read_from_its_cache_by_an_import() -> None:
+    """A signature on a decorator does that, and brings the whole of numba's registry along: half a second."""
+    assert "numba.typed.typeddict" not in modules_after("import vislam.slam")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_answers_for_help_before_it_loads_anything_heavy(verb: str) -> None:
+    call = f"from vislam.cli import run_verb\ntry: run_verb([{verb!r}, '--help'])\nexcept SystemExit: pass"
+    assert not HEAVY & modules_after(call)
+
+
+def test_a_pose_graph_file_loads_neither_the_pipeline_nor_what_draws() -> None:
+    loaded = modules_after("import vislam.run.offline.optimize_graph, vislam.report.graph_page")
+    assert not (HEAVY - {"numpy", "scipy", "numba"}) & loaded
+    assert "vislam.slam" not in loaded

@@ -1,0 +1,1 @@
+"""Worlds with exact truth that tests and benchmarks measure in."""

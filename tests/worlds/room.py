@@ -1,0 +1,131 @@
+"""Random landmarks around an exact motion, seen by a pinhole rig: keyframe packets without images, for tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import invert, so3_exp, transform
+from vislam.core.messages import Array, KeyframePacket, NavState, Observations, Tracking, VoMeasurement
+from vislam.imu import ImuNoise
+from vislam.imu.series import ImuSeries
+from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion
+from worlds.parts import R_BODY_CAM, bare_keyframe, on_walls
+
+PINHOLE = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
+T_BODY_CAM0 = transform(R_BODY_CAM, np.array([0.05, 0.05, 0.02]))
+T_BODY_CAM1 = transform(R_BODY_CAM, np.array([0.05, -0.06, 0.02]))
+MONO = Rig((PINHOLE,), (T_BODY_CAM0,))
+STEREO = Rig((PINHOLE, PINHOLE), (T_BODY_CAM0, T_BODY_CAM1))
+RGBD = Rig((PINHOLE,), (T_BODY_CAM0,), has_depth=True)
+GYRO_BIAS, ACCEL_BIAS = np.array([0.006, -0.004, 0.008]), np.array([0.08, -0.05, 0.06])
+
+
+@dataclass(frozen=True)
+class World:
+    """A motion, landmarks on the walls of a room around it, and how they are seen."""
+
+    motion: Motion
+    rig: Rig = MONO
+    seed: int = 0
+    duration_s: float = 20.0
+    keyframe_hz: float = 5.0
+    tracks: int = 80
+    sigma_px: float = 1.0
+    outliers: float = 0.0
+    noise: ImuNoise = EUROC_NOISE
+    time_offset_s: float = 0.0  # the camera's stamps are early by this much: true time = stamp + offset
+    readout_s: float = 0.0
+    R_cam_correction: Array | None = None  # truth: R_body_cam0 = rig's @ exp(this)
+    depth_sigma_rho: float = 2e-3
+    room_m: tuple[float, float, float] = (7.0, 7.0, 4.0)
+    rest_until_s: float = 0.0  # packets say "at rest" up to here; the motion must agree
+
+    def landmarks(self, rng: np.random.Generator, count: int = 1500) -> Array:
+        return on_walls(rng, count, np.array(self.room_m))
+
+    def truth(self, t_ns: int) -> tuple[Array, Array]:
+        T, v, _, _ = self.motion.at((t_ns - T0_NS) / NS)
+        return T, v
+
+    def packets(self) -> tuple[list[KeyframePacket], list[tuple[Array, Array, Array]]]:
+        """Return keyframe packets and, for each, the true pose, velocity and biases [6]."""
+        rng = np.random.default_rng(self.seed)
+        samples, biases = self.motion.samples(
+            self.duration_s + 0.5, self.noise.rate_hz, self.noise, rng, GYRO_BIAS, ACCEL_BIAS
+        )
+        series = ImuSeries()
+        for sample in samples:
+            series.append(sample)
+        world = self.landmarks(rng)
+        ids = np.full(len(world), -1)
+        live: set[int] = set()
+        next_id, packets, truths, t_before = 0, [], [], None
+        correction = np.eye(3) if self.R_cam_correction is None else so3_exp(self.R_cam_correction)
+        T_cams = [T_BODY_CAM0 @ transform(correction, np.zeros(3))]
+        if self.rig.is_stereo:
+            T_cams.append(T_cams[0] @ self.rig.T_cam0_cam1)
+        for k in range(int(self.duration_s * self.keyframe_hz)):
+            t_s = 0.1 + k / self.keyframe_hz
+            t_ns = T0_NS + round(t_s * NS)
+            views = [self._seen(t_s + self.time_offset_s, T, world) for T in T_cams]
+            pixels, depth = views[0]
+            visible = np.flatnonzero(np.isfinite(pixels[:, 0]))
+            live &= set(visible.tolist())
+            if len(live) < self.tracks:
+                fresh = [int(i) for i in rng.permutation(visible) if i not in live][: self.tracks - len(live)]
+                for i in fresh:
+                    ids[i], next_id = next_id, next_id + 1
+                live |= set(fresh)
+            chosen = np.array(sorted(live), dtype=np.int64)
+            noisy = pixels[chosen] + rng.normal(size=(len(chosen), 2)) * self.sigma_px
+            wrong = rng.random(len(chosen)) < self.outliers
+            noisy[wrong] += rng.uniform(-30, 30, (int(wrong.sum()), 2))
+            right, depth_m = None, None
+            if self.rig.is_stereo:
+                right = views[1][0][chosen] + rng.normal(size=(len(chosen), 2)) * self.sigma_px
+            if self.rig.has_depth:
+                depth_m = 1.0 / (1.0 / depth[chosen] + rng.normal(size=len(chosen)) * self.depth_sigma_rho)
+            T, v, _, _ = self.motion.at(t_s)
+            imu = None if t_before is None else series.cut(t_before, t_ns)
+            seen = Observations(ids[chosen].copy(), noisy, right, depth_m)
+            packets.append(packet(k, t_ns, seen, imu, at_rest=k > 0 and t_s <= self.rest_until_s))
+            truths.append((T, v, biases[min(round(t_s * self.noise.rate_hz), len(biases) - 1)]))
+            t_before = t_ns
+        return packets, truths
+
+    def _seen(self, t_s: float, T_body_cam: Array, world: Array) -> tuple[Array, Array]:
+        T = invert(self.motion.pose(t_s) @ T_body_cam)
+        p = world @ T[:3, :3].T + T[:3, 3]
+        pixels = PINHOLE.project(p)
+        pixels[~PINHOLE.contains(pixels) | (p[:, 2] < 0.3)] = np.nan
+        if self.readout_s:  # of those in view, each where its own row sees it
+            for i in np.flatnonzero(np.isfinite(pixels[:, 1])):
+                for _ in range(2):
+                    row = pixels[i, 1] / PINHOLE.height - 0.5
+                    T = invert(self.motion.pose(t_s + row * self.readout_s) @ T_body_cam)
+                    p[i] = T[:3, :3] @ world[i] + T[:3, 3]
+                    pixels[i] = PINHOLE.project(p[i : i + 1])[0]
+            pixels[~PINHOLE.contains(pixels)] = np.nan
+        return pixels, p[:, 2]
+
+
+def packet(k: int, t_ns: int, seen: Observations, imu, at_rest: bool = False) -> KeyframePacket:
+    vo = VoMeasurement(t_ns, max(k - 1, 0), None, np.eye(6), False, Tracking.LOST, 0)
+    return KeyframePacket(bare_keyframe(k, t_ns), vo, seen, imu, at_rest=at_rest)
+
+
+START_SIGMAS = np.repeat([0.01, 1e-3, 0.05, 0.005, 0.05], 3)
+
+
+def start_state(truth: tuple[Array, Array, Array], t_ns: int, rng: np.random.Generator) -> NavState:
+    """Return the true state disturbed by START_SIGMAS (yaw and position not: they are the gauge)."""
+    T, v, bias = truth
+    e = rng.normal(size=15) * START_SIGMAS
+    up = T[2, :3]
+    e[:3] -= up * (up @ e[:3])
+    T = T.copy()
+    T[:3, :3] = T[:3, :3] @ so3_exp(-e[:3])
+    return NavState(t_ns, T, v - e[6:9], bias[:3] - e[9:12], bias[3:] - e[12:15], np.diag(START_SIGMAS**2))
