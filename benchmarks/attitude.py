@@ -18,14 +18,15 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import numpy as np  # noqa: E402
-from broad import Trial, errors_deg, rms, started  # noqa: E402
-from carts import GRAVITY_M_S2, Cart  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 from vqf import VQF  # noqa: E402
 
 from vislam.config import AttitudeConfig  # noqa: E402
+from vislam.core.messages import Array  # noqa: E402
 from vislam.imu import AttitudeFilter  # noqa: E402
-from vislam.messages import Array  # noqa: E402
+from worlds.broad import Trial, errors_deg, rms, started  # noqa: E402
+from worlds.cart import Cart  # noqa: E402
+from worlds.parts import GRAVITY_M_S2  # noqa: E402
 
 METHODS = ("vqf", "complementary")
 

@@ -28,14 +28,16 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-import ekf_monte_carlo as mc  # noqa: E402
 import gtsam  # noqa: E402
 import numpy as np  # noqa: E402
-from inertial_world import GRAVITY_M_S2  # noqa: E402
 
+import results  # noqa: E402
 from vislam.config import EkfConfig  # noqa: E402
-from vislam.ekf import Ekf, kernels  # noqa: E402
-from vislam.messages import Array, ImuSample  # noqa: E402
+from vislam.core.messages import Array, ImuSample  # noqa: E402
+from vislam.ekf import Ekf  # noqa: E402
+from vislam.ekf.loose import kernels  # noqa: E402
+from worlds import monte_carlo as mc  # noqa: E402
+from worlds.parts import GRAVITY_M_S2  # noqa: E402
 
 DT = 1.0 / mc.IMU.rate_hz
 SIGMAS = np.array(
@@ -136,8 +138,8 @@ def microseconds(work: Callable[[], None], calls: int) -> float:
     return (time.process_time() - begin) / calls * 1e6
 
 
-def cost(rounds: int) -> None:
-    """Print microseconds of the compiled filter and of its peers, and their ratios."""
+def cost(rounds: int) -> dict[str, float]:
+    """Print microseconds of the compiled filter and of its peers, and their ratios; return CPU ms of the filter."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(21, 21)) * 0.01
     x, P = np.zeros(kernels.NOMINAL), root @ root.T + 1e-6 * np.eye(21)
@@ -172,16 +174,19 @@ def cost(rounds: int) -> None:
     print(
         f"{f'median of {rounds}':14s}{'compiled us':>13s}{'numpy us':>10s}{'gtsam us':>10s}{'numpy':>9s}{'gtsam':>9s}"
     )
+    cpu_ms = {}
     for name, rows in times.items():
         table = np.array(rows)
+        cpu_ms[f"kernel {name}"] = 1e-3 * float(np.median(table[:, 0]))
         a, b, c = np.median(table, axis=0)
         by_numpy, by_gtsam = np.median(table[:, 1] / table[:, 0]), np.median(table[:, 2] / table[:, 0])
         print(f"{name:14s}{a:13.2f}{b:10.1f}{c:10.2f}{by_numpy:8.1f}x{by_gtsam:8.2f}x")
-    _whole_filter()
+    return cpu_ms | _whole_filter()
 
 
-def _whole_filter() -> None:
-    """Print what a caller waits for: bookkeeping, history and replay included."""
+def _whole_filter() -> dict[str, float]:
+    """Print what a caller waits for, and return it in CPU ms: bookkeeping, history and replay included."""
+    cpu_ms = {}
     way = mc.drive("hand", 1, 20.0)
     samples = [ImuSample(int(t), v[:3], v[3:]) for t, v in zip(way.t_ns, way.samples, strict=True)]
     for delay_s in (0.0, 0.1, 0.25):
@@ -203,6 +208,8 @@ def _whole_filter() -> None:
             f"Ekf.predict {rest / len(samples) * 1e6:6.1f} us a sample, "
             f"update_vo {in_vision / frames * 1e6:6.0f} us a frame that is {delay_s * 1e3:3.0f} ms late"
         )
+        cpu_ms[f"update_vo {delay_s * 1e3:.0f} ms late"] = 1e3 * in_vision / frames
+    return cpu_ms | {"predict": 1e3 * rest / len(samples)}
 
 
 def one(job: tuple[mc.Scenario, EkfConfig, int]) -> mc.Run:
@@ -237,6 +244,7 @@ def main() -> None:
     verbs = parser.add_subparsers(dest="verb", required=True)
     verb = verbs.add_parser("cost", help="microseconds against numpy and gtsam")
     verb.add_argument("--rounds", type=int, default=9)
+    verb.add_argument("--record", action="store_true", help="keep the times in benchmarks/results")
     verb = verbs.add_parser("nees", help="the Monte-Carlo campaign")
     verb.add_argument("--runs", type=int, default=100)
     verb.add_argument("--seed", type=int, default=5000, help="of the first run")
@@ -248,7 +256,9 @@ def main() -> None:
     verb.add_argument("--minutes", type=float, default=60.0)
     args = parser.parse_args()
     if args.verb == "cost":
-        cost(args.rounds)
+        cpu_ms = cost(args.rounds)
+        if args.record:
+            results.record("ekf", cpu_ms)
     elif args.verb == "nees":
         nees(args)
     else:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 TESTS = Path(__file__).resolve().parent.parent / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "frontend")]
+sys.path[:0] = [str(TESTS)]
 
-from point_world import KINDS, Start, initialiser  # noqa: E402
+from worlds.start import KINDS, Start, initialiser  # noqa: E402
 
 SHARES = {"static": 15, "moving": 40, "gentle": 15, "rotation": 10, "uniform": 10, "accelerating": 10}
 

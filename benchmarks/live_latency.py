@@ -29,7 +29,7 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "live")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import numpy as np  # noqa: E402
 
@@ -41,9 +41,9 @@ KEYFRAMES = 1000
 
 def correct(connection, seconds: float, ready, go, epoch) -> None:
     """Send the corrections of a body at rest, each 50 ms late."""
+    from vislam.core.messages import NavState, Tracking, VoMeasurement, no_observations
     from vislam.ekf import Correction
-    from vislam.live.messages import Start
-    from vislam.messages import NavState, Tracking, VoMeasurement, no_observations
+    from vislam.live.notices import Start
 
     ready.wait()
     while not go.wait(1.0):
@@ -61,11 +61,11 @@ def correct(connection, seconds: float, ready, go, epoch) -> None:
 
 def close_loops(connection, stop, grown, closed) -> None:
     """Build a graph of 1,000 keyframes, then add more and close a loop over 1,000 with every tenth."""
-    from graph_world import GRAVITY_M_S2, RIG, World
-
     from vislam.config import GraphConfig, WindowConfig
     from vislam.graph import PoseGraph
-    from vislam.live.messages import MapMoved
+    from vislam.live.notices import MapMoved
+    from worlds.lap import RIG, World
+    from worlds.parts import GRAVITY_M_S2
 
     world = World(duration_s=2.0 * KEYFRAMES / 5.0)
     graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, GRAVITY_M_S2, RIG, WindowConfig())
@@ -89,7 +89,7 @@ def close_loops(connection, stop, grown, closed) -> None:
 
 def listen(address: str, results, ready) -> None:
     """Note for each datagram how old its sample is when it is here."""
-    from vislam.live.publisher import PoseListener
+    from vislam.live.wire.publisher import PoseListener
 
     listener = PoseListener(address)
     gc.disable()  # a collection would keep it from reading for a hundred milliseconds
@@ -111,8 +111,8 @@ def fast(signals, samples, inbox, settings, epoch, table, report) -> None:
 
     from vislam.config import load
     from vislam.imu import BiasMemory, ImuNoise
-    from vislam.live import fast_process
-    from vislam.live.child import guarded
+    from vislam.live.processes import fast as fast_process
+    from vislam.live.processes.child import guarded
     from vislam.live.replayed_imu import ReplayedImu
 
     config = load(None, settings)
@@ -129,8 +129,8 @@ def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
     """Measure."""
     import socket
 
-    from vislam.live.child import Failure, Flag, Ready, Signals
     from vislam.live.epoch import Epoch
+    from vislam.live.processes.child import Failure, Flag, Ready, Signals
     from vislam.live.replayed_imu import InertialTable
 
     context = get_context("spawn")
@@ -214,7 +214,7 @@ def filter_cost() -> None:
     """Print what predicting, correcting and replaying cost."""
     from numba import config
 
-    from vislam.ekf import kernels
+    from vislam.ekf.loose import kernels
 
     x, P = np.zeros(23), np.eye(21) * 1e-4
     x[6] = x[19] = 1.0
@@ -240,11 +240,11 @@ def filter_cost() -> None:
 def late_frame_us(frames: int) -> float:
     """Return what a motion that comes 50 ms late costs the process of the pose, least of many."""
     from vislam.config import load
+    from vislam.core.messages import ImuSample, NavState, Tracking, VoMeasurement, no_observations
     from vislam.ekf import Correction
     from vislam.imu import ImuNoise
     from vislam.live.fast import FastPath
-    from vislam.live.messages import Start
-    from vislam.messages import ImuSample, NavState, Tracking, VoMeasurement, no_observations
+    from vislam.live.notices import Start
 
     noise, dt_ns = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ), int(1e9 / RATE_HZ)
     fast = FastPath(load(None, {}), noise, np.eye(4), lambda pose: None)

@@ -32,16 +32,17 @@ import psutil  # noqa: E402
 matplotlib.use("Agg")
 
 from g2o_edges import BEST_CHI2, EdgeFile  # noqa: E402
-from graph_world import GRAVITY_M_S2, packet_of  # noqa: E402
-from lap_world import STEREO, LapWorld, cart_round, window_of_truth  # noqa: E402
 from matplotlib import pyplot as plt  # noqa: E402
 
 import vislam.window  # noqa: E402
 from vislam.config import GraphConfig, WindowConfig  # noqa: E402
-from vislam.factors.replay import EdgeGraph  # noqa: E402
-from vislam.geometry import align_points, se3_exp, transform  # noqa: E402
+from vislam.core.geometry import align_points, se3_exp, transform  # noqa: E402
+from vislam.core.messages import Tracking, VoMeasurement  # noqa: E402
 from vislam.graph import PoseGraph  # noqa: E402
-from vislam.messages import Tracking, VoMeasurement  # noqa: E402
+from vislam.graph.replay import EdgeGraph  # noqa: E402
+from worlds.endless_lap import STEREO, LapWorld, cart_round, window_of_truth  # noqa: E402
+from worlds.lap import packet_of  # noqa: E402
+from worlds.parts import GRAVITY_M_S2  # noqa: E402
 
 RESULTS = ROOT / "results" / "long_run"
 

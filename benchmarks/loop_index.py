@@ -28,11 +28,11 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.sparse import csc_matrix  # noqa: E402
 
-from vislam.features import describe  # noqa: E402
-from vislam.loop.index import InvertedIndex  # noqa: E402
-from vislam.loop.vocabulary import BagOfWords, Vocabulary, depth_for, train  # noqa: E402
-from vislam.messages import Frame  # noqa: E402
-from vislam.sources import open_source  # noqa: E402
+from vislam.core.messages import Frame  # noqa: E402
+from vislam.loop.words.index import InvertedIndex  # noqa: E402
+from vislam.loop.words.vocabulary import BagOfWords, Vocabulary, depth_for, train  # noqa: E402
+from vislam.run.sources import open_source  # noqa: E402
+from vislam.vision.features import describe  # noqa: E402
 
 FEATURES = 1000
 SIZES = (1_000, 5_000, 10_000, 50_000, 200_000)

@@ -27,11 +27,12 @@ sys.path.insert(0, str(ROOT))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
+import results  # noqa: E402
 from vislam.config import LoopConfig, LoopTruthConfig  # noqa: E402
-from vislam.geometry import invert, so3_log  # noqa: E402
+from vislam.core.geometry import invert, so3_log  # noqa: E402
+from vislam.core.messages import Frame, Keyframe, LoopCandidate, LoopDecision, LoopEdge  # noqa: E402
 from vislam.loop.detector import LoopDetector  # noqa: E402
-from vislam.messages import Frame, Keyframe, LoopCandidate, LoopDecision, LoopEdge  # noqa: E402
-from vislam.session.reader import Session, StoredKeyframe  # noqa: E402
+from vislam.run.session.reader import Session, StoredKeyframe  # noqa: E402
 
 RULE = LoopTruthConfig()
 
@@ -61,10 +62,15 @@ class Pass:
         detector.close()
         self.digest = digest.hexdigest()[:12]
 
+    def percentiles_ms(self) -> tuple[float, float, float]:
+        """Return median, 95th percentile and longest time."""
+        p50, p95, most = np.percentile(self.times_ms, (50, 95, 100)).tolist()
+        return p50, p95, most
+
     def row(self, name: str, kind: str) -> str:
         """Return a line of the table."""
         count = len(self.times_ms)
-        p50, p95, most = np.percentile(self.times_ms, (50, 95, 100))
+        p50, p95, most = self.percentiles_ms()
         return (
             f"| {name} | {kind} | {count} | {p50:.1f} / {p95:.1f} / {most:.1f} | {self.verified / count:.1f} "
             f"| {self.edges} | {self.gross} | {self.digest} |"
@@ -88,15 +94,23 @@ def main() -> None:
     """Measure the runs that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--record", action="store_true", help="keep the times in benchmarks/results")
+    args = parser.parse_args()
     cv2.setNumThreads(1)
     print("| run | keyframes | number | CPU p50 / p95 / most [ms] | verified each | edges | gross | digest |")
     print("|---|---|---:|---:|---:|---:|---:|---|")
-    for run in parser.parse_args().runs:
+    cpu_ms: dict[str, float] = {}
+    for run in args.runs:
         session = Session(run / "session.db")
         stored = list(session.keyframes())
         for kind in ("in a row", "lost"):
-            print(Pass(session, stored, kind == "lost").row(run.name, kind), flush=True)
+            done = Pass(session, stored, kind == "lost")
+            print(done.row(run.name, kind), flush=True)
+            p50, p95, _ = done.percentiles_ms()
+            cpu_ms |= {f"{run.name}, {kind}: p50": p50, f"{run.name}, {kind}: p95": p95}
         session.close()
+    if args.record:
+        results.record("loop_step", cpu_ms)
 
 
 if __name__ == "__main__":

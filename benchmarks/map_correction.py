@@ -23,13 +23,13 @@ sys.path[:0] = [str(Path(__file__).resolve().parent.parent)]
 import numpy as np  # noqa: E402
 
 from vislam.config import MapConfig  # noqa: E402
-from vislam.factor_log import rig_from  # noqa: E402
-from vislam.geometry import se3_exp  # noqa: E402
+from vislam.core.geometry import se3_exp  # noqa: E402
+from vislam.core.memory import PackedScan  # noqa: E402
+from vislam.core.messages import GraphUpdate  # noqa: E402
+from vislam.factors.factor_log import rig_from  # noqa: E402
 from vislam.mapping.mapper import Mapper  # noqa: E402
-from vislam.mapping.octomap_io import encode_ot  # noqa: E402
-from vislam.memory import PackedScan  # noqa: E402
-from vislam.messages import GraphUpdate  # noqa: E402
-from vislam.session import Session  # noqa: E402
+from vislam.mapping.octree.octomap_io import encode_ot  # noqa: E402
+from vislam.run.session import Session  # noqa: E402
 
 KEYFRAMES = 1000
 ROOM_M = 8.0  # from one room to the next

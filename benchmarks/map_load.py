@@ -18,13 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.camera import Camera, Rig
 from vislam.config import Config
-from vislam.geometry import invert, se3_exp, so3_exp, transform
-from vislam.loop.detector import LoopDetector
-from vislam.loop.vocabulary import train
-from vislam.memory import EdgeRecord, GraphNews, KeyframeEntry, LoopPlace, LoopState, WindowRecord, WordsMemory
-from vislam.messages import (
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import invert, se3_exp, so3_exp, transform
+from vislam.core.memory import EdgeRecord, GraphNews, KeyframeEntry, LoopPlace, LoopState, WindowRecord, WordsMemory
+from vislam.core.messages import (
     Frame,
     GraphUpdate,
     Keyframe,
@@ -35,7 +33,9 @@ from vislam.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.session import Session, SessionWriter, recall
+from vislam.loop.detector import LoopDetector
+from vislam.loop.words.vocabulary import train
+from vislam.run.session import Session, SessionWriter, recall
 from vislam.slam import Slam
 
 LAP = 200  # keyframes
@@ -111,7 +111,7 @@ def load(path: Path, query: Keyframe) -> dict[str, float]:
     slam.begin_in_map(memory)
     step("graph and index")
     assert slam.back is not None and isinstance(slam.back.loops, LoopDetector)
-    _, candidates = slam.back.loops.detect(query, np.eye(4), begins_piece=True)
+    _, candidates = slam.back.loops.detect(query, np.eye(4), begins_submap=True)
     step("first query")
     spent["by the clock"] = time.perf_counter() - began
     spent["candidates"] = float(len(candidates))

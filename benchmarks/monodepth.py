@@ -28,22 +28,22 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "mapping")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
-from table_world import camera, frame, motion  # noqa: E402
 
-from vislam.camera import Rig  # noqa: E402
 from vislam.config import MonoDepthConfig  # noqa: E402
-from vislam.mapping.depth import mono_camera  # noqa: E402
-from vislam.mapping.monodepth import DepthFilter, MonoDepth, SeenFrame  # noqa: E402
-from vislam.mapping.monodepth.matching import LEAST_SCORE  # noqa: E402
-from vislam.messages import Frame  # noqa: E402
-from vislam.odometry_keyframe import OdometryKeyframe  # noqa: E402
-from vislam.session import Session  # noqa: E402
-from vislam.sources import open_source  # noqa: E402
+from vislam.core.camera import Rig  # noqa: E402
+from vislam.core.messages import Frame  # noqa: E402
+from vislam.mapping.depth.image import mono_camera  # noqa: E402
+from vislam.mapping.depth.mono import DepthFilter, MonoDepth, SeenFrame  # noqa: E402
+from vislam.mapping.depth.mono.matching import LEAST_SCORE  # noqa: E402
+from vislam.run.session import Session  # noqa: E402
+from vislam.run.sources import open_source  # noqa: E402
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe  # noqa: E402
+from worlds.table import camera, frame, motion  # noqa: E402
 
 WIDTH = 640
 K = camera(WIDTH).K

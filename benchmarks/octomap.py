@@ -32,13 +32,14 @@ sys.path[:0] = [str(ROOT)]
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
+import results  # noqa: E402
 from vislam.config import MapConfig  # noqa: E402
-from vislam.mapping.depth import filter_depth, rgbd_view, scan_points  # noqa: E402
-from vislam.mapping.occupancy import OccupancyMap  # noqa: E402
-from vislam.mapping.octomap_io import encode_bt, encode_ot  # noqa: E402
-from vislam.messages import Array, Frame  # noqa: E402
-from vislam.recording import Recording  # noqa: E402
-from vislam.sources import open_source  # noqa: E402
+from vislam.core.messages import Array, Frame  # noqa: E402
+from vislam.core.recording import Recording  # noqa: E402
+from vislam.mapping.depth.image import filter_depth, rgbd_view, scan_points  # noqa: E402
+from vislam.mapping.octree.occupancy import OccupancyMap  # noqa: E402
+from vislam.mapping.octree.octomap_io import encode_bt, encode_ot  # noqa: E402
+from vislam.run.sources import open_source  # noqa: E402
 
 MAX_RANGE_M = 4.0
 CONFIGURATIONS = [(r, i) for r in (0.05, 0.02) for i in ("full", "discretised")]
@@ -189,12 +190,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--every", type=int, default=1, help="frames between those that are taken")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", type=Path, help="write the numbers here too")
+    parser.add_argument("--record", action="store_true", help="keep the times in benchmarks/results")
     args = parser.parse_args()
     print("| configuration | OctoMap ms | ours ms | ratio (target) | OctoMap MB | ours MB | nodes | files equal |")
     rows = compare(args)
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1))
+    if args.record:
+        label = f"{args.source.split(',')[0].split('/')[-1]}, {args.frames} frames"
+        times = {f"{label}, {row['resolution_m']:g} m {row['insertion']}": row["ours_ms"] for row in rows}
+        results.record("octomap", times)
 
 
 if __name__ == "__main__":

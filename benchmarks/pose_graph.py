@@ -28,21 +28,23 @@ from typing import Any
 
 import numpy as np
 
+import results
+
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from vislam.batch.graph_certificate import certify  # noqa: E402
-from vislam.batch.graph_files import read_pose_graph  # noqa: E402
-from vislam.batch.graph_g2o import write_g2o  # noqa: E402
-from vislam.batch.graph_problem import PoseGraphProblem  # noqa: E402
-from vislam.batch.graph_solver import levenberg_marquardt  # noqa: E402
-from vislam.batch.graph_structure import Structure  # noqa: E402
-from vislam.batch.graph_worlds import simulate_graph  # noqa: E402
+from vislam.batch.posegraph.certificate import certify  # noqa: E402
+from vislam.batch.posegraph.files import read_pose_graph  # noqa: E402
+from vislam.batch.posegraph.g2o import write_g2o  # noqa: E402
+from vislam.batch.posegraph.problem import PoseGraphProblem  # noqa: E402
+from vislam.batch.posegraph.solver import levenberg_marquardt  # noqa: E402
+from vislam.batch.posegraph.structure import Structure  # noqa: E402
+from vislam.batch.posegraph.worlds import simulate_graph  # noqa: E402
 from vislam.config import GraphWorldConfig  # noqa: E402
-from vislam.errors import VislamError  # noqa: E402
+from vislam.core.errors import VislamError  # noqa: E402
 
 PEER = ROOT / "benchmarks" / "peers" / "pose_graph_peer.py"
 OURS, PEERS = "vislam", ("vislam", "gtsam_lm", "gtsam_chordal_lm", "g2o_lm", "ceres_lm")
@@ -78,8 +80,9 @@ def judge(problem: PoseGraphProblem, poses: np.ndarray) -> tuple[float, str, flo
     return certificate.chi2, "yes" if certificate.certified else "no", problem.chi2(refined.poses)
 
 
-def compare(files: list[Path], limit_s: float, folder: Path, wheels: str, rounds: int) -> None:
-    """Print the table of all peers on files."""
+def compare(files: list[Path], limit_s: float, folder: Path, wheels: str, rounds: int) -> dict[str, float]:
+    """Print the table of all peers on files; return CPU ms of ours."""
+    cpu_ms: dict[str, float] = {}
     print("| file | peer | load s | solve s | total s | wall s | chi2 | above the lowest | certified | refined |")
     print("|---|---|---:|---:|---:|---:|---:|---:|---|---:|")
     versions: dict[str, str] = {}
@@ -106,10 +109,13 @@ def compare(files: list[Path], limit_s: float, folder: Path, wheels: str, rounds
             ends = f"{chi2:.9g} | {chi2 / lowest - 1.0:.1e} | {word} | {refined:.9g}"
             print(f"| {source.stem} | {peer} | {' | '.join(numbers)} | {ends} |", flush=True)
         if OURS in judged:
+            for part in ("load", "solve"):
+                cpu_ms[f"{source.stem}, {part}"] = 1e3 * min(float(run[part]) for run in rows[OURS])
             certificate = certify(problem, np.load(folder / f"{source.stem}_{OURS}.g2o.npy"))
             theirs = f", published {SE_SYNC[source.stem]:g}" if source.stem in SE_SYNC else ""
             print(f"\n{source.stem}: SE-Sync's cost {certificate.isotropic_cost:.6g}{theirs}; {certificate.text}\n")
     print("versions: " + ", ".join(f"{peer} {number}" for peer, number in versions.items()))
+    return cpu_ms
 
 
 def growth(
@@ -173,13 +179,16 @@ def main() -> None:
     parser.add_argument("--peers", default="", help="folder with the wheels of g2opy and pyceres")
     parser.add_argument("--rounds", type=int, default=3, help="in which peers take turns on a file")
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--record", action="store_true", help="keep the times in benchmarks/results")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         if args.files == ["growth"]:
             growth(args.shapes, args.sizes, args.loops_per_pose, args.limit_s, folder, args.picture)
         else:
-            compare([Path(file) for file in args.files], args.limit_s, folder, args.peers, args.rounds)
+            cpu_ms = compare([Path(file) for file in args.files], args.limit_s, folder, args.peers, args.rounds)
+            if args.record:
+                results.record("pose_graph", cpu_ms)
 
 
 if __name__ == "__main__":

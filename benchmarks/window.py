@@ -29,15 +29,17 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "window")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import numpy as np  # noqa: E402
-from inertial_world import GRAVITY_M_S2, Motion, state_error  # noqa: E402
-from window_world import MONO, PINHOLE, START_SIGMAS, T_BODY_CAM0, World, start_state  # noqa: E402
 
+import results  # noqa: E402
 from vislam.config import WindowConfig  # noqa: E402
-from vislam.messages import Array, KeyframePacket, NavState  # noqa: E402
+from vislam.core.messages import Array, KeyframePacket, NavState  # noqa: E402
 from vislam.window import SlidingWindow  # noqa: E402
+from worlds.motion import Motion, state_error  # noqa: E402
+from worlds.parts import GRAVITY_M_S2  # noqa: E402
+from worlds.room import MONO, PINHOLE, START_SIGMAS, T_BODY_CAM0, World, start_state  # noqa: E402
 
 WARM_UP = 20  # keyframes before times count: compilation, and a window that is not full yet
 MIN_VIEWS = 4  # before a peer's explicit landmark is triangulated
@@ -261,6 +263,7 @@ def compare(args: argparse.Namespace) -> None:
     """Print one row per seed and estimator."""
     print(f"{args.seconds:.0f} s, {args.tracks} tracks, {args.keyframes} keyframes; CPU ms per keyframe, position in m")
     print(f"{'seed':>4} {'estimator':>10} {'median':>8} {'p99':>8} {'rmse':>8}")
+    medians, tails = [], []
     for seed in range(args.seeds):
         for estimator in ("ours", "smart", "landmarks"):
             command = [sys.executable, __file__, "worker", "--estimator", estimator, "--seed", str(seed)]
@@ -279,7 +282,13 @@ def compare(args: argparse.Namespace) -> None:
                 print(f"{seed:>4} {estimator:>10} failed: {reason}")
                 continue
             row = json.loads(done.stdout.strip().splitlines()[-1])
+            if estimator == "ours":
+                medians.append(row["median"])
+                tails.append(row["p99"])
             print(f"{seed:>4} {estimator:>10} {row['median']:8.2f} {row['p99']:8.2f} {row['rmse']:8.4f}", flush=True)
+    if args.record:
+        setting = f"{args.tracks} tracks, {args.keyframes} keyframes"
+        results.record("window", {f"{setting}: p50": np.median(medians), f"{setting}: p99": np.median(tails)})
 
 
 def nees(args: argparse.Namespace) -> None:
@@ -319,6 +328,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=15)
     parser.add_argument("--estimator", choices=("ours", "smart", "landmarks"), default="ours")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--record", action="store_true", help="keep the times in benchmarks/results")
     args = parser.parse_args()
     {"compare": compare, "nees": nees, "worker": worker}[args.what](args)
 

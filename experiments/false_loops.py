@@ -19,17 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.batch.graph_files import read_pose_graph
-from vislam.batch.graph_optimize import optimize_pose_graph
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.camera import Camera, Rig
+from vislam.batch.posegraph.files import read_pose_graph
+from vislam.batch.posegraph.optimize import optimize_pose_graph
+from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.config import GraphConfig, WindowConfig
-from vislam.factors.journal import loop_record
-from vislam.factors.loop import LoopModel
-from vislam.geometry import align_points, invert, se3_adjoint, se3_exp, transform_points
-from vislam.graph import PoseGraph
-from vislam.loop.injection import FalseLoops, is_injected
-from vislam.messages import (
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import align_points, invert, se3_adjoint, se3_exp, transform_points
+from vislam.core.messages import (
     Array,
     Frame,
     Keyframe,
@@ -40,6 +36,10 @@ from vislam.messages import (
     VoMeasurement,
     no_observations,
 )
+from vislam.factors.journal import loop_record
+from vislam.factors.loop import LoopModel
+from vislam.graph import PoseGraph
+from vislam.loop.injection import FalseLoops, is_injected
 
 _DRIFT_SIGMAS = np.repeat([0.01, 0.05], 3)  # of a step of odometry, per unit of drift
 _FALSE_SIGMAS = np.repeat([0.05, 0.3], 3)  # of the pose that a false loop claims: two places that look alike

@@ -26,10 +26,10 @@ START_S = 4.0  # standing, so that gravity is found
 
 def steer(name: str, command_name: str, course_odom: np.ndarray, stop: threading.Event, log: list[tuple]) -> None:
     """Follow the course [N, 2] in odom from the published pose until its end, or `stop`."""
-    from vislam.errors import DataError
+    from vislam.core.errors import DataError
     from vislam.hw.health import Health
-    from vislam.live.publisher import PoseReader
     from vislam.live.virtual.pilot import CommandWriter, PathFollower
+    from vislam.live.wire.publisher import PoseReader
 
     wheels, follower = CommandWriter(command_name), PathFollower(course_odom)
     reader: PoseReader | None = None
@@ -80,13 +80,14 @@ def write_picture(path: Path, course: np.ndarray, driven: np.ndarray, believed: 
 def main() -> None:
     """Run it."""
     from vislam.config import load, load_sensors
+    from vislam.core.files import write_json
     from vislam.live.run_live import LiveRun
-    from vislam.live.sensors import open_live
+    from vislam.live.sources import open_live
     from vislam.live.status import status_line
     from vislam.live.virtual.cart import VirtualCart
     from vislam.live.virtual.pilot import PathFollower
     from vislam.live.virtual.place import course
-    from vislam.runfolder import prepare, write_json
+    from vislam.run.folder import prepare
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/follow_path"))

@@ -33,7 +33,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from vislam.errors import VislamError, printable
+from vislam.core.errors import VislamError, printable
 
 LIMIT_S = 10.0  # of the processor's time
 FREE_BYTES, TIMES = 300 * 2**20, 10
@@ -284,7 +284,7 @@ def small_targets() -> list[Target]:
 def run_target(folder: Path) -> list[Target]:
     """Return the targets that need a run folder, which is made here."""
     from vislam.cli import run_verb
-    from vislam.session import SessionWriter
+    from vislam.run.session import SessionWriter
 
     source = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=60"
     with open(os.devnull, "w", encoding="utf-8") as null, redirect_stdout(null):
@@ -469,16 +469,16 @@ _TRACKS = (
 
 
 def _read_tracks(folder: Path) -> None:
-    from vislam.datasets.eqvio import read_track_table
+    from vislam.datasets.formats.eqvio import read_track_table
 
     read_track_table(folder / "tracks.csv", {})
 
 
 def _maps() -> list[dict[str, bytes]]:
-    from vislam.mapping.octomap_io import encode_bt, encode_ot
-    from vislam.mapping.octree import Octree
-    from vislam.mapping.pcd import write_pcd
-    from vislam.mapping.ply import write_ply
+    from vislam.mapping.formats.pcd import write_pcd
+    from vislam.mapping.formats.ply import write_ply
+    from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
+    from vislam.mapping.octree.tree import Octree
 
     starts = np.arange(32, dtype=np.int64) * 9 + (1 << 45)
     values = np.where(np.arange(32) % 2, 2.0, -2.0).astype(np.float32)
@@ -494,9 +494,9 @@ def _maps() -> list[dict[str, bytes]]:
 
 
 def _read_maps(folder: Path) -> None:
-    from vislam.mapping.octomap_io import read_octree
-    from vislam.mapping.pcd import read_pcd
-    from vislam.mapping.ply import read_ply
+    from vislam.mapping.formats.pcd import read_pcd
+    from vislam.mapping.formats.ply import read_ply
+    from vislam.mapping.octree.octomap_io import read_octree
 
     for path in folder.iterdir():
         read: Callable[[Path], object] = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix, read_octree)
@@ -504,7 +504,7 @@ def _read_maps(folder: Path) -> None:
 
 
 def _vocabularies() -> list[dict[str, bytes]]:
-    from vislam.loop.vocabulary import train
+    from vislam.loop.words.vocabulary import train
 
     rng = np.random.default_rng(2)
     small = train([rng.integers(0, 256, (60, 32), np.uint8) for _ in range(3)], 3, 2, 0, 1000)
@@ -513,8 +513,8 @@ def _vocabularies() -> list[dict[str, bytes]]:
 
 
 def _read_vocabularies(folder: Path) -> None:
-    from vislam.loop.orbslam import read_orbslam
-    from vislam.loop.vocabulary import Vocabulary
+    from vislam.loop.words.orbslam import read_orbslam
+    from vislam.loop.words.vocabulary import Vocabulary
 
     for path in folder.iterdir():
         vocabulary = Vocabulary.load(path) if path.suffix == ".npz" else read_orbslam(path)
@@ -522,7 +522,7 @@ def _read_vocabularies(folder: Path) -> None:
 
 
 def _bridge() -> bytes:
-    from vislam.hw.bridge_protocol import Chips, Hello, RawSample, Status, encode
+    from vislam.hw.bridge.protocol import Chips, Hello, RawSample, Status, encode
 
     hello = Hello(0, 1000, Chips(7), 0xE5, 0x68, b"H43", 200, 38, 1213, 92, 1, 35000, 4000, 30000, 2000)
     samples = [RawSample(i, 1000 * i, Status(0), (0, 0, 256), (1, 2, 3), (4, 5, 6), 100) for i in range(20)]
@@ -530,7 +530,7 @@ def _bridge() -> bytes:
 
 
 def _read_bridge(folder: Path) -> None:
-    from vislam.hw.bridge_protocol import FrameDecoder
+    from vislam.hw.bridge.protocol import FrameDecoder
 
     data, decoder = (folder / "bytes").read_bytes(), FrameDecoder()
     for at in range(0, len(data), 61):
@@ -556,7 +556,7 @@ def _read_tables(folder: Path) -> None:
 
 
 def _read_run(folder: Path) -> None:
-    from vislam.runfolder import read_metrics, read_setup
+    from vislam.run.folder import read_metrics, read_setup
 
     for arguments in (("report", str(folder)), ("loops", str(folder)), ("eval", str(folder))):
         _verb(*arguments)
@@ -565,7 +565,7 @@ def _read_run(folder: Path) -> None:
 
 
 def _read_session(folder: Path, whole: list[str]) -> None:
-    from vislam.session import Session, SessionWriter, has_begun, recall
+    from vislam.run.session import Session, SessionWriter, has_begun, recall
 
     path = folder / "session.db"
     has_begun(path)

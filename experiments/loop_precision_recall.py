@@ -28,15 +28,14 @@ from typing import Any
 import numpy as np
 
 from vislam.config import LoopTruthConfig
-from vislam.errors import VislamError
+from vislam.core.errors import VislamError
+from vislam.core.files import write_json, write_text
+from vislam.core.messages import Array, Frame, Keyframe, LoopCandidate
 from vislam.loop.detector import LoopDetector
 from vislam.loop.table import LoopRow, loops_text, retrieved_text
-from vislam.messages import Array, Frame, Keyframe, LoopCandidate
-from vislam.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
 from vislam.report import write_loop_plot
-from vislam.runfolder import write_json
-from vislam.session import Session
-from vislam.trajectory import write_text
+from vislam.run.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
+from vislam.run.session import Session
 
 WORLDS = ("workshop-cart", "corridor-loop", "aliased-halls")
 _START = "from vislam.cli import main; main()"

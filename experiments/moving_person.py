@@ -32,17 +32,17 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
-from vislam.camera import Camera  # noqa: E402
 from vislam.config import MapConfig  # noqa: E402
-from vislam.geometry import invert  # noqa: E402
-from vislam.mapping.depth import DepthView, filter_depth, rgbd_view, scan_points  # noqa: E402
-from vislam.mapping.occupancy import Occupancy, OccupancyMap  # noqa: E402
-from vislam.mapping.query import nearest_obstacle  # noqa: E402
-from vislam.messages import Array, ImageF32  # noqa: E402
+from vislam.core.camera import Camera  # noqa: E402
+from vislam.core.geometry import invert  # noqa: E402
+from vislam.core.messages import Array, ImageF32  # noqa: E402
+from vislam.mapping.depth.image import DepthView, filter_depth, rgbd_view, scan_points  # noqa: E402
+from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap  # noqa: E402
+from vislam.mapping.octree.query import nearest_obstacle  # noqa: E402
 from vislam.sim import Simulation, open_world  # noqa: E402
-from vislam.sim.figure import figure_depth  # noqa: E402
-from vislam.sim.render import Renderer  # noqa: E402
-from vislam.sim.sensors import DepthNoise, sense_depth  # noqa: E402
+from vislam.sim.scene.figure import figure_depth  # noqa: E402
+from vislam.sim.scene.render import Renderer  # noqa: E402
+from vislam.sim.sensing import DepthNoise, sense_depth  # noqa: E402
 
 HZ = 10.0
 STRIDES = {10.0: 1, 5.0: 2, 3.3: 3, 2.0: 5}  # rates of keyframes, as every n-th frame

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from vislam import open_source
 from vislam.config import Config
+from vislam.core.messages import Array, Frame
+from vislam.core.recording import Recording
 from vislam.frontend import make_frontend
-from vislam.messages import Array, Frame
-from vislam.recording import Recording
 from vislam.trajectory import Trajectory
 
 AGES_S = (0.0, 0.075, 0.2, 0.5, 1.0, np.inf)

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import MapConfig
-from vislam.errors import DataError, VislamError
-from vislam.mapping.drive import DriveGrid, DriveMap
-from vislam.mapping.occupancy import OccupancyMap
-from vislam.mapping.octomap_io import read_octree
-from vislam.mapping.picture import Line
-from vislam.mapping.plan_picture import render_drive
+from vislam.core.errors import DataError, VislamError
+from vislam.mapping.drive.drive import DriveGrid, DriveMap
+from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.octomap_io import read_octree
+from vislam.mapping.pictures.picture import Line
+from vislam.mapping.pictures.plan import render_drive
 from vislam.trajectory import read_trajectory
 
 Array = NDArray[np.float64]

@@ -25,14 +25,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from vislam import open_source
-from vislam.clock import StageClock
 from vislam.config import Config, PlanarConfig
-from vislam.front import Front, FrontStep
-from vislam.frontend.planar import PlanarFrontEnd
-from vislam.geometry import interpolate, invert
-from vislam.messages import Array, Frame, NavState, Tracking
-from vislam.recording import Recording
-from vislam.trajectory import Trajectory, write_text
+from vislam.core.clock import StageClock
+from vislam.core.files import write_text
+from vislam.core.geometry import interpolate, invert
+from vislam.core.messages import Array, Frame, NavState, Tracking
+from vislam.core.recording import Recording
+from vislam.frontend.planar.odometry import PlanarFrontEnd
+from vislam.pipeline.front import Front
+from vislam.pipeline.steps import FrontStep
+from vislam.trajectory import Trajectory
 from vislam.trajectory.consistency import anees
 
 SEGMENT_M = 2.0

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vislam.trajectory import write_text
+from vislam.core.files import write_text
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"
@@ -36,6 +36,9 @@ COLUMNS = (
     "keyframes",
     "loops",
     "real-time factor",
+    "CPU [ms/frame]",
+    "memory [MB]",
+    "first pose [s]",
     "coverage",
 )
 
@@ -145,7 +148,7 @@ def row(outcome: Outcome) -> list[str]:
         return [outcome.entry.recording, "–", reason, *["–"] * (len(COLUMNS) - 3)]
     accuracy = metrics.get("accuracy") or {}
     final, before = accuracy.get("graph") or {}, accuracy.get("ekf") or {}
-    loops = metrics.get("loops") or {}
+    loops, cost = metrics.get("loops") or {}, metrics.get("cost") or {}
     inertial = metrics.get("has_imu", True)
     mode = str(metrics.get("mode", "?")) + (", inertial" if inertial else "")
     scale = final.get("scale")
@@ -160,6 +163,9 @@ def row(outcome: Outcome) -> list[str]:
         _number(metrics.get("keyframes"), 0),
         f"{_number(loops.get('accepted'), 0)} of {_number(loops.get('candidates'), 0)}",
         _number(metrics.get("realtime_factor"), 2),
+        _number(cost.get("cpu_ms_per_frame"), 0),
+        _number(cost.get("peak_memory_mb"), 0),
+        f"{_number(cost.get('first_pose_s'), 2)} ({_number(cost.get('first_pose_cpu_s'), 1)} CPU)",
         _percent(final.get("coverage")),
     ]
 

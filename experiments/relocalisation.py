@@ -5,8 +5,8 @@
 
 One simulated recording is the map. The second one goes the same way with other motion, noise and exposure, and the
 light goes off and on every five seconds (two stops). Each query begins at another time of the second recording with a
-new visual odometry and a new piece of trajectory, and lasts one second; what it knows is its images and which way is
-up, as an IMU would tell. The answer is the pose at the keyframe with which the graph joins the piece to the map; right
+new visual odometry and a new submap, and lasts one second; what it knows is its images and which way is
+up, as an IMU would tell. The answer is the pose at the keyframe with which the graph joins the submap to the map; right
 is one within 5 cm and 2 degrees of the truth, wrong one off by more than 0.5 m or 10 degrees. Map and truth are aligned
 on the map's own keyframes (SE(3)).
 
@@ -30,17 +30,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vislam.clock import StageClock
 from vislam.config import Config, LoopTruthConfig, load
-from vislam.datasets import open_dataset
-from vislam.front import Front
-from vislam.frontend import make_frontend
-from vislam.geometry import align_points, invert, level_rotation, so3_log, transform
-from vislam.graph import PoseGraph
-from vislam.loop.detector import LoopDetector
-from vislam.loop.evaluation import true_places
-from vislam.memory import GraphMemory, PlacesMemory
-from vislam.messages import (
+from vislam.core.clock import StageClock
+from vislam.core.files import write_text
+from vislam.core.geometry import align_points, invert, level_rotation, so3_log, transform
+from vislam.core.memory import GraphMemory, PlacesMemory
+from vislam.core.messages import (
     Array,
     Frame,
     ImuSample,
@@ -53,11 +48,16 @@ from vislam.messages import (
     VoMeasurement,
     no_observations,
 )
-from vislam.recording import Recording, WrappedRecording
+from vislam.core.recording import Recording, WrappedRecording
+from vislam.datasets import open_dataset
+from vislam.frontend import make_frontend
+from vislam.graph import PoseGraph
+from vislam.loop.detector import LoopDetector
+from vislam.loop.evaluation import true_places
+from vislam.pipeline.front import Front
 from vislam.sim import open_world
-from vislam.sim.simulation import Simulation
+from vislam.sim.worlds.simulation import Simulation
 from vislam.slam import Slam
-from vislam.trajectory import write_text
 
 WORLDS = ("handheld-room", "workshop-cart", "corridor-loop")
 LIGHT = {"light_every_s": 5.0, "light_stops": 2.0}
@@ -147,12 +147,12 @@ def ask(known: SavedMap, recording: Simulation, first: int, config: Config) -> A
                 T_up = transform(level_rotation(T_truth[2, :3]), np.zeros(3)) @ invert(found.T_odom_body)
             packet, T_odom_body = renumbered(found.packet, count), T_up @ found.T_odom_body
             start = time.process_time()
-            edges = detector.detect(packet.keyframe, T_map_odom @ T_odom_body, packet.begins_piece)[0]
+            edges = detector.detect(packet.keyframe, T_map_odom @ T_odom_body, packet.begins_submap)[0]
             cpu_ms.append(1e3 * (time.process_time() - start))
             update = graph.add(packet, edges, T_odom_body)
             detector.move(update)
             T_map_odom = update.T_map_odom
-            if update.pieces.are_joined(0, packet.keyframe.id):
+            if update.submaps.are_joined(0, packet.keyframe.id):
                 error = invert(T_truth) @ known.T_truth_map @ T_map_odom @ T_odom_body
                 turn = so3_log(np.ascontiguousarray(error[:3, :3]))
                 metres, degrees = float(np.linalg.norm(error[:3, 3])), float(np.rad2deg(np.linalg.norm(turn)))
@@ -165,13 +165,13 @@ def renumbered(packet: KeyframePacket, by: int) -> KeyframePacket:
     first = packet.keyframe.id == 0
     keyframe = replace(packet.keyframe, id=packet.keyframe.id + by)
     vo = replace(packet.vo, keyframe_id=packet.vo.keyframe_id + by)
-    return replace(packet, keyframe=keyframe, vo=vo, begins_piece=first or packet.begins_piece)
+    return replace(packet, keyframe=keyframe, vo=vo, begins_submap=first or packet.begins_submap)
 
 
 def measure(world: str, every_s: float, width_px: int) -> dict[str, Any]:
     """Return what a world gave: its map, its answers and their summary."""
     config = load(None, {"map.enabled": False, "view.enabled": False})
-    # a query begins as a piece does after a loss: keyframes come as soon as they may
+    # a query begins as a submap does after a loss: keyframes come as soon as they may
     quick = replace(config.frontend, keyframe_max_interval_s=config.frontend.keyframe_min_interval_s)
     known = make_map(open_world(world, 1, image_width_px=width_px), config)
     print(f"{world}: a map of {len(known.T_map_body)} keyframes, ATE {1e3 * known.ate_m:.0f} mm", flush=True)
@@ -289,7 +289,7 @@ def _ask_frame(
     detector = LoopDetector(config.loop, recording.rig, config.seed)
     detector.restore(known.places)
     start = time.thread_time()
-    candidates = detector.detect(query, np.eye(4), begins_piece=True, tags=())[1]
+    candidates = detector.detect(query, np.eye(4), begins_submap=True, tags=())[1]
     cpu_ms = 1e3 * (time.thread_time() - start)
     detector.close()
     T_map_body = _answer(candidates, known)

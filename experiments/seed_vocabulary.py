@@ -1,4 +1,4 @@
-"""Make the vocabulary that serves the first keyframes of a run again: vislam/loop/seed_vocabulary.npz.
+"""Make the vocabulary that serves the first keyframes of a run again: vislam/loop/words/seed_vocabulary.npz.
 
     .venv/bin/python experiments/seed_vocabulary.py
 
@@ -16,7 +16,7 @@ import cv2
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from vislam.offline.train_vocabulary import train_vocabulary  # noqa: E402
+from vislam.run.offline.train_vocabulary import train_vocabulary  # noqa: E402
 
 WORLDS = {"workshop-cart": 0.5, "handheld-room": 1.0, "corridor-loop": 0.5}  # images per second: all show new things
 WORLD_SEEDS = (1, 2, 3)
@@ -32,7 +32,7 @@ def main() -> None:
         for world, rate_hz in WORLDS.items()
     )
     vocabulary, images, _ = train_vocabulary(sources, depth=DEPTH)
-    path = ROOT / "vislam" / "loop" / "seed_vocabulary.npz"
+    path = ROOT / "vislam" / "loop" / "words" / "seed_vocabulary.npz"
     vocabulary.save(path)
     print(f"{vocabulary.word_count} words from {images} images, {path.stat().st_size} bytes, {vocabulary.hash}")
 

@@ -30,21 +30,21 @@ import cv2
 import numpy as np
 
 from vislam.config import Config, from_data
-from vislam.errors import DataError, TrackingLostError
+from vislam.core.errors import DataError, TrackingLostError
+from vislam.core.messages import Tracking
+from vislam.core.recording import Recording
 from vislam.experiment.jobs import Job, expand, unique
 from vislam.experiment.plan import load_plan
-from vislam.messages import Tracking
-from vislam.recording import Recording
 from vislam.run import imu_noise
 from vislam.run.evidence import front_evidence, whole_evidence
+from vislam.run.folder import RunLog
 from vislam.run.metrics import initialisation
-from vislam.runfolder import RunLog
+from vislam.run.sources import measured_inertial, open_source, shaken, split_source
+from vislam.run.verdict import judge as verdict_of
 from vislam.sim import MeasuredInertial, open_points
 from vislam.slam import Slam
-from vislam.sources import measured_inertial, open_source, shaken, split_source
 from vislam.trajectory import Trajectory, evaluate
 from vislam.trajectory.consistency import stated_scale_sigma
-from vislam.verdict import judge as verdict_of
 
 PLAN = Path(__file__).with_name("starts.toml")
 SOON_S = 3.0  # a controller waits no longer

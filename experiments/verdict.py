@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from vislam.config import Config, load, validated
-from vislam.errors import VislamError
+from vislam.core.errors import VislamError
 from vislam.experiment.recordings import open_cached
 from vislam.run import execute
-from vislam.runfolder import prepare, read_metrics
-from vislam.sim.faults import FAULTS, FaultyRecording
-from vislam.verdict import Evidence, judge
+from vislam.run.folder import prepare, read_metrics
+from vislam.run.verdict import Evidence, judge
+from vislam.sim.faults.faults import FAULTS, FaultyRecording
 
 _WRONG = 3.0  # times the clean error
 _CLEAN = "clean"

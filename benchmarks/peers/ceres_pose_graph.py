@@ -12,8 +12,8 @@ import numpy as np
 import pyceres
 from numba import njit
 
-from vislam.batch.graph_kernels import errors_2d, errors_3d
-from vislam.batch.graph_problem import PoseGraphProblem
+from vislam.batch.posegraph.arithmetic import errors_2d, errors_3d
+from vislam.batch.posegraph.problem import PoseGraphProblem
 
 _BERNOULLI = (0.5, 1.0 / 12.0, 0.0, -1.0 / 720.0, 0.0, 1.0 / 30240.0, 0.0, -1.0 / 1209600.0)  # of Jr^-1 in ad
 _EDGE = np.array([[0, 1]])

@@ -47,9 +47,9 @@ class Laps:
 
 def vislam(path: str, result: str) -> Laps:
     """Ours, as `vislam optimize` calls it."""
-    from vislam.batch.graph_files import read_pose_graph
-    from vislam.batch.graph_g2o import write_g2o
-    from vislam.batch.graph_optimize import optimize_pose_graph
+    from vislam.batch.posegraph.files import read_pose_graph
+    from vislam.batch.posegraph.g2o import write_g2o
+    from vislam.batch.posegraph.optimize import optimize_pose_graph
 
     for _ in range(2):  # the first round loads compiled code
         laps = Laps("vislam")
@@ -140,8 +140,8 @@ def ceres_lm(path: str, result: str) -> Laps:
     """The wheel pyceres: Levenberg-Marquardt and sparse Cholesky as Ceres' pose-graph examples call them."""
     import ceres_pose_graph  # beside this file
 
-    from vislam.batch.graph_files import read_pose_graph
-    from vislam.batch.graph_g2o import write_g2o
+    from vislam.batch.posegraph.files import read_pose_graph
+    from vislam.batch.posegraph.g2o import write_g2o
 
     ceres_pose_graph.compile_costs()
     laps = Laps("pyceres")
