@@ -9,31 +9,36 @@ for value in recording.events():
         print(step.front.frame.t_ns, step.T_map_body)
 slam.finish()
 print(slam.back.graph.poses())
+
+`vislam run SOURCE --out RUN` keeps all of it in a folder; `load_run("RUN")` brings it back as numpy arrays.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from vislam.core.kernel_cache import choose_kernel_cache
+from vislam.core.late import late
 
 if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets import open_dataset
+    from vislam.run.loaded import LoadedRun, load_run
+    from vislam.run.sources import open_source
     from vislam.slam import Slam
-    from vislam.sources import open_source
 
-__all__ = ["Config", "Slam", "open_dataset", "open_source"]
+__all__ = ["Config", "LoadedRun", "Slam", "load_run", "open_dataset", "open_source"]
 
-_HOMES = {
-    "Config": "vislam.config",
-    "Slam": "vislam.slam",
-    "open_dataset": "vislam.datasets",
-    "open_source": "vislam.sources",
-}
+choose_kernel_cache()
 
-
-def __getattr__(name: str) -> Any:
-    """Import late: `import vislam` must stay as light as what is used of it."""
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'vislam' has no attribute '{name}'")
+__getattr__ = late(
+    __name__,
+    {
+        "Config": "vislam.config",
+        "LoadedRun": "vislam.run.loaded",
+        "Slam": "vislam.slam",
+        "load_run": "vislam.run.loaded",
+        "open_dataset": "vislam.datasets",
+        "open_source": "vislam.run.sources",
+    },
+)

@@ -1,10 +1,17 @@
 """Batch optimisation: a whole run at once, as the reference of accuracy, and pose graphs from files."""
 
-from vislam.batch.graph_files import read_pose_graph, write_pose_graph
-from vislam.batch.graph_optimize import PoseGraphSolution, optimize_pose_graph
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.loops import LoopVerdict
-from vislam.batch.optimize import BatchResult, optimize_run
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vislam.core.late import late
+
+if TYPE_CHECKING:
+    from vislam.batch.bundle.bundle_adjustment import BatchResult, optimize_run
+    from vislam.batch.bundle.loops import LoopVerdict
+    from vislam.batch.posegraph.files import read_pose_graph, write_pose_graph
+    from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
+    from vislam.batch.posegraph.problem import PoseGraphProblem
 
 __all__ = [
     "BatchResult",
@@ -16,3 +23,17 @@ __all__ = [
     "read_pose_graph",
     "write_pose_graph",
 ]
+
+__getattr__ = late(
+    __name__,
+    {
+        "BatchResult": "vislam.batch.bundle.bundle_adjustment",
+        "optimize_run": "vislam.batch.bundle.bundle_adjustment",
+        "LoopVerdict": "vislam.batch.bundle.loops",
+        "read_pose_graph": "vislam.batch.posegraph.files",
+        "write_pose_graph": "vislam.batch.posegraph.files",
+        "PoseGraphSolution": "vislam.batch.posegraph.optimize",
+        "optimize_pose_graph": "vislam.batch.posegraph.optimize",
+        "PoseGraphProblem": "vislam.batch.posegraph.problem",
+    },
+)

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from vislam.calibration import options as o
-from vislam.calibration.board import print_board
-from vislam.calibration.camera import calibrate_camera
-from vislam.calibration.camera_imu import calibrate_camera_imu
-from vislam.calibration.floor import calibrate_floor
-from vislam.calibration.imu import calibrate_imu
-from vislam.calibration.mag import calibrate_mag
-from vislam.calibration.noise import calibrate_noise
-from vislam.calibration.outcome import Outcome
+
+if TYPE_CHECKING:
+    from vislam.calibration.outcome import Outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,18 +18,34 @@ class Kind:
     """One kind of calibration."""
 
     options: type[Any]
-    calibrate: Callable[[Any], Outcome]
+    home: str  # of its function, below this package
     summary: str
+
+    @property
+    def calibrate(self) -> Callable[[Any], Outcome]:
+        """What does it, imported now: --help needs none of it."""
+        module, _, name = self.home.rpartition(".")
+        return getattr(import_module(f"vislam.calibration.{module}"), name)
 
 
 KINDS = {
-    "board": Kind(o.BoardFile, print_board, "draw a calibration board to print"),
-    "camera": Kind(o.CameraOptions, calibrate_camera, "focal length, centre and distortion, from views of a board"),
-    "camera-imu": Kind(
-        o.CameraImuOptions, calibrate_camera_imu, "rotation of the camera against the IMU and offset of their clocks"
+    "board": Kind(o.BoardFile, "cameras.board.print_board", "draw a calibration board to print"),
+    "camera": Kind(
+        o.CameraOptions, "cameras.camera.calibrate_camera", "focal length, centre and distortion, from views of a board"
     ),
-    "floor": Kind(o.FloorOptions, calibrate_floor, "tilt and height of a cart's camera, from a short drive"),
-    "imu": Kind(o.ImuOptions, calibrate_imu, "scale, axes and bias of an IMU, from poses held by hand"),
-    "mag": Kind(o.MagOptions, calibrate_mag, "hard and soft iron of a magnetometer, on the cart or by hand"),
-    "noise": Kind(o.NoiseOptions, calibrate_noise, "white noise and bias walk of an IMU that stands still"),
+    "camera-imu": Kind(
+        o.CameraImuOptions,
+        "extrinsics.camera_imu.calibrate_camera_imu",
+        "rotation of the camera against the IMU and offset of their clocks",
+    ),
+    "floor": Kind(
+        o.FloorOptions, "cameras.floor.calibrate_floor", "tilt and height of a cart's camera, from a short drive"
+    ),
+    "imu": Kind(o.ImuOptions, "inertial.imu.calibrate_imu", "scale, axes and bias of an IMU, from poses held by hand"),
+    "mag": Kind(
+        o.MagOptions, "inertial.mag.calibrate_mag", "hard and soft iron of a magnetometer, on the cart or by hand"
+    ),
+    "noise": Kind(
+        o.NoiseOptions, "inertial.noise.calibrate_noise", "white noise and bias walk of an IMU that stands still"
+    ),
 }

@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from vislam.config import CalibrationConfig
+from vislam.config.ranges import Count, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -18,13 +19,13 @@ class BoardOptions:
 
     kind: Literal["charuco", "chessboard"] = "charuco"
     """charuco may be seen in part, up to the corners of the image; a chessboard only whole"""
-    columns: int = 9
+    columns: Count = 9
     """Squares along the longer side"""
-    rows: int = 6
+    rows: Count = 6
     """Squares along the shorter side"""
-    square_mm: float = 30.0
+    square_mm: Positive = 30.0
     """Side of a square, as measured on the print"""
-    marker_share: float = 0.75
+    marker_share: Share = 0.75
     """Side of a marker over that of a square"""
     dictionary: str = "5X5_100"
     """Of the markers: OpenCV's DICT_..., such as 4X4_50, 5X5_100, 6X6_250, APRILTAG_36h11"""
@@ -54,11 +55,11 @@ class CameraOptions:
     board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
     model: Literal["radtan", "radtan5", "equidistant"] = "radtan"
     """radtan: k1 k2 p1 p2; radtan5: and k3, which Kalibr does not know; equidistant: lenses of over 100 degrees"""
-    max_images: int = 300
+    max_images: Count = 300
     """So many images, evenly spaced, are searched for the board"""
-    max_views: int = 40
+    max_views: Count = 40
     """So many of those that show it, as different as possible, are used"""
-    live_s: float = 60.0
+    live_s: Positive = 60.0
     """How long a live camera is looked at; move the board slowly, hold it still now and then"""
     out: Path = Path("calibration")
     """Folder for camchain.yaml (Kalibr), camera.yaml (ASL), camera_info.yaml (ROS), camera.png and camera.json"""
@@ -90,17 +91,17 @@ class FloorOptions:
 
     source: Positional[str]
     """Recording (or sim:WORLD) in which the cart drives 3 m or more over a level floor with texture"""
-    distance_m: float | None = None
+    distance_m: Positive | None = None
     """How far the cart is from where it began, by tape, at the end of the recording; driven straight"""
-    distance_sigma_m: float = 0.005
+    distance_sigma_m: NonNegative = 0.005
     """How well that was measured: 5 mm for a tape between two marks under the cart"""
-    height_m: float | None = None
+    height_m: Positive | None = None
     """Height of the lens above the floor, by tape, where no distance was measured"""
-    height_sigma_m: float = 0.003
+    height_sigma_m: NonNegative = 0.003
     """How well that was measured; the middle of a lens is hard to find"""
-    begin_s: float = 0.0
+    begin_s: NonNegative = 0.0
     """Leave out so much of the recording at its beginning"""
-    duration_s: float | None = None
+    duration_s: Positive | None = None
     """Take so much of it; None: all"""
     out: Path = Path("calibration")
     """Folder for floor.toml, floor.png and floor.json"""
@@ -120,9 +121,9 @@ class ImuOptions:
     """Folder for imu.yaml, imu.png and imu.json"""
     model: Literal["full", "scale"] = "full"
     """full: scale, axes, bias; scale: axes as they are, for which seven poses do"""
-    rest_s: float = 2.0
+    rest_s: Positive = 2.0
     """A pose counts when it was held so long"""
-    gravity_m_s2: float = 9.81
+    gravity_m_s2: Positive = 9.81
     """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as imu.gravity_m_s2 of the config"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
@@ -137,7 +138,7 @@ class CameraImuOptions:
     source: Positional[str]
     """Recording as for `vislam run`: camera and IMU turn briskly to and fro about all axes before a textured scene"""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    max_s: float = 120.0
+    max_s: Positive = 120.0
     """Only the first so many seconds"""
     out: Path = Path("calibration")
     """Folder for camera-imu.yaml (Kalibr's camchain), camera-imu.png and camera-imu.json"""

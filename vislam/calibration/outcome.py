@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from vislam.errors import DataError, UsageError
+from vislam.core.errors import DataError, StorageError, UsageError
+from vislam.core.files import replacing, write_json, write_text
 from vislam.report.style import light
-from vislam.runfolder import storage, write_json
-from vislam.trajectory.files import write_text
+from vislam.run.folder import storage
 
 Draw = Callable[[Figure, Mapping[str, str]], None]  # onto a figure, with the report's colours by name
 
@@ -49,28 +50,42 @@ class Folder:
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a text file, atomically."""
-        path = self._out / name
-        write_text(path, text)
-        self.files.append(path)
+        with self._added(name) as path:
+            write_text(path, text)
         return path
 
     def write_report(self, name: str, report: Mapping[str, Any]) -> Path:
         """Write the report as JSON."""
-        path = self._out / name
-        write_json(path, dict(report))
-        self.files.append(path)
+        with self._added(name) as path:
+            write_json(path, dict(report))
         return path
 
     def write_picture(self, name: str, size_inch: tuple[float, float], draw: Draw) -> Path:
         """Write what `draw` puts on an empty figure as PNG, in the style of the reports; same data, same bytes."""
-        path = self._out / name
         colors, settings = light()
-        with storage(path), mpl.rc_context(settings):
+        with mpl.rc_context(settings):
             figure = Figure(figsize=size_inch, layout="constrained")
             draw(figure, colors)
-            figure.savefig(path, dpi=_PNG_DPI, facecolor=colors["paper"], metadata={"Software": None})
-        self.files.append(path)
+            how: dict[str, Any] = {"dpi": _PNG_DPI, "facecolor": colors["paper"], "metadata": {"Software": None}}
+            return self.write_with(name, lambda file: figure.savefig(file, format="png", **how))
+
+    def write_with(self, name: str, write: Callable[[BinaryIO], None]) -> Path:
+        """Write a file by a function that is given it open, atomically."""
+        with self._added(name) as path, replacing(path) as file:
+            write(file)
         return path
+
+    @contextmanager
+    def _added(self, name: str) -> Iterator[Path]:
+        """Count a file among those written; where it cannot be, remove those: they would be in the next try's way."""
+        path = self._out / name
+        try:
+            yield path
+        except StorageError:
+            for written in self.files:
+                written.unlink(missing_ok=True)
+            raise
+        self.files.append(path)
 
 
 def refuse(what: str, reasons: list[str]) -> None:

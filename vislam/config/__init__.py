@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
-
 from vislam.config.batch import BatchConfig, GraphWorldConfig, PoseGraphConfig
 from vislam.config.estimators import EkfConfig, GraphConfig, PublishConfig, WindowConfig
 from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig, PlanarConfig
@@ -20,6 +18,8 @@ from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig, Vib
 from vislam.config.live import LiveConfig, ViewConfig
 from vislam.config.loop import LoopConfig, LoopTruthConfig
 from vislam.config.mapping import DriveConfig, MapConfig, MapProduct, MonoDepthConfig
+from vislam.config.profiles import merged, profile
+from vislam.config.ranges import Whole, check_ranges
 from vislam.config.sensors import (
     Axes,
     BridgeClockConfig,
@@ -33,8 +33,8 @@ from vislam.config.sensors import (
     WebcamConfig,
 )
 from vislam.config.verdict import VerdictConfig
-from vislam.errors import UsageError
-from vislam.reading import read_text
+from vislam.core.errors import UsageError
+from vislam.core.reading import read_text
 
 __all__ = [
     "AttitudeConfig",
@@ -86,7 +86,7 @@ Options = TypeVar("Options")
 class Config:
     """The whole configuration of a run."""
 
-    seed: int = 0  # of every random choice in the pipeline
+    seed: Whole = 0  # of every random choice in the pipeline
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
     frontend: FrontEndConfig = field(default_factory=FrontEndConfig)
@@ -110,12 +110,13 @@ def dump(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def load(path: Path | None = None, overrides: dict[str, Any] | None = None) -> Config:
-    """Build a configuration from defaults, a TOML file and dotted overrides such as `{"graph.coupling": "tight"}`.
+def load(path: Path | None = None, overrides: dict[str, Any] | None = None, profile_name: str | None = None) -> Config:
+    """Build a configuration from defaults, a profile, a TOML file and dotted overrides as `{"map.enabled": False}`.
 
-    Raises UsageError naming the field, what was asked and what is allowed.
+    Each goes before those named before it. Raises UsageError naming the field, what was asked and what is allowed.
     """
-    data = {} if path is None else _read_toml(path)
+    below = {} if profile_name is None else profile(profile_name)
+    data = merged(below, {} if path is None else _read_toml(path))
     for dotted, value in (overrides or {}).items():
         *sections, name = dotted.split(".")
         node = data
@@ -146,17 +147,21 @@ def from_data(data: dict[str, Any], source: str) -> Config:
 
 
 def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Options:
-    """Build a dataclass from plain data; unknown and ill-typed fields raise UsageError that begins with `where`."""
+    """Build a dataclass from plain data; what is unknown, ill-typed or out of range raises UsageError with `where`."""
     known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
     for name in data:
         if name not in known:
             raise UsageError(f"{where}: no option '{name}'; there are: {', '.join(known)}")
+    from pydantic import TypeAdapter, ValidationError  # takes a tenth of a second to load, and most never read a file
+
     try:
-        return TypeAdapter(cls).validate_python(data)
+        options = TypeAdapter(cls).validate_python(data)
     except ValidationError as error:
         first = error.errors()[0]
         field_path = ".".join(str(part) for part in first["loc"])
         raise UsageError(f"{where}: option {field_path}: {first['msg']}, got {first['input']!r}") from error
+    check_ranges(options, where)
+    return options
 
 
 def _refuse_unknown(data: dict[str, Any], cls: type, source: str, prefix: str = "") -> None:

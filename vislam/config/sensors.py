@@ -1,13 +1,14 @@
 """Defaults of the sensors of a cart: chips, bridge, camera, recording."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from vislam.config.frontend import CalibrationConfig
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Share
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 Axes = tuple[Axis, Axis, Axis]
-Vector3 = tuple[float, float, float]
+Vector3 = tuple[Finite, Finite, Finite]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 _IDENTITY: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -36,22 +37,22 @@ class Gy85Config:
     """The GY-85 board (ADXL345, ITG3205, HMC5883L or a clone of it) on an I2C bus."""
 
     bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
-    bus_timeout_s: float = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
-    rate_hz: float = 400.0  # of samples; 30 % of a 400 kHz bus. On a 100 kHz bus ask for 100
+    bus_timeout_s: NonNegative = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
+    rate_hz: Positive = 400.0  # of samples; 30 % of a 400 kHz bus. On a 100 kHz bus ask for 100
     gyro_bandwidth_hz: Literal[256, 188, 98, 42, 20, 10, 5] = 98  # below half the rate: the chip cannot be aliased
-    gyro_delay_s: float | None = None  # of that filter, taken off the stamps; None: what its makers state
+    gyro_delay_s: NonNegative | None = None  # of that filter, taken off the stamps; None: what its makers state
     accel_rate_hz: Literal[100, 200, 400, 800] = 400  # 1600 and more lose the last bit, less than 100 no self-test
     accel_range_g: Literal[2, 4, 8, 16] = 16  # full resolution has 3.9 mg in every range, so the widest costs nothing
     mag: bool = True  # look for a magnetometer
-    mag_rate_hz: float = 50.0  # how often it is asked; it measures at 75 (clones: 100)
-    mag_range_ga: float = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
+    mag_rate_hz: Positive = 50.0  # how often it is asked; it measures at 75 (clones: 100)
+    mag_range_ga: Positive = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
     self_test: bool = True  # at the start, 1 s, standing still; docs/cart.md says what is tested
-    supply_v: float = 3.3  # of the accelerometer: its self-test limits grow with it
-    reopen_s: float = 0.5  # between attempts to reach a chip or bus that went away; one costs up to 0.1 s
-    nacks_to_reopen: int = 5  # in a row until a chip counts as gone: single ones are noise on the wire
-    silent_s: float = 0.1  # without a sample, a chip is set up again, and the source says that it is missing
-    stuck_samples: int = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
-    max_temperature_change_c: float = 10.0  # since the biases were taken; an ITG3205 then drifts by up to 1 deg/s
+    supply_v: Positive = 3.3  # of the accelerometer: its self-test limits grow with it
+    reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away; one costs up to 0.1 s
+    nacks_to_reopen: Count = 5  # in a row until a chip counts as gone: single ones are noise on the wire
+    silent_s: NonNegative = 0.1  # without a sample, a chip is set up again, and the source says that it is missing
+    stuck_samples: Count = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
+    max_temperature_change_c: NonNegative = 10.0  # since the biases were taken; an ITG3205 then drifts by up to 1 deg/s
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
 
@@ -59,13 +60,13 @@ class Gy85Config:
 class BridgeClockConfig:
     """The line that turns the serial bridge's clock into the host's."""
 
-    window_s: float = 20.0  # of arrivals that the line is laid under; 0.1 ms of jitter then costs 5 ppm of rate
-    bin_s: float = 0.1  # the least delayed arrival of each counts; the line is laid anew so often
-    settle_s: float = 0.5  # no sample is passed before the rate has been seen for so long
-    max_drift: float = 0.025  # of the rate; a ceramic resonator, as on an Arduino Nano, is off by up to 0.5 %
-    step_s: float = 0.1  # before its time by so much is no jitter: the device restarted or the host slept
-    late_s: float = 2.0  # everything late by step_s for so long: the device's clock lost time
-    max_slew: float = 0.05  # share of an interval by which a better line may stretch it: 5 ms are caught up in 0.1 s
+    window_s: NonNegative = 20.0  # of arrivals that the line is laid under; 0.1 ms of jitter then costs 5 ppm of rate
+    bin_s: Positive = 0.1  # the least delayed arrival of each counts; the line is laid anew so often
+    settle_s: NonNegative = 0.5  # no sample is passed before the rate has been seen for so long
+    max_drift: Share = 0.025  # of the rate; a ceramic resonator, as on an Arduino Nano, is off by up to 0.5 %
+    step_s: NonNegative = 0.1  # before its time by so much is no jitter: the device restarted or the host slept
+    late_s: NonNegative = 2.0  # everything late by step_s for so long: the device's clock lost time
+    max_slew: Share = 0.05  # share of an interval by which a better line may stretch it: 5 ms are caught up in 0.1 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +74,17 @@ class SerialConfig:
     """The serial bridge: a microcontroller that reads the inertial chips, docs/cart.md."""
 
     port: str = "/dev/ttyUSB0"  # the path in /dev/serial/by-id stays the same when other devices come and go
-    baud: int = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
-    chips_s: float = 0.0005  # from a sample's time to its first byte: reading two chips at 400 kHz
-    filter_s: float = 0.0033  # delay of the gyro's 98 Hz filter, and half a millisecond of its sampling
-    mag_delay_s: float = 0.0067  # half a period of 75 Hz
-    missing_s: float = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
-    start_s: float = 4.0  # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it anew
-    reopen_s: float = 0.5  # between attempts to open a port that is not there
-    stuck_s: float = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
-    calibrated_at_c: float | None = None  # temperature of the gyro when its biases were taken
-    max_temperature_change_c: float = 10.0  # from it; an ITG3205 then drifts by up to 1 deg/s
+    baud: Count = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
+    chips_s: NonNegative = 0.0005  # from a sample's time to its first byte: reading two chips at 400 kHz
+    filter_s: NonNegative = 0.0033  # delay of the gyro's 98 Hz filter, and half a millisecond of its sampling
+    mag_delay_s: NonNegative = 0.0067  # half a period of 75 Hz
+    missing_s: NonNegative = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
+    # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it anew
+    start_s: NonNegative = 4.0
+    reopen_s: NonNegative = 0.5  # between attempts to open a port that is not there
+    stuck_s: NonNegative = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
+    calibrated_at_c: Finite | None = None  # temperature of the gyro when its biases were taken
+    max_temperature_change_c: NonNegative = 10.0  # from it; an ITG3205 then drifts by up to 1 deg/s
     clock: BridgeClockConfig = field(default_factory=BridgeClockConfig)
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
@@ -92,20 +94,23 @@ class WebcamConfig:
     """A webcam on V4L2; docs/cart.md. What a camera does not do as asked is reported, not hidden."""
 
     device: str = "0"  # index, or a path below /dev/v4l/by-id, which stays the same when other cameras come and go
-    width_px: int = 640  # enough for 400 tracks; 1280 costs four times the work of the front end
-    height_px: int = 480
-    rate_hz: float = 30.0
+    width_px: Count = 640  # enough for 400 tracks; 1280 costs four times the work of the front end
+    height_px: Count = 480
+    rate_hz: Positive = 30.0
     fourcc: str = "MJPG"  # uncompressed video of more than 640x480 at 30 Hz does not fit through USB 2
-    exposure_s: float | None = 0.01  # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera, and lights flicker then
-    gain: float | None = None  # in units of the camera; None leaves it as it is
-    focus: float | None = 0.0  # in units of the camera, 0 is infinity; None leaves autofocus on, which moves the centre
-    white_balance_k: float | None = None  # None leaves it to the camera: tracking uses grey images
-    buffers: int = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
-    delay_s: float = 0.05  # from capture to arrival, where the driver's stamps cannot be used: exposure, readout, USB
-    max_age_s: float = 1.0  # of a stamp at arrival; older, it is from another clock
-    missing_s: float = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
-    start_s: float = 5.0  # until the first image; some cameras take 2 s
-    reopen_s: float = 1.0  # between attempts to open a camera that is not there
+    # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera, and lights flicker then
+    exposure_s: NonNegative | None = 0.01
+    gain: NonNegative | None = None  # in units of the camera; None leaves it as it is
+    # in units of the camera, 0 is infinity; None leaves autofocus on, which moves the centre
+    focus: Finite | None = 0.0
+    white_balance_k: NonNegative | None = None  # None leaves it to the camera: tracking uses grey images
+    buffers: Count = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
+    # from capture to arrival, where the driver's stamps cannot be used: exposure, readout, USB
+    delay_s: NonNegative = 0.05
+    max_age_s: NonNegative = 1.0  # of a stamp at arrival; older, it is from another clock
+    missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
+    start_s: NonNegative = 5.0  # until the first image; some cameras take 2 s
+    reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +121,20 @@ class SensorsConfig:
     serial: SerialConfig = field(default_factory=SerialConfig)
     webcam: WebcamConfig = field(default_factory=WebcamConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    gyro_noise_density: float = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
-    accel_noise_density: float = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis
-    gyro_bias_walk: float = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet tells it
-    accel_bias_walk: float = 2e-4  # m/s^3/sqrt(Hz), as well
-    hfov_deg: float = 70.0  # horizontal field of view without a camera file; webcams have 60 to 80
+    gyro_noise_density: NonNegative = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
+    accel_noise_density: NonNegative = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis
+    gyro_bias_walk: NonNegative = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet tells it
+    accel_bias_walk: NonNegative = 2e-4  # m/s^3/sqrt(Hz), as well
+    # horizontal field of view without a camera file; webcams have 60 to 80
+    hfov_deg: Annotated[float, Range(0.0, 180.0, without_low=True, without_high=True)] = 70.0
 
 
 @dataclass(frozen=True, slots=True)
 class RecordConfig:
     """Recording of live sensors to a disk that may be slow or full."""
 
-    max_gb: float = 8.0  # the recording ends at this size; 640x480 JPEG at 30 Hz takes 9 an hour
-    min_free_gb: float = 1.0  # and when the disk has less left: a full root disk stops the machine
+    max_gb: Positive = 8.0  # the recording ends at this size; 640x480 JPEG at 30 Hz takes 9 an hour
+    min_free_gb: NonNegative = 1.0  # and when the disk has less left: a full root disk stops the machine
     image_format: Literal["jpg", "png"] = "jpg"  # MJPG cameras give no more; png takes five times the space
-    image_queue: int = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
-    imu_queue: int = 8000  # samples that may wait: 18 s at 450 Hz
+    image_queue: Count = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
+    imu_queue: Count = 8000  # samples that may wait: 18 s at 450 Hz

@@ -1,6 +1,6 @@
 """Readers of recordings: one module per format, all yielding the same values; and the recorder of our own.
 
-`open_dataset("euroc:PATH")` gives a `vislam.recording.Recording`; a bare path is recognised by what is in it.
+`open_dataset("euroc:PATH")` gives a `vislam.core.recording.Recording`; a bare path is recognised by what is in it.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Protocol
 
 from vislam.config import CalibrationConfig
-from vislam.datasets import asl, kitti, tum, video
+from vislam.core.errors import DataError, UsageError
+from vislam.core.recording import Recording
 from vislam.datasets.calibrated import calibrated
+from vislam.datasets.formats import asl, kitti, tum, video
 from vislam.datasets.stream import FileRecording, Survey
-from vislam.errors import DataError, UsageError
-from vislam.recording import Recording
 
 __all__ = ["READERS", "Reader", "open_dataset", "survey"]
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.camera import Rig
 from vislam.config import CalibrationConfig, Config
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.stream import Survey
-from vislam.errors import DataError
 
 _OFFSET_WIDER = 3.0  # sigmas of a calibrated time offset that a later day may be off
 _LEAST_OFFSET_SIGMA_S = 0.001

@@ -13,16 +13,14 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from vislam.camera import Camera, Distortion
+from vislam.core.camera import Camera, Distortion
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert
+from vislam.core.messages import Array
+from vislam.core.reading import read_text
 from vislam.datasets.tables import check_size
-from vislam.errors import DataError
-from vislam.geometry import invert
 from vislam.imu import ImuNoise
-from vislam.reading import read_text
-
-Array = NDArray[np.float64]
 
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
 _MAX_YAML_BYTES = 2**18

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from vislam.camera import Camera, Distortion
+from vislam.core.camera import Camera, Distortion
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert
+from vislam.core.messages import Array
 from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_camera, read_pose
-from vislam.errors import DataError
-from vislam.geometry import invert
-from vislam.messages import Array
 
 _MAX_CAMERAS = 2
 _KALIBR_MODELS: dict[Distortion, str] = {"radtan": "radtan", "equidistant": "equidistant", "none": "none"}

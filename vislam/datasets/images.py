@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera
-from vislam.errors import DataError
-from vislam.messages import ImageF32, ImageU8
-from vislam.reading import open_file, read_bytes
+from vislam.core.camera import Camera
+from vislam.core.cpu import working_ahead
+from vislam.core.errors import DataError
+from vislam.core.messages import ImageF32, ImageU8
+from vislam.core.reading import open_file, read_bytes
 
 Stamps = NDArray[np.int64]
 Job = TypeVar("Job")
@@ -193,11 +194,16 @@ def decode_ahead(
     OpenCV decodes without the interpreter's lock, so this overlaps with tracking. The answer does not depend on timing:
     order is kept, and an exception comes out at its place. Closing the generator ends the threads.
     """
+
+    def timed(job: Job) -> Result:
+        with working_ahead("decode"):
+            return load(job)
+
     pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="decode")
     pending: deque[Future[Result]] = deque()
     try:
         for job in jobs:
-            pending.append(pool.submit(load, job))
+            pending.append(pool.submit(timed, job))
             if len(pending) > ahead:
                 yield pending.popleft().result()
         while pending:

@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from vislam.core.errors import DataError
+from vislam.core.messages import Array
 from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_noise
-from vislam.errors import DataError
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.messages import Array
 
 Calibration = TypeVar("Calibration", ImuCalibration, MagCalibration)
 

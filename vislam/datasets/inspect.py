@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError
+from vislam.core.findings import Finding, Severity, worst
 from vislam.datasets import survey as survey_recording
 from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, probe, read_depth, read_grey_or_color
 from vislam.datasets.loaders import FrameTable
@@ -26,11 +28,9 @@ from vislam.datasets.plausibility import (
 )
 from vislam.datasets.stream import Survey, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
 from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
-from vislam.errors import DataError
-from vislam.findings import Finding, Severity, worst
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
-from vislam.truth_fit import fit_truth
+from vislam.trajectory.truth_fit import fit_truth
 
 Stamps = NDArray[np.int64]
 

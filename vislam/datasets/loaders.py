@@ -9,7 +9,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import ImageF32, ImageU8
+from vislam.core.reading import check_file
 from vislam.datasets.images import (
     ImageList,
     Stamps,
@@ -18,9 +21,6 @@ from vislam.datasets.images import (
     read_depth,
     read_grey_or_color,
 )
-from vislam.errors import DataError
-from vislam.messages import ImageF32, ImageU8
-from vislam.reading import check_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +108,7 @@ class VideoLoader:
         self._frame_numbers = frame_numbers
         self._camera = camera
         self._next = 0
-        self._capture = _open_video(path)
+        self._capture = open_video(path)
         check_size_px(_video_size(self._capture), camera, path)
 
     def load(self, i: int) -> LoadedImages:
@@ -134,14 +134,15 @@ class VideoLoader:
 
 def video_facts(path: Path) -> tuple[tuple[int, int], int]:
     """Return (width, height) and frame count of a video, the count 0 if unknown; raises DataError if unreadable."""
-    capture = _open_video(path)
+    capture = open_video(path)
     try:
         return _video_size(capture), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     finally:
         capture.release()
 
 
-def _open_video(path: Path) -> cv2.VideoCapture:
+def open_video(path: Path) -> cv2.VideoCapture:
+    """Return an open video; raises DataError when it cannot be read or decoded."""
     try:
         check_file(path)
     except OSError as error:

@@ -14,21 +14,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import invert, skew, so3_exp, so3_log
+from vislam.core.messages import Array, ImageU8
 from vislam.datasets.tables import Row
-from vislam.geometry import invert, skew, so3_exp, so3_log
-from vislam.messages import ImageU8
+from vislam.imu.rest import is_still
+from vislam.vision.two_view import essential_ransac
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _WINDOW_NS = 500_000_000
-_REST_GYRO_STD, _REST_ACCEL_STD = 0.05, 0.3  # rad/s, m/s^2: a hand or an idling motor shakes more
-_REST_GYRO_MEAN = 0.2  # rad/s: above any sane gyro bias
+_REST = (0.05, 0.3, 0.2)  # rad/s, m/s^2: a hand or an idling motor shakes more; rad/s: above any sane gyro bias
 _CORNERS = 300
 _MIN_TRACKS = 40
 _MATCH_RATIO = 0.8
 _EPIPOLAR_LIMIT_PX = 2.0
+_INLIER_PX = 1.5
 _TURN_SPAN_NS = 200_000_000
 _MIN_TURN_RAD = np.deg2rad(3.0)  # a smaller turn tells little beside bias and noise of a few tracks
 
@@ -52,13 +53,13 @@ class ImuFacts:
 def imu_facts(rows: Iterable[Row[list[float]]]) -> ImuFacts:
     """Return the facts of inertial rows (gyro, then accelerometer) in time order; only stamps are kept of them."""
     stamps = array("q")
-    windows: list[tuple[int, Array, Array]] = []
+    windows: list[tuple[int, Array, bool]] = []
     current: list[list[float]] = []
 
     def finish() -> None:
         if len(current) > 1:
             values = np.array(current)
-            windows.append((begin_ns, values.mean(axis=0), values.std(axis=0)))
+            windows.append((begin_ns, values.mean(axis=0), is_still(values[:, :3], values[:, 3:], _REST)))
 
     begin_ns = 0
     for t_ns, values in rows:
@@ -69,16 +70,12 @@ def imu_facts(rows: Iterable[Row[list[float]]]) -> ImuFacts:
         stamps.append(t_ns)
     finish()
     means = np.array([window[1] for window in windows]).reshape(-1, 6)
-    stds = np.array([window[2] for window in windows]).reshape(-1, 6)
-    still = (np.linalg.norm(stds[:, :3], axis=1) < _REST_GYRO_STD) & (
-        np.linalg.norm(stds[:, 3:], axis=1) < _REST_ACCEL_STD
-    )
     return ImuFacts(
         t_ns=np.array(stamps, dtype=np.int64),
         window_t_ns=np.array([window[0] for window in windows], dtype=np.int64),
         accel_mean=means[:, 3:],
         gyro_mean=means[:, :3],
-        at_rest=still & (np.linalg.norm(means[:, :3], axis=1) < _REST_GYRO_MEAN),
+        at_rest=np.array([window[2] for window in windows], dtype=np.bool_),
     )
 
 
@@ -142,13 +139,9 @@ def turn_disagreement(camera: Camera, R_body_cam: Array, images: Sequence[ImageU
     usable = np.all(np.isfinite(np.hstack([first, last])), axis=1)
     if int(usable.sum()) < _MIN_TRACKS:
         return None
-    first, last = np.ascontiguousarray(first[usable]), np.ascontiguousarray(last[usable])
-    cv2.setRNGSeed(0)
-    E, inliers = cv2.findEssentialMat(first, last, np.eye(3), cv2.RANSAC, 0.999, 1.5 / camera.fx)
-    if E is None or E.shape != (3, 3):
-        return None
-    _, R_last_first, _, _ = cv2.recoverPose(E, first, last, np.eye(3), mask=inliers)
-    return float(np.linalg.norm(so3_log(np.ascontiguousarray(R_gyro.T @ R_last_first.T)))) / angle
+    # of the two rotations of an essential matrix the one nearer to none: a turn on the spot has no depths to decide by
+    found = essential_ransac(np.eye(3), first[usable], last[usable], _INLIER_PX / camera.fx, 0)
+    return None if found is None else float(np.linalg.norm(so3_log(R_gyro.T @ found[0]))) / angle
 
 
 def _track(images: Sequence[ImageU8]) -> tuple[Array, Array] | None:

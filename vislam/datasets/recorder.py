@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -18,17 +19,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, StorageError, UsageError
+from vislam.core.geometry import quaternion_wxyz
+from vislam.core.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
+from vislam.core.recording import Recording
 from vislam.datasets.calibration import DEPTH_UNITS_PER_M, camera_text, depth_text, imu_text, pose_text
 from vislam.datasets.imu_files import imu_calibration_keys, mag_calibration_keys
 from vislam.datasets.tables import Problems
-from vislam.errors import DataError, StorageError, UsageError
-from vislam.geometry import quaternion_wxyz
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.messages import Frame, ImageF32, ImageU8, ImuSample, MagSample
-from vislam.recording import Recording
 
-Array = NDArray[np.float64]
 ImageFormat = Literal["png", "jpg"]
 
 _IMU_HEADER = (
@@ -63,10 +63,12 @@ class Recorder:
         comment: str = "recorded by vislam",
         imu_calibration: ImuCalibration | None = None,
         mag_calibration: MagCalibration | None = None,
+        keeps_parts: bool = True,
     ) -> None:
         """Make the folder and its sensor files. Without a rig there will be no frames, without noise no IMU samples.
 
-        Where a calibration is given, samples are written raw and readers apply it.
+        Where a calibration is given, samples are written raw and readers apply it. Without `keeps_parts` the recording
+        appears when the context is left without an error, and what there is of it is removed else.
 
         Raises:
             UsageError: the folder already holds something; a recording is never overwritten.
@@ -74,7 +76,8 @@ class Recorder:
         """
         self.problems = Problems()
         self.counts = {"frames": 0, "imu samples": 0, "mag samples": 0, "true poses": 0}
-        self._root = folder / "mav0"
+        self._whole = folder / "mav0"
+        self._root = self._whole if keeps_parts else folder / ".mav0.partial"
         self.bytes_written = 0
         self._rig = rig
         self._has_imu = imu_noise is not None
@@ -85,11 +88,18 @@ class Recorder:
         self._newest_ns: int | None = None
         self._last_frame_ns: int | None = None
         try:
-            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            left = [] if folder.is_dir() or not folder.exists() else [folder]
+            left += [path for path in folder.glob("*") if path.name != ".mav0.partial"]
+            if left:
                 raise UsageError(f"{folder} already holds something; choose a new folder for the recording")
+            shutil.rmtree(folder / ".mav0.partial", ignore_errors=True)  # of a process that was killed
+        except OSError as error:
+            raise self._storage_error(error, folder) from error
+        try:
             imu_keys = "" if imu_calibration is None else imu_calibration_keys(imu_calibration)
             self._make_folders(rig, imu_noise, comment, imu_keys)
         except OSError as error:
+            shutil.rmtree(self._root, ignore_errors=True)  # a recording of nothing would be in the way of the next try
             raise self._storage_error(error, folder) from error
 
     def __enter__(self) -> Self:
@@ -97,6 +107,15 @@ class Recorder:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
+        if self._root == self._whole:
+            return
+        try:
+            if kind is None:
+                self._root = self._root.replace(self._whole)
+        except OSError as failed:
+            raise self._storage_error(failed, self._whole) from failed
+        finally:
+            shutil.rmtree(self._whole.with_name(".mav0.partial"), ignore_errors=True)
 
     def write(self, value: ImuSample | MagSample | Frame) -> None:
         """Append one value.
@@ -223,11 +242,13 @@ class Recorder:
 
     def _storage_error(self, error: OSError, where: Path) -> StorageError:
         reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+        said = f"{error.filename or where} cannot be written: {reason}"
+        if self._root != self._whole:
+            return StorageError(f"{said}; free some space, then do it again: nothing is kept of it")
         kept = ", ".join(f"{count} {what}" for what, count in self.counts.items() if count) or "nothing"
         until = "" if self._newest_ns is None else f" up to t={self._newest_ns * 1e-9:.3f} s"
         return StorageError(
-            f"{error.filename or where} cannot be written: {reason}; kept {kept}{until} in {self._root.parent}; "
-            "free some space and record into a new folder"
+            f"{said}; kept {kept}{until} in {self._root.parent}; free some space and record into a new folder"
         )
 
 
@@ -276,11 +297,13 @@ def record(
 ) -> Recorder:
     """Write a whole recording with its truth into a new ASL folder and return the closed recorder.
 
-    `on_frame` is told how many frames are written, after each. Raises UsageError, DataError and StorageError as
-    `Recorder` does.
+    `on_frame` is told how many frames are written, after each. The recording is there whole or not at all. Raises
+    UsageError, DataError and StorageError as `Recorder` does.
     """
     comment = f"vislam, {recording.name}"
-    with Recorder(folder, recording.rig, recording.imu_noise, image_format=image_format, comment=comment) as recorder:
+    with Recorder(
+        folder, recording.rig, recording.imu_noise, image_format=image_format, comment=comment, keeps_parts=False
+    ) as recorder:
         truth = recording.truth()
         if truth is not None:
             for t_ns, T_world_body in zip(truth.t_ns.tolist(), truth.T_world_body, strict=True):

@@ -11,18 +11,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import ImuConfig
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.datasets.formats.truth import Truth
 from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, decode_ahead, match_by_time, probe
 from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoader
 from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
-from vislam.datasets.truth import Truth
-from vislam.errors import DataError
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.messages import Frame, ImuSample, MagSample
 from vislam.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 STEREO_TOLERANCE_NS = 2_000_000  # at 1 m/s the body moves 2 mm in it, far less than any baseline
 DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
@@ -92,7 +90,7 @@ def open_loader(survey: Survey, rig: Rig, frames: FrameTable) -> Loader:
 
 
 class FileRecording:
-    """A recording on disk that implements `vislam.recording.Recording`.
+    """A recording on disk that implements `vislam.core.recording.Recording`.
 
     Memory does not grow with its length, apart from the index of its images (some 100 bytes each).
     """

@@ -12,8 +12,8 @@ from decimal import Decimal
 from pathlib import Path
 from typing import IO, TypeVar
 
-from vislam.errors import DataError
-from vislam.reading import open_file
+from vislam.core.errors import DataError
+from vislam.core.reading import open_file
 
 T = TypeVar("T")
 Row = tuple[int, T]  # stamp in ns, and what the row holds

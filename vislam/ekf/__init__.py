@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 from vislam.config import EkfConfig
 from vislam.ekf.correction import Correction, Hint
-from vislam.ekf.filter import Ekf, UpdateResult
-from vislam.ekf.msckf import CameraCalibration, MsckfEkf
+from vislam.ekf.loose.filter import Ekf
+from vislam.ekf.tight import CameraCalibration, MsckfEkf
+from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
-    from vislam.camera import Rig
+    from vislam.core.camera import Rig
 
 __all__ = ["CameraCalibration", "Correction", "Ekf", "Hint", "MsckfEkf", "UpdateResult", "make_ekf"]
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vislam.ekf.filter import Ekf
+from vislam.core.messages import Observations, Tracking, VoMeasurement, no_observations
+from vislam.ekf.loose.filter import Ekf
 from vislam.imu import SeenNoise
-from vislam.messages import Observations, Tracking, VoMeasurement, no_observations
 
 if TYPE_CHECKING:
-    from vislam.ekf.filter import UpdateResult
-    from vislam.ekf.msckf import MsckfEkf
+    from vislam.ekf.tight import MsckfEkf
+    from vislam.ekf.timeline import UpdateResult
 
 
 @dataclass(frozen=True, slots=True, eq=False)

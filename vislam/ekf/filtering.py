@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vislam.config import EkfConfig
+from vislam.core.geometry import invert
+from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, NavState, Observations, VoMeasurement
 from vislam.ekf import Ekf, make_ekf
 from vislam.ekf.correction import Correction
-from vislam.ekf.msckf import CameraCalibration, MsckfEkf
-from vislam.geometry import invert
+from vislam.ekf.tight import CameraCalibration, MsckfEkf
 from vislam.imu import ImuNoise, SeenNoise
-from vislam.messages import AS_MODELLED, Array, GraphUpdate, NavState, Observations, VoMeasurement
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
-    from vislam.camera import Rig
+    from vislam.core.camera import Rig
 
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 

@@ -1,119 +1,158 @@
-"""What the filter remembers so that it can go back: measurements in time order and states to start again from."""
+"""What a filter remembers so that it can go back: measurements in time order and states to start again from."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from enum import StrEnum
+from typing import Generic, NamedTuple, TypeVar
 
-import numpy as np
+from vislam.core.messages import Array, NoiseScale
 
-from vislam.ekf.timeline import Timeline
-from vislam.messages import AS_MODELLED, Array, NoiseScale, VoMeasurement
-
-OUTCOMES = (  # every counter a measurement can end in, and what they cause
-    "keyframes",
-    "vo_accepted",
-    "vo_gated",  # failed the chi-square gate
-    "vo_opposed",  # moved against the direction seen
-    "vo_no_keyframe",  # relative to a keyframe that is not the cloned one
-    "vo_no_scale",  # accumulated vision needs metric motion
-    "vo_lost",
-    "vo_invalid",
-    "zero_velocity_accepted",
-    "zero_velocity_gated",
-    "nonholonomic_accepted",
-    "nonholonomic_gated",
-    "bias_accepted",
-    "bias_gated",
-    "bias_invalid",
-    "noise_changes",
-    "noise_invalid",
-    "before_start",
-    "too_late",
-    "too_early",
-    "rewinds",
-    "soft_resets",
-)
+S = TypeVar("S")
+M = TypeVar("M")
+Statistics = dict[str, tuple[int, float, int]]  # by kind of measurement: number, sum of NIS, of degrees of freedom
 
 
-class Kind(StrEnum):
-    """What an event does to the filter."""
+class AtRest(NamedTuple):
+    """The body does not move."""
 
-    KEYFRAME = "keyframe"
-    VO = "vo"
-    ZERO_VELOCITY = "zero_velocity"
-    NONHOLONOMIC = "nonholonomic"
-    BIAS = "bias"
-    NOISE = "noise"
+
+class KnownBias(NamedTuple):
+    """Biases of the IMU that somebody else found."""
+
+    values: Array  # [12] gyro, accel, and their sigmas
 
 
 @dataclass(slots=True, eq=False)
-class Event:
-    """A measurement, and what became of it the last time it was applied."""
+class Outcome:
+    """What became of a measurement."""
 
-    t_ns: int
-    kind: Kind
-    keyframe_id: int = -1
-    vo: VoMeasurement | None = None
-    bias: Array | None = None  # [12] gyro, accel, and their sigmas
-    noise: NoiseScale = AS_MODELLED  # from here on, over what the filter was made with
-    outcome: str = ""  # the counter it stands in; "" while it waits for the IMU
-    was_reset: bool = False
     accepted: bool = False
     nis: float = float("nan")
-    degrees: int = 0  # of freedom, of `nis`
-    reason: str = "waits for an inertial sample as new"
+    reason: str = ""
+    counts: dict[str, int] = field(default_factory=dict)
+    statistics: Statistics = field(default_factory=dict)
+
+    def count(self, name: str, number: int = 1) -> None:
+        """Add to a counter."""
+        if number:
+            self.counts[name] = self.counts.get(name, 0) + number
+
+    def accept(self, name: str) -> None:
+        """Take the measurement for used."""
+        self.accepted = True
+        self.count(name)
+
+    def test(self, kind: str, number: int, nis: float, dof: int) -> None:
+        """Add tests to the statistics."""
+        add(self.statistics, kind, (number, nis, dof))
+
+
+@dataclass(slots=True, eq=False)
+class Event(Generic[M]):
+    """A measurement, and what became of it the last time it was applied."""
+
+    t_ns: int  # by the clock of the sensor: the core says when that was by the IMU's
+    measurement: M | AtRest | KnownBias | NoiseScale  # noise: from here on, over what the filter was made with
+    outcome: Outcome | None = None  # None while it waits for the IMU
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ledger:
-    """What the filter knows besides x and P."""
-
-    clone_id: int | None = None
-    # added to the clone for shared landmark errors; None: several keyframes stand there, each with its own
-    shared: Array | None = field(default_factory=lambda: np.zeros((6, 6)))
-    clone_rests: bool = False  # the clone was taken in the rest that goes on
-    rested_t_ns: int | None = None  # when the body was last seen at rest
-    rejects: int = 0  # in a row
-    rejects_since_ns: int = 0
-    last_vo_t_ns: int = 0
-    T_odom_keyframe: Array | None = None  # [4, 4] where accumulated vision has the keyframe
-    T_odom_vo: Array | None = None  # [4, 4] where it had the body last, and when
-    vo_t_ns: int = 0
-    noise: NoiseScale = AS_MODELLED  # white noise of the IMU over that of the model
-    floor_z_m: float = 0.0  # height of the body in `odom` at the start, where a floor keeps it
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Checkpoint:
+class Checkpoint(Generic[S]):
     """The whole filter at one instant, after `applied` events since the start."""
 
     t_ns: int
     applied: int
-    x: Array
-    P: Array
-    ledger: Ledger
+    state: S
+    after_event: bool  # taken right after the last of them
 
 
-class History(Timeline[Event, Checkpoint]):
-    """What came to the filter and where it can go back to."""
+class History(Generic[S, M]):
+    """Events in order of their stamps (ties in order of arrival) and checkpoints, both bounded by `forget_before`."""
 
-    def rewind(self, number: int, t_ns: int) -> Checkpoint:
-        """Drop the checkpoints that an event of this number and time invalidates; return the newest that is left.
+    def __init__(self, first: Checkpoint[S], time_of: Callable[[Event[M], S], int]) -> None:
+        """Begin at a checkpoint; `time_of` tells when an event happened by the IMU's clock, as far as a state knows."""
+        self.checkpoints = [first]
+        self._time_of = time_of
+        self._events: list[Event[M]] = []
+        self._forgotten = 0  # events dropped from the front; all numbering counts them
 
-        The caller has made sure that the event is not older than the first checkpoint.
+    @property
+    def events(self) -> list[Event[M]]:
+        """Those not forgotten, in time order."""
+        return self._events
+
+    def insert(self, event: Event[M]) -> int:
+        """Sort an event in and return its number since the start."""
+        place = bisect_right(self._events, event.t_ns, key=_stamp)
+        self._events.insert(place, event)
+        return place + self._forgotten
+
+    def event(self, number: int) -> Event[M] | None:
+        """Return an event by its number, None past the last."""
+        place = number - self._forgotten
+        return self._events[place] if place < len(self._events) else None
+
+    def holds(self, t_ns: int, kind: type[object]) -> bool:
+        """Whether a measurement of this kind and stamp is here already."""
+        place = bisect_right(self._events, t_ns, key=_stamp)
+        while place > 0 and self._events[place - 1].t_ns == t_ns:
+            place -= 1
+            if isinstance(self._events[place].measurement, kind):
+                return True
+        return False
+
+    def checkpoint_at(self, t_ns: int) -> Checkpoint[S] | None:
+        """Return the newest checkpoint at or before a time, None if it is older than all."""
+        place = bisect_right(self.checkpoints, t_ns, key=_stamp)
+        return self.checkpoints[place - 1] if place else None
+
+    def is_too_old(self, event: Event[M]) -> bool:
+        """Whether an event belongs before the oldest checkpoint."""
+        first = self.checkpoints[0]
+        if self._time_of(event, first.state) < first.t_ns:
+            return True
+        return bisect_right(self._events, event.t_ns, key=_stamp) + self._forgotten < first.applied
+
+    def rewind(self, number: int) -> Checkpoint[S]:
+        """Drop the checkpoints that come after event `number` in the order of things; return the newest that is left.
+
+        The caller has made sure that the event is not too old.
         """
-        while self.checkpoints[-1].t_ns > t_ns or self.checkpoints[-1].applied > number:
+        event = self.event(number)
+        while len(self.checkpoints) > 1:
+            last = self.checkpoints[-1]
+            if last.applied < number or (last.applied == number and last.after_event):
+                break  # after an event that happened later, one still comes after it: stamps decide the order
+            if last.applied == number and event is not None and last.t_ns <= self._time_of(event, last.state):
+                break
             self.checkpoints.pop()
         return self.checkpoints[-1]
 
+    def forget_before(self, t_ns: int) -> list[Event[M]]:
+        """Drop what is not needed to go back to `t_ns` or later and return the events of it; one checkpoint stays."""
+        keep = max(bisect_right(self.checkpoints, t_ns, key=_stamp) - 1, 0)
+        del self.checkpoints[:keep]
+        drop = min(self.checkpoints[0].applied - self._forgotten, len(self._events))
+        forgotten, self._events = self._events[:drop], self._events[drop:]
+        self._forgotten += drop
+        return forgotten
 
-def add_nis(sums: dict[str, tuple[int, float, int]], events: Iterable[Event]) -> dict[str, tuple[int, float, int]]:
-    """Return count, sum of NIS and sum of degrees of freedom by kind, with those of accepted events added."""
-    out = dict(sums)
+
+def _stamp(item: Event[M] | Checkpoint[S]) -> int:
+    return item.t_ns
+
+
+def add(sums: Statistics, kind: str, more: tuple[int, float, int]) -> None:
+    """Add a number of tests, their NIS and their degrees of freedom to the sums, in place."""
+    number, nis, dof = sums.get(kind, (0, 0.0, 0))
+    sums[kind] = (number + more[0], nis + more[1], dof + more[2])
+
+
+def add_all(sums: Statistics, events: Iterable[Event[M]]) -> None:
+    """Add the tests of events to the sums, in place."""
     for event in events:
-        if event.accepted and event.degrees:
-            count, nis, degrees = out.get(event.kind.value, (0, 0.0, 0))
-            out[event.kind.value] = count + 1, nis + event.nis, degrees + event.degrees
-    return out
+        if event.outcome is not None:
+            for kind, more in event.outcome.statistics.items():
+                add(sums, kind, more)

@@ -1,182 +1,286 @@
-"""What both filters do with time: order measurements, go back to checkpoints, take the samples between."""
+"""What every filter does with time: measurements late and out of order, going back and running forward, counters.
+
+The filter goes back to the time of a measurement and runs forward again, so the answer depends only on the set of
+measurements, not on when they came. What a state is and how it is corrected is the core's.
+"""
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
 from vislam.config import EkfConfig
-from vislam.ekf.kernels import pose
-from vislam.geometry import interpolate
+from vislam.core.geometry import interpolate
+from vislam.core.messages import Array, ImuSample, NavState, NoiseScale
+from vislam.ekf.filter_core import Core, S
+from vislam.ekf.history import Checkpoint, Event, History, KnownBias, M, Outcome, Statistics, add_all
+from vislam.ekf.loose.kernels import pose
+from vislam.ekf.stretch import keep_track, stretch
 from vislam.imu import ImuSeries
-from vislam.messages import Array
 
-REST_PAUSE_NS = 300_000_000  # frames at rest this far apart are of one rest: either looked back on all that is between
-
-
-class Timed(Protocol):
-    """Something that happened at a time."""
-
-    @property
-    def t_ns(self) -> int:
-        """When."""
-        ...
+_NS = 1_000_000_000
+_WAITS = "waits for an inertial sample as new"
 
 
-class Restorable(Timed, Protocol):
-    """A filter at one instant, after `applied` events since the start."""
+@dataclass(frozen=True, slots=True)
+class UpdateResult:
+    """What the filter did with a measurement; `nis` is NaN where none was computed."""
 
-    @property
-    def applied(self) -> int:
-        """How many events it has seen."""
-        ...
-
-    @property
-    def x(self) -> Array:
-        """Nominal state; position, velocity and quaternion come first."""
-        ...
+    accepted: bool
+    nis: float
+    reason: str
 
 
-E = TypeVar("E", bound=Timed)
-C = TypeVar("C", bound=Restorable)
+class Timeline(Generic[S, M]):
+    """Owns the state, its covariance and the last seconds of samples and measurements. One thread only.
 
+    Until it is begun, samples are only kept; a state in the past is then brought to the present through them.
+    """
 
-class Timeline(Generic[E, C]):
-    """Events in time order (ties in order of arrival) and checkpoints, both bounded by `forget_before`."""
-
-    def __init__(self, first: C) -> None:
-        self.checkpoints = [first]
-        self._events: list[E] = []
-        self._forgotten = 0  # events dropped from the front; all numbering counts them
+    def __init__(self, core: Core[S, M], state: S, config: EkfConfig, history_s: float) -> None:
+        """Set up an uninitialised filter of which `state` is a placeholder."""
+        self._core = core
+        self._state = state
+        self._checkpoint_ns = round(config.checkpoint_s * _NS)
+        self._history_ns = round(history_s * _NS)
+        self._max_gap_ns = round(config.max_gap_s * _NS)
+        self._series = ImuSeries(extra=10)  # beside each sample, x[:10] as of the last run through it
+        self._history: History[S, M] | None = None
+        self._t_ns = 0
+        self._applied = 0
+        self._stops_at_event = False  # see `replayed_once`
+        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *core.counters), 0)
+        self._statistics: Statistics = {}  # of events that the history has forgotten
 
     @property
-    def events(self) -> list[E]:
-        """Those not forgotten, in time order."""
-        return self._events
+    def initialised(self) -> bool:
+        """Whether there is a state."""
+        return self._history is not None
 
-    def insert(self, event: E) -> int:
-        """Sort an event in and return its number since the start."""
-        place = bisect_right(self._events, event.t_ns, key=time_of)
-        self._events.insert(place, event)
-        return place + self._forgotten
+    @property
+    def counters(self) -> dict[str, int]:
+        """What came in and what became of it."""
+        return {**self._counts, **{f"imu_{reason}": n for reason, n in self._series.refused.items()}}
 
-    def event(self, number: int) -> E | None:
-        """Return an event by its number, None past the last."""
-        place = number - self._forgotten
-        return self._events[place] if place < len(self._events) else None
+    @property
+    def nis_statistics(self) -> Statistics:
+        """Return count, sum of the normalised innovation squared and sum of its degrees of freedom, by measurement.
 
-    def checkpoint_at(self, t_ns: int) -> C | None:
-        """Return the newest checkpoint at or before a time, None if it is older than all."""
-        place = bisect_right(self.checkpoints, t_ns, key=time_of)
-        return self.checkpoints[place - 1] if place else None
+        Of the measurements that were accepted, each as of the last time it was applied; what the gate refused is in
+        `counters`. The second over the third is 1 where the noise that the filter assumes is the true one.
+        """
+        sums = dict(self._statistics)
+        add_all(sums, [] if self._history is None else self._history.events)
+        return sums
 
-    def forget_before(self, t_ns: int) -> list[E]:
-        """Drop what is not needed to go back to `t_ns` or later and return the events of it; one checkpoint stays."""
-        keep = max(bisect_right(self.checkpoints, t_ns, key=time_of) - 1, 0)
-        del self.checkpoints[:keep]
-        drop = min(self.checkpoints[0].applied - self._forgotten, len(self._events))
-        forgotten, self._events = self._events[:drop], self._events[drop:]
-        self._forgotten += drop
-        return forgotten
+    @property
+    def dead_reckoning_s(self) -> float:
+        """Seconds since vision last corrected the state, or since `initialise`; infinite before."""
+        return (self._t_ns - self._state.last_vision_t_ns) / _NS if self.initialised else float("inf")
 
+    def predict(self, sample: ImuSample) -> None:
+        """Take a sample and bring the state to its time.
 
-def time_of(item: Timed) -> int:
-    """Return when something happened, as a key to search by."""
-    return item.t_ns
+        Samples that are not finite, beyond any sensor, duplicate or backward are counted and change nothing.
+        """
+        before = self._series.newest_t_ns
+        if not self._series.append(sample):
+            return
+        self._counts["imu_samples"] += 1
+        dt_ns = 0 if before is None else sample.t_ns - before
+        if dt_ns > self._max_gap_ns:
+            self._counts["imu_gaps"] += 1
+        history = self._history
+        if history is None:
+            if sample.t_ns - int(self._series.t_ns[0]) > 2 * self._history_ns:
+                self._series.forget_before(sample.t_ns - self._history_ns)
+            return
+        if before != self._t_ns or dt_ns > self._max_gap_ns or history.event(self._applied) is not None:
+            self._run()
+            return
+        values = self._series.values  # the way of nearly every sample: one step, no measurement on it
+        self._core.step(self._state, values[-2], values[-1], dt_ns * 1e-9)
+        self._series.extra[-1] = self._state.x[:10]
+        self._t_ns = sample.t_ns
+        if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
+            self._take_checkpoint()
 
+    @contextmanager
+    def replayed_once(self) -> Iterator[None]:
+        """Inside, go no farther than each measurement; what came after them is replayed at the end, once for all."""
+        self._stops_at_event = True
+        try:
+            yield
+        finally:
+            self._stops_at_event = False
+            self._run()
 
-class Stretch(NamedTuple):
-    """The samples from one time to another, both ends interpolated."""
+    def follow_noise(self, t_ns: int, scale: NoiseScale) -> UpdateResult:
+        """Take it that white noise is so many times that of the model from `t_ns` on: a ride shakes, a rest not."""
+        if not (np.isfinite(scale).all() and min(scale) > 0.0):
+            return self._refuse("noise_invalid", "factors on noise must be finite and positive")
+        return self._insert(Event(t_ns, scale))
 
-    t_ns: NDArray[np.int64]  # [N]
-    samples: Array  # [N, 6] gyro, accel
-    gaps_s: Array  # [N] length of the hole that the step to this sample lies in, else 0
-    begin: int  # of the series, between the ends
-    end: int
+    def feed_back(
+        self,
+        gyro_bias: Array,
+        accel_bias: Array,
+        gyro_sigma: float | Array,
+        accel_sigma: float | Array,
+    ) -> UpdateResult:
+        """Take biases [3] (rad/s, m/s^2) that the graph found, as soft measurements at the present time.
 
+        Only the biases move: pose and velocity stay, now and when late measurements are replayed. The graph has used
+        the same images, so give sigmas well above its own.
+        """
+        sigmas = np.broadcast_to(gyro_sigma, 3), np.broadcast_to(accel_sigma, 3)
+        bias = np.concatenate([gyro_bias, accel_bias, *sigmas]).astype(np.float64)
+        if not (np.isfinite(bias).all() and (bias[6:] > 0.0).all()):
+            return self._refuse("bias_invalid", "biases must be finite and their sigmas positive")
+        return self._insert(Event(self._t_ns, KnownBias(bias)))
 
-def stretch(series: ImuSeries, t0_ns: int, t1_ns: int, max_gap_ns: int) -> Stretch:
-    """Return the samples between two times; a step longer than `max_gap_ns` is a hole. The series is not empty."""
-    return _stretch(series.t_ns, series.values, t0_ns, t1_ns, max_gap_ns)
+    def state(self) -> NavState:
+        """Return the state at the newest sample. Raises ValueError before `initialise`."""
+        if self._history is None:
+            raise ValueError("the filter has no state yet; call initialise first")
+        return self._nav_state(self._t_ns, self._state)
 
+    def state_at(self, t_ns: int) -> NavState | None:
+        """Return the filtered state at a time within the history, None outside of it."""
+        checkpoint = self._checkpoint_at(t_ns)
+        if checkpoint is None:
+            return None
+        state = checkpoint.state.copy()
+        self._integrate(state, checkpoint.t_ns, t_ns)
+        return self._nav_state(t_ns, state)
 
-@njit(cache=True, nogil=True)
-def _stretch(times: NDArray[np.int64], values: Array, t0_ns: int, t1_ns: int, max_gap_ns: int) -> Stretch:
-    begin, end = int(np.searchsorted(times, t0_ns, side="right")), int(np.searchsorted(times, t1_ns))
-    n = end - begin + 2
-    stamps, samples, gaps_s = np.empty(n, dtype=np.int64), np.empty((n, 6)), np.zeros(n)
-    stamps[0], stamps[1:-1], stamps[-1] = t0_ns, times[begin:end], t1_ns
-    _sample_at(times, values, t0_ns, samples[0])
-    samples[1:-1] = values[begin:end]
-    _sample_at(times, values, t1_ns, samples[-1])
-    # A step inside a hole must know how long the whole hole is, not only its own part of it.
-    neighbours = times[max(begin - 1, 0) : end + 1]
-    if len(neighbours) != n:  # the state is older than every sample, or newer
-        neighbours = stamps
-    for k in range(1, n):
-        hole_ns = neighbours[k] - neighbours[k - 1]
-        gaps_s[k] = hole_ns * 1e-9 if hole_ns > max_gap_ns else 0.0
-    return Stretch(stamps, samples, gaps_s, begin, end)
+    def pose_at(self, t_ns: int) -> Array | None:
+        """Return T_odom_body [4, 4] at a time within the history, interpolated; None outside of it."""
+        checkpoint = self._checkpoint_at(t_ns)
+        if checkpoint is None:
+            return None
+        if checkpoint.t_ns == t_ns:
+            return pose(checkpoint.state.x, 0, 6)
+        times, track = self._series.t_ns, self._series.extra
+        after = int(np.searchsorted(times, t_ns))
+        if after == len(times):  # the start, when it is newer than every sample
+            return pose(self._state.x, 0, 6)
+        before_ns, before = checkpoint.t_ns, checkpoint.state.x[:10]
+        if after > 0 and int(times[after - 1]) > before_ns:
+            before_ns, before = int(times[after - 1]), track[after - 1]
+        alpha = (t_ns - before_ns) / (int(times[after]) - before_ns)
+        return interpolate(pose(before.copy(), 0, 6), pose(track[after].copy(), 0, 6), alpha)
 
+    def _begin(self, t_ns: int, state: S) -> None:
+        """Start at a state, at any time, and run it through the samples that are already here. Forgets the past."""
+        self._t_ns, self._applied, self._state = t_ns, 0, state
+        self._series.extra[:] = np.nan
+        self._history = History(self._snapshot(after_event=True), self._core.time_of)
+        self._run()
 
-@njit(cache=True, nogil=True)
-def _sample_at(times: NDArray[np.int64], values: Array, t_ns: int, out: Array) -> None:
-    """Write the sample at a time into `out` [6], as `ImuSeries.at` has it."""
-    k = np.searchsorted(times, t_ns)
-    if k == len(times):
-        out[:] = values[k - 1]
-    elif k == 0 or times[k] == t_ns:
-        out[:] = values[k]
-    else:
-        alpha = (t_ns - times[k - 1]) / (times[k] - times[k - 1])
-        out[:] = (1.0 - alpha) * values[k - 1] + alpha * values[k]
+    def _refuse(self, counter: str, reason: str) -> UpdateResult:
+        self._counts[counter] += 1
+        return UpdateResult(False, float("nan"), reason)
 
+    def _insert(self, event: Event[M]) -> UpdateResult:
+        history = self._history
+        if history is None:
+            return self._refuse("before_start", "the filter has no state yet")
+        t_ns = self._core.time_of(event, self._state)
+        oldest = history.checkpoints[0].t_ns
+        if history.is_too_old(event):
+            return self._refuse("too_late", f"{(oldest - event.t_ns) / _NS:.3f} s older than the history")
+        newest = max(self._series.newest_t_ns or oldest, self._t_ns)
+        if t_ns - newest > self._history_ns:
+            return self._refuse("too_early", f"{(t_ns - newest) / _NS:.3f} s ahead of the newest inertial sample")
+        number = history.insert(event)
+        if t_ns < self._t_ns or number < self._applied:
+            self._counts["rewinds"] += 1
+            self._restore(history.rewind(number))
+        elif t_ns > self._t_ns:  # a sample as new has to come first
+            return UpdateResult(False, float("nan"), _WAITS)
+        self._run(t_ns if self._stops_at_event else None)
+        outcome = event.outcome
+        if outcome is None:
+            return UpdateResult(False, float("nan"), _WAITS)
+        return UpdateResult(outcome.accepted, outcome.nis, outcome.reason)
 
-def keep_track(series: ImuSeries, piece: Stretch, track: Array) -> None:
-    """Keep x[:10] of every time of the stretch [N, 10] beside the samples."""
-    extra, end = series.extra, piece.end
-    extra[piece.begin : end] = track[1:-1]
-    if end < len(extra) and series.t_ns[end] == piece.t_ns[-1]:
-        extra[end] = track[-1]
+    def _run(self, until_ns: int | None = None) -> None:
+        """Go on from the present state through every sample and event that is here, or until a time."""
+        history = self._history
+        newest = self._series.newest_t_ns if until_ns is None else until_ns
+        if history is None:
+            return
+        while (event := history.event(self._applied)) is not None:
+            t_ns = self._core.time_of(event, self._state)
+            if t_ns > max(newest or 0, self._t_ns):
+                break
+            self._advance(t_ns)
+            self._apply(event, t_ns)
+            self._applied += 1
+            self._take_checkpoint(after_event=True)
+        if newest is not None:
+            self._advance(newest)
 
+    def _advance(self, t_ns: int) -> None:
+        while self._t_ns < t_ns:
+            step_ns = min(t_ns, self._t_ns + self._checkpoint_ns)
+            if step_ns < t_ns:  # stop on a sample: stopping between two would change the arithmetic
+                step_ns = int(self._series.t_ns[np.searchsorted(self._series.t_ns, step_ns)])
+                step_ns = min(step_ns, t_ns)
+            self._integrate(self._state, self._t_ns, step_ns, keep=True)
+            self._t_ns = step_ns
+            if self._history is not None and step_ns - self._history.checkpoints[-1].t_ns >= self._checkpoint_ns:
+                self._take_checkpoint()
 
-def pose_between(series: ImuSeries, x: Array, checkpoint: Restorable, t_ns: int) -> Array:
-    """Return the pose [4, 4] at a time between a checkpoint and the present state x, from the track."""
-    if checkpoint.t_ns == t_ns:
-        return pose(checkpoint.x, 0, 6)
-    times, track = series.t_ns, series.extra
-    after = int(np.searchsorted(times, t_ns))
-    if after == len(times):  # the start, when it is newer than every sample
-        return pose(x, 0, 6)
-    before_ns, before = checkpoint.t_ns, checkpoint.x[:10]
-    if after > 0 and int(times[after - 1]) > before_ns:
-        before_ns, before = int(times[after - 1]), track[after - 1]
-    alpha = (t_ns - before_ns) / (int(times[after]) - before_ns)
-    return interpolate(pose(before.copy(), 0, 6), pose(track[after].copy(), 0, 6), alpha)
+    def _integrate(self, state: S, t0_ns: int, t1_ns: int, keep: bool = False) -> None:
+        if t1_ns <= t0_ns:
+            return
+        piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
+        track = np.empty((len(piece.t_ns), 10))
+        self._core.run(state, piece, track)
+        if keep:
+            keep_track(self._series, piece, track)
 
+    def _apply(self, event: Event[M], t_ns: int) -> None:
+        rate = self._series.at(t_ns)[:3] if len(self._series) else np.zeros(3)
+        if event.outcome is not None:  # a rerun: what it was counted as before no longer holds
+            self._account(event.outcome, -1)
+        event.outcome = self._core.apply(self._state, event, rate, (self._t_ns - t_ns) * 1e-9)
+        self._account(event.outcome, 1)
 
-def bias_measurement(
-    gyro_bias: Array, accel_bias: Array, gyro_sigma: float | Array, accel_sigma: float | Array
-) -> Array | None:
-    """Return biases and their sigmas as one vector [12]; None when they are not finite, or a sigma not positive."""
-    sigmas = np.broadcast_to(gyro_sigma, 3), np.broadcast_to(accel_sigma, 3)
-    bias = np.concatenate([gyro_bias, accel_bias, *sigmas]).astype(np.float64)
-    return bias if np.isfinite(bias).all() and (bias[6:] > 0.0).all() else None
+    def _account(self, outcome: Outcome, sign: int) -> None:
+        for name, number in outcome.counts.items():
+            self._counts[name] += sign * number
 
+    def _checkpoint_at(self, t_ns: int) -> Checkpoint[S] | None:
+        return self._history.checkpoint_at(t_ns) if self._history is not None and t_ns <= self._t_ns else None
 
-def reset_sigmas(config: EkfConfig) -> Array:
-    """Return what a soft reset adds to the sigmas of the state [15]."""
-    return np.repeat(
-        [
-            np.deg2rad(config.reset_rotation_deg),
-            config.reset_position_m,
-            config.reset_velocity_m_s,
-            config.reset_gyro_bias_rad_s,
-            config.reset_accel_bias_m_s2,
-        ],
-        3,
-    )
+    def _snapshot(self, after_event: bool) -> Checkpoint[S]:
+        return Checkpoint(self._t_ns, self._applied, self._state.copy(), after_event)
+
+    def _take_checkpoint(self, after_event: bool = False) -> None:
+        history = self._history
+        assert history is not None
+        history.checkpoints.append(self._snapshot(after_event))
+        if self._t_ns - history.checkpoints[0].t_ns > self._history_ns + 8 * self._checkpoint_ns:
+            add_all(self._statistics, history.forget_before(self._t_ns - self._history_ns))
+            self._series.forget_before(history.checkpoints[0].t_ns)
+
+    def _restore(self, checkpoint: Checkpoint[S]) -> None:
+        self._t_ns, self._applied, self._state = checkpoint.t_ns, checkpoint.applied, checkpoint.state.copy()
+
+    def _nav_state(self, t_ns: int, state: S) -> NavState:
+        x = state.x
+        return NavState(
+            t_ns=t_ns,
+            T_world_body=pose(x, 0, 6),
+            velocity_world_m_s=x[3:6].copy(),
+            gyro_bias_rad_s=x[13:16].copy(),
+            accel_bias_m_s2=x[10:13].copy(),
+            covariance=self._core.covariance(state),
+        )

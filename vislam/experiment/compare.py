@@ -10,20 +10,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from vislam.errors import TrackingLostError, UsageError
+from vislam.core.errors import TrackingLostError, UsageError
+from vislam.core.files import write_json, write_text
+from vislam.core.revision import code_revision
 from vislam.experiment import engines
 from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, expand, source_identities, unique
 from vislam.experiment.options import CompareOptions
-from vislam.experiment.page import comparison_page
 from vislam.experiment.plan import Plan, load_plan
+from vislam.experiment.report.exports import latex, runs_csv, summary_csv, tests_csv
+from vislam.experiment.report.page import comparison_page
 from vislam.experiment.statistics import compare, groups
 from vislam.experiment.store import ResultStore
-from vislam.experiment.tables import latex, runs_csv, summary_csv, tests_csv
 from vislam.experiment.trials import Trial, trials
 from vislam.experiment.verify import read_manifest, verify
-from vislam.runfolder import code_revision, storage, write_json
-from vislam.trajectory import write_text
+from vislam.run.folder import storage
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, a short note
 

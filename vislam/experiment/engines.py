@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from vislam.errors import UsageError
+from vislam.core.errors import UsageError
 from vislam.experiment.isolated import run_isolated
 
 _ANSWER_S = 20.0  # a scheduler that is there answers much sooner

@@ -10,8 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from vislam.runfolder import fingerprint
-from vislam.sources import is_world, split_source
+from vislam.run.folder import fingerprint
+from vislam.run.sources import is_world, split_source
 
 HARNESS_VERSION = 1  # of what a job does and measures beside the code below; a new one makes all results new
 

@@ -11,7 +11,7 @@ from typing import Any
 from vislam.config import dump, from_data
 from vislam.experiment.identity import environment, sha256_of, source_identity
 from vislam.experiment.plan import Plan, Scalar, Sequence, nested
-from vislam.runfolder import fingerprint
+from vislam.run.folder import fingerprint
 
 JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import resource
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.errors import DataError, VislamError
+from vislam.core.errors import DataError, VislamError
 from vislam.trajectory import (
     Alignment,
     Trajectory,
@@ -30,9 +28,9 @@ _CURVE_POINTS = 240  # of each trajectory that are kept for pictures
 SEGMENTS_M = (1, 5, 10)
 
 
-def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float], cpu_s: float) -> dict[str, Any]:
+def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float]) -> dict[str, Any]:
     """Return what belongs to the run as a whole: time, memory, counts, and the filter's innovations."""
-    timing, initialisation = metrics["timing_ms"], metrics["initialisation"]
+    timing, initialisation, cost = metrics["timing_ms"], metrics["initialisation"], metrics["cost"]
     p50_ms, p99_ms = np.percentile(np.array(latencies_s) * 1e3, (50, 99)) if len(latencies_s) else (None, None)
     duration_s = metrics["duration_s"]
     return {
@@ -49,8 +47,8 @@ def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float], cpu_s: f
         "latency_p99_ms": _plain(p99_ms),
         "filter_p50_ms": timing.get("ekf", {}).get("p50"),
         "filter_p99_ms": timing.get("ekf", {}).get("p99"),
-        "cpu_s_per_s": cpu_s / duration_s if duration_s > 0.0 else None,
-        "peak_memory_mb": peak_memory_mb(),
+        "cpu_s_per_s": cost["cpu_s"] / duration_s if duration_s > 0.0 else None,
+        **{name: cost[name] for name in ("cpu_ms_per_frame", "peak_memory_mb", "first_pose_s", "first_pose_cpu_s")},
         "nis": nis_measures(metrics.get("nis") or {}),
         "doubts": len(metrics["doubts"]),
         "warnings": metrics["warnings"],
@@ -131,16 +129,6 @@ def nis_measures(statistics: dict[str, Any]) -> dict[str, Any]:
         for kind, (count, total, freedom) in statistics.items()
         if freedom > 0
     }
-
-
-def peak_memory_mb() -> float:
-    """Return the most resident memory that this process ever had."""
-    try:  # ru_maxrss begins with the size of the parent process, this does not
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        unit = 2**20 if sys.platform == "darwin" else 2**10
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def _plain(value: Any) -> float | None:

@@ -8,6 +8,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+from vislam.config.ranges import Count, Whole
+
 
 @dataclass(frozen=True)
 class CompareOptions:
@@ -17,7 +19,7 @@ class CompareOptions:
     """TOML file that says what to compare on what; docs/experiments.md"""
     out: Path | None = None
     """Folder for report, tables and manifest; None: results/NAME of the plan"""
-    workers: int = 2
+    workers: Count = 2
     """Jobs at the same time on this machine; 1 for undisturbed timings"""
     engine: Literal["local", "dask"] = "local"
     """Processes of this machine, or the workers of a Dask cluster"""
@@ -33,7 +35,7 @@ class CompareOptions:
     """Run the jobs again that failed before"""
     verify: Path | None = None
     """Run jobs of this comparison (folder or manifest) again: do the numbers come out? Exit code 4 if not"""
-    sample: int = 3
+    sample: Whole = 3
     """How many jobs --verify runs; 0: all"""
     dry_run: bool = False
     """Only list the jobs and which of them are done"""

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vislam.config import validated
-from vislam.errors import UsageError
-from vislam.reading import read_text
-from vislam.sources import is_world, split_source
+from vislam.core.errors import UsageError
+from vislam.core.reading import read_text
+from vislam.run.sources import is_world, split_source
 
 Scalar = bool | int | float | str
 Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.coupling": "tight"}

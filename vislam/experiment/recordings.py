@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vislam.config import CalibrationConfig
+from vislam.core.errors import StorageError
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.recording import Recording, WrappedRecording
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
-from vislam.errors import StorageError
 from vislam.experiment.identity import code_sha256, sha256_of
-from vislam.messages import Frame, ImuSample, MagSample
-from vislam.recording import Recording, WrappedRecording
-from vislam.sources import open_source
+from vislam.run.sources import open_source
 
 _SIMULATOR = Path(__file__).resolve().parent.parent / "sim"
 
@@ -57,7 +57,7 @@ class TimedRecording(WrappedRecording):
     """
 
     def __init__(self, recording: Recording) -> None:
-        """Wrap a recording (see `vislam.recording.Recording`)."""
+        """Wrap a recording (see `vislam.core.recording.Recording`)."""
         super().__init__(recording)
         self.latencies_s: list[float] = []
         self.span_ns: tuple[int, int] | None = None

@@ -11,8 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from vislam.database import connect
-from vislam.errors import DataError, StorageError
+from vislam.core.database import connect
+from vislam.core.errors import DataError, StorageError
 
 _SCHEMA_VERSION = 1
 _BUSY_S = 30.0  # another comparison may be writing to the same file

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from vislam.errors import DataError, UsageError
+from vislam.core.errors import DataError, UsageError
+from vislam.core.reading import read_json
 from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, source_identities
 from vislam.experiment.plan import Plan
 from vislam.experiment.trials import Trial, trials
-from vislam.reading import read_json
 
 Outcome = Literal["identical", "within the spread", "differs"]
 Rerun = Callable[[Sequence[Job]], dict[str, dict[str, Any]]]  # from jobs to results by key, without the store

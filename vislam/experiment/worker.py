@@ -10,18 +10,18 @@ import json
 import os
 import sys
 import threading
-import time
 import traceback
 from pathlib import Path
 from typing import Any
 
 from vislam.config import Config, from_data
-from vislam.errors import VislamError
+from vislam.core.errors import VislamError
+from vislam.core.files import write_json
 from vislam.experiment.identity import environment
 from vislam.experiment.measures import output_measures, run_measures
 from vislam.experiment.recordings import TimedRecording, open_cached
 from vislam.run import execute
-from vislam.runfolder import prepare, write_json
+from vislam.run.folder import prepare
 
 _ORPHANED = 70
 _MAX_TRACE = 4000  # characters of a traceback that are kept
@@ -51,15 +51,13 @@ def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -
     config: Config = from_data(spec["config"], "job")
     recording = TimedRecording(open_cached(spec["source"], config.seed, cache, config.calibration))
     prepare(out, overwrite=False)
-    cpu_s = time.process_time()
     try:
         execute(recording, config, out, spec["source"], ["vislam", "compare"], recording.frame_done)
     finally:
-        cpu_s = time.process_time() - cpu_s
         metrics_file = out / "metrics.json"
         if metrics_file.is_file():
             metrics = json.loads(metrics_file.read_text(encoding="utf-8"))
-            result["run"] = run_measures(metrics, recording.latencies_s, cpu_s)
+            result["run"] = run_measures(metrics, recording.latencies_s)
             outputs = ["ekf", "live", "graph", *_batch(spec, config, out, result)]
             result["outputs"] = output_measures(out, outputs, metrics, recording.span_ns)
 
@@ -68,7 +66,7 @@ def _batch(spec: dict[str, Any], config: Config, out: Path, result: dict[str, An
     """Estimate the run again in batch, if that was asked for; time and memory of the run are those without it."""
     if not spec["batch"]:
         return []
-    from vislam.offline.optimize import optimize
+    from vislam.run.offline.optimize_run import optimize
 
     try:
         optimize(out, config.batch)

@@ -8,16 +8,16 @@ import gtsam
 import numpy as np
 
 from vislam.config import GraphConfig
+from vislam.core.geometry import invert, transform
+from vislam.core.messages import Array
 from vislam.factors import motion
-from vislam.factors.imu import Preintegrated, Preintegrator
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
-from vislam.factors.noise import gaussian, huber, of_vision
+from vislam.factors.noise_models import gaussian, huber, of_vision
+from vislam.factors.preintegration import Preintegrated, Preintegrator
 from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
-from vislam.geometry import invert, transform
 from vislam.imu import ImuNoise
-from vislam.messages import Array
 
 Label = tuple[str, int]  # names a factor that will be replaced or taken out: its kind and a number
 
@@ -126,7 +126,7 @@ class Builder:
 
     def _visual_covariance(self, record: KeyframeRecord, vo_scale: float) -> Array:
         assert record.covariance is not None
-        return record.covariance if record.begins_piece else of_vision(record, self._config, vo_scale)
+        return record.covariance if record.begins_submap else of_vision(record, self._config, vo_scale)
 
     def _visual(self, record: KeyframeRecord, before: Guess, guess: Guess, vo_scale: float) -> gtsam.NonlinearFactor:
         assert record.T_previous_body is not None
@@ -152,7 +152,7 @@ class Builder:
         """Keep velocity and biases bounded where the IMU factor had to be dropped."""
         assert self._preintegrator is not None
         walk = self._preintegrator.bias_walk_sigmas(duration_s)
-        sigma_m_s = self._config.piece_speed_sigma_m_s if record.begins_piece else self._config.lost_speed_sigma_m_s
+        sigma_m_s = self._config.submap_speed_sigma_m_s if record.begins_submap else self._config.lost_speed_sigma_m_s
         speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, sigma_m_s)
         return [speed, motion.bias_walk(record.id, walk)]
 
@@ -176,7 +176,7 @@ class Builder:
         elif measured is not None and integrated is None:
             step_m = float(np.linalg.norm(last_motion[:3, 3]))
             T = before.T_map_body @ transform(measured[:3, :3].copy(), step_m * measured[:3, 3])
-        if record.begins_piece:
+        if record.begins_submap:
             velocity = np.zeros(3)
         elif integrated is None:
             velocity = (T[:3, 3] - before.T_map_body[:3, 3]) / duration_s

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.memory import WindowRecord
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
 from vislam.factors.keys import nearest_rigid
-from vislam.factors.noise import checked_covariance, checked_covariances
-from vislam.memory import WindowRecord
-from vislam.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
+from vislam.factors.noise_models import checked_covariance, checked_covariances
 
 _RIGID = 1e-4  # how far R^T R may be from identity
 _USELESS_RAD = 0.5  # odometry that knows rotation or translation no better than this is as good as lost
@@ -45,7 +45,7 @@ class KeyframeRecord:
     degraded: bool
     imu: ImuSpan | None
     rest_from: int | None  # the keyframe since which the body has not moved; None: it may have
-    begins_piece: bool = False  # nothing was measured; then the motion above is a guess, with sigmas that say so
+    begins_submap: bool = False  # nothing was measured; then the motion above is a guess, with sigmas that say so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> Keyfram
         raise DataError(f"{what}: ids must be dense, expected {expected}")
     if previous is None:
         return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, None)
-    if packet.begins_piece:  # of another recording perhaps, whose clock began anew
+    if packet.begins_submap:  # of another recording perhaps, whose clock began anew
         return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, None, True)
     if keyframe.t_ns <= previous.t_ns:
         raise DataError(f"{what}: time must increase, the previous keyframe is at {previous.t_ns} ns")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from vislam.messages import Array
+from vislam.core.messages import Array
 
 _INDEX_BITS = 56
 _POSE, _VELOCITY, _BIAS = (ord(c) << _INDEX_BITS for c in "xvb")

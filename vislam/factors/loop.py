@@ -5,11 +5,14 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from vislam.chi_square import chi_square_limit
 from vislam.config import GraphConfig
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.memory import Tie
+from vislam.core.messages import Array
 from vislam.factors.journal import LoopRecord
 from vislam.factors.keys import X, nearest_rigid
-from vislam.factors.noise import cauchy, conditioned, gaussian, inflated
+from vislam.factors.noise_models import cauchy, conditioned, gaussian, inflated
 from vislam.factors.visual import (
     DirectionMeasurement,
     direction_as_pose,
@@ -18,9 +21,6 @@ from vislam.factors.visual import (
     direction_residual,
     pose_factor,
 )
-from vislam.geometry import invert, se3_adjoint, se3_log
-from vislam.memory import Tie
-from vislam.messages import Array
 
 _SCALE_SIGMA = 5.0  # relative, on the length of the way of a loop that did not measure it
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse

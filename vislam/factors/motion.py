@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 
 from vislam.config import GraphConfig
+from vislam.core.geometry import skew
+from vislam.core.messages import Array
 from vislam.factors.keys import B, V, X
-from vislam.factors.noise import sigmas
-from vislam.geometry import skew
-from vislam.messages import Array
+from vislam.factors.noise_models import sigmas
 
 
 def zero_velocity(k: int, sigma_m_s: float) -> gtsam.PriorFactorVector:

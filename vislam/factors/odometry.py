@@ -8,11 +8,11 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
+from vislam.core.geometry import invert
+from vislam.core.messages import Array
 from vislam.factors.builder import Builder, Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, KeyframeRecord, StartRecord
 from vislam.factors.keys import nearest_rigid
-from vislam.geometry import invert
-from vislam.messages import Array
 
 
 class Odometry(Protocol):
@@ -88,7 +88,7 @@ class MotionOdometry:
 
     def reach_m(self, k: int) -> float:
         """See Odometry."""
-        if self._records[k].begins_piece:
+        if self._records[k].begins_submap:
             return float("inf")
         return SPEED_MAX_M_S * (self._records[k].t_ns - self._records[k - 1].t_ns) * 1e-9
 
@@ -97,5 +97,5 @@ class MotionOdometry:
         return None
 
     def relink(self, k: int, T_previous_body: Array) -> None:
-        """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""
+        """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
         self._records[k] = replace(self._records[k], T_previous_body=nearest_rigid(T_previous_body))

@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 
 from vislam.config import GraphConfig
+from vislam.core.messages import Array
 from vislam.factors.journal import StartRecord
 from vislam.factors.keys import B, V, X, bias_of
-from vislam.factors.noise import gaussian, sigmas
-from vislam.messages import Array
+from vislam.factors.noise_models import gaussian, sigmas
 
 
 def start_factors(start: StartRecord, config: GraphConfig) -> list[gtsam.NonlinearFactor]:

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.geometry import skew
-from vislam.memory import EdgeRecord, TiltRecord
-from vislam.messages import Array
+from vislam.core.geometry import skew
+from vislam.core.memory import EdgeRecord, GravityRecord
+from vislam.core.messages import Array
 
 _NO_WAY_M = 1e-6  # an edge so short has no direction
 
@@ -34,7 +34,7 @@ class SharedErrors:
         way = T[:3, :3].T @ T[:3, 3]
         length_m = float(np.linalg.norm(way))
         self._along[edge.to_id] = 0.0
-        if edge.begins_piece or length_m < _NO_WAY_M:
+        if edge.begins_submap or length_m < _NO_WAY_M:
             return
         way /= length_m
         across = np.eye(3) - np.outer(way, way)
@@ -42,7 +42,7 @@ class SharedErrors:
         beyond = float(way @ P @ way) - float(np.linalg.eigvalsh(across @ P @ across)[-1])
         self._along[edge.to_id] = np.sqrt(max(beyond, 0.0)) * way
 
-    def level(self, tilt: TiltRecord) -> None:
+    def level(self, tilt: GravityRecord) -> None:
         """Take how well level is known at a keyframe."""
         self._level_rad = min(self._level_rad, tilt.sigma_rad)
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numba import njit
 
-from vislam.geometry import skew, so3_log, so3_right_jacobian_inverse, tangent_basis
-from vislam.messages import Array
+from vislam.core.geometry import skew, so3_log, so3_right_jacobian_inverse, tangent_basis
+from vislam.core.jit import njit
+from vislam.core.messages import Array
 
 _FACING_MIN = 0.1  # bounds the residual near the opposite direction
 _NO_DIRECTION = 0.5  # a translation column shorter than this says: no parallax

@@ -8,17 +8,17 @@ import gtsam
 import numpy as np
 
 from vislam.config import GraphConfig
+from vislam.core.geometry import se3_log
+from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
+from vislam.core.messages import Array
 from vislam.factors.builder import Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, StartRecord
 from vislam.factors.keys import X, bias_of, nearest_rigid
 from vislam.factors.motion import no_motion, on_floor
-from vislam.factors.noise import gaussian, huber, inflated
+from vislam.factors.noise_models import gaussian, huber, inflated
 from vislam.factors.priors import pose_covariance
 from vislam.factors.shared import SharedErrors
 from vislam.factors.visual import pose_factor
-from vislam.geometry import se3_log
-from vislam.memory import EdgeRecord, TiltRecord, WindowRecord
-from vislam.messages import Array
 
 _SPREAD = 1.5  # a provisional edge is worth replacing when its variance changed by more than this factor
 _UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
@@ -34,7 +34,7 @@ class WindowOdometry:
         self._newest: WindowRecord | None = None
         self._t_ns: list[int] = []
         self._edges: list[EdgeRecord | None] = []  # by the newer keyframe
-        self._tilts: dict[int, TiltRecord] = {}
+        self._tilts: dict[int, GravityRecord] = {}
         self._rest_from: list[int | None] = []
         self._shared = SharedErrors() if config.edges_share_scale else None
 
@@ -96,7 +96,7 @@ class WindowOdometry:
         covariance = self.covariance(edge, vo_scale)
         named: dict[Label, gtsam.NonlinearFactor] = {("edge", k): self._edge_factor(edge, covariance)}
         if k in self._tilts:
-            named["tilt", k] = self._tilt_factor(self._tilts[k])
+            named["tilt", k] = self._gravity_factor(self._tilts[k])
         rest_from, still = self._rest_from[k], list[gtsam.NonlinearFactor]()
         if rest_from is not None:
             still.append(no_motion(rest_from, k, self._config))
@@ -120,13 +120,13 @@ class WindowOdometry:
             if edge.to_id != self._newest.id:
                 out["edge", edge.to_id] = self._edge_factor(edge, self.covariance(edge, vo_scale))
         for tilt in self._newest.tilts:
-            out["tilt", tilt.id] = self._tilt_factor(tilt)
+            out["tilt", tilt.id] = self._gravity_factor(tilt)
         return out
 
     def reach_m(self, k: int) -> float:
         """See Odometry."""
         edge = self._edges[k]
-        if edge is not None and edge.begins_piece:
+        if edge is not None and edge.begins_submap:
             return float("inf")
         return SPEED_MAX_M_S * (self._t_ns[k] - self._t_ns[k - 1]) * 1e-9
 
@@ -135,7 +135,7 @@ class WindowOdometry:
         return None if self._shared is None else self._shared.effect(ids, poses)
 
     def relink(self, k: int, T_previous_body: Array) -> None:
-        """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""
+        """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
         edge = self._edges[k]
         assert edge is not None
         self._edges[k] = replace(edge, T_previous_body=nearest_rigid(T_previous_body))
@@ -143,7 +143,7 @@ class WindowOdometry:
     def covariance(self, edge: EdgeRecord, vo_scale: float) -> Array:
         """Return the covariance [6, 6] that the graph gives an edge."""
         config = self._config
-        if edge.begins_piece:
+        if edge.begins_submap:
             return edge.covariance
         floor_rad = np.deg2rad(config.window_floor_deg)
         return inflated(edge.covariance, vo_scale * config.window_inflation, floor_rad, config.window_floor_m)
@@ -153,7 +153,7 @@ class WindowOdometry:
         model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
         return pose_factor(X(edge.to_id - 1), X(edge.to_id), edge.T_previous_body, model)
 
-    def _tilt_factor(self, tilt: TiltRecord) -> gtsam.NonlinearFactor:
+    def _gravity_factor(self, tilt: GravityRecord) -> gtsam.NonlinearFactor:
         sigma_rad = float(np.hypot(tilt.sigma_rad, np.deg2rad(self._config.tilt_floor_deg)))
         model = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad)
         return gtsam.AttitudeFactorPose3(X(tilt.id), _UP, model, gtsam.Unit3(tilt.up_body))

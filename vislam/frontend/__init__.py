@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from vislam.camera import Rig
 from vislam.config import FrontEndConfig
-from vislam.errors import UsageError
+from vislam.config.frontend import Mode
+from vislam.core.camera import Rig
+from vislam.core.errors import UsageError
 from vislam.frontend.metric import MetricFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
@@ -38,14 +39,14 @@ FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {
 }
 
 
-def mode_for(config: FrontEndConfig, rig: Rig) -> str:
+def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
     """Return the name of the front end that a configuration means.
 
     `auto` takes the richest that the rig allows; one camera whose height above a floor is known is `planar`.
     """
     if config.mode != "auto":
         return config.mode
-    one_camera = "mono" if config.planar.height_m is None else "planar"
+    one_camera: Mode = "mono" if config.planar.height_m is None else "planar"
     return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
 
 

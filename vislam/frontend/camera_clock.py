@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from vislam.config import InitConfig
+from vislam.core.messages import Frame, ImuSpan, NavState, VoMeasurement
 from vislam.frontend.time_offset import TimeOffset, TimeOffsetEstimate
 from vislam.imu import ImuBuffer
-from vislam.messages import Frame, ImuSpan, NavState, VoMeasurement
 
 _NS = 1_000_000_000
 _EVERY_FRAMES = 5  # between estimates: they change slowly, and each costs a millisecond

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.messages import Array, Frame
+from vislam.core.messages import Array, Frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.messages import Frame, ImageU8
+from vislam.core.messages import Frame, ImageU8
 
 _EVERY_PX = 8  # the image is compared with the one before at one pixel in so many, each way
 _MEDIAN_OF = 31  # intervals, that tell the usual one

@@ -7,9 +7,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from vislam.camera import Rig
-from vislam.errors import DataError
-from vislam.messages import Frame, Observations
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import Frame, Observations
 
 _DESCRIPTOR_BYTES = 32
 

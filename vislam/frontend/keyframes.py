@@ -1,4 +1,4 @@
-"""When a frame becomes a keyframe, and what a keyframe is made of."""
+"""When a frame becomes a keyframe, what a keyframe is made of, and the life of the one that frames are placed by."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera
 from vislam.config import FrontEndConfig
-from vislam.features import describe
-from vislam.geometry import transform_points
-from vislam.messages import Array, Frame, Keyframe
+from vislam.core.camera import Camera
+from vislam.core.geometry import so3_log, transform_points
+from vislam.core.messages import Array, Frame, Keyframe, Observations, no_observations
+from vislam.frontend.result import TrackResult, identity_motion, lost_motion
+from vislam.vision.features import describe
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +54,15 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig, spacing: float
     return next((reason for value, limit, reason in limits if value >= spacing * limit), "")
 
 
+MeasureDepth = Callable[[Array, NDArray[np.int64] | None], Array]
+"""Gives z-depths [N] in metres of raw pixels [N, 2] and the tracks [N] that they belong to, if any."""
+
+
 def make_keyframe(
-    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int,
-    measure_depth: Callable[[Array, NDArray[np.int64] | None], Array] | None,
-) -> Keyframe:  # fmt: skip
+    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int, measure_depth: MeasureDepth | None
+) -> Keyframe:
     """Describe a frame for loop closing.
 
-    `measure_depth` gives z-depths [N] in metres of raw pixels [N, 2] and the tracks [N] that they belong to, if any.
     A frame that brings its tracks brings their descriptors too, or has nothing to recognise it by.
     """
     ids = None
@@ -73,3 +76,83 @@ def make_keyframe(
     if measure_depth is not None:
         points = transform_points(T_body_cam, camera.unproject(pixels) * measure_depth(pixels, ids)[:, None])
     return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points)
+
+
+class KeyframeLife:
+    """The keyframe that frames are placed by: its number, when the next one is due, and when it is given up."""
+
+    def __init__(self, config: FrontEndConfig, has_scale: bool) -> None:
+        """Begin without a keyframe; `has_scale` says of all measurements whether they are in metres."""
+        self.keyframe: Keyframe | None = None
+        self._config = config
+        self._has_scale = has_scale
+        self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
+        self._first_id = 0
+        self._tracks = 0  # with which the keyframe began
+        self._t_placed_ns = -1  # of the last frame that was placed
+
+    @property
+    def newest_id(self) -> int:
+        """The keyframe's id, -1 before the first."""
+        return -1 if self.keyframe is None else self.keyframe.id
+
+    def begin_at(self, keyframe_id: int, seeks_place: bool) -> None:
+        """Number the first keyframe; see FrontEnd.begin_at."""
+        self._first_id = keyframe_id
+        if seeks_place:
+            self._since_restart = 0
+
+    def placed(self, t_ns: int) -> None:
+        """Take note that a frame was placed."""
+        self._t_placed_ns = t_ns
+
+    def is_given_up(self, t_ns: int) -> bool:
+        """Return whether no frame was placed for so long that another keyframe has to begin."""
+        return (t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s
+
+    def departure(
+        self, t_ns: int, R_key_cam: Array, parallax_px: float, followed: int, inliers: int, fit: bool = True
+    ) -> Departure:
+        """Return how far a placed frame has come; `followed` tracks of those with which the keyframe began."""
+        assert self.keyframe is not None
+        return Departure(
+            dt_s=(t_ns - self.keyframe.t_ns) * 1e-9,
+            rotation_rad=float(np.linalg.norm(so3_log(np.ascontiguousarray(R_key_cam)))),
+            parallax_px=parallax_px,
+            alive=followed / max(self._tracks, 1),
+            inliers=inliers,
+            fit=fit,
+            restarted=self._since_restart < self._config.restart_keyframes,
+        )
+
+    def install(
+        self, frame: Frame, camera: Camera, T_body_cam: Array, tracks: int, measure_depth: MeasureDepth | None = None
+    ) -> Keyframe:
+        """Make a frame with so many tracks the keyframe; see make_keyframe."""
+        new_id = self._first_id if self.keyframe is None else self.keyframe.id + 1
+        features = self._config.described_features
+        self.keyframe = make_keyframe(new_id, frame, camera, T_body_cam, features, measure_depth)
+        self._since_restart += 1
+        self._tracks = tracks
+        self._t_placed_ns = frame.t_ns
+        return self.keyframe
+
+    def lost(self, t_ns: int, why: str, inliers: int = 0) -> TrackResult:
+        """Return the result of a frame that could not be placed."""
+        vo = lost_motion(t_ns, self.newest_id, self._has_scale, inliers)
+        return TrackResult(vo, no_observations(), None, 0.0, why)
+
+    def refused(self, t_ns: int, failure: str, lack: str) -> TrackResult:
+        """Return the result of a frame that lacks what a start needs, after a failure or as the first."""
+        return self.lost(t_ns, f"{failure}; {lack}" if failure else lack)
+
+    def started(self, observations: Observations, corners: int, failure: str) -> TrackResult:
+        """Return the result of the frame that was just installed as the first keyframe or after a failure."""
+        new = self.keyframe
+        assert new is not None
+        if new.id == self._first_id:
+            vo = identity_motion(new.t_ns, new.id, self._has_scale, corners)
+            return TrackResult(vo, observations, new, 0.0, "first keyframe")
+        self._since_restart = 0
+        vo = lost_motion(new.t_ns, new.id - 1, self._has_scale)
+        return TrackResult(vo, observations, new, 0.0, f"restarted: {failure}")

@@ -7,26 +7,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import FrontEndConfig
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.memory import FrontNews
+from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.frontend.agreement import confirmed, failure, weakness
 from vislam.frontend.depth import DepthReading
-from vislam.frontend.epipolar import epipolar_distances
 from vislam.frontend.intake import Intake
-from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
-from vislam.frontend.landmarks import Landmarks, fuse, move
-from vislam.frontend.locate import pnp_ransac, recognise
+from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
-from vislam.frontend.prediction import MotionPredictor, body_motion
-from vislam.frontend.refine import PoseEstimate, extra_parameter, pose_covariance, refine_pose
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
-from vislam.frontend.shutter import Shutter
+from vislam.frontend.prediction import MotionPredictor
+from vislam.frontend.result import TrackResult, metric_motion, too_few
 from vislam.frontend.tracker import Tracker, given_rows
 from vislam.frontend.view import View, sees
-from vislam.geometry import invert, se3_adjoint, se3_log, so3_log
-from vislam.memory import FrontNews
-from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
-
-Bools = NDArray[np.bool_]
+from vislam.vision.landmarks import Landmarks, fuse, move
+from vislam.vision.locate import pnp_ransac, recognise
+from vislam.vision.refine import PoseEstimate, extra_parameter, pose_covariance, refine_pose
+from vislam.vision.shutter import Shutter
+from vislam.vision.two_view import epipolar_distances
 
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
 # times what tracks scatter by: the noise of independent tracks that would move a pose as much. What neighbours have in
@@ -35,9 +34,6 @@ _ALIKE = 4.0
 _USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is told: what blurs or bends images spoils both
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
-_ASTRAY_PX = 6.0  # from where a filter that knows its motion expects a track: it belongs to something that moves
-_CONTRADICTS = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
-_MIN_AS_EXPECTED = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
 _FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
 _DEEP = 0.02  # of a keyframe's tracks are given depth at least, or its sensor is covered: wrong matches alone are fewer
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
@@ -59,6 +55,10 @@ class _Attempt:
     @property
     def followed(self) -> int:
         return int(np.isfinite(self.xy[:, 0]).sum())
+
+    @property
+    def agreeing(self) -> Bools:
+        return self.estimate.inliers
 
     @property
     def inliers(self) -> int:
@@ -83,15 +83,11 @@ class MetricFrontEnd:
         self._shutter = Shutter(self._camera, config.readout_s)
         self._sigma_xy = config.track_sigma_px / self._camera.fx
         self._landmarks = Landmarks()
-        self._keyframe: Keyframe | None = None
-        self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
-        self._first_id = 0
-        self._keyframe_tracks = 0
+        self._life = KeyframeLife(config, has_scale=True)
         self._keyframe_twist: Array = np.zeros(6)
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
         self._key_sees = True  # whether the usual camera sees anything in the keyframe
         self._now_sees = True  # and in this frame; only asked while another camera is looked through
-        self._t_placed_ns = -1  # of the last frame that was placed
         self._lost = False
         self._lacks_depth = False  # hardly a track of the keyframe was given depth when it began
         self._blind = False  # the keyframe is the first and has no depth
@@ -106,42 +102,42 @@ class MetricFrontEnd:
 
     def _track(self, frame: Frame, imu: ImuSpan | None, T_last_now: Array | None) -> TrackResult:
         whole, dt_s = self._intake.accept(frame)
-        if self._keyframe is None:
+        keyframe = self._life.keyframe
+        if keyframe is None:
             return self._start(whole, "")
-        self._look_back(whole, self._keyframe)
+        self._look_back(whole, keyframe)
         frame = self._view.of(whole)
         T_before = self._T_key_cam
         T_guess = T_before @ self._predictor.predict(dt_s, imu)
         if self._blind:
-            return self._leave_blindness(frame, self._keyframe, T_guess)
+            return self._leave_blindness(frame, keyframe, T_guess)
         attempt = self._attempt(frame, T_before, T_guess, dt_s)
-        other = self._by_other_camera(whole, self._keyframe, T_guess, dt_s) if attempt.failure else None
+        other = self._by_other_camera(whole, keyframe, T_guess, dt_s) if attempt.failure else None
         if other is not None:
             frame, T_before, attempt = self._view.of(whole), self._T_key_cam, other
         if T_last_now is not None:
             T_expected = T_before @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
             attempt = self._confirmed(attempt, frame, T_before, T_expected, dt_s)
         if attempt.failure:
-            T_found = self._recognise(frame, self._keyframe)
+            T_found = self._recognise(frame, keyframe)
             if T_found is not None:
                 attempt = self._attempt(frame, T_before, T_found, dt_s)
         if attempt.failure:
             self._T_key_cam = T_guess
-            return self._lose(frame, self._keyframe, attempt)
+            return self._lose(frame, attempt)
         self._T_key_cam = attempt.estimate.T_key_cam
         if not self._lost:
             self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
         self._lost = False
-        self._t_placed_ns = frame.t_ns
+        self._life.placed(frame.t_ns)
         self._learn_shutter(attempt)
-        self._learn_noise(attempt, self._keyframe)
-        return self._report(frame, self._keyframe, attempt)
+        self._learn_noise(attempt, keyframe)
+        return self._report(frame, keyframe, attempt)
 
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
-        self._first_id, self._tracker.next_id = keyframe_id, news.next_track_id
-        if seeks_place:
-            self._since_restart = 0
+        self._life.begin_at(keyframe_id, seeks_place)
+        self._tracker.next_id = news.next_track_id
         if news.readout_s is not None:
             self._shutter.start_at(news.readout_s)
 
@@ -159,19 +155,13 @@ class MetricFrontEnd:
         return self._place(frame, T_before, T_guess, dt_s, pixels)
 
     def _confirmed(self, attempt: _Attempt, frame: Frame, T_before: Array, T_expected: Array, dt_s: float) -> _Attempt:
-        """Return the attempt, or another without the tracks that contradict the filter's motion, where most do.
-
-        Where they do not, the filter has no say: vision drawn to what the filter believes would tell it nothing new.
-        """
+        """Return the attempt, or another without the tracks that are not where the filter's motion puts them."""
         expected, covariance = move(self._landmarks.mean, self._landmarks.covariance, T_expected)
-        gate_xy = _ASTRAY_PX / self._camera.fx + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+        gate_xy = self._config.astray_px / self._camera.fx + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
         astray = np.linalg.norm(attempt.xy - expected[:, :2], axis=1) > gate_xy
-        if not attempt.failure and (astray & attempt.estimate.inliers).sum() <= _CONTRADICTS * attempt.inliers:
-            return attempt
-        pixels = np.where(astray[:, None], np.nan, attempt.pixels)
-        other = self._place(frame, T_before, T_expected, dt_s, pixels)
-        few = other.inliers < _MIN_AS_EXPECTED * attempt.followed
-        return attempt if few or other.failure else other
+        return confirmed(
+            attempt, astray, lambda pixels: self._place(frame, T_before, T_expected, dt_s, pixels), self._config
+        )
 
     def _place(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float, pixels: Array) -> _Attempt:
         """Place the frame by tracks found at `pixels` [N, 2], from a guess."""
@@ -188,18 +178,12 @@ class MetricFrontEnd:
             twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
             xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
             estimate = self._polish(estimate, xy, depth_now)
-        failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
-        return _Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, failure)
+        why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
+        return _Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, why_not)
 
     def _failure(self, estimate: PoseEstimate, followed: int) -> str:
-        agree = int(estimate.inliers.sum())
-        if followed < self._config.min_inliers:
-            return f"only {followed} of {len(self._tracker)} tracks found"
-        if not estimate.converged:
-            return "the motion does not converge"
-        if agree < max(self._config.min_inliers, self._config.min_inlier_ratio * followed):
-            return f"only {agree} of {followed} tracks agree on a motion"
-        return ""
+        agree, least = int(estimate.inliers.sum()), self._config.min_inliers
+        return failure(len(self._tracker), followed, agree, estimate.converged, least, self._config)
 
     def _search(self, T_guess: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
@@ -352,14 +336,13 @@ class MetricFrontEnd:
 
     def _report(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt) -> TrackResult:
         vo = self._measurement(frame, keyframe.id, attempt)
-        departure = Departure(
-            dt_s=(frame.t_ns - keyframe.t_ns) * 1e-9,
-            rotation_rad=float(np.linalg.norm(so3_log(np.ascontiguousarray(self._T_key_cam[:3, :3])))),
-            parallax_px=self._parallax_px(attempt),
-            alive=attempt.followed / max(self._keyframe_tracks, 1),
-            inliers=attempt.inliers,
-            fit=self._depth.available(frame),
-            restarted=self._since_restart < self._config.restart_keyframes,
+        departure = self._life.departure(
+            frame.t_ns,
+            self._T_key_cam[:3, :3],
+            self._parallax_px(attempt),
+            attempt.followed,
+            attempt.inliers,
+            self._depth.available(frame),
         )
         reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
         reason = self._sees_again(frame) or reason
@@ -382,24 +365,14 @@ class MetricFrontEnd:
             return "cam0 sees nothing; cam1 is followed"
         if self._lacks_depth:
             return "the keyframe has no depth of its own"
-        if attempt.inliers < self._config.degraded_inliers:
-            return f"only {attempt.inliers} inliers"
-        if attempt.inliers < self._config.degraded_inlier_ratio * attempt.followed:
-            return f"only {attempt.inliers} of {attempt.followed} tracks agree"
-        return ""
+        return weakness(attempt.followed, attempt.inliers, self._config.degraded_inliers, self._config)
 
     def _measurement(self, frame: Frame, keyframe_id: int, attempt: _Attempt) -> VoMeasurement:
-        adjoint = se3_adjoint(self._T_body_cam)
-        covariance = adjoint @ self._covariance(attempt, frame.tracks is not None) @ adjoint.T
-        return VoMeasurement(
-            t_ns=frame.t_ns,
-            keyframe_id=keyframe_id,
-            T_keyframe_body=body_motion(attempt.estimate.T_key_cam, self._T_body_cam),
-            covariance=0.5 * (covariance + covariance.T),
-            has_scale=True,
-            tracking=Tracking.DEGRADED if self._weakness(attempt) else Tracking.OK,
-            inliers=attempt.inliers,
-        )
+        covariance = self._covariance(attempt, frame.tracks is not None)
+        return metric_motion(
+            frame.t_ns, keyframe_id, attempt.estimate.T_key_cam, covariance, self._T_body_cam, attempt.inliers,
+            is_weak=bool(self._weakness(attempt)),
+        )  # fmt: skip
 
     def _covariance(self, attempt: _Attempt, given: bool) -> Array:
         """Return the covariance [6, 6] of the camera's motion, by the noise that was measured instead of told."""
@@ -423,13 +396,11 @@ class MetricFrontEnd:
         moved = turned[:, :2] / turned[:, 2:] - self._landmarks.mean[good, :2]
         return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx)
 
-    def _lose(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt) -> TrackResult:
+    def _lose(self, frame: Frame, attempt: _Attempt) -> TrackResult:
         self._lost = True
-        late = (frame.t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s
-        if late and self._depth.available(frame):
+        if self._life.is_given_up(frame.t_ns) and self._depth.available(frame):
             return self._start(frame, attempt.failure)
-        vo = lost_motion(frame.t_ns, keyframe.id, True, attempt.inliers)
-        return TrackResult(vo, no_observations(), None, 0.0, attempt.failure)
+        return self._life.lost(frame.t_ns, attempt.failure, attempt.inliers)
 
     # -- a first keyframe without depth ------------------------------------------------------------------------------
 
@@ -439,8 +410,7 @@ class MetricFrontEnd:
         pixels = self._tracker.follow(frame, self._camera.project(rays @ T_guess[:3, :3]))
         self._blind_px = np.where(np.isfinite(pixels), pixels, self._blind_px)
         if not self._depth.available(frame):
-            vo = lost_motion(frame.t_ns, keyframe.id, True)
-            return TrackResult(vo, no_observations(), None, 0.0, "no depth has been seen yet")
+            return self._life.lost(frame.t_ns, "no depth has been seen yet")
         xy = self._camera.normalise(pixels)
         reading = self._depth.measure(frame, pixels, xy, np.full(len(xy), np.nan), self._tracker.ids)
         points = np.column_stack([xy, reading.rho])
@@ -453,9 +423,9 @@ class MetricFrontEnd:
         self._landmarks.covariance[usable, 2, 2] = (_BLIND_SIGMA * moved[:, 2]) ** 2
         estimate = self._search(np.asarray(invert(T_cam_key)), xy, None)
         estimate = self._polish(estimate, xy, None) if estimate.converged else estimate
-        failure = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
-        if failure:
-            return self._start(frame, failure)
+        why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
+        if why_not:
+            return self._start(frame, why_not)
         attempt = _Attempt(pixels, xy, xy, None, reading.rho, np.zeros(6), estimate, "")
         self._T_key_cam = estimate.T_key_cam
         # followed for long, through a rolling shutter of which nothing was known: true, but not to the millimetre
@@ -467,40 +437,33 @@ class MetricFrontEnd:
 
     # -- keyframes ---------------------------------------------------------------------------------------------------
 
-    def _start(self, frame: Frame, failure: str) -> TrackResult:
+    def _start(self, frame: Frame, why: str) -> TrackResult:
         """Begin anew with this frame as keyframe, if there is enough to see in it."""
-        last_id = self._keyframe.id if self._keyframe is not None else -1
         self._tracker.forget()
         self._landmarks = Landmarks()
         frame = self._view.of(frame)
         self._look_through(self._views[0])
         count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         reading = self._add_landmarks(frame, count, np.zeros(6))
-        lack = self._lack(frame, last_id)
+        lack = self._lack(frame)
         if lack:
             self._tracker.forget()
             self._landmarks = Landmarks()
-            vo = lost_motion(frame.t_ns, last_id, True)
-            return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {lack}" if failure else lack)
+            return self._life.refused(frame.t_ns, why, lack)
         self._predictor.forget()
         self._lost = False
         self._lacks_depth = False
         self._blind, self._blind_px = not self._depth.available(frame), self._tracker.pixels.copy()
-        keyframe = self._install(frame, np.zeros(6))
+        self._install(frame, np.zeros(6))
         observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
-        if last_id < 0:
-            vo = identity_motion(frame.t_ns, keyframe.id, True, count)
-            return TrackResult(vo, observations, keyframe, 0.0, "first keyframe")
-        self._since_restart = 0
-        vo = lost_motion(frame.t_ns, last_id, True)
-        return TrackResult(vo, observations, keyframe, 0.0, f"restarted: {failure}")
+        return self._life.started(observations, count, why)
 
-    def _lack(self, frame: Frame, last_id: int) -> str:
+    def _lack(self, frame: Frame) -> str:
         """Return what a frame lacks to start from, or an empty string; only the very first may be without depth."""
         corners, deep = len(self._tracker), int(self._landmarks.known.sum())
         if corners < self._config.min_start_corners:
             return too_few(frame, corners)
-        if deep < self._config.min_inliers and (last_id >= 0 or self._depth.available(frame)):
+        if deep < self._config.min_inliers and (self._life.keyframe is not None or self._depth.available(frame)):
             return f"only {deep} of {corners} corners have depth"
         return ""
 
@@ -561,16 +524,10 @@ class MetricFrontEnd:
             expected_rho = self._landmarks.expected_rho(xy)
             return usual.depth.measure(whole, pixels, xy, expected_rho, ids).depth_m
 
-        new_id = self._keyframe.id + 1 if self._keyframe is not None else self._first_id
-        features = self._config.described_features
-        keyframe = make_keyframe(new_id, whole, usual.camera, usual.T_body_cam, features, measure_depth)
-        self._keyframe = keyframe
-        self._since_restart += 1
-        self._keyframe_tracks = len(self._tracker)
+        keyframe = self._life.install(whole, usual.camera, usual.T_body_cam, len(self._tracker), measure_depth)
         self._keyframe_twist = twist_per_s
         self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)
-        self._t_placed_ns = frame.t_ns
         return keyframe
 
 

@@ -5,10 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import FrontEndConfig
-from vislam.frontend.epipolar import (
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert, transform
+from vislam.core.memory import FrontNews
+from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.frontend.agreement import confirmed, failure, weakness
+from vislam.frontend.intake import Intake
+from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
+from vislam.frontend.pixel_noise import PixelNoise
+from vislam.frontend.prediction import MotionPredictor
+from vislam.frontend.result import TrackResult, too_few
+from vislam.frontend.tracker import Tracker
+from vislam.vision.refine import refine_pose
+from vislam.vision.two_view import (
     RotationPrior,
     TwoViewEstimate,
     direction_given_rotation,
@@ -17,16 +29,6 @@ from vislam.frontend.epipolar import (
     from_epipolar_segment,
     refine_two_view,
 )
-from vislam.frontend.intake import Intake
-from vislam.frontend.keyframes import Departure, keyframe_reason, make_keyframe
-from vislam.frontend.pixel_noise import PixelNoise
-from vislam.frontend.prediction import MotionPredictor
-from vislam.frontend.refine import refine_pose
-from vislam.frontend.result import TrackResult, identity_motion, lost_motion, too_few
-from vislam.frontend.tracker import Tracker
-from vislam.geometry import invert, so3_log, transform
-from vislam.memory import FrontNews
-from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
 
 _RANSAC_PX = 1.5
 _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second solution that a flat scene has
@@ -34,9 +36,6 @@ _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a trans
 _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
 _GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
 _BOTH_ENDS = 2.0**0.5
-_ASTRAY_PX = 6.0  # from where a filter that knows its motion can explain a track: it belongs to something that moves
-_CONTRADICTS = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
-_MIN_AS_EXPECTED = 0.2  # of the tracks have to be where they can be, or the expectation is wrong
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
@@ -52,6 +51,10 @@ class _Motion:
     @property
     def followed(self) -> int:
         return int(np.isfinite(self.pixels[:, 0]).sum())
+
+    @property
+    def agreeing(self) -> NDArray[np.bool_]:
+        return self.view.inliers
 
     @property
     def inliers(self) -> int:
@@ -81,17 +84,13 @@ class MonoFrontEnd:
         self._min_inliers = config.min_inliers
         self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
         self._min_parallax_px = config.mono_min_parallax_px
-        self._keyframe: Keyframe | None = None
-        self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
-        self._first_id = 0
-        self._keyframe_tracks = 0
+        self._life = KeyframeLife(config, has_scale=False)
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
         self._R_key_gyro: Array = np.eye(3)  # of the last frame, by the gyroscope alone
         self._gyro_sigma_rad = 0.0
         self._T_key_filter: Array | None = np.eye(4)  # of the last frame's camera, by the filter; None: not all known
         self._direction_key: Array = np.zeros(3)  # to the last frame, or where it will probably go; zero: not known
-        self._t_placed_ns = -1
         self._lost = False
 
     def track(
@@ -110,7 +109,7 @@ class MonoFrontEnd:
         self._min_inliers = self._config.min_inliers if frame.tracks is None else self._config.min_given
         self._sigma_xy = given * self._config.track_sigma_px / self._camera.fx
         self._min_parallax_px = given * self._config.mono_min_parallax_px
-        if self._keyframe is None:
+        if self._life.keyframe is None:
             return self._start(frame, "")
         R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])
         R_before = self._R_key_cam
@@ -124,22 +123,21 @@ class MonoFrontEnd:
         motion = self._confirmed(self._locate(R_guess, prior, pixels), R_guess, prior, T_last_now)
         if motion.failure:
             self._R_key_cam = R_guess
-            return self._lose(frame, self._keyframe, motion)
+            return self._lose(frame, motion)
         self._R_key_cam = motion.view.R_key_cam
         if motion.view.direction_key.any():
             self._direction_key = motion.view.direction_key
         if not self._lost:
             self._predictor.observe(transform(R_before.T @ self._R_key_cam, np.zeros(3)), dt_s)
         self._lost = False
-        self._t_placed_ns = frame.t_ns
+        self._life.placed(frame.t_ns)
         self._learn_noise(motion, given**2)
-        return self._report(frame, self._keyframe, motion)
+        return self._report(frame, motion)
 
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
-        self._first_id, self._tracker.next_id = keyframe_id, news.next_track_id
-        if seeks_place:
-            self._since_restart = 0
+        self._life.begin_at(keyframe_id, seeks_place)
+        self._tracker.next_id = news.next_track_id
 
     @property
     def news(self) -> FrontNews:
@@ -159,23 +157,15 @@ class MonoFrontEnd:
     def _confirmed(
         self, motion: _Motion, R_guess: Array, prior: RotationPrior | None, T_last_now: Array | None
     ) -> _Motion:
-        """Return the motion, or another without the tracks that contradict the filter's motion, where most do.
-
-        A track contradicts it where no depth explains it by the filter's motion since the keyframe. Where most do not,
-        the filter has no say: vision drawn to what the filter believes would tell it nothing new.
-        """
+        """Return the motion, or another without the tracks that no depth explains by the filter's motion."""
         if T_last_now is None or self._T_key_filter is None:
             self._T_key_filter = None
             return motion
         self._T_key_filter = self._T_key_filter @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
         key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(motion.pixels)
         off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, key_xy, xy, 1.0 / self._config.min_depth_m)
-        astray = off_px > _ASTRAY_PX
-        if not motion.failure and (astray & motion.view.inliers).sum() <= _CONTRADICTS * motion.inliers:
-            return motion
-        other = self._locate(R_guess, prior, np.where(astray[:, None], np.nan, motion.pixels))
-        few = other.inliers < _MIN_AS_EXPECTED * motion.followed
-        return motion if few or other.failure else other
+        astray = off_px > self._config.astray_px
+        return confirmed(motion, astray, lambda pixels: self._locate(R_guess, prior, pixels), self._config)
 
     def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
         key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
@@ -190,17 +180,9 @@ class MonoFrontEnd:
             if both.converged or not still.converged:
                 view = _without_vague_direction(both)
                 parallax_px = self._parallax_px(view.R_key_cam, key_xy, xy)
-        return _Motion(view, pixels, parallax_px, self._failure(view, followed))
-
-    def _failure(self, view: TwoViewEstimate, followed: int) -> str:
-        agree = int(view.inliers.sum())
-        if followed < self._min_inliers:
-            return f"only {followed} of {len(self._tracker)} tracks found"
-        if not view.converged:
-            return "the motion does not converge"
-        if agree < max(self._min_inliers, self._config.min_inlier_ratio * followed):
-            return f"only {agree} of {followed} tracks agree on a motion"
-        return ""
+        agree, least = int(view.inliers.sum()), self._min_inliers
+        why = failure(len(self._tracker), followed, agree, view.converged, least, self._config)
+        return _Motion(view, pixels, parallax_px, why)
 
     def _turn(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
         """Explain the image by rotation alone: all points at infinity."""
@@ -230,7 +212,7 @@ class MonoFrontEnd:
         if best is None or not best.converged or best.inliers.sum() < _RANSAC_BELOW * np.isfinite(xy[:, 0]).sum():
             start = essential_ransac(R_guess, key_xy, xy, _RANSAC_PX / self._camera.fx, self._min_inliers)
             if start is not None:
-                other = refine_two_view(*start, key_xy, xy, self._sigma_xy, config.cauchy)
+                other = refine_two_view(*start[:2], key_xy, xy, self._sigma_xy, config.cauchy)
                 if best is None or other.inliers.sum() > best.inliers.sum():
                     best = other
         if best is None:
@@ -270,18 +252,12 @@ class MonoFrontEnd:
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 
-    def _report(self, frame: Frame, keyframe: Keyframe, motion: _Motion) -> TrackResult:
-        weakness = self._weakness(motion)
-        vo = self._measurement(frame, keyframe.id, motion, Tracking.DEGRADED if weakness else Tracking.OK)
+    def _report(self, frame: Frame, motion: _Motion) -> TrackResult:
+        weak = self._weakness(motion)
+        vo = self._measurement(frame, self._life.newest_id, motion, Tracking.DEGRADED if weak else Tracking.OK)
         good = motion.view.inliers
-        departure = Departure(
-            dt_s=(frame.t_ns - keyframe.t_ns) * 1e-9,
-            rotation_rad=float(np.linalg.norm(so3_log(self._R_key_cam))),
-            parallax_px=motion.parallax_px,
-            alive=motion.followed / max(self._keyframe_tracks, 1),
-            inliers=motion.inliers,
-            fit=True,
-            restarted=self._since_restart < self._config.restart_keyframes,
+        departure = self._life.departure(
+            frame.t_ns, self._R_key_cam, motion.parallax_px, motion.followed, motion.inliers
         )
         reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
         if reason:
@@ -291,16 +267,12 @@ class MonoFrontEnd:
             return TrackResult(vo, self._observations(), new, motion.parallax_px, reason)
         observations = Observations(self._tracker.ids[good].copy(), motion.pixels[good])
         self._last_px = self._last_px[self._tracker.judge(good)]
-        return TrackResult(vo, observations, None, motion.parallax_px, weakness)
+        return TrackResult(vo, observations, None, motion.parallax_px, weak)
 
     def _weakness(self, motion: _Motion) -> str:
         # of tracks that somebody chose, as many times the least as of our own
         enough = self._config.degraded_inliers * self._min_inliers // self._config.min_inliers
-        if motion.inliers < enough:
-            return f"only {motion.inliers} inliers"
-        if motion.inliers < self._config.degraded_inlier_ratio * motion.followed:
-            return f"only {motion.inliers} of {motion.followed} tracks agree"
-        return ""
+        return weakness(motion.followed, motion.inliers, enough, self._config)
 
     def _measurement(self, frame: Frame, keyframe_id: int, motion: _Motion, tracking: Tracking) -> VoMeasurement:
         """Express rotation and direction in body axes; the perturbation is on the body side, as for metric motion."""
@@ -320,18 +292,16 @@ class MonoFrontEnd:
             inliers=motion.inliers,
         )
 
-    def _lose(self, frame: Frame, keyframe: Keyframe, motion: _Motion) -> TrackResult:
+    def _lose(self, frame: Frame, motion: _Motion) -> TrackResult:
         self._lost = True
-        if (frame.t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s:
+        if self._life.is_given_up(frame.t_ns):
             return self._start(frame, motion.failure)
-        vo = lost_motion(frame.t_ns, keyframe.id, False, motion.inliers)
-        return TrackResult(vo, no_observations(), None, 0.0, motion.failure)
+        return self._life.lost(frame.t_ns, motion.failure, motion.inliers)
 
     # -- keyframes ---------------------------------------------------------------------------------------------------
 
-    def _start(self, frame: Frame, failure: str) -> TrackResult:
+    def _start(self, frame: Frame, why: str) -> TrackResult:
         """Begin anew with this frame as keyframe, if there is enough to see in it."""
-        last_id = self._keyframe.id if self._keyframe is not None else -1
         self._tracker.forget()
         count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         self._last_px = self._tracker.pixels.copy()
@@ -339,36 +309,23 @@ class MonoFrontEnd:
         if count < least:
             self._tracker.forget()
             self._last_px = np.empty((0, 2))
-            reason = too_few(frame, count)
-            vo = lost_motion(frame.t_ns, last_id, False)
-            return TrackResult(vo, no_observations(), None, 0.0, f"{failure}; {reason}" if failure else reason)
+            return self._life.refused(frame.t_ns, why, too_few(frame, count))
         self._predictor.forget()
         self._direction_key = np.zeros(3)
         self._lost = False
-        keyframe = self._install(frame)
-        if last_id < 0:
-            vo = identity_motion(frame.t_ns, keyframe.id, False, count)
-            return TrackResult(vo, self._observations(), keyframe, 0.0, "first keyframe")
-        self._since_restart = 0
-        vo = lost_motion(frame.t_ns, last_id, False)
-        return TrackResult(vo, self._observations(), keyframe, 0.0, f"restarted: {failure}")
+        self._install(frame)
+        return self._life.started(self._observations(), count, why)
 
     def _observations(self) -> Observations:
         return Observations(self._tracker.ids.copy(), self._tracker.pixels.copy())
 
     def _install(self, frame: Frame) -> Keyframe:
-        new_id = self._keyframe.id + 1 if self._keyframe is not None else self._first_id
-        features = self._config.described_features
-        keyframe = make_keyframe(new_id, frame, self._camera, self._T_body_cam, features, None)
-        self._keyframe = keyframe
-        self._since_restart += 1
-        self._keyframe_tracks = len(self._tracker)
+        keyframe = self._life.install(frame, self._camera, self._T_body_cam, len(self._tracker))
         self._last_px = self._tracker.pixels.copy()
         self._direction_key = self._R_key_cam.T @ self._direction_key
         self._R_key_cam = np.eye(3)
         self._R_key_gyro, self._gyro_sigma_rad = np.eye(3), 0.0
         self._T_key_filter = np.eye(4)
-        self._t_placed_ns = frame.t_ns
         return keyframe
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.camera import Camera
-from vislam.messages import Array, Observations
+from vislam.core.camera import Camera
+from vislam.core.messages import Array, Observations
 
 _MEDIAN_ABS = 0.6745  # of a normal distribution, in standard deviations
 _TRIM = 2.0  # standard deviations

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from vislam.geometry import invert, se3_adjoint, se3_exp, se3_log, so3_exp
-from vislam.messages import Array, ImuSpan
-
-
-@njit(cache=True, nogil=True)
-def _integrate(t_s: Array, gyro: Array) -> Array:
-    """Return the rotation [3, 3] from the first to the last sample, with the mean rate of each interval."""
-    R = np.eye(3)
-    for i in range(len(t_s) - 1):
-        R = R @ so3_exp(0.5 * (gyro[i] + gyro[i + 1]) * (t_s[i + 1] - t_s[i]))
-    return R
+from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
+from vislam.core.messages import Array, ImuSpan
+from vislam.imu.gyro_turns import integrate_gyro
 
 
 def gyro_rotation(span: ImuSpan) -> Array:
     """Return R_first_last [3, 3] of the body over a span, by trapezoidal integration of the angular rate."""
     t_s = (span.t_ns - span.t_ns[0]).astype(np.float64) * 1e-9
-    return np.asarray(_integrate(t_s, np.ascontiguousarray(span.gyro_rad_s)))
+    return np.asarray(integrate_gyro(t_s, np.ascontiguousarray(span.gyro_rad_s))[-1])
 
 
 class MotionPredictor:

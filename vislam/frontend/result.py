@@ -7,9 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
-from vislam.geometry import transform
-from vislam.memory import FrontNews
-from vislam.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.core.geometry import se3_adjoint, transform
+from vislam.core.memory import FrontNews
+from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.frontend.prediction import body_motion
 
 _NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement that says nothing
 
@@ -75,6 +76,23 @@ def lost_motion(t_ns: int, keyframe_id: int, has_scale: bool, inliers: int = 0) 
     """Return the measurement of a frame whose motion since keyframe `keyframe_id` (-1: none yet) is unknown."""
     covariance: Array = np.eye(6) * _NO_KNOWLEDGE
     return VoMeasurement(t_ns, keyframe_id, None, covariance, has_scale, Tracking.LOST, inliers)
+
+
+def metric_motion(
+    t_ns: int, keyframe_id: int, T_key_cam: Array, covariance: Array, T_body_cam: Array, inliers: int, is_weak: bool
+) -> VoMeasurement:
+    """Return the measurement of a camera's motion [4, 4] in metres with covariance [6, 6], as the body's."""
+    adjoint = se3_adjoint(T_body_cam)
+    of_body = adjoint @ covariance @ adjoint.T
+    return VoMeasurement(
+        t_ns=t_ns,
+        keyframe_id=keyframe_id,
+        T_keyframe_body=body_motion(T_key_cam, T_body_cam),
+        covariance=0.5 * (of_body + of_body.T),
+        has_scale=True,
+        tracking=Tracking.DEGRADED if is_weak else Tracking.OK,
+        inliers=inliers,
+    )
 
 
 def too_few(frame: Frame, corners: int) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
+from vislam.core.jit import njit
+from vislam.core.messages import Array, Frame, ImageF32
 from vislam.frontend.depth import DepthReading
 from vislam.frontend.tracker import given_rows
-from vislam.messages import Array, Frame, ImageF32
 
 _REACH_PX = 4  # half the side of the neighbourhood that says how much a wrong registration would matter
 

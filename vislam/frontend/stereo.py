@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import FrontEndConfig
-from vislam.features import FlowSettings, follow
-from vislam.frontend.brightness import matched
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert
+from vislam.core.jit import njit
+from vislam.core.messages import Array, Frame
 from vislam.frontend.depth import DepthReading
 from vislam.frontend.tracker import given_rows
-from vislam.geometry import invert
-from vislam.messages import Array, Frame
+from vislam.vision.brightness import matched
+from vislam.vision.features import FlowSettings, follow
 
 _START_DISPARITIES = (8.0, 25.0, 60.0)  # px; with the reach of Lucas-Kanade they cover 0 to about 90
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import InitConfig
-from vislam.messages import Array, Observations
+from vislam.core.messages import Array, Observations
 
 _NS = 1_000_000_000
 _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
@@ -26,6 +26,7 @@ _MIN_TRACKS = 10  # fewer say nothing about the motion of the camera
 _HOLD = 1.5  # times the limits over the window, as long as the tracks are where they were when rest began
 _SIGNIFICANT = 3.0  # standard deviations
 _WIDEST = 4.0  # of the threshold: noise that hides more than this many of them excuses nothing
+_FAR = 20.0  # times the threshold that most tracks moved over the window: no noise, parallax or fit makes that a rest
 _ROBUST_STEPS = 4
 _CAUCHY = 2.4  # standard deviations; 95 % efficient
 _MEDIAN_SQUARE = 2.0 * np.log(2.0)  # median of a squared distance in two dimensions, in variances
@@ -37,7 +38,7 @@ class Stillness:
     Attributes:
         resting: whether a rest goes on, up to the newest frame; for those who already know their state. It bears a
             frame that noise moves a little beyond the limit, and ends when the tracks have left their places.
-        moved_px: common motion over the window, median over the tracks; NaN where it could not be told.
+        moved_px: common motion over the window, median over the tracks; NaN where it could not be told or is far.
         parallax_px: motion in which tracks differ, beyond noise; NaN where it could not be told.
         noise_px: standard deviation of one coordinate of a pixel about its line; NaN where it could not be told.
     """
@@ -78,9 +79,15 @@ class Stillness:
             return np.inf
         t_s = np.array([(at_ns - t_ns) / _NS for at_ns, _, _ in self._frames])
         ids, pixels = self._pixels()
-        if len(ids) < _MIN_TRACKS:
+        if len(ids) < _MIN_TRACKS or self._is_far(pixels):
             return np.inf
         return float(max(self._over_window(t_s, ids, pixels), self._in_last_step(pixels)))
+
+    def _is_far(self, pixels: Array) -> bool:
+        """Return whether most tracks [frames, N, 2] are so far from where they were that nothing has to be fitted."""
+        moved = np.hypot(*(pixels[-1] - pixels[0]).T)
+        moved = moved[np.isfinite(moved)]
+        return len(moved) >= _MIN_TRACKS and float(np.median(moved)) > _FAR * self._limit_px
 
     def _follow_rest(self, t_ns: int, times_limit: float) -> None:
         """Begin a rest, go on with it or end it; one that ends by displacement begins again after a whole window."""

@@ -5,8 +5,7 @@ a keyframe and a frame, by vision and by gyroscope, is compared over a sliding w
 offset, gyro bias and a small misalignment of the axes, for which one least-squares problem is solved, integrated anew
 around every solution. A camera with a clock of its own (`init.clock_drift`) adds the rate by which that is off: its
 offset is then that of the newest frame, and never final. Neither gravity nor scale is needed. The idea is that of Li
-and Mourikis, "Online temporal
-calibration for camera-IMU systems", IJRR 2014, and of the rotation part of Kalibr (Furgale et al., IROS 2013).
+and Mourikis, "Online temporal calibration for camera-IMU systems", IJRR 2014.
 """
 
 from __future__ import annotations
@@ -14,12 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vislam.config import InitConfig
-from vislam.geometry import so3_exp, so3_log
-from vislam.messages import Array, ImuSpan, Tracking, VoMeasurement
+from vislam.core.geometry import so3_exp
+from vislam.core.jit import njit
+from vislam.core.messages import Array, ImuSpan, Tracking, VoMeasurement
+from vislam.imu.gyro_turns import UNKNOWNS, SeenTurns, integrated, turn_errors
 
 _NS = 1_000_000_000
 _WINDOW_S = 10.0  # of frames that are looked at: longer than a hand takes to turn this way and that
@@ -32,7 +32,6 @@ _TOLD_SIGMA_S = 1e-3  # what others find is believed no further: their models ha
 TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
 _CAUCHY = 3.0  # standard deviations
 _ROUNDS = 5
-_UNKNOWNS = 8  # offset, gyro bias, misalignment, drift
 _NO_DRIFT = 1e-7  # sigma of the drift of a clock that is the host's
 _KNOWN_S, _KNOWN_DRIFT = 0.003, 0.002  # sigmas below which an estimate is carried on as the next one's prior
 
@@ -136,13 +135,17 @@ class TimeOffset:
 
     def solve(self, span: ImuSpan) -> TimeOffsetEstimate:
         """Estimate from the frames that `span` covers, no bias taken off; keep the old estimate if that fails."""
-        problem, known, now_ns = self._problem(span), self.estimate, self._t_ns[-1]
+        begin, known, now_ns = int(span.t_ns[0]), self.estimate, self._t_ns[-1]
+        t_s, key_s, frame_s = (
+            (np.asarray(t, dtype=np.int64) - begin) / _NS for t in (span.t_ns, self._keyframe_ns, self._t_ns)
+        )
+        gyro, seen = np.ascontiguousarray(span.gyro_rad_s), SeenTurns(key_s, frame_s, np.array(self._rotations))
         guess_s = known.at(now_ns)
         x = np.concatenate([[guess_s], known.gyro_bias_rad_s, known.R_correction, [known.drift]])
         prior, mean = self._prior_at(now_ns)
-        scale, H, used = 1.0, np.eye(_UNKNOWNS), 0
+        scale, H, used = 1.0, np.eye(UNKNOWNS), 0
         for _ in range(_ROUNDS):
-            H, g, squares, used = _normal_equations(*problem, x, scale)
+            H, g, squares, used = _normal_equations(t_s, gyro, seen, x, scale)
             if used < _MIN_FRAMES:
                 return self.estimate
             H += prior
@@ -171,10 +174,10 @@ class TimeOffset:
         prior = self._prior
         sigmas = np.repeat([_GYRO_BIAS_SIGMA, TURN_SIGMA], 3)
         information = np.diag([0.0, *(1.0 / sigmas**2), 1.0 / prior.drift_sigma**2])
-        then = np.zeros(_UNKNOWNS)  # the offset at the prior's time, by the unknowns
+        then = np.zeros(UNKNOWNS)  # the offset at the prior's time, by the unknowns
         then[0], then[7] = 1.0, -(now_ns - prior.t_ns) / _NS
         information += np.outer(then, then) / prior.sigma_s**2
-        mean = np.zeros(_UNKNOWNS)
+        mean = np.zeros(UNKNOWNS)
         mean[0], mean[7] = prior.at(now_ns), prior.drift
         return information, mean
 
@@ -186,102 +189,14 @@ class TimeOffset:
             self._prior = replace(self._prior, offset_s=offset_s, sigma_s=told_s, t_ns=t_ns)
             self.estimate = replace(self.estimate, offset_s=offset_s, sigma_s=sigma_s, t_ns=t_ns)
 
-    def _problem(self, span: ImuSpan) -> tuple[Array, Array, Array, Array, Array]:
-        """Return times in seconds after the span's begin (samples, keyframes, frames), rates and visual rotations."""
-        begin = int(span.t_ns[0])
-        times = [(np.asarray(t, dtype=np.int64) - begin) / _NS for t in (span.t_ns, self._keyframe_ns, self._t_ns)]
-        return times[0], np.ascontiguousarray(span.gyro_rad_s), times[1], times[2], np.array(self._rotations)
-
-
-@njit(cache=True, nogil=True)
-def _turned(R: Array, rate_a: Array, rate_b: Array, bias: Array, dt: float, out: Array) -> None:
-    """Write R after `dt` at the mean of two rates into `out` [3, 3]."""
-    w = np.empty(3)
-    for i in range(3):
-        w[i] = (0.5 * (rate_a[i] + rate_b[i]) - bias[i]) * dt
-    _multiply(R, so3_exp(w), out)
-
-
-@njit(cache=True, nogil=True)
-def _multiply(A: Array, B: Array, out: Array) -> None:
-    """Write A @ B of two [3, 3] into `out`: in loops, which numba compiles in a fraction of the time of `@`."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
-@njit(cache=True, nogil=True)
-def _integrate(t_s: Array, gyro: Array, bias: Array) -> tuple[Array, Array]:
-    """Return the attitude [N, 3, 3] since the first sample, and its integral over time [N, 3, 3]."""
-    R, total = np.zeros((len(t_s), 3, 3)), np.zeros((len(t_s), 3, 3))
-    for i in range(3):
-        R[0, i, i] = 1.0
-    for k in range(len(t_s) - 1):
-        dt = t_s[k + 1] - t_s[k]
-        _turned(R[k], gyro[k], gyro[k + 1], bias, dt, R[k + 1])
-        for i in range(3):
-            for j in range(3):
-                total[k + 1, i, j] = total[k, i, j] + (0.5 * dt) * (R[k, i, j] + R[k + 1, i, j])
-    return R, total
-
-
-@njit(cache=True, nogil=True)
-def _at(t: float, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array) -> tuple[Array, Array, Array]:
-    """Return attitude, its integral and rate at a time inside the samples."""
-    k = int(np.searchsorted(t_s, t)) - 1
-    k = min(max(k, 0), len(t_s) - 2)
-    h, share = t - t_s[k], (t - t_s[k]) / (t_s[k + 1] - t_s[k])
-    rate, turned, integral = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        rate[i] = gyro[k, i] + (gyro[k + 1, i] - gyro[k, i]) * share
-    _turned(R[k], gyro[k], rate, bias, h, turned)
-    for i in range(3):
-        rate[i] -= bias[i]
-        for j in range(3):
-            integral[i, j] = total[k, i, j] + (0.5 * h) * (R[k, i, j] + turned[i, j])
-    return turned, integral, rate
-
-
-@njit(cache=True, nogil=True)
-def _error(
-    begin_s: float, end_s: float, since_s: Array, t_s: Array, gyro: Array, bias: Array, R: Array, total: Array,
-    turn: Array, seen: Array, J: Array,
-) -> Array:  # fmt: skip
-    """Return the turn [3] that gyroscope and vision, `seen` [3, 3], differ by, and its derivative in J [3, 8].
-
-    `since_s` [2] is how long after the time of the offset the camera took keyframe and frame.
-    """
-    R_a, total_a, rate_a = _at(begin_s, t_s, gyro, bias, R, total)
-    R_b, total_b, rate_b = _at(end_s, t_s, gyro, bias, R, total)
-    R_a_b, to_camera, by_bias, predicted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    gap, change, from_a = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    _multiply(R_a.T.copy(), R_b, R_a_b)
-    _multiply(turn, R_a_b, to_camera)
-    _multiply(to_camera, turn.T.copy(), predicted)
-    _multiply(seen, predicted.T.copy(), gap)
-    for i in range(3):
-        for j in range(3):
-            change[i, j] = total_b[i, j] - total_a[i, j]
-    _multiply(turn, R_a.T.copy(), from_a)
-    _multiply(from_a, change, by_bias)
-    for i in range(3):
-        J[i, 0], J[i, 7] = 0.0, 0.0
-        for j in range(3):
-            by_begin, by_end = -turn[i, j] * rate_a[j], to_camera[i, j] * rate_b[j]
-            J[i, 0] += by_end + by_begin
-            J[i, 7] += by_end * since_s[1] + by_begin * since_s[0]
-            J[i, 1 + j] = -by_bias[i, j]
-            J[i, 4 + j] = (1.0 if i == j else 0.0) - predicted[i, j]
-    return so3_log(gap)
-
 
 @njit(cache=True, nogil=True)
 def _take_out_common(H: Array, g: Array, weight: float, link: Array, head: Array) -> None:
     """Eliminate the turn that all frames of a keyframe share, with its weight, and forget it in `link` and `head`."""
-    for a in range(_UNKNOWNS):
+    for a in range(UNKNOWNS):
         for i in range(3):
             g[a] -= link[a, i] * head[i] / weight
-            for b in range(_UNKNOWNS):
+            for b in range(UNKNOWNS):
                 H[a, b] -= link[a, i] * link[b, i] / weight
     link[:] = 0.0
     head[:] = 0.0
@@ -289,29 +204,25 @@ def _take_out_common(H: Array, g: Array, weight: float, link: Array, head: Array
 
 @njit(cache=True, nogil=True)
 def _normal_equations(
-    t_s: Array, gyro: Array, keyframe_s: Array, frame_s: Array, rotations: Array, x: Array, scale: float
+    t_s: Array, gyro: Array, seen: SeenTurns, x: Array, scale: float
 ) -> tuple[Array, Array, Array, int]:
     """Sum up the frames that the samples cover; what all frames of a keyframe have in common is eliminated.
 
     Returns:
         H [8, 8], g [8], the squared residuals per axis in nominal sigmas, and how many frames were used.
     """
-    offset, bias, turn, drift = x[0], x[1:4], so3_exp(x[4:7]), x[7]
-    R, total = _integrate(t_s, gyro, bias)
-    H, g = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS)
-    squares, used = np.zeros(len(frame_s)), 0
+    errors, Js = turn_errors(integrated(t_s, gyro, x[1:4]), seen, so3_exp(x[4:7]), x[0], x[7])
+    H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
+    squares, used = np.zeros(len(errors)), 0
     weight0 = 1.0 / (_SIGMA_RAD * scale) ** 2
-    shared_weight, link, head = weight0, np.zeros((_UNKNOWNS, 3)), np.zeros(3)
-    J, since_s = np.empty((3, _UNKNOWNS)), np.empty(2)
-    for k in range(len(frame_s)):
-        if k > 0 and keyframe_s[k] != keyframe_s[k - 1]:
+    shared_weight, link, head = weight0, np.zeros((UNKNOWNS, 3)), np.zeros(3)
+    for k in range(len(errors)):
+        if k > 0 and seen.key_s[k] != seen.key_s[k - 1]:
             _take_out_common(H, g, shared_weight, link, head)
             shared_weight = weight0
-        since_s[0], since_s[1] = keyframe_s[k] - frame_s[-1], frame_s[k] - frame_s[-1]
-        begin, end = keyframe_s[k] + offset + drift * since_s[0], frame_s[k] + offset + drift * since_s[1]
-        if begin < t_s[0] or end > t_s[-1]:
+        error, J = errors[k], Js[k]
+        if np.isnan(error[0]):
             continue
-        error = _error(begin, end, since_s, t_s, gyro, bias, R, total, turn, rotations[k], J)
         square = (error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / (3.0 * _SIGMA_RAD**2)
         squares[used] = square
         used += 1
@@ -319,10 +230,10 @@ def _normal_equations(
         shared_weight += weight
         for i in range(3):
             head[i] += weight * error[i]
-            for a in range(_UNKNOWNS):
+            for a in range(UNKNOWNS):
                 link[a, i] += weight * J[i, a]
                 g[a] += weight * J[i, a] * error[i]
-                for b in range(_UNKNOWNS):
+                for b in range(UNKNOWNS):
                     H[a, b] += weight * J[i, a] * J[i, b]
     _take_out_common(H, g, shared_weight, link, head)
     return H, g, squares, used

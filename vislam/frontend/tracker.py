@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
-from vislam.features import FlowSettings, detect_corners, follow
-from vislam.frontend.brightness import matched
-from vislam.messages import Array, Frame, ImageU8, Observations
+from vislam.core.messages import Array, Bools, Frame, ImageU8, Observations
+from vislam.vision.brightness import matched
+from vislam.vision.features import FlowSettings, detect_corners, follow
 
-Bools = NDArray[np.bool_]
 FindCorners = Callable[[ImageU8, Array], Array]
 """Finds new corners: grey image [H, W], pixels [M, 2] of those that are followed -> pixels [N, 2]."""
 

@@ -7,8 +7,8 @@ from collections import deque
 import numpy as np
 
 from vislam.config import InitConfig
-from vislam.geometry import so3_exp
-from vislam.messages import Array, ImuSpan, NavState
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import Array, ImuSpan, NavState
 
 _PIECE_S = 0.2  # over which force is averaged: noise and vibration show no scale
 _PIECES = 20  # 4 s, the longest that the search for a first scale looks at, too

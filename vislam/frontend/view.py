@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vislam.camera import Camera, Rig
 from vislam.config import FrontEndConfig
-from vislam.features import detect_corners
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import invert
+from vislam.core.messages import Array, Frame, ImageU8
 from vislam.frontend.depth import DepthSensor
-from vislam.frontend.landmarks import move
 from vislam.frontend.stereo import StereoDepth
-from vislam.geometry import invert
-from vislam.messages import Array, Frame, ImageU8
+from vislam.vision.features import detect_corners
+from vislam.vision.landmarks import move
 
 
 @dataclass(frozen=True, slots=True, eq=False)

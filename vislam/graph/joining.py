@@ -1,7 +1,7 @@
-"""Where a piece of trajectory belongs: the rigid motion on which loops from several frames agree.
+"""Where a submap belongs: the rigid motion on which loops from several frames agree.
 
-Between pieces that no odometry ties there is nothing that a loop could be tested against, so loops have to be each
-other's witnesses: through the odometry inside both pieces they must say the same, and one image is one witness however
+Between submaps that no odometry ties there is nothing that a loop could be tested against, so loops have to be each
+other's witnesses: through the odometry inside both submaps they must say the same, and one image is one witness however
 many old keyframes it resembles.
 """
 
@@ -14,13 +14,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.chi_square import chi_square_limit
 from vislam.config import GraphConfig
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert, se3_adjoint, transform
+from vislam.core.messages import Array, Submaps
 from vislam.factors.journal import KeyframeRecord, checked_pose
 from vislam.factors.keys import nearest_rigid
 from vislam.factors.loop import LoopModel
-from vislam.geometry import invert, se3_adjoint, transform
-from vislam.messages import Array, Pieces
 
 _MIN_RAY_ANGLE_RAD = np.deg2rad(5.0)  # between two directions that are to fix a place
 
@@ -29,7 +29,7 @@ RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """The motion [4, 4], in map, that brings a group of pieces to where loops say it is, and the loops that agree."""
+    """The motion [4, 4], in map, that brings a group of submaps to where loops say it is, and the loops that agree."""
 
     group: int
     T_map_moved: Array
@@ -37,7 +37,7 @@ class Placement:
 
 
 class Waiting:
-    """Loops between pieces that are not joined."""
+    """Loops between submaps that are not joined."""
 
     def __init__(self, config: GraphConfig) -> None:
         """Start empty."""
@@ -55,23 +55,23 @@ class Waiting:
         self._edges.append(edge)
         return self._edges.pop(0) if len(self._edges) > self._config.join_waiting else None
 
-    def take_joined(self, pieces: Pieces) -> list[LoopModel]:
+    def take_joined(self, submaps: Submaps) -> list[LoopModel]:
         """Remove and return the loops whose two ends are joined by now."""
-        joined = [e for e in self._edges if pieces.are_joined(e.record.from_id, e.record.to_id)]
-        self._edges = [e for e in self._edges if not pieces.are_joined(e.record.from_id, e.record.to_id)]
+        joined = [e for e in self._edges if submaps.are_joined(e.record.from_id, e.record.to_id)]
+        self._edges = [e for e in self._edges if not submaps.are_joined(e.record.from_id, e.record.to_id)]
         return joined
 
-    def place(self, pieces: Pieces, poses: Array, known: RelativeCovariance) -> Placement | None:
+    def place(self, submaps: Submaps, poses: Array, known: RelativeCovariance) -> Placement | None:
         """Return where the newer of two groups belongs, if enough of its loops agree on that; those wait no longer.
 
         `poses` [M, 4, 4] are those of all keyframes, good within each group; `known` says how good.
         """
-        pairs = [(pieces.group(e.record.from_id), pieces.group(e.record.to_id)) for e in self._edges]
+        pairs = [(submaps.group(e.record.from_id), submaps.group(e.record.to_id)) for e in self._edges]
         for pair in sorted({(min(p), max(p)) for p in pairs}):
             edges = [e for e, p in zip(self._edges, pairs, strict=True) if (min(p), max(p)) == pair]
             if len({e.record.to_id for e in edges}) < self._config.join_frames:
                 continue
-            found = self._place(edges, _Ends(poses, pieces, pair[1]), known)
+            found = self._place(edges, _Ends(poses, submaps, pair[1]), known)
             if found is not None:
                 self._edges = [e for e in self._edges if all(e is not other for other in found[1])]
                 return Placement(pair[1], *found)
@@ -140,7 +140,7 @@ class _Ends:
     """The poses of both ends of a loop, one of which moves with its group."""
 
     poses: Array  # [M, 4, 4]
-    pieces: Pieces
+    submaps: Submaps
     moving: int  # the group
 
     def of(self, edge: LoopModel, T: Array) -> tuple[Array, Array]:
@@ -178,7 +178,7 @@ class _Ends:
         return nearest_rigid(transform(R, np.linalg.solve(A, b)))
 
     def _older_moves(self, edge: LoopModel) -> bool:
-        return self.pieces.group(edge.record.from_id) == self.moving
+        return self.submaps.group(edge.record.from_id) == self.moving
 
 
 def _witnesses(edges: list[LoopModel]) -> tuple[int, int]:
@@ -186,17 +186,17 @@ def _witnesses(edges: list[LoopModel]) -> tuple[int, int]:
     return len({e.record.to_id for e in edges}), len(edges)
 
 
-def relinked(pieces: Pieces, moved: NDArray[np.int64]) -> list[int]:
-    """Return the keyframes that begin a piece and move otherwise than the one before them."""
+def relinked(submaps: Submaps, moved: NDArray[np.int64]) -> list[int]:
+    """Return the keyframes that begin a submap and move otherwise than the one before them."""
     inside = set(moved.tolist())
-    return [k for k in pieces.first_ids[1:] if (k in inside) != (k - 1 in inside)]
+    return [k for k in submaps.first_ids[1:] if (k in inside) != (k - 1 in inside)]
 
 
 def weak_link(
     record: KeyframeRecord, T_map_before: Array, T_odom_before: Array | None, T_odom_body: Array | None,
     has_gravity: bool, config: GraphConfig,
 ) -> KeyframeRecord:  # fmt: skip
-    """Return the record of a keyframe that begins a piece, tied to the one before as loosely as it deserves.
+    """Return the record of a keyframe that begins a submap, tied to the one before as loosely as it deserves.
 
     The motion is what odom makes of it, a guess for the eye. Without any tie the equations had no unique solution.
 
@@ -206,10 +206,10 @@ def weak_link(
     T = np.eye(4)
     if T_odom_before is not None and T_odom_body is not None:
         T = checked_pose(invert(T_odom_before) @ T_odom_body, f"keyframe {record.id}: its motion in odom")
-    variances = np.full(3, np.deg2rad(config.piece_sigma_deg) ** 2)
+    variances = np.full(3, np.deg2rad(config.submap_sigma_deg) ** 2)
     if has_gravity:
-        variances[:2] = np.deg2rad(config.piece_tilt_sigma_deg) ** 2
+        variances[:2] = np.deg2rad(config.submap_tilt_sigma_deg) ** 2
     R = (T_map_before @ T)[:3, :3]
-    covariance = np.eye(6) * config.piece_sigma_m**2
+    covariance = np.eye(6) * config.submap_sigma_m**2
     covariance[:3, :3] = R.T @ np.diag(variances) @ R
     return replace(record, T_previous_body=T, covariance=covariance)

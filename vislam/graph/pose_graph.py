@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import GraphConfig, WindowConfig
-from vislam.errors import DataError, UsageError
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import invert
+from vislam.core.memory import EdgeReport, GraphMemory, GraphNews, LoopPlace, WindowRecord
+from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Submaps
 from vislam.factors.builder import Step
-from vislam.factors.estimator import Estimator
-from vislam.factors.gate import EdgeReport
 from vislam.factors.journal import (
     KeyframeRecord,
     LoopRecord,
@@ -23,18 +24,16 @@ from vislam.factors.journal import (
     start_record,
 )
 from vislam.factors.loop import LoopModel
-from vislam.factors.travel import Travel
-from vislam.geometry import invert
+from vislam.graph.belief import LoopSet
+from vislam.graph.estimator import Estimator
 from vislam.graph.joining import Placement, Waiting, relinked, weak_link
-from vislam.graph.loop_set import LoopSet
 from vislam.graph.restore import restored_journal, sort_loops
 from vislam.graph.source import MotionSource, Source, WindowSource
+from vislam.graph.travel import Travel
 from vislam.imu import ImuNoise
-from vislam.memory import GraphMemory, GraphNews, LoopPlace, WindowRecord
-from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Pieces
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
-_UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new piece: no loop may be tested against it
+_UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new submap: no loop may be tested against it
 _NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 
 
@@ -68,7 +67,7 @@ class PoseGraph:
         self._keyframes: list[KeyframeRecord] = []
         self._travel = Travel()
         self._loops = LoopSet(config, self._lever_m, self._estimator, self._travel)
-        self._pieces = Pieces()
+        self._submaps = Submaps()
         self._waiting = Waiting(config)
         self._T_odom_last: Array | None = None
         self._said: WindowRecord | None = None
@@ -103,7 +102,7 @@ class PoseGraph:
         self._start_t_ns = None if state is None else state.t_ns
 
     def begin_recording(self, state: NavState | None, T_odom_body: Array) -> None:
-        """Prepare for another recording after the keyframes that are there: its first keyframe begins a new piece.
+        """Prepare for another recording after the keyframes that are there: its first keyframe begins a new submap.
 
         `state` is that of this keyframe, or None without an IMU; `T_odom_body` [4, 4] its pose in the new odom, whose
         axes are those of map until loops say otherwise. Raises as `initialise`.
@@ -111,7 +110,7 @@ class PoseGraph:
         if self._config.coupling != "tight":
             raise UsageError("a map is continued with tight coupling only; use --graph.coupling tight")
         start = start_record(state, T_odom_body)
-        self._source.begin_piece(start, state)
+        self._source.begin_submap(start, state)
         self._T_odom_last = self._estimator.poses[-1].copy()
 
     def hold(self, count: int | None = None) -> None:
@@ -121,7 +120,7 @@ class PoseGraph:
     def restore(self, memory: GraphMemory) -> GraphUpdate:
         """Take over the keyframes, loops and last estimate of an earlier run; return all poses.
 
-        `initialise` comes before, with the first state of that run, and `go_on` or a new piece after.
+        `initialise` comes before, with the first state of that run, and `go_on` or a new submap after.
         Raises DataError, and the graph cannot be used, when the memory contradicts itself.
         """
         if self._start is None or self._keyframes:
@@ -129,8 +128,8 @@ class PoseGraph:
         has_gravity = self._noise is not None
         self._keyframes, self._journal = restored_journal(memory, self._config, has_gravity, self._start)
         guesses = self._source.restore(self._keyframes, memory)
-        for k in [record.id for record in self._keyframes if record.begins_piece]:
-            self._pieces = self._pieces.begun(k)
+        for k in [record.id for record in self._keyframes if record.begins_submap]:
+            self._submaps = self._submaps.begun(k)
             self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
         models = [LoopModel(r, self._config, self._lever_m) for r in self._journal if isinstance(r, LoopRecord)]
         by_place = sort_loops(memory.loops, {m.id: m for m in models})
@@ -181,7 +180,7 @@ class PoseGraph:
             raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
         if previous is None:
             self._check_start(record)
-        elif record.begins_piece:
+        elif record.begins_submap:
             before, config = self._estimator.poses[-1], self._config
             record = weak_link(record, before, self._T_odom_last, T_odom_body, self._noise is not None, config)
         said = self._source.add(packet, record, T_odom_body)
@@ -198,9 +197,9 @@ class PoseGraph:
                 self._travel.amend(older, variance_rad2, variance_m2, self._motion(older))
             notes = [step.note, note]
         self._keyframes.append(record)
-        if record.begins_piece:
-            self._pieces = self._pieces.begun(record.id)
-            notes.append(f"keyframe {record.id} begins piece {len(self._pieces.groups) - 1} of the trajectory")
+        if record.begins_submap:
+            self._submaps = self._submaps.begun(record.id)
+            notes.append(f"keyframe {record.id} begins submap {len(self._submaps.groups) - 1} of the trajectory")
         self._T_odom_last = T_odom_body
         accepted, refused = self._close(edges, notes)
         if T_odom_body is not None:
@@ -250,7 +249,7 @@ class PoseGraph:
         return invert(self._estimator.poses[k - 1]) @ self._estimator.poses[k]
 
     def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
-        """Gate loops, accept or park them, and let the review work; return accepted and refused ids."""
+        """Gate loops, accept them or keep them pending, and let the review work; return accepted and refused ids."""
         here: list[LoopModel] = []
         touched: list[int] = []
         self._estimator.look_at([k for e in edges for k in (e.from_id, e.to_id) if 0 <= k < len(self._keyframes)])
@@ -260,19 +259,19 @@ class PoseGraph:
             if model is None:
                 continue
             self._journal.append(model.record)
-            if not self._pieces.are_joined(edge.from_id, edge.to_id):
+            if not self._submaps.are_joined(edge.from_id, edge.to_id):
                 touched += self._wait(model)
             else:
                 here.append(model)
         here += self._join(touched, notes)
-        passed, parked = self._loops.test(here)
-        parked += self._loops.accept(passed, notes, "inside the gate")
-        touched += self._loops.park(parked) + self._loops.review(notes)
+        passed, pending = self._loops.test(here)
+        pending += self._loops.accept(passed, notes, "inside the gate")
+        touched += self._loops.keep_pending(pending) + self._loops.review(notes)
         notes.append(self._loops.freeze())
         return self._loops.split(touched)
 
     def _wait(self, model: LoopModel) -> list[int]:
-        """Let a loop between pieces that are not joined wait for other frames; return the ids of those that left."""
+        """Let a loop between submaps that are not joined wait for other frames; return the ids of those that left."""
         self._loops.wait(model)
         gone = self._waiting.add(model)
         if gone is None:
@@ -281,13 +280,13 @@ class PoseGraph:
         return [gone.record.id]
 
     def _join(self, touched: list[int], notes: list[str]) -> list[LoopModel]:
-        """Join pieces as far as loops between them agree; return those that waited and can be gated now."""
-        while (found := self._waiting.place(self._pieces, self._estimator.poses, self._between)) is not None:
+        """Join submaps as far as loops between them agree; return those that waited and can be gated now."""
+        while (found := self._waiting.place(self._submaps, self._estimator.poses, self._between)) is not None:
             touched += [m.record.id for m in found.agreeing]
             self._bring(found, notes)
             witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"
-            for model in self._loops.accept(found.agreeing, notes, f"joins two pieces, as {witnesses} say"):
-                self._loops.report(model, LoopDecision.REJECTED, "though it was to join two pieces")
+            for model in self._loops.accept(found.agreeing, notes, f"joins two submaps, as {witnesses} say"):
+                self._loops.report(model, LoopDecision.REJECTED, "though it was to join two submaps")
             for model in found.agreeing:
                 self._loops.offer(model)
             kept = [m for m in found.agreeing if m.record.id in self._estimator.loops]
@@ -296,31 +295,31 @@ class PoseGraph:
                     self._loops.report(model, LoopDecision.REJECTED, "its witnesses against one another do not hold")
                 notes.append(self._estimator.drop(kept))
             self._count_joined()
-        ready = self._waiting.take_joined(self._pieces)
+        ready = self._waiting.take_joined(self._submaps)
         touched += [m.record.id for m in ready]
         return ready
 
     def _bring(self, found: Placement, notes: list[str]) -> None:
-        """Move a group of pieces to where loops say that it is, with the weak links that it has to others."""
-        ids = self.ids[self._pieces.groups_of(self.ids) == found.group]
+        """Move a group of submaps to where loops say that it is, with the weak links that it has to others."""
+        ids = self.ids[self._submaps.groups_of(self.ids) == found.group]
         self._estimator.look_at(self.ids.tolist())
         poses = self._estimator.poses.copy()
         poses[ids] = found.T_map_moved @ poses[ids]
-        for k in relinked(self._pieces, ids):
+        for k in relinked(self._submaps, ids):
             self._source.relink(k, invert(poses[k - 1]) @ poses[k])
         notes.append(self._estimator.move(ids, found.T_map_moved))
         notes.append(
-            f"piece {found.group}, {len(ids)} keyframes with what it was joined with before, joins an older one"
+            f"submap {found.group}, {len(ids)} keyframes with what it was joined with before, joins an older one"
         )
 
     def _count_joined(self) -> None:
-        """Find out which pieces are joined, by the loops that the graph holds now."""
-        if len(self._pieces.groups) > 1:
-            self._pieces = self._pieces.joined_by((m.record.from_id, m.record.to_id) for m in self._loops.held)
+        """Find out which submaps are joined, by the loops that the graph holds now."""
+        if len(self._submaps.groups) > 1:
+            self._submaps = self._submaps.joined_by((m.record.from_id, m.record.to_id) for m in self._loops.held)
 
     def _between(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j: by summed odometry, an upper bound, where that is short."""
-        if abs(i - j) <= _NEAR_KEYFRAMES and self._pieces.of(i) == self._pieces.of(j):
+        if abs(i - j) <= _NEAR_KEYFRAMES and self._submaps.of(i) == self._submaps.of(j):
             return self._travel.relative_covariance(i, j)
         return self.relative_covariance(i, j)
 
@@ -356,7 +355,7 @@ class PoseGraph:
         newest = self._newest = self._state(len(poses) - 1) if self._noise is not None else None
         details = {
             "solver": self._estimator.solver_name,
-            "parked": self._loops.parked,
+            "pending": self._loops.pending,
             "vo_scale": self._estimator.vo_scale,
             **self._source.details,
         }
@@ -370,10 +369,10 @@ class PoseGraph:
             tuple(refused),
             note,
             details,
-            self._pieces,
+            self._submaps,
         )
 
 
 def _variances(record: KeyframeRecord, step: Step) -> tuple[float, float]:
     """Return the variances in rad^2 and m^2 of the motion to a keyframe."""
-    return _UNKNOWN if record.begins_piece else (step.variance_rad2, step.variance_m2)
+    return _UNKNOWN if record.begins_submap else (step.variance_rad2, step.variance_m2)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vislam.config import GraphConfig
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.memory import GraphMemory, LoopPlace, OfferedLoop
 from vislam.factors.journal import KeyframeRecord, LoopRecord, Record, StartRecord, keyframe_records, loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.joining import weak_link
-from vislam.memory import GraphMemory, LoopPlace, OfferedLoop
 
 
 def restored_journal(
@@ -30,7 +30,7 @@ def restored_journal(
     loop = next(loops, None)
     for k, measured in enumerate(keyframe_records(memory.packets)):
         record = measured
-        if record.begins_piece:  # tied to the one before as the map has them
+        if record.begins_submap:  # tied to the one before as the map has them
             before, now = memory.T_map_body[k - 1 : k + 1]
             record = weak_link(record, before, before, now, has_gravity, config)
         if is_tight:

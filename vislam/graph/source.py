@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from vislam.config import GraphConfig
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.memory import EdgeRecord, GraphMemory, GravityRecord, WindowRecord, at_pose
+from vislam.core.messages import Array, KeyframePacket, NavState
 from vislam.factors.builder import Builder, Guess
-from vislam.factors.estimator import Estimator
-from vislam.factors.journal import KeyframeRecord, StartRecord, checked_pose
+from vislam.factors.journal import KeyframeRecord, StartRecord, checked_poses
 from vislam.factors.keys import B, V, X, bias_of
 from vislam.factors.loop import LoopModel
-from vislam.factors.noise import checked_covariance, conditioned
+from vislam.factors.noise_models import checked_covariances, conditioned
 from vislam.factors.odometry import MotionOdometry, Odometry
 from vislam.factors.window import WindowOdometry
+from vislam.graph.estimator import Estimator
 from vislam.imu import ImuNoise
-from vislam.memory import EdgeRecord, GraphMemory, TiltRecord, WindowRecord, at_pose
-from vislam.messages import Array, KeyframePacket, NavState
 from vislam.window.messages import WindowEdge, WindowUpdate
 
 _RATIO_MAX = 1e12  # eigenvalues of a covariance that is solved with
@@ -48,7 +49,7 @@ class Source(Protocol):
     def begin(self, start: StartRecord, state: NavState | None) -> None:
         """Take the first state."""
 
-    def begin_piece(self, start: StartRecord, state: NavState | None) -> None:
+    def begin_submap(self, start: StartRecord, state: NavState | None) -> None:
         """Take the first state of another recording, whose first keyframe comes next."""
 
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
@@ -70,7 +71,7 @@ class Source(Protocol):
         """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
 
     def relink(self, k: int, T_previous_body: Array) -> None:
-        """Let the link with which keyframe k begins a piece say that motion [4, 4], as loosely as before."""
+        """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
 
     def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
         """Return the state of keyframe k in map with its covariance, NaN where nobody can tell."""
@@ -98,7 +99,7 @@ class MotionSource:
         """See Source."""
         self._odometry.begin(start)
 
-    def begin_piece(self, start: StartRecord, state: NavState | None) -> None:
+    def begin_submap(self, start: StartRecord, state: NavState | None) -> None:
         """See Source; the graph's own velocities and biases go on."""
 
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
@@ -179,7 +180,7 @@ class WindowSource:
         self._odometry.begin(start)
         self._window.initialise(state, start.T_map_body)
 
-    def begin_piece(self, start: StartRecord, state: NavState | None) -> None:
+    def begin_submap(self, start: StartRecord, state: NavState | None) -> None:
         """See Source."""
         self._window.initialise(state, start.T_map_body)
 
@@ -247,43 +248,41 @@ class WindowSource:
         notes = [update.note]
         kept, changed = [], []
         recent = record.id - 2 * self._config.window_refresh_max  # older edges hardly change any more
-        for edge in update.odometry:
-            if (not edge.settled and edge.to_id < recent) or self._begins_piece(edge.to_id, record):
-                continue
-            try:
-                taken = _edge_record(edge)
-            except DataError as error:
-                notes.append(str(error))
-                continue
-            sigmas = self._odometry.worth_replacing(taken)
-            if taken.settled or taken.to_id == record.id:
-                kept.append(taken)
+        wanted = [
+            edge
+            for edge in update.odometry
+            if (edge.settled or edge.to_id >= recent) and not self._begins_submap(edge.to_id, record)
+        ]
+        for edge in _edge_records(wanted, notes):
+            sigmas = self._odometry.worth_replacing(edge)
+            if edge.settled or edge.to_id == record.id:
+                kept.append(edge)
             elif sigmas > 0.0:
-                changed.append((sigmas, taken))
+                changed.append((sigmas, edge))
         changed.sort(key=lambda item: -item[0])
         kept += [edge for _, edge in changed[: self._config.window_refresh_max]]
         if record.id and all(edge.to_id != record.id for edge in kept):
             kept.append(self._stand_in(record))
-            if not record.begins_piece:
+            if not record.begins_submap:
                 notes.append("no usable edge from the window, went on as odometry or the last motion says")
         tilts = tuple(
-            TiltRecord(tilt.id, np.array(tilt.up_body), float(tilt.sigma_rad))
+            GravityRecord(tilt.id, np.array(tilt.up_body), float(tilt.sigma_rad))
             for tilt in update.tilts
-            if tilt.id % self._config.tilt_every == 0 and _is_direction(tilt.up_body) and np.isfinite(tilt.sigma_rad)
+            if tilt.id % self._config.gravity_every == 0 and _is_direction(tilt.up_body) and np.isfinite(tilt.sigma_rad)
         )
         note = "; ".join(n for n in notes if n)
         return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, note, record.rest_from)
 
-    def _begins_piece(self, k: int, newest: KeyframeRecord) -> bool:
-        """Return whether keyframe k begins a piece: what a window makes of its motion is no edge."""
+    def _begins_submap(self, k: int, newest: KeyframeRecord) -> bool:
+        """Return whether keyframe k begins a submap: what a window makes of its motion is no edge."""
         edge = self._odometry.edge(k)
-        return newest.begins_piece if k == newest.id else edge is not None and edge.begins_piece
+        return newest.begins_submap if k == newest.id else edge is not None and edge.begins_submap
 
     def _stand_in(self, record: KeyframeRecord) -> EdgeRecord:
         """Return an edge to the newest keyframe where the window gave none: from odometry, else as before, loosely."""
         config = self._config
         if record.T_previous_body is not None and record.covariance is not None and record.has_scale:
-            weak = record.begins_piece
+            weak = record.begins_submap
             return EdgeRecord(record.id, record.T_previous_body, record.covariance, weak, weak)
         last = self._odometry.edge(record.id - 1)
         T = np.eye(4) if last is None else last.T_previous_body
@@ -310,10 +309,21 @@ def in_map(local: NavState, T_map_body: Array, pose_covariance: Array | None) ->
     return state
 
 
-def _edge_record(edge: WindowEdge) -> EdgeRecord:
-    what = f"the window's edge from {edge.from_id} to {edge.to_id}"
-    T = checked_pose(edge.T_from_to, what)
-    return EdgeRecord(edge.to_id, T, checked_covariance(edge.covariance, 6, what), edge.settled)
+def _edge_records(edges: Sequence[WindowEdge], notes: list[str]) -> list[EdgeRecord]:
+    """Return the edges that can be used; `notes` gets what is wrong with others."""
+    whats = [f"the window's edge from {edge.from_id} to {edge.to_id}" for edge in edges]
+    try:
+        motions = checked_poses([edge.T_from_to for edge in edges], whats)
+        covariances = checked_covariances([edge.covariance for edge in edges], 6, whats)
+    except DataError as error:
+        if len(edges) > 1:
+            return [record for edge in edges for record in _edge_records([edge], notes)]
+        notes.append(str(error))
+        return []
+    return [
+        EdgeRecord(edge.to_id, T, covariance, edge.settled)
+        for edge, T, covariance in zip(edges, motions, covariances, strict=True)
+    ]
 
 
 def _is_direction(v: Array) -> bool:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.config import Axes, Matrix3, Vector3
-from vislam.errors import HardwareError
-from vislam.messages import Array
+from vislam.core.errors import HardwareError
+from vislam.core.messages import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vislam.findings import Finding, Severity
+from vislam.core.findings import Finding, Severity
+from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
-from vislam.messages import ImuSample, MagSample
 
 Add = Callable[..., None]
 

@@ -12,17 +12,16 @@ from typing import TypeVar
 import numpy as np
 
 from vislam.config import Gy85Config, SerialConfig, WebcamConfig
-from vislam.errors import HardwareError
-from vislam.findings import Finding, Severity, worst
+from vislam.core.errors import HardwareError
+from vislam.core.findings import Finding, Severity, worst
+from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.board_check import check_board
-from vislam.hw.bridge import SerialBridge
-from vislam.hw.bus import I2cBus, kernel_driver, unbind_command
-from vislam.hw.chip_ids import identify
+from vislam.hw.bridge.bridge import SerialBridge
+from vislam.hw.cameras.webcam import Capture, Webcam
+from vislam.hw.chips import I2cBus, identify, kernel_driver, unbind_command
 from vislam.hw.gy85 import Gy85
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.hw.timing import Clock, HostClock
-from vislam.hw.webcam import Capture, Webcam
-from vislam.messages import ImuSample, MagSample
 
 _NS = 1_000_000_000
 _MIN_BUS_HZ = 350_000.0  # a bus of 400 kHz, its clock stretched

@@ -9,21 +9,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.config import Gy85Config
-from vislam.errors import HardwareError, UsageError
-from vislam.hw import adxl345, itg3205
-from vislam.hw.adxl345 import Adxl345
+from vislam.core.errors import HardwareError, UsageError
+from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.affine import Affine
-from vislam.hw.bus import BusError, I2cBus, SettingsLostError, kernel_driver, unbind_command
-from vislam.hw.field import Magnetometer
+from vislam.hw.chips import (
+    Adxl345,
+    BusError,
+    Hmc5883l,
+    I2cBus,
+    Itg3205,
+    Magnetometer,
+    SelfTest,
+    SettingsLostError,
+    adxl345,
+    find_magnetometer,
+    itg3205,
+    kernel_driver,
+    unbind_command,
+)
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.hmc5883l import Hmc5883l
-from vislam.hw.itg3205 import Itg3205
-from vislam.hw.magnetometer import find_magnetometer
-from vislam.hw.self_test import SelfTest
 from vislam.hw.timing import Clock, HostClock
 from vislam.hw.track import SampleTrack
-from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
 _MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 1000.0  # the gyro samples at 1 kHz inside

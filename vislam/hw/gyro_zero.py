@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vislam.messages import Array
+from vislam.core.messages import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

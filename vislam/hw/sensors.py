@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vislam.config import SensorCalibration, SensorsConfig
-from vislam.errors import UsageError
+from vislam.core.errors import HardwareError, UsageError
 
 if TYPE_CHECKING:
-    from vislam.hw.bridge import SerialBridge
+    from vislam.hw.bridge.bridge import SerialBridge
+    from vislam.hw.cameras.video import VideoCamera
+    from vislam.hw.cameras.webcam import Webcam
     from vislam.hw.gy85 import Gy85
-    from vislam.hw.video_camera import VideoCamera
-    from vislam.hw.webcam import Webcam
 
 
 def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) -> Gy85 | SerialBridge:
@@ -31,7 +33,7 @@ def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) 
         board = replace(config.gy85, bus=where) if where else config.gy85
         return Gy85(board, must_be_there=must_be_there)
     if kind == "serial":
-        from vislam.hw.bridge import SerialBridge
+        from vislam.hw.bridge.bridge import SerialBridge
 
         bridge = replace(config.serial, port=where) if where else config.serial
         return SerialBridge(bridge, must_be_there)
@@ -50,12 +52,37 @@ def open_camera(
     Raises HardwareError when it is missing and must be there.
     """
     if is_video(name):
-        from vislam.hw.video_camera import VideoCamera
+        from vislam.hw.cameras.video import VideoCamera
 
         return VideoCamera(Path(name), stamps_ns, in_real_time)
-    from vislam.hw.webcam import Webcam
+    from vislam.hw.cameras.webcam import Webcam
 
     return Webcam(config.webcam if name == "webcam" else replace(config.webcam, device=name), must_be_there)
+
+
+def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
+    """Look for the device files of an IMU and a camera (`none`: there is none); nothing is set up.
+
+    Raises HardwareError where one is missing or may not be opened.
+    """
+    kind, _, where = inertial.partition(":")
+    if kind == "gy85":
+        from vislam.hw.chips import I2cBus
+
+        I2cBus(where or config.gy85.bus, config.gy85.bus_timeout_s).close()
+    elif kind == "serial":
+        from vislam.hw.bridge.bridge import why_not_open
+
+        bridge = replace(config.serial, port=where) if where else config.serial
+        if not os.access(bridge.port, os.R_OK | os.W_OK):  # opening it would reset the board
+            code = errno.EACCES if Path(bridge.port).exists() else errno.ENOENT
+            raise HardwareError(why_not_open(bridge, OSError(code, os.strerror(code))))
+    if camera != "none" and not is_video(camera):
+        from vislam.hw.cameras.webcam import device_path, why_not_there
+
+        problem = why_not_there(device_path(config.webcam.device if camera == "webcam" else camera))
+        if problem is not None:
+            raise HardwareError(problem)
 
 
 def is_video(name: str) -> bool:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from vislam.core.messages import Array, ImageU8, ImuSample, MagSample
 from vislam.hw.health import Health
-from vislam.messages import Array, ImageU8, ImuSample, MagSample
 
 
 class InertialSource(Protocol):

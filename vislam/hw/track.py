@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 
+from vislam.core.messages import Array
 from vislam.hw.timing import SampleClock
-from vislam.messages import Array
 
 
 class SampleTrack:

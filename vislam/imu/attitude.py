@@ -7,9 +7,9 @@ from math import isfinite
 import numpy as np
 
 from vislam.config import AttitudeConfig
+from vislam.core.messages import Array, ImuSample, ImuSpan, MagSample
 from vislam.imu.complementary import Complementary
 from vislam.imu.vqf import Vqf
-from vislam.messages import Array, ImuSample, ImuSpan, MagSample
 
 _NS = 1e-9
 _MAX_STEP_S = 0.1  # longer holes are bridged by as much

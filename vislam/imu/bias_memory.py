@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vislam.errors import DataError, StorageError
-from vislam.messages import Array
-from vislam.reading import read_json
+from vislam.core.errors import DataError
+from vislam.core.files import write_text
+from vislam.core.messages import Array
+from vislam.core.reading import read_json
 
 _MAX_BYTES = 100_000
 _MAX_RATE_RAD_S = 10.0
@@ -89,17 +89,7 @@ class BiasMemory:
             {"temperature_c": temperature, "gyro_bias_rad_s": bias.tolist()}
             for _, (temperature, bias) in sorted(self._entries.items())
         ]
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            with partial.open("w", encoding="utf-8") as file:
-                json.dump({"gyro_biases": items}, file, indent=1)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            reason = error.strerror or error
-            raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
+        write_text(path, json.dumps({"gyro_biases": items}, indent=1))
 
 
 def _entry(item: Any) -> tuple[float, Array]:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from vislam.config import ImuConfig
-from vislam.imu.noise import ImuNoise
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import ImuSample, ImuSpan
 from vislam.imu.noise_floor import NoiseFloor
 from vislam.imu.series import ImuSeries
-from vislam.messages import ImuSample, ImuSpan
 
 _NS = 1_000_000_000
 
@@ -22,11 +22,13 @@ class ImuBuffer:
         counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than
             `config.max_gap_s`.
         noise_floor: what the samples show of their noise; None without a model to compare with.
+        outages: spans that `unbroken` could not give.
     """
 
     def __init__(self, config: ImuConfig, noise: ImuNoise | None = None) -> None:
         """Start empty; with a noise model the spans tell what the samples show against it."""
         self.noise_floor = None if noise is None else NoiseFloor(noise)
+        self.outages = 0
         self._series = ImuSeries()
         self._buffer_ns = round(config.buffer_s * _NS)
         self._max_gap_ns = round(config.max_gap_s * _NS)
@@ -74,6 +76,13 @@ class ImuBuffer:
         if span is None or self.noise_floor is None:
             return span
         return replace(span, noise=self.noise_floor.between(t0_ns, t1_ns))
+
+    def unbroken(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
+        """Return `span`, or None, and count it, where a hole in it is longer than `config.max_gap_s`."""
+        if self.gap_s(t0_ns, t1_ns) > self._max_gap_ns / _NS:
+            self.outages += 1
+            return None
+        return self.span(t0_ns, t1_ns)
 
     def gap_s(self, t0_ns: int, t1_ns: int) -> float:
         """Return the longest time between neighbouring samples among those that `[t0_ns, t1_ns]` touches.

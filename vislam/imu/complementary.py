@@ -7,11 +7,11 @@ The accelerometer's part is gated, for a cart that speeds up would tilt the hori
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from vislam.config import AttitudeConfig
-from vislam.geometry import so3_exp
-from vislam.messages import Array
+from vislam.core.geometry import so3_exp
+from vislam.core.jit import njit
+from vislam.core.messages import Array
 
 _NO_FIELD = np.full(3, np.nan)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.messages import Array, ImuSample
+from vislam.core.messages import Array, ImuSample
 
 _NS = 1_000_000_000
 _WINDOW, _AGAIN = 256, 96  # samples looked at together, and how many of them again in the next window

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from vislam.config import AttitudeConfig
+from vislam.core.jit import njit
+from vislam.core.messages import Array
 from vislam.imu.low_pass import low_pass
-from vislam.messages import Array
 
 
 class Heading(NamedTuple):

@@ -11,12 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from vislam.config import AttitudeConfig
-from vislam.geometry import so3_exp
+from vislam.core.geometry import so3_exp
+from vislam.core.jit import njit
+from vislam.core.messages import Array
 from vislam.imu.low_pass import low_pass
-from vislam.messages import Array
 
 _FORGOTTEN_RAD_S = np.deg2rad(0.1)  # the bias wanders by so much in `bias_forgetting_s`
 _UNSEEN = 2.5  # variance of white acceleration behind the filter, over tau^2 times that of its low-passed slope

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from vislam.messages import Array
+from vislam.core.jit import njit
+from vislam.core.messages import Array
 
 
 @njit(cache=True, nogil=True)

@@ -19,8 +19,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.imu.noise import ImuNoise
-from vislam.messages import AS_MODELLED, Array, ImuSample, NoiseScale
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import AS_MODELLED, Array, ImuSample, NoiseScale
 
 _WINDOW_S, _HOP_S = 1.0, 0.5  # resolves 2 Hz; half a second is short against how long a ride or a rest lasts
 _MOST_SAMPLES = 8192  # in a window, whatever rate is told: no IMU is faster

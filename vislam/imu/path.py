@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from vislam.geometry import so3_exp
-from vislam.messages import Array
+from vislam.core.messages import Array
 
 _GYRO_DRIFT_S = 20.0  # between the knots of its drift; at 40 the accelerometer of V2_01 fits worse, at 10 that of V1_01
 
@@ -26,17 +24,6 @@ class SmoothAttitude:
     def at(self, t_s: Array) -> Array:
         """Return rotations [M, 3, 3] at times [M]."""
         return np.asarray(Rotation.from_quat(self._q(t_s)).as_matrix())
-
-
-@njit(cache=True, nogil=True)
-def integrate_gyro(t_s: Array, gyro: Array) -> Array:
-    """Return rotations [N, 3, 3] from the first sample on; the mean rate of two samples turns between them."""
-    out = np.empty((len(t_s), 3, 3))
-    out[0] = np.eye(3)
-    for i in range(1, len(t_s)):
-        step = so3_exp(0.5 * (gyro[i - 1] + gyro[i]) * (t_s[i] - t_s[i - 1]))
-        out[i] = out[i - 1] @ step
-    return out
 
 
 def integrate_twice(t_s: Array, acceleration: Array) -> tuple[Array, Array]:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.config import PowerUpConfig
-from vislam.geometry import level_rotation
+from vislam.core.geometry import level_rotation
+from vislam.core.messages import Array, ImuSpan
 from vislam.imu.bias_memory import BiasMemory
-from vislam.messages import Array, ImuSpan
 
 _NS = 1e-9
 _MAX_STEP_S = 0.1  # a hole in which the cart may have moved

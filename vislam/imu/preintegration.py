@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from vislam.geometry import skew, so3_exp, so3_right_jacobian, transform
-from vislam.imu.noise import ImuNoise
-from vislam.messages import Array, ImuSpan, NavState
+from vislam.core.geometry import skew, so3_exp, so3_right_jacobian, transform
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.jit import njit
+from vislam.core.messages import Array, ImuSpan, NavState
 
 _NS = 1e-9
 

@@ -7,14 +7,20 @@ from collections import deque
 import numpy as np
 
 from vislam.config import InitConfig
-from vislam.imu.noise import ImuNoise
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import Array, ImuSpan
 from vislam.imu.series import join
-from vislam.messages import Array, ImuSpan
 
 _NS = 1_000_000_000
 _NOISE_SIGMAS = 3.0  # a sensor noisier than the thresholds assume must still be able to rest
 _SET_OFF_M_S = 0.02  # gained since the force was that of rest: a filter takes rest's speed for zero to 5 mm/s
 _MEMORY_S = 2.0  # of the force at rest: biases and tilt wander
+
+
+def is_still(gyro_rad_s: Array, accel_m_s2: Array, most: tuple[float, float, float]) -> bool:
+    """Return whether samples [N, 3] look like rest: spread of rate and of force, and mean rate, below the `most`."""
+    found = gyro_rad_s.std(axis=0), accel_m_s2.std(axis=0), gyro_rad_s.mean(axis=0)
+    return all(float(np.linalg.norm(value)) < limit for value, limit in zip(found, most, strict=True))
 
 
 class RestDetector:
@@ -29,7 +35,6 @@ class RestDetector:
         """Set thresholds from the configuration, widened where the sensor's own white noise needs it."""
         self._config = config
         self._rest_ns = round(config.rest_s * _NS)
-        self._gyro_max = config.rest_gyro_max_rad_s
         self._spans: deque[ImuSpan] = deque()
         self._force: Array = np.zeros(3)  # mean [3] of this rest before the spans, fading; m/s^2 ...
         self._force_s = 0.0  # ... and over how long
@@ -59,7 +64,7 @@ class RestDetector:
         if span.t_ns[-1] - self._spans[0].t_ns[0] < self._rest_ns:
             return False
         joined = join(list(self._spans))
-        if not self.is_still(joined):
+        if not self._is_still(joined):
             self._force_s, self._set_off = 0.0, False
             return False
         if self._sets_off(joined):
@@ -84,11 +89,8 @@ class RestDetector:
         sigma_m_s = density * np.sqrt(3.0 * dt_s * (1.0 + dt_s / self._force_s))
         return gained_m_s > max(_SET_OFF_M_S, _NOISE_SIGMAS * sigma_m_s)
 
-    def is_still(self, span: ImuSpan) -> bool:
+    def _is_still(self, span: ImuSpan) -> bool:
         """Return whether one span looks like rest, whatever its length."""
-        gyro_std = float(np.linalg.norm(span.gyro_rad_s.std(axis=0)))
-        accel_std = float(np.linalg.norm(span.accel_m_s2.std(axis=0)))
-        rate = float(np.linalg.norm(span.gyro_rad_s.mean(axis=0)))
         gyro_limit = max(self._config.rest_gyro_std_rad_s, self._gyro_white_std * span.noise.gyro)
         accel_limit = max(self._config.rest_accel_std_m_s2, self._accel_white_std * span.noise.accel)
-        return gyro_std < gyro_limit and accel_std < accel_limit and rate < self._gyro_max
+        return is_still(span.gyro_rad_s, span.accel_m_s2, (gyro_limit, accel_limit, self._config.rest_gyro_max_rad_s))

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.messages import Array, ImuSample, ImuSpan, NoiseScale
+from vislam.core.messages import Array, ImuSample, ImuSpan, NoiseScale
 
 _FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
 _MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 1e3, 1e4  # beyond every sensor: such numbers come from a broken transfer

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from vislam.config import AttitudeConfig
+from vislam.core.jit import njit
+from vislam.core.messages import Array
 from vislam.imu.heading import Heading, begin_heading, hold_heading, magnetic
 from vislam.imu.levelling import Level, Levelling, begin_level, level, levelling
-from vislam.messages import Array
 
 
 class Vqf:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vislam.config import Config
-from vislam.errors import DataError, UsageError
-from vislam.memory import SlamMemory
-from vislam.recording import Recording
+from vislam.core.errors import DataError, UsageError
+from vislam.core.memory import SlamMemory
+from vislam.core.recording import Recording
 from vislam.run import check_fits, imu_noise, map_of
-from vislam.runfolder import MapChoice
-from vislam.session import Session, has_begun, recall
+from vislam.run.folder import MapChoice
+from vislam.run.session import Session, has_begun, recall
 
 
 @dataclass(frozen=True, slots=True)

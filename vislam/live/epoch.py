@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from multiprocessing import get_context
+
+from vislam.core.interrupts import SIGNALS
 
 _LEAD_NS = 200_000_000  # so that every process is there when it begins
 
@@ -12,7 +15,12 @@ class Epoch:
     """CLOCK_MONOTONIC ns of the beginning; the first who asks decides."""
 
     def __init__(self) -> None:
-        self._value = get_context("spawn").Value("q", 0)
+        # the first lock starts the process that removes locks; it ignores signals, but not SIGHUP
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            self._value = get_context("spawn").Value("q", 0)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def begin_ns(self) -> int:
         """Return when it begins, or began."""

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config
-from vislam.continuity import Continuity, in_odom
+from vislam.core.geometry import invert, transform
+from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking
 from vislam.ekf.correction import Correction, Hint
-from vislam.ekf.filter import Ekf
-from vislam.geometry import invert, transform
+from vislam.ekf.loose.filter import Ekf
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
 from vislam.live.inertial_only import InertialOnly
-from vislam.live.messages import CameraHealth, Doubted, MapMoved, Rebase, Start, ToFast
-from vislam.live.published_pose import PublishedPose, of_base
-from vislam.messages import Array, ImuSample, MagSample, NavState, Tracking
+from vislam.live.notices import CameraHealth, Doubted, MapMoved, Rebase, Start, ToFast
+from vislam.live.wire.published_pose import PublishedPose, of_base
+from vislam.trajectory.continuity import Continuity, in_odom
 
 _NS = 1_000_000_000
 _REST_STEP_NS = 100_000_000  # rest is asked for so often

@@ -8,10 +8,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from vislam.camera import Camera, Rig
+from vislam.core.camera import Camera, Rig
+from vislam.core.messages import Frame
 from vislam.hw.health import Health
 from vislam.hw.source import ImageSource
-from vislam.messages import Frame
 
 
 class FrameSource(Protocol):

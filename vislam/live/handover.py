@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.factors.gate import EdgeReport
-from vislam.front import FrontReport, FrontStep
+from vislam.core.memory import EdgeReport, FrontNews, GraphNews, StartFacts
+from vislam.core.messages import Array, GraphUpdate, NavState
 from vislam.imu import ImuNoise
-from vislam.memory import FrontNews, GraphNews, StartFacts
-from vislam.messages import Array, GraphUpdate, NavState
-from vislam.odometry_keyframe import OdometryKeyframe
+from vislam.pipeline.front_report import FrontReport
+from vislam.pipeline.steps import FrontStep
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
 Timings = dict[str, dict[str, float]]
 

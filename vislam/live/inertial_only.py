@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config
-from vislam.geometry import transform
+from vislam.core.geometry import transform
+from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.imu import AttitudeFilter, BiasMemory, ImuBuffer, ImuNoise, PowerUp, Refusal, power_up
-from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
 _SETTLE_NS = 100_000_000  # more than the window, so that it is whole

@@ -7,7 +7,7 @@ import os
 import struct
 
 from vislam.config import LiveConfig
-from vislam.live.child import Life
+from vislam.live.processes.child import Life
 
 _ATTRIBUTES = struct.Struct("<IIQiIQQQ")  # sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # the number of the system call; Python has no function for it

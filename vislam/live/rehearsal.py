@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from vislam.camera import Rig
-from vislam.clock import StageClock
 from vislam.config import Config
-from vislam.front import Front
+from vislam.core.camera import Rig
+from vislam.core.clock import StageClock
+from vislam.core.messages import Frame, ImuSample
 from vislam.imu import ImuNoise
-from vislam.messages import Frame, ImuSample
+from vislam.pipeline.front import Front
 from vislam.slam import Slam
 
 _RESTING_FRAMES = 18  # enough for a first state

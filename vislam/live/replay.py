@@ -9,15 +9,15 @@ from functools import partial
 
 import numpy as np
 
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.recording import Recording
 from vislam.hw.health import Health
-from vislam.live.child import Life
 from vislam.live.epoch import Epoch
 from vislam.live.frames import FrameSource
+from vislam.live.processes.child import Life
 from vislam.live.replayed_imu import InertialTable, ReplayedImu
-from vislam.messages import Frame, ImuSample, MagSample
-from vislam.recording import Recording
-from vislam.sources import open_source
+from vislam.run.sources import open_source
 from vislam.trajectory import Trajectory
 
 _NS = 1_000_000_000
@@ -59,6 +59,9 @@ class ReplaySource:
         self._uri, self._seed = uri, seed
         self._outages = outages or Outages()
         self._epoch = Epoch()
+
+    def check(self) -> None:
+        """Do nothing: the recording is there."""
 
     def inertial(self) -> Callable[[], ReplayedImu]:
         """Return what plays the samples."""

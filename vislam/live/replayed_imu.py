@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
-from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
 _MISSING_NS = 100_000_000

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import connection, get_context
@@ -15,25 +15,31 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
 from vislam.config import Config
-from vislam.errors import HardwareError, StorageError, UsageError, VislamError
-from vislam.front import filter_config
+from vislam.core import interrupts, log
+from vislam.core.errors import HardwareError, UsageError, VislamError
+from vislam.core.files import write_json
+from vislam.core.recording import Recording
 from vislam.hw.source import InertialSource
-from vislam.imu import BiasMemory
-from vislam.live import back_process, bridge, fast_process, front_process, map_process
 from vislam.live.beginning import Beginning
-from vislam.live.child import Failure, Flag, Life, Note, Ready, Signals, guarded
+from vislam.live.bridges import translator
+from vislam.live.cost import whole_cost
 from vislam.live.frames import FrameSource
-from vislam.live.slot import remove
-from vislam.recording import Recording
+from vislam.live.kept_bias import KeptBias
+from vislam.live.processes import back as back_process
+from vislam.live.processes import fast as fast_process
+from vislam.live.processes import front as front_process
+from vislam.live.processes import map as map_process
+from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded
+from vislam.live.processes.measured import measured
+from vislam.live.wire.slot import remove
+from vislam.pipeline.settings import derived
 from vislam.run import imu_noise
-from vislam.runfolder import MapChoice, write_json
+from vislam.run.folder import MapChoice
 
+_LOG = logging.getLogger(__name__)
 _WATCH_S = 0.2
 _AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
-_END_S = 10.0  # that a process may take to end after it was told twice
 
 
 class LiveSource(Recording, Protocol):
@@ -42,6 +48,10 @@ class LiveSource(Recording, Protocol):
     duration_s: float | None  # after which there is no more; None: endless
     has_camera: bool  # without one, attitude alone is published
     is_mag_calibrated: bool  # without, a magnetometer is not believed
+
+    def check(self) -> None:
+        """Raise HardwareError where a sensor cannot be there, at once: processes need minutes to be ready."""
+        ...
 
     def inertial(self) -> Callable[[], InertialSource]:
         """Return what opens the IMU; it travels to the fast process."""
@@ -65,6 +75,9 @@ class _Child:
     process: SpawnProcess
     report: Connection
     is_ready: bool = False
+
+
+Show = Callable[["LiveRun"], None]  # is called now and then
 
 
 class LiveRun:
@@ -93,8 +106,10 @@ class LiveRun:
         Raises:
             UsageError: settings that only make sense with a recording, or a bridge that cannot be.
             DataError: the file of remembered biases is damaged.
+            HardwareError: a sensor is not there.
         """
         noise = imu_noise(config.imu, source.imu_noise)
+        config = derived(config, source.rig, noise)
         if noise is None:
             raise UsageError("a live run needs an IMU: leave imu.enabled on")
         for name, is_on in {
@@ -103,6 +118,7 @@ class LiveRun:
         }.items():
             if is_on:
                 raise UsageError(f"--{name} is for recordings: record the drive and run it with that, or leave it off")
+        source.check()
         self.notes: dict[str, dict[str, Any]] = {}
         self.metrics: dict[str, Any] | None = None
         self._source, self._out, self._shared_name = source, out, config.live.name
@@ -111,28 +127,15 @@ class LiveRun:
         self._children: dict[str, _Child] = {}
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
-        path = config.power_up.memory
-        self._memory_path = None if path is None else Path(path)
-        self._memory = BiasMemory(config.power_up.remembered)
-        if self._memory_path is not None:
-            self._memory = BiasMemory.read(self._memory_path, config.power_up.remembered)
-        self._is_zeroed = False  # power-up found a bias
-        self._unremembered: str | None = None  # why it is not kept
+        self._bias = KeptBias(config.power_up)
         self._roles = self._wire(source, config, out, asked, command, noise, base, beginning)
 
     def _wire(
-        self,
-        source: LiveSource,
-        config: Config,
-        out: Path,
-        asked: str,
-        command: list[str],
-        noise: Any,
-        base: MapChoice | None,
-        beginning: Beginning | None,
-    ) -> dict[str, Callable[[Life], None]]:
+        self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str], noise: Any,
+        base: MapChoice | None, beginning: Beginning | None,
+    ) -> dict[str, Callable[[Life], None]]:  # fmt: skip
         """Return what each process does, with its ends of the wires."""
-        bridges = bridge.asked(config.live)
+        bridges = translator.asked(config.live)
         send_to = (*config.live.send_to, *(at for at, _ in bridges.values()))
         samples_in, samples_out = socket.socketpair()
         front_says, fast_hears_front = self._context.Pipe(duplex=False)[::-1]
@@ -145,14 +148,12 @@ class LiveRun:
             frames_out, frames, keyframes_out, keyframes,
         ]  # fmt: skip
         rig = source.rig
-        fast = replace(config, live=replace(config.live, send_to=send_to), ekf=filter_config(config, rig))
-        return {
-            **source.helpers(),
-            **{role: body for role, (_, body) in bridges.items()},
+        fast = replace(config, live=replace(config.live, send_to=send_to))
+        ours: dict[str, Callable[[Life], None]] = {
             "fast": partial(
                 fast_process.run, config=fast, noise=noise, T_body_camera=rig.T_body_cams[0],
                 open_source=source.inertial(), samples=samples_in, inbox=[fast_hears_front, fast_hears_back],
-                memory=self._memory, is_mag_calibrated=source.is_mag_calibrated,
+                memory=self._bias.memory, is_mag_calibrated=source.is_mag_calibrated,
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),
@@ -167,11 +168,21 @@ class LiveRun:
                 frames=frames, keyframes=keyframes, beginning=beginning, base=base, has_camera=source.has_camera,
             ),
         }  # fmt: skip
+        return {
+            **source.helpers(),
+            **{role: body for role, (_, body) in bridges.items()},
+            **{role: partial(measured, body=body) for role, body in ours.items()},
+        }
 
     @property
     def is_going(self) -> bool:
         """Whether every process is ready and the sensors are read."""
         return self._signals.go.is_set()
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the sensors are not read any more, and what there is is written down."""
+        return self._signals.stop.is_set()
 
     @property
     def waits_for(self) -> list[str]:
@@ -186,8 +197,8 @@ class LiveRun:
         """Return the processes that were started, by role."""
         return {role: child.process for role, child in self._children.items()}
 
-    def execute(self, show: Callable[[LiveRun], None] | None = None, duration_s: float | None = None) -> dict[str, Any]:
-        """Run until Ctrl-C, `duration_s` or a failure; return the metrics.
+    def execute(self, show: Show | None = None, duration_s: float | None = None) -> dict[str, Any]:
+        """Run until a signal (`interrupts.SIGNALS`), `duration_s` or a failure; return the metrics.
 
         Args:
             show: is called now and then with this object.
@@ -195,28 +206,15 @@ class LiveRun:
 
         Raises:
             VislamError: what a process raised, or that one was killed; what was computed is in the run folder.
-            KeyboardInterrupt: a second Ctrl-C, while the first was being obeyed.
+            KeyboardInterrupt: a signal before the sensors were read, or a second one while the first was being obeyed.
         """
         try:
-            self._start()
-            with _interrupts() as asked:
-                deadline = float("inf")
-                while not self._signals.stop.is_set():
-                    self._watch(show)
-                    if duration_s is not None and self._signals.go.is_set() and deadline == float("inf"):
-                        deadline = time.monotonic() + duration_s
-                    if asked() or time.monotonic() > deadline or self._failure is not None:
-                        self._signals.stop.set()
-                patience = float("inf")
-                while any(child.process.is_alive() for child in self._children.values()):
-                    self._watch(show)
-                    if asked() > 1:
-                        raise KeyboardInterrupt
-                    if self._failure is not None and patience == float("inf"):
-                        patience = time.monotonic() + _AFTER_FAILURE_S
-                    if time.monotonic() > patience:
-                        break  # a killed process may have held what the others wait for
-                self._watch(show)
+            with interrupts.counted() as asked:
+                self._start()
+                self._watch_until_end(asked, show, duration_s)
+                if not self.is_going and self._failure is None:
+                    raise KeyboardInterrupt  # nothing was recorded
+                self._watch_ending(asked, show)
         finally:
             self._end()
         if self._failure is not None:
@@ -224,19 +222,46 @@ class LiveRun:
         if self.metrics is None:
             raise HardwareError("the run ended before its folder was written; see what is said above")
         told = {name: value for name, value in self.notes.get("fast", {}).items() if name != "status"}
+        for doubt in self._doubts:
+            _LOG.warning("%s", doubt)
         warnings = [*self.metrics["warnings"], *self._doubts]
-        self.metrics = {**self.metrics, "warnings": warnings, "live": told}
+        cost = whole_cost(self.metrics, self.notes)
+        self.metrics = {**self.metrics, "warnings": warnings, "live": told, "cost": cost}
         write_json(self._out / "metrics.json", self.metrics)
         return self.metrics
 
+    def _watch_until_end(self, asked: interrupts.Asked, show: Show | None, duration_s: float | None) -> None:
+        """Watch over the processes until the run is to end, and tell them so."""
+        deadline = float("inf")
+        while not self._signals.stop.is_set():
+            self._watch(show)
+            if self.is_going:
+                asked.take_time()
+                deadline = min(deadline, time.monotonic() + (float("inf") if duration_s is None else duration_s))
+            if asked.count or time.monotonic() > deadline or self._failure is not None:
+                self._signals.stop.set()
+
+    def _watch_ending(self, asked: interrupts.Asked, show: Show | None) -> None:
+        """Watch over the processes while they write down what there is; those that had not begun are not waited for."""
+        patience = float("inf")
+        while self.is_going and any(child.process.is_alive() for child in self._children.values()):
+            self._watch(show)
+            if asked.count > 1:
+                raise KeyboardInterrupt
+            if self._failure is not None:
+                patience = min(patience, time.monotonic() + _AFTER_FAILURE_S)
+            if time.monotonic() > patience:
+                break  # a killed process may have held what the others wait for
+        self._watch(show)
+
     def _start(self) -> None:
-        """Start every process; Ctrl-C does not reach one that is not ready for it."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        """Start every process; no signal reaches one that is not ready for it."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)
         try:
             for role, body in self._roles.items():
                 hears, says = self._context.Pipe(duplex=False)
                 process = self._context.Process(
-                    target=guarded, args=(role, says, self._signals, body), name=f"vislam {role}"
+                    target=guarded, args=(role, says, self._signals, body, log.level()), name=f"vislam {role}"
                 )
                 process.start()
                 says.close()
@@ -246,7 +271,7 @@ class LiveRun:
         for end in self._ends:
             end.close()
 
-    def _watch(self, show: Callable[[LiveRun], None] | None) -> None:
+    def _watch(self, show: Show | None) -> None:
         """Hear what the processes tell, for a moment; notice one that died."""
         reports = [child.report for child in self._children.values() if not child.report.closed]
         sentinels = [child.process.sentinel for child in self._children.values() if child.process.is_alive()]
@@ -257,7 +282,9 @@ class LiveRun:
             if code and self._failure is None:
                 how = f"was killed by signal {-code}" if code < 0 else f"left with code {code}"
                 self._failure = HardwareError(f"the {role} process {how}; the other processes were ended cleanly")
+                _LOG.error("%s", self._failure)
         if not self._signals.go.is_set() and all(child.is_ready for child in self._children.values()):
+            _LOG.info("every process is ready: sensors are read from now on")
             self._signals.go.set()
         if show is not None:
             show(self)
@@ -268,12 +295,16 @@ class LiveRun:
                 message = child.report.recv()
                 if isinstance(message, Ready):
                     child.is_ready = True
+                    _LOG.info("the %s process is ready", role)
+                elif isinstance(message, logging.LogRecord):
+                    log.take_record(message)
                 elif isinstance(message, Note):
                     self.notes[role] = {**self.notes.get(role, {}), **message.values}
                     self.metrics = message.values.get("metrics", self.metrics)
-                    self._remember(message.values.get("power_up", {}))
+                    self._bias.take(message.values.get("power_up", {}))
                 else:
                     raised = _raised(message)
+                    _LOG.error("the %s process failed:\n%s", role, message.traceback)
                     if self._failure is None:
                         self._failure = raised
                     else:
@@ -286,37 +317,21 @@ class LiveRun:
         """What the user should know of power-up."""
         told = self.notes.get("fast", {}).get("power_up", {})
         doubts = [f"no zero at power-up: {told['refused']}"] if "refused" in told else []
-        return doubts + ([] if self._unremembered is None else [self._unremembered])
-
-    def _remember(self, told: dict[str, Any]) -> None:
-        """Keep the gyro's bias for the next power-up, once; here, for no sensor waits for a disk."""
-        temperature_c = told.get("temperature_c")
-        if self._memory_path is None or self._is_zeroed or temperature_c is None:
-            return
-        self._is_zeroed = True
-        self._memory.add(temperature_c, np.array(told["gyro_bias_rad_s"]))
-        try:
-            self._memory.write(self._memory_path)
-        except StorageError as error:
-            self._unremembered = str(error)
+        return doubts + ([] if self._bias.refusal is None else [self._bias.refusal])
 
     def _end(self) -> None:
         """Make sure that nothing is left behind, whatever happened."""
         self._signals.stop.set()
-        self._signals.go.set()
+        alive = [child.process for child in self._children.values() if child.process.is_alive()]
+        for process in alive:
+            process.kill()
         for child in self._children.values():
-            if child.process.is_alive():
-                child.process.terminate()
-        for child in self._children.values():
-            child.process.join(_END_S)
-            if child.process.is_alive():
-                child.process.kill()
-                child.process.join()
+            child.process.join()
             child.process.close()
             child.report.close()
         for end in self._ends:
             end.close()
-        if self._failure is not None:
+        if alive or self._failure is not None:
             remove(self._shared_name)
         self._source.close()
 
@@ -334,20 +349,3 @@ class ChildError(VislamError):
     """A bug in a child process, with its traceback."""
 
     exit_code = 1
-
-
-@contextmanager
-def _interrupts() -> Iterator[Callable[[], int]]:
-    """Count Ctrl-C and SIGTERM instead of raising."""
-    count = 0
-
-    def note(signum: int, frame: object) -> None:
-        nonlocal count
-        count += 1
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: count
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

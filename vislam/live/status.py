@@ -11,6 +11,8 @@ def status_line(run: LiveRun) -> str:
     if not run.is_going:
         waiting = ", ".join(run.waits_for) or "nothing"
         return f"getting ready: waiting for {waiting}"
+    if run.is_ending:
+        return "ending: the run is written down; Ctrl-C again does not wait for that"
     told = run.notes.get("fast", {})
     status, latency = told.get("status"), told.get("latency_ms", {})
     if not status:
@@ -24,7 +26,9 @@ def status_line(run: LiveRun) -> str:
     names += f"  because {reasons[0]}" if reasons else ""
     names += f"  no zero yet: {refused}" if refused else ""
     late = f"{latency['p50']:.2f}/{latency['p99']:.2f} ms" if "p50" in latency else "-"
+    every = run.notes.get("front", {}).get("every", 1)
+    slow = f"too slow, one frame in {every} is taken  " if every > 1 else ""
     return (
-        f"x {x:7.2f} y {y:7.2f} z {z:5.2f} m +-{status['sigma_m']:.2f}  {status['speed_m_s']:.2f} m/s  "
+        f"{slow}x {x:7.2f} y {y:7.2f} z {z:5.2f} m +-{status['sigma_m']:.2f}  {status['speed_m_s']:.2f} m/s  "
         f"map {status['map_revision']}  sample to pose {late} (p50/p99)  {names}"
     )

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from vislam.camera import Camera
-from vislam.loop.likeness import Likeness
-from vislam.messages import Array
+from vislam.core.camera import Camera
+from vislam.core.jit import njit
+from vislam.core.messages import Array
+from vislam.loop.verification import Likeness
 
 _MAX_VIEW_ANGLE_RAD = np.deg2rad(45.0)  # between the rays to one point; ORB matches little beyond
 _MAX_DISTANCE_RATIO = 2.5  # of a point from both cameras; ORB's octaves span 3.6

@@ -7,29 +7,26 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import LoopConfig
-from vislam.geometry import invert_many, transform_points
-from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
-from vislam.loop.checks import judge, tilt_error_rad
-from vislam.loop.database import PlaceDatabase, side_by_side
-from vislam.loop.likeness import Likeness
-from vislam.loop.pose_table import PoseTable
-from vislam.loop.tags import TagBook, sight_tags
-from vislam.loop.verifier import Verification, Verifier
-from vislam.loop.view import View, make_view, make_views
-from vislam.loop.vocabulary import Vocabulary
-from vislam.memory import PlacesMemory, TagSighting, WordsMemory
-from vislam.messages import (
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert_many, transform_points
+from vislam.core.memory import PlacesMemory, TagSighting, WordsMemory
+from vislam.core.messages import (
     Array,
     GraphUpdate,
     Keyframe,
     LoopCandidate,
     LoopDecision,
     LoopEdge,
-    Pieces,
     RetrievedKeyframe,
+    Submaps,
 )
+from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
+from vislam.loop.pose_table import PoseTable
+from vislam.loop.tags import TagBook, sight_tags
+from vislam.loop.verification import Likeness, Verification, Verifier, judge, tilt_error_rad
+from vislam.loop.view import View, make_view, make_views
+from vislam.loop.words import PlaceDatabase, Vocabulary, side_by_side
 
 _PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
 _SHOWN_MATCHES = 40  # per candidate, for the picture that explains it
@@ -50,7 +47,7 @@ class LoopDetector:
         self._bounds = view_bounds(rig.cameras[0])
         self._views: dict[int, View] = {}
         self._poses = PoseTable()
-        self._pieces = Pieces()
+        self._submaps = Submaps()
         self._database = PlaceDatabase(config, seed)
         self._appearance = AppearanceCandidates(config.island_gap)
         self._verifier = Verifier(config, rig, seed)
@@ -96,7 +93,7 @@ class LoopDetector:
         self,
         keyframe: Keyframe,
         T_map_body: Array,
-        begins_piece: bool = False,
+        begins_submap: bool = False,
         tags: tuple[TagSighting, ...] | None = None,
     ) -> tuple[list[LoopEdge], list[LoopCandidate]]:
         """Look for loops that a new keyframe closes.
@@ -104,7 +101,7 @@ class LoopDetector:
         Args:
             keyframe: the newest keyframe; ids ascend.
             T_map_body: its current estimate [4, 4].
-            begins_piece: no odometry ties it to the one before.
+            begins_submap: no odometry ties it to the one before.
             tags: that it saw; None: they are looked for in its image.
 
         Returns:
@@ -114,8 +111,8 @@ class LoopDetector:
         if not self._config.enabled:
             return [], []
         view = make_view(keyframe, self._rig)
-        if begins_piece and len(self._poses):
-            self._pieces = self._pieces.begun(view.id)
+        if begins_submap and len(self._poses):
+            self._submaps = self._submaps.begun(view.id)
         self._poses.add(view.id, T_map_body)
         if tags is None:
             tags = sight_tags(keyframe.frame, self._rig.cameras[0], self._config)
@@ -132,9 +129,9 @@ class LoopDetector:
         self._database.close()
 
     def move(self, update: GraphUpdate) -> None:
-        """Follow the keyframes that the graph moved, and the pieces that it joined."""
+        """Follow the keyframes that the graph moved, and the submaps that it joined."""
         self._poses.move(update)
-        self._pieces = update.pieces
+        self._submaps = update.submaps
 
     def _candidates(self, view: View) -> list[Candidate]:
         """Return candidates in the order of verification: by tags, then by appearance and odometry in turn.
@@ -160,7 +157,7 @@ class LoopDetector:
         for old in reversed(self._views.values()):
             age_s = (view.t_ns - old.t_ns) * 1e-9
             long_ago = len(recent) >= config.appearance_skip_keyframes and age_s >= config.appearance_skip_s
-            if long_ago or self._pieces.of(old.id) != self._pieces.of(view.id):
+            if long_ago or self._submaps.of(old.id) != self._submaps.of(view.id):
                 break
             recent.append(old.id)
         ids, scores = self._database.query(view, config.retrieved, np.array(recent, dtype=np.int64))
@@ -182,16 +179,16 @@ class LoopDetector:
 
     def _old(self, view: View) -> NDArray[np.int64]:
         """Return the places, in the table of poses, of keyframes that visual odometry does not tie to a view."""
-        ids, own = self._poses.ids, self._pieces.of(view.id)
-        begin = int(np.searchsorted(ids, self._pieces.first_ids[own]))
+        ids, own = self._poses.ids, self._submaps.of(view.id)
+        begin = int(np.searchsorted(ids, self._submaps.first_ids[own]))
         return np.arange(max(begin, len(ids) - 1 - self._config.odometry_skip_keyframes))
 
     def _near(self, view: View) -> list[Candidate]:
         """Return candidates by odometry: old keyframes that should see most of the same by the current map."""
         config = self._config
         old = self._old(view)
-        if len(self._pieces.groups) > 1:  # poses in pieces that are not joined mean nothing to each other
-            old = old[self._pieces.groups_of(self._poses.ids[old]) == self._pieces.group(view.id)]
+        if len(self._submaps.groups) > 1:  # poses in submaps that are not joined mean nothing to each other
+            old = old[self._submaps.groups_of(self._poses.ids[old]) == self._submaps.group(view.id)]
         if len(old) == 0:
             return []
         T_body_cam = self._rig.T_body_cams[0]

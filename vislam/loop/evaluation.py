@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import LoopTruthConfig
-from vislam.geometry import invert, invert_many, so3_log, transform_points
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert, invert_many, so3_log, transform_points
+from vislam.core.messages import Array
 from vislam.loop.candidates import overlaps, view_bounds
-from vislam.messages import Array
 
 _PROBES = 64  # points per keyframe that are looked for in the other views
 RIGHT, DOUBTFUL, WRONG = 1, 0, -1  # verdicts

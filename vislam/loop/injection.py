@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vislam.errors import UsageError
-from vislam.geometry import invert, se3_exp
-from vislam.messages import Array, LoopCandidate, LoopDecision, LoopEdge
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_exp
+from vislam.core.messages import Array, LoopCandidate, LoopDecision, LoopEdge
 
 SOURCE = "injected"  # of candidates
 FIRST_ID = 1_000_000_000  # ids from here on are injected; those of the detector never get there

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.messages import Array, GraphUpdate
+from vislam.core.messages import Array, GraphUpdate
 
 
 class PoseTable:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vislam.errors import DataError
-from vislam.geometry import quaternion_xyzw_from_rotation, rotation_from_quaternion_xyzw
-from vislam.messages import Array, RetrievedKeyframe
-from vislam.reading import open_file
+from vislam.core.errors import DataError
+from vislam.core.geometry import quaternion_xyzw_from_rotation, rotation_from_quaternion_xyzw
+from vislam.core.messages import Array, RetrievedKeyframe
+from vislam.core.reading import open_file
 
 _POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LOOPS_HEADER = (

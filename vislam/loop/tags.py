@@ -10,14 +10,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vislam.camera import Camera
 from vislam.config import LoopConfig
-from vislam.features import find_tags
-from vislam.geometry import invert, se3_adjoint, skew
+from vislam.core.camera import Camera
+from vislam.core.geometry import invert, se3_adjoint, skew
+from vislam.core.memory import TagSighting
+from vislam.core.messages import Array, Frame
 from vislam.loop.candidates import Candidate
-from vislam.loop.verifier import Verification
-from vislam.memory import TagSighting
-from vislam.messages import Array, Frame
+from vislam.loop.verification import Verification
+from vislam.vision.features import find_tags
 
 _CORNER_SIGMA_PX = 0.5  # 0.1 to 0.6 px measured on rendered tags of 88 down to 30 px
 _MIN_SIDE_PX = 30.0  # smaller tags are read, but their corners are off by more

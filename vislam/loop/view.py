@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
-from vislam.errors import DataError
-from vislam.geometry import invert
-from vislam.hamming import packed
-from vislam.messages import Array, Keyframe
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert
+from vislam.core.jit import njit
+from vislam.core.messages import Array, Keyframe
+from vislam.vision.hamming import packed
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,26 +8,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import MapConfig
-from vislam.errors import DataError
-from vislam.mapping.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
-from vislam.mapping.correct import CorrectedOccupancy
-from vislam.mapping.depth import surface_points
-from vislam.mapping.drive import DriveGrid, DriveMap
-from vislam.mapping.extract import ScanExtractor
-from vislam.mapping.grid import Grid, floor_height_m, navigation_grid
-from vislam.mapping.mesh import Mesh, fuse_mesh
-from vislam.mapping.monodepth import LateDepth
-from vislam.mapping.occupancy import Occupancy, OccupancyMap
-from vislam.mapping.octree import Octree
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.memory import PackedScan
+from vislam.core.messages import Array, GraphUpdate, Keyframe, Submaps
+from vislam.mapping.cloud.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
+from vislam.mapping.cloud.mesh import Mesh, fuse_mesh
+from vislam.mapping.cloud.store import KeyframeStore, Scan
+from vislam.mapping.cloud.surfels import SurfelMap, Surfels
+from vislam.mapping.depth.extract import ScanExtractor
+from vislam.mapping.depth.image import surface_points
+from vislam.mapping.depth.mono import LateDepth
+from vislam.mapping.drive.drive import DriveGrid, DriveMap
+from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
+from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
 from vislam.mapping.products import remove_products, write_products
-from vislam.mapping.store import KeyframeStore, Scan
-from vislam.mapping.surfels import SurfelMap, Surfels
-from vislam.memory import PackedScan
-from vislam.messages import GraphUpdate, Keyframe, Pieces
-
-Array = NDArray[np.float64]
 
 _RIGID_TOLERANCE = 1e-4
 _MAX_COLOURED_VOXELS = 1 << 22  # of the octree; more, and neighbours share a colour
@@ -49,8 +45,8 @@ class Mapper:
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
         self._drive = DriveMap(config)
         self._surfels = SurfelMap(config.surfel_m)
-        self._pieces = Pieces()
-        self._apart: dict[int, Array] = {}  # newest poses of keyframes in pieces that no loop has joined with the map
+        self._submaps = Submaps()
+        self._apart: dict[int, Array] = {}  # newest poses of keyframes in submaps that no loop has joined with the map
         self.notes: dict[str, str] = {}  # what was left out of an export, and why
 
     @property
@@ -74,9 +70,9 @@ class Mapper:
         return self._occupancy.occupancy.copy()
 
     def add(self, keyframe: Keyframe, T_map_body: Array) -> None:
-        """Integrate a keyframe at its pose [4, 4], after the `move` that knows its piece of trajectory.
+        """Integrate a keyframe at its pose [4, 4], after the `move` that knows its submap.
 
-        Where no loop has joined that piece with the oldest one, it waits outside of the map, for its pose there means
+        Where no loop has joined that submap with the oldest one, it waits outside of the map, for its pose there means
         nothing. Raises DataError on a pose that is not rigid, an id seen before, or images of another size than the
         camera's.
         """
@@ -122,7 +118,7 @@ class Mapper:
     def move(self, update: GraphUpdate) -> None:
         """Take over corrected poses, and re-integrate a bounded number of keyframes if some moved by a voxel.
 
-        Keyframes of pieces that were joined come into the map so, and those of pieces that came apart leave it.
+        Keyframes of submaps that were joined come into the map so, and those of submaps that came apart leave it.
         Raises DataError, and changes nothing, when a pose is not rigid.
         """
         _check_rigid(np.asarray(update.T_map_body, dtype=np.float64), update.ids)
@@ -130,8 +126,8 @@ class Mapper:
         for keyframe_id, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
             if keyframe_id in self._apart:
                 self._apart[keyframe_id] = np.array(T, dtype=np.float64)
-        if update.pieces != self._pieces:
-            self._pieces = update.pieces
+        if update.submaps != self._submaps:
+            self._submaps = update.submaps
             self._sort()
         self._occupancy.advance(self._config.rebuild_keyframes_per_call)
 
@@ -194,13 +190,13 @@ class Mapper:
     def export(self, folder: Path, step: Callable[[str], None] | None = None) -> dict[str, Path]:
         """Write the configured products of the map; return what was written, and note what could not be.
 
-        Keyframes of pieces that are not joined with the map get one of their own, in a folder `piece_N`. Each file is
+        Keyframes of submaps that are not joined with the map get one of their own, in a folder `submap_N`. Each file is
         replaced whole. `step` is told the name of each product before it is made. Raises StorageError when one cannot
         be written.
         """
         written, self.notes = write_products(self, folder, self._config, step)
         layers = self._layers()
-        for old in sorted(folder.glob("piece_*")):
+        for old in sorted(folder.glob("submap_*")):
             if old.name not in layers:
                 remove_products(old)
         for name, layer in layers.items():
@@ -214,16 +210,16 @@ class Mapper:
         return written
 
     def _place(self, keyframe_id: int, scan: Scan, T_map_body: Array) -> None:
-        if self._pieces.group(keyframe_id) == 0:
+        if self._submaps.group(keyframe_id) == 0:
             self._occupancy.add(keyframe_id, scan, T_map_body)
         else:
             self._apart[keyframe_id] = T_map_body
 
     def _sort(self) -> None:
-        """Take keyframes in and out of the map by what is joined with the oldest piece now."""
-        pieces = self._pieces
-        joined = {i: T for i, T in self._apart.items() if pieces.group(i) == 0}
-        apart = {i: T for i, T in self._occupancy.poses.items() if pieces.group(i) != 0}
+        """Take keyframes in and out of the map by what is joined with the oldest submap now."""
+        submaps = self._submaps
+        joined = {i: T for i, T in self._apart.items() if submaps.group(i) == 0}
+        apart = {i: T for i, T in self._occupancy.poses.items() if submaps.group(i) != 0}
         self._apart = {i: T for i, T in self._apart.items() if i not in joined} | apart
         if joined:
             self._occupancy.enter(joined)
@@ -231,11 +227,11 @@ class Mapper:
             self._occupancy.leave(apart)
 
     def _layers(self) -> dict[str, Mapper]:
-        """Return the maps of the pieces that are not joined with the map, complete, by name."""
+        """Return the maps of the submaps that are not joined with the map, complete, by name."""
         layers: dict[str, Mapper] = {}
-        for piece in sorted({self._pieces.group(i) for i in self._apart}):
-            poses = {i: T for i, T in self._apart.items() if self._pieces.group(i) == piece}
-            layer = layers[f"piece_{piece}"] = Mapper(self._config, self._rig, self._one_camera)
+        for submap in sorted({self._submaps.group(i) for i in self._apart}):
+            poses = {i: T for i, T in self._apart.items() if self._submaps.group(i) == submap}
+            layer = layers[f"submap_{submap}"] = Mapper(self._config, self._rig, self._one_camera)
             layer.restore({i: scan for i in poses if (scan := self._store.packed(i)) is not None}, poses)
             layer.finish()
         return layers

@@ -9,19 +9,17 @@ from pathlib import Path
 from typing import Protocol
 
 from vislam.config import MapConfig
-from vislam.errors import DataError, StorageError
-from vislam.mapping.cloud import Cloud
-from vislam.mapping.drive import DriveGrid
-from vislam.mapping.files import replacing
-from vislam.mapping.grid import Grid, write_grid
-from vislam.mapping.mesh import Mesh, poisson_mesh
-from vislam.mapping.mesh_files import write_glb, write_obj
-from vislam.mapping.occupancy import OccupancyMap
-from vislam.mapping.octomap_io import encode_bt, encode_ot
-from vislam.mapping.octree import Octree
-from vislam.mapping.pcd import write_pcd
-from vislam.mapping.ply import write_ply
-from vislam.mapping.surfels import Surfels
+from vislam.core.errors import DataError, StorageError
+from vislam.core.files import replacing
+from vislam.mapping.cloud.cloud import Cloud
+from vislam.mapping.cloud.mesh import Mesh, poisson_mesh
+from vislam.mapping.cloud.surfels import Surfels
+from vislam.mapping.drive.drive import DriveGrid
+from vislam.mapping.drive.grid import Grid, write_grid
+from vislam.mapping.formats.mesh_files import write_glb, write_obj
+from vislam.mapping.formats.pcd import write_pcd
+from vislam.mapping.formats.ply import write_ply
+from vislam.mapping.octree import OccupancyMap, Octree, encode_bt, encode_ot
 
 FILES = {
     "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",

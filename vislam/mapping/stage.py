@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from vislam.camera import Rig
-from vislam.clock import StageClock
 from vislam.config import MapConfig
+from vislam.core.camera import Rig
+from vislam.core.clock import StageClock
+from vislam.core.memory import PackedScan
+from vislam.core.messages import Array, GraphUpdate
+from vislam.mapping.depth.mono import MonoDepth, SeenFrame
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.monodepth import MonoDepth, SeenFrame
-from vislam.memory import PackedScan
-from vislam.messages import Array, GraphUpdate
-from vislam.odometry_keyframe import OdometryKeyframe
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
 
 class MapStage:

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from vislam.batch.graph_certificate import Certificate
-from vislam.batch.graph_optimize import PoseGraphSolution
-from vislam.batch.graph_problem import PoseGraphProblem
-from vislam.batch.graph_uncertainty import Uncertainty, ellipses
-from vislam.errors import DataError
-from vislam.messages import Array
-from vislam.report.html import bullets, card, escape, folded, grid, note, number, section, table, tile
-from vislam.report.style import CODE, RC, stylesheet, svg
-from vislam.trajectory import write_text
+from vislam.batch.posegraph.certificate import Certificate
+from vislam.batch.posegraph.optimize import PoseGraphSolution
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
+from vislam.core.errors import DataError
+from vislam.core.files import write_text
+from vislam.core.messages import Array
+from vislam.report.drawing import Axis, Lines, drawing
+from vislam.report.html import bullets, card, escape, folded, grid, note, number, section, stylesheet, table, tile
 
 _MAX_LINES = 3000  # edges drawn of a picture: more cannot be seen and only makes the file heavy
 _REGIONS = 40  # poses whose uncertainty is drawn
@@ -45,11 +40,11 @@ def write_graph_report(
         *([tile(certificate.word, "", "global optimum")] if certificate is not None else []),
     )
     regions, enlarged = _regions(problem, solution)
-    after = _picture(problem, solution, solution.poses, "after", regions)
+    after = _picture(problem, solution, solution.poses, regions)
     times = "" if enlarged == 1.0 else f", {enlarged:g} times as large"
     title = f"After, with 95 % regions of some poses{times}" if len(regions) else "After"
     pictures = grid(
-        card(_picture(problem, solution, solution.start, "before"), title=f"Before: start '{solution.start_name}'"),
+        card(_picture(problem, solution, solution.start), title=f"Before: start '{solution.start_name}'"),
         card(after, title=title),
     )
     starts = table(("start", "chi²"), [(k, f"{v:.6g}") for k, v in solution.start_costs.items()])
@@ -100,45 +95,36 @@ def _regions(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[Ar
     return ellipses(solution.poses[chosen], covariances, axes=axes, enlarged=enlarged), enlarged
 
 
-def _picture(
-    problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Array, name: str, regions: Array | None = None
-) -> str:
+def _picture(problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Array, regions: Array | None = None) -> str:
     """Draw the poses in the plane in which they spread most, with their edges and the outlines of `regions`."""
     d = problem.dimension
     first, second = _plane(solution.poses)
     points = poses[:, [first, second], d]
     shown = (problem.edges != problem.world).all(axis=1)
     successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(5.5, 4.7), layout="constrained")
-        axes = figure.add_subplot()
-        rejected = solution.weights == 0.0
-        _lines(axes, points, problem.edges[rejected], CODE["bad"], 0.4, 0.5)
-        _lines(axes, points, problem.edges[shown & ~successive & ~rejected], CODE["muted"], 0.4, 0.5)
-        _lines(axes, points, problem.edges[shown & successive & ~problem.is_position], CODE["graph"], 1.2, 1.0)
-        if regions is not None:
-            axes.add_collection(LineCollection(list(regions), colors=CODE["ekf"], linewidths=0.8))
-        axes.autoscale_view()
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]")
-        return svg(figure, name)
+    rejected = solution.weights == 0.0
+    between = shown & ~rejected
+    lines = [
+        _edges(points, problem.edges[shown & rejected], "bad", 0.4, 0.5),
+        _edges(points, problem.edges[between & ~successive], "muted", 0.4, 0.5),
+        _edges(points, problem.edges[shown & successive & ~problem.is_position], "graph", 1.2, 1.0),
+    ]
+    if regions is not None:
+        lines.append(Lines(regions, "ekf", 0.8))
+    return drawing(lines, Axis(f"{'xyz'[first]} [m]"), Axis(f"{'xyz'[second]} [m]"), height_pt=338, same_scale=True)
 
 
-def _lines(axes: Axes, points: Array, edges: Array, color: str, width: float, alpha: float) -> None:
+def _edges(points: Array, edges: Array, color: str, width_pt: float, opacity: float) -> Lines:
     step = max(1, -(-len(edges) // _MAX_LINES))
-    axes.add_collection(LineCollection(list(points[edges[::step]]), colors=color, linewidths=width, alpha=alpha))
+    return Lines(points[edges[::step]], color, width_pt, opacity)
 
 
 def _cost_curve(solution: PoseGraphSolution) -> str:
     costs = np.maximum(np.array(solution.costs), 1e-12)
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(5.5, 3.2), layout="constrained")
-        axes = figure.add_subplot()
-        axes.plot(np.arange(len(costs)), costs, color=CODE["graph"], marker="o", markersize=3.0)
-        axes.set_yscale("log")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set(xlabel="iteration", ylabel="chi²")
-        return svg(figure, "cost")
+    curve = np.stack((np.arange(len(costs), dtype=np.float64), costs), axis=1)
+    dots = np.stack((curve, curve), axis=1)
+    lines = (Lines(curve[None], "graph", 1.4), Lines(dots, "graph", 4.0))
+    return drawing(lines, Axis("iteration", whole=True), Axis("chi²", log=True), height_pt=230)
 
 
 def _rejected(problem: PoseGraphProblem, solution: PoseGraphSolution) -> str:

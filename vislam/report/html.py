@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from vislam.datasets.images import image_size
-from vislam.reading import read_bytes
+from vislam.core.reading import read_bytes
 
 _MAX_PICTURE_PX = 1600
 _KEEP_BYTES = 400_000  # a smaller picture is embedded as it is
@@ -29,6 +27,11 @@ class Cell:
     text: str
     mark: str = ""
     kind: str = ""  # "text" (left) or "text long" (left, may wrap)
+
+
+def stylesheet() -> str:
+    """Return the style sheet of every page, to be embedded."""
+    return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
 
 
 def escape(value: object) -> str:
@@ -113,6 +116,10 @@ def folded(title: str, content: str) -> str:
 
 def picture(path: Path, caption: str) -> str:
     """Return an image embedded as data, made smaller where it is large; a reason when it cannot be read."""
+    import cv2
+
+    from vislam.datasets.images import image_size
+
     try:
         data = read_bytes(path, _MAX_PICTURE_BYTES)
     except OSError as error:

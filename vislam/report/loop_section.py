@@ -13,7 +13,7 @@ from vislam.report.scene import Scene
 
 _SHOWN_LOOPS = 10  # rows that are always seen
 _MAX_LOOPS = 300  # rows that can be unfolded; the rest is in loops.csv
-_DECISIONS = ("accepted", "parked", "rejected")
+_DECISIONS = ("accepted", "pending", "rejected")
 
 
 def loops_section(run: RunFiles, scene: Scene) -> str:
@@ -70,7 +70,7 @@ def _loop_pictures(run: RunFiles) -> str:
     told = {(loop.from_id, loop.to_id, loop.decision): loop for loop in run.loops}
     cards: dict[str, list[str]] = {"accepted": [], "others": []}
     for path in run.loop_pictures:
-        match = re.fullmatch(r"\d+_(\d+)_(\d+)_(accepted|parked|rejected)", path.stem)
+        match = re.fullmatch(r"\d+_(\d+)_(\d+)_(accepted|pending|rejected)", path.stem)
         loop = told.get((int(match[1]), int(match[2]), match[3])) if match else None
         if loop is None:
             continue

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vislam.core.files import write_text
 from vislam.report import plots
 from vislam.report.html import (
     Cell,
@@ -24,15 +25,14 @@ from vislam.report.html import (
     picture,
     preformatted,
     section,
+    stylesheet,
     table,
     tile,
 )
 from vislam.report.loop_section import loops_section
 from vislam.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_run
 from vislam.report.scene import Scene, build_scene
-from vislam.report.style import stylesheet
-from vislam.trajectory import write_text
-from vislam.verdict import verdict_sentence
+from vislam.run.verdict import verdict_sentence
 
 
 def write_report(run: Path) -> Path:
@@ -137,6 +137,11 @@ def _tiles(run: RunFiles, scene: Scene) -> str:
     factor = m.get("realtime_factor")
     fast = isinstance(factor, int | float) and factor >= 1.0
     tiles.append(tile(number(factor, 2), "×", "real time", "good" if fast else "warn"))
+    cost = as_dict(m, "cost")
+    if cost:
+        tiles.append(tile(number(cost.get("cpu_ms_per_frame"), 0), "ms", "of CPU per frame"))
+        tiles.append(tile(number(cost.get("peak_memory_mb"), 0), "MB", "of memory at most"))
+        tiles.append(tile(number(cost.get("first_pose_s"), 2), "s", "of recording until the first pose"))
     tiles.append(
         tile(number(loops.get("accepted", 0), 0), "", f"loops of {number(loops.get('candidates', 0), 0)} candidates")
     )
@@ -265,7 +270,30 @@ def _timing(run: RunFiles) -> str:
             [name, *quantiles, number(stage.get("count"), 0), number(stage.get("total_s"), 2), percent(share, 0)]
         )
     head = ["stage", "p50 [ms]", "p95", "p99", "calls", "total [s]", "share"]
-    return section("Time", grid(card(figure) if figure else "", card(table(head, rows))))
+    return section("Time", grid(card(figure) if figure else "", card(table(head, rows))), _cost(run))
+
+
+def _cost(run: RunFiles) -> str:
+    """Return what the run cost in CPU time, stage by stage; empty for a run that did not measure it."""
+    cost = as_dict(run.metrics, "cost")
+    stages = [
+        (name, ms)
+        for name, ms in as_dict(cost, "stages_cpu_ms_per_frame").items()
+        if isinstance(ms, int | float) and not isinstance(ms, bool)
+    ]
+    if not stages:
+        return ""
+    whole_ms = sum(ms for _, ms in stages)
+    rows: list[list[str | Cell]] = [
+        [name, number(ms, 2), percent(ms / whole_ms if whole_ms > 0.0 else None, 0)]
+        for name, ms in sorted(stages, key=lambda stage: -stage[1])
+    ]
+    text = (
+        f"{number(cost.get('cpu_s'), 1)} s of CPU in all, beside {number(cost.get('compile_cpu_s'), 1)} s of "
+        f"compilation; {number(cost.get('first_pose_cpu_s'), 1)} s of it until the first pose. "
+        "Threads that read ahead are in “decode”, others (Rerun's, for one) and what lies between stages in “other”."
+    )
+    return card(table(["stage", "CPU [ms/frame]", "share"], rows), title="CPU time") + note(text)
 
 
 def _biases(run: RunFiles, scene: Scene) -> str:

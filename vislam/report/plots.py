@@ -10,14 +10,11 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
-from vislam.messages import NavState
+from vislam.core.messages import Array, NavState
 from vislam.report.run_files import RunFiles
 from vislam.report.scene import Scene, loop_segments
 from vislam.report.style import CODE, RC, svg
-
-Array = NDArray[np.float64]
 
 _WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
 _STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad"}

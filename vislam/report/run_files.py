@@ -10,14 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.messages import Array, NavState, Tracking
+from vislam.core.reading import read_json
 from vislam.loop.table import LoopRow, read_loops, read_rows
-from vislam.messages import NavState, Tracking
-from vislam.reading import read_json
-from vislam.runfolder import TRACKING_COLUMNS
+from vislam.run.folder import TRACKING_COLUMNS
 from vislam.trajectory import Trajectory, read_states_csv, read_tum
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 ESTIMATES = ("ekf", "live", "graph", "batch")

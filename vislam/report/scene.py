@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.errors import VislamError
-from vislam.geometry import invert, sim3_parts, transform
+from vislam.core.errors import VislamError
+from vislam.core.geometry import invert, sim3_parts, transform
+from vislam.core.messages import Array
 from vislam.report.run_files import RunFiles, as_dict
-from vislam.runfolder import recorded_alignment
+from vislam.run.folder import recorded_alignment
 from vislam.trajectory import Trajectory, align, associate, nees
-
-Array = NDArray[np.float64]
 
 _LABELS = {"truth": "truth", "ekf": "EKF alone", "live": "live (causal)", "graph": "graph, final", "batch": "batch"}
 

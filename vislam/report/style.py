@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+
+from vislam.report.html import stylesheet
 
 # matplotlib cannot write CSS variables: these colours stand for them and are replaced in the SVG
 _VARIABLES = {
@@ -54,11 +55,6 @@ RC: dict[str, Any] = {
     "legend.handlelength": 1.6,
     "lines.solid_capstyle": "round",
 }
-
-
-def stylesheet() -> str:
-    """Return the style sheet of every page, to be embedded."""
-    return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
 
 
 def light() -> tuple[dict[str, str], dict[str, Any]]:

@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from vislam.config import Config
-from vislam.errors import DataError, UsageError
-from vislam.factor_log import rig_data
+from vislam.core.errors import DataError, UsageError
+from vislam.core.memory import SlamMemory
+from vislam.core.recording import Recording
+from vislam.factors.factor_log import rig_data
 from vislam.imu import ImuNoise
-from vislam.memory import SlamMemory
-from vislam.recording import Recording
+from vislam.pipeline.settings import derived
 from vislam.run.drive import Progress, Run, imu_noise
-from vislam.runfolder import MapChoice, storage, write_setup
-from vislam.session import Session, SessionWriter, has_begun, recall
+from vislam.run.folder import MapChoice, storage, write_setup
+from vislam.run.session import Session, SessionWriter, has_begun, recall
 
 # settings (map.*) that decide what a keyframe's cloud is; what is made of clouds may be set otherwise in every run
 _SHAPING = (
@@ -88,8 +89,9 @@ def begun(
 
     `make` makes another kind of run of its session.
     """
-    info = {"source": source, "config": asdict(config)}
     noise = imu_noise(config.imu, recording.imu_noise)
+    config = derived(config, recording.rig, noise)
+    info = {"source": source, "config": asdict(config)}
     path = out / "session.db"
     make = make or partial(Run, recording, config, out)
     if base is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -15,33 +16,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import Config, ImuConfig
-from vislam.errors import DataError, UsageError, VislamError
-from vislam.front import FrontReport
+from vislam.core import interrupts
+from vislam.core.errors import DataError, UsageError, VislamError
+from vislam.core.files import write_json
+from vislam.core.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
+from vislam.core.messages import Frame, ImuSample, Localisation, LoopDecision, MagSample, Submaps, Tracking
+from vislam.core.recording import Recording
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
-from vislam.mapping.map_pictures import write_pictures
 from vislam.mapping.mapper import Mapper
-from vislam.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
-from vislam.messages import Frame, ImuSample, LoopDecision, MagSample, Pieces
-from vislam.recording import Recording
+from vislam.mapping.pictures.of_map import write_pictures
+from vislam.pipeline.front_report import FrontReport
+from vislam.pipeline.steps import KeyframeStep, Step
+from vislam.run.cost import CostMeter
 from vislam.run.evidence import KeyframeWitness, front_evidence, whole_evidence
+from vislam.run.folder import RunLog
 from vislam.run.loop_gallery import LoopGallery
-from vislam.run.metrics import accuracy, initialisation, refuse, verdict_entry
+from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, verdict_entry
 from vislam.run.pipeline import Pipeline
-from vislam.run.view import show_map, show_paths, show_step
-from vislam.runfolder import RunLog, write_json
-from vislam.session import Session, SessionWriter, recall
-from vislam.slam import KeyframeStep, Slam, Step
-from vislam.sources import shaken
+from vislam.run.session import Session, SessionWriter, recall
+from vislam.run.show import show_map, show_paths, show_step
+from vislam.run.sources import shaken
+from vislam.run.verdict import Evidence, judge
+from vislam.run.viewer import NullViewer, open_viewer
+from vislam.slam import Slam
 from vislam.trajectory import Trajectory
-from vislam.verdict import Evidence, judge
-from vislam.viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:
-    from vislam.viewer.recording import RunViewer
+    from vislam.run.viewer.recording import RunViewer
 
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
+_LOG = logging.getLogger(__name__)
 _INERTIAL_BEFORE_NS = 1_000_000_000  # given again before the keyframe at which a run is resumed
 
 
@@ -75,9 +81,10 @@ class Run:
         self.noise = imu_noise(config.imu, recording.imu_noise)
         self.slam: Pipeline = Slam(config, recording.rig, self.noise) if slam is None else slam
         self.log = RunLog()
+        self.cost = CostMeter()
         self.gallery = LoopGallery()
         self.witness = KeyframeWitness(config)
-        self._pieces = Pieces()
+        self._submaps = Submaps()
         self.session = session
         self.resumed: list[dict[str, Any]] = []
         self._first_frame = 0  # that was not remembered from an earlier process
@@ -135,22 +142,25 @@ class Run:
     def execute(self, progress: Progress | None = None) -> dict[str, Any]:
         """Process the whole recording and write every file; return the metrics.
 
-        What was computed is written whatever happens; the error is raised afterwards. Raises TrackingLostError when
-        fewer than half of the frames got a pose.
+        Whatever happens, what was computed is written, after an interrupt without map and pictures; then the error is
+        raised. Raises TrackingLostError when fewer than half of the frames got a pose.
         """
         start = time.perf_counter()
+        _LOG.info("%s, %s frames", self.recording.name, self.recording.frame_count or "unknown")
         self._open_viewer()
-        failure: BaseException | None = None
+        failure: VislamError | KeyboardInterrupt | None = None
         try:
             self._feed(progress)
         except (VislamError, KeyboardInterrupt) as error:
             failure = error
             self.warnings.append(f"stopped early: {error or 'interrupted'}")
         try:
-            metrics = self._finish(start)
+            metrics = self._finish(start, isinstance(failure, KeyboardInterrupt))
             self.session.close(finished=failure is None)
         except VislamError as error:
             raise failure or error from error
+        finally:
+            self.viewer.close()
         if failure is not None:
             raise failure
         if self.wants_frames:
@@ -172,17 +182,18 @@ class Run:
 
     def _feed(self, progress: Progress | None) -> None:
         assert isinstance(self.slam, Slam)
-        clock = self.slam.clock
         values = iter(self._values())
-        while True:
-            with clock.measure("read"):
-                value = next(values, None)
-            if value is None:
-                return
-            for step in self.slam.feed(value):
-                self._take(step)
-                if progress is not None:
-                    progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
+        with interrupts.counted() as asked:
+            while not asked.count:
+                with self.slam.clock.measure("read"):
+                    value = next(values, None)
+                if value is None:
+                    return
+                for step in self.slam.feed(value):
+                    self._take(step)
+                    if progress is not None:
+                        progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
+        raise KeyboardInterrupt  # between two values, where the pipeline is whole
 
     def _values(self) -> Iterator[ImuSample | MagSample | Frame]:
         """Yield the recording, or what is left of it."""
@@ -207,7 +218,10 @@ class Run:
     def _take(self, step: Step) -> None:
         if self._from is not None and step.front.frame.t_ns <= self._from.t_ns:
             return  # the keyframe at which the run is resumed is remembered already
+        self.cost.take(step)
+        before = self.log.newest_tracking
         self.session.add_frame(self.log.add(step))
+        _log_changes(step, before)
         for keyframe in step.keyframes:
             self._store(keyframe)
         with self.slam.clock.measure("view"):
@@ -224,11 +238,14 @@ class Run:
             self.session.add(entry)
             self.gallery.add(step)
             self.witness.add(packet, step.update)
-            self._pieces = step.update.pieces
-        if self.base is not None and self.joined_t_ns is None and step.update.pieces.group(packet.keyframe.id) == 0:
+            self._submaps = step.update.submaps
+            for loop_id in step.update.accepted_loop_ids:
+                _LOG.info("keyframe %d: loop %d is in the graph", packet.keyframe.id, loop_id)
+        if self.base is not None and self.joined_t_ns is None and step.update.submaps.group(packet.keyframe.id) == 0:
             self.joined_t_ns = packet.keyframe.t_ns
 
-    def _finish(self, start: float) -> dict[str, Any]:
+    def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
+        mapper = None if is_brief else self._mapper
         finish = self.slam.finish()
         for step in finish.steps:
             self._take(step)
@@ -239,23 +256,27 @@ class Run:
             self.session.move(finish.update, finish.news)
             self.viewer.move(finish.update)
         final, rows, loops = self._write_estimates()
-        self._explain(rows)
+        self._explain([] if is_brief else rows)
         truth = self._truth()
         self.log.write_trajectories(self.out, final, truth)
-        if self._mapper is not None:
+        if mapper is not None:
             with self.slam.clock.measure("map export"):
-                self._mapper.export(self.out / "map")
-            self.warnings += [f"no {name}: {reason}" for name, reason in self._mapper.notes.items()]
+                mapper.export(self.out / "map")
+            self.warnings += [f"no {name}: {reason}" for name, reason in mapper.notes.items()]
         show_paths(self.viewer, final, truth, self.slam.front.report().alignment)
         is_level = self.slam.front.start is not None
-        if self._mapper is not None and len(self.log):
-            show_map(self.viewer, int(self.log.stamps_ns[-1]), self._mapper, is_level, is_last=True)
-        self.viewer.close()
+        if mapper is not None and len(self.log):
+            show_map(self.viewer, int(self.log.stamps_ns[-1]), mapper, is_level, is_last=True)
+        self.warnings += filter(None, [self.viewer.close()])
         wall_s = time.perf_counter() - start  # everything but pictures and report
-        if self._mapper is not None:
-            write_pictures(self._mapper, self.out / "map", final.positions_m, is_level)
+        if mapper is not None:
+            with self.slam.clock.measure("pictures"):
+                write_pictures(mapper, self.out / "map", final.positions_m, is_level)
         metrics = self._metrics(final, truth, wall_s, loops)
         write_json(self.out / "metrics.json", metrics)
+        for warning in metrics["warnings"]:
+            _LOG.warning("%s", warning)
+        _LOG.info("%d frames, %d keyframes, %s", metrics["frames"], metrics["keyframes"], metrics["verdict"]["state"])
         return metrics
 
     def _write_estimates(self) -> tuple[Trajectory, list[LoopRow], dict[str, int]]:
@@ -270,19 +291,11 @@ class Run:
         rows = self.log.loop_rows({report.loop_id: report for report in graph.edge_reports()})
         loops = self.log.write_tables(self.out, rows)
         final = self.log.final_trajectory(ids, graph.poses(), states, self.config.imu)
-        return self._with_scale(final), rows, loops
-
-    def _with_scale(self, final: Trajectory) -> Trajectory:
-        """Return what has metres: one camera may see for a while before anybody knows how large that is."""
         from_ns = self.slam.front.report().scaled_from_ns
-        if from_ns is None:
-            return final
-        keep, length_s = final.t_ns >= from_ns, (from_ns - int(self.log.stamps_ns[0])) * 1e-9
-        self.warnings.append(
-            f"{int((~keep).sum())} frames in the first {length_s:.1f} s are not in trajectory_graph: scale was found "
-            "later and does not reach back so far; begin at rest or with more acceleration"
-        )
-        return Trajectory(final.t_ns[keep], final.T_world_body[keep])
+        if from_ns is not None:
+            final, warning = in_metres(final, from_ns, int(self.log.stamps_ns[0]))
+            self.warnings.append(warning)
+        return final, rows, loops
 
     def _explain(self, rows: list[LoopRow]) -> None:
         """Write the pictures of telling loop candidates, and show all as they were decided in the end."""
@@ -303,7 +316,7 @@ class Run:
         self, final: Trajectory, truth: Trajectory | None, wall_s: float, loops: dict[str, int]
     ) -> dict[str, Any]:
         front, back = self.slam.front.report(), self.slam.back
-        stamps = self.log.stamps_ns
+        stamps, timing_ms = self.log.stamps_ns, self.slam.clock.summary_ms()
         part = stamps[self._first_frame :]
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
@@ -335,7 +348,8 @@ class Run:
             "imu_noise": front.imu_noise,
             "track_noise": front.track_noise,
             "accuracy": errors,
-            "timing_ms": self.slam.clock.summary_ms(),
+            "timing_ms": timing_ms,
+            "cost": self.cost.entry(timing_ms),
             "counters": counters,
             "nis": front.nis,
             "problems": dict(self.recording.problems),
@@ -354,7 +368,7 @@ class Run:
             return whole_evidence(front, self.log, final, [], {}, 0, {})
         ids, states = graph.ids.tolist(), graph.states()
         by_keyframe = dict(zip(ids, states, strict=True)) if states else {}
-        apart = len({*self._pieces.groups}) - 1
+        apart = len({*self._submaps.groups}) - 1
         keyframes = self.witness.evidence(ids, graph.poses(), states)
         return whole_evidence(front, self.log, final, graph.edge_reports(), by_keyframe, apart, keyframes)
 
@@ -366,6 +380,15 @@ class Run:
             self.warnings.append(f"the recording was not found in the map {self.base['path']}: its poses begin anew")
             return {**self.base, "found_t_s": None}
         return {**self.base, "found_t_s": (self.joined_t_ns - int(self.log.stamps_ns[0])) * 1e-9}
+
+
+def _log_changes(step: Step, before: Tracking | None) -> None:
+    """Log when vision is lost or found again, and when the place in the map is."""
+    track, t_s = step.front.track, step.front.frame.t_ns * 1e-9
+    if track.vo.tracking is not before:
+        _LOG.info("frame at %.3f s: tracking is %s; %s", t_s, track.vo.tracking, track.reason or "all is well")
+    if step.localisation is Localisation.RELOCALISED:
+        _LOG.info("frame at %.3f s: found in the map", t_s)
 
 
 def _length_s(stamps_ns: NDArray[np.int64]) -> float:

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config, ImuConfig
-from vislam.errors import VislamError
-from vislam.factors.gate import EdgeReport
-from vislam.front import FrontReport
+from vislam.core.errors import VislamError
+from vislam.core.memory import EdgeReport
+from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
 from vislam.imu import Preintegrated, preintegrate
-from vislam.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
-from vislam.runfolder import RunLog
+from vislam.pipeline.front_report import FrontReport
+from vislam.run.folder import RunLog
+from vislam.run.verdict import Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
 from vislam.trajectory import Trajectory, align, associate
-from vislam.verdict import Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
 
 _MIN_COMPARED = 10  # poses
 _SAMPLES = 4  # of a span, at least, that says something
@@ -29,7 +29,7 @@ _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_ga
 def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
     """Return what the front half has to say, at any time of a run."""
     counters = report.counters
-    front, feed, ekf = (counters.get(name, {}) for name in ("front", "camera feed", "ekf"))
+    front, feed, ekf, live = (counters.get(name, {}) for name in ("front", "camera feed", "ekf", "live"))
     has_imu = report.condition is not None
     refusals = counters.get("initialisation refused", {})
     offered = [(ekf.get(first, 0), sum(ekf.get(name, 0) for name in others)) for first, *others in _VISION]
@@ -41,6 +41,13 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         frames_degraded=front.get("frames_degraded", 0),
         frames_missing=feed.get("missing", 0),
         frames_repeated=feed.get("repeated", 0),
+        frames_offered=live.get("frames_offered", 0),
+        frames_dropped=live.get("frames_dropped", 0),
+        frames_left_out=live.get("frames_left_out", 0),
+        samples=live.get("samples", 0),
+        samples_missed=live.get("samples_missed", 0),
+        late_s=1e-3 * live.get("late_ms", 0),
+        busy=0.01 * live.get("busy_percent", 0),
         has_imu=has_imu,
         is_started=not has_imu or report.start is not None,
         start_reason=report.refusal,
@@ -95,7 +102,7 @@ class KeyframeWitness:
         span, vo = packet.imu, packet.vo
         if update.details is not None and update.newest is not None:
             self._rotation = _window_turn(update.details.get("calibration"), self._config.window.rotation_sigma_deg)
-        if span is None or packet.begins_piece or len(span.t_ns) < _SAMPLES:
+        if span is None or packet.begins_submap or len(span.t_ns) < _SAMPLES:
             return
         if float(np.diff(span.t_ns).max()) * 1e-9 > self._config.imu.max_gap_s:
             return
@@ -139,7 +146,7 @@ def _window_turn(calibration: Any, prior_deg: float) -> Moved | None:
 
 def whole_evidence(
     front: Evidence, log: RunLog, final: Trajectory, reports: Sequence[EdgeReport], states: dict[int, NavState],
-    pieces_apart: int, keyframes: dict[str, Any],
+    submaps_apart: int, keyframes: dict[str, Any],
 ) -> Evidence:  # fmt: skip
     """Return the evidence of a whole run.
 
@@ -149,13 +156,13 @@ def whole_evidence(
         final: the final trajectory.
         reports: what became of the loops that were offered to the graph.
         states: of the graph, by keyframe.
-        pieces_apart: pieces of the trajectory that are joined with nothing.
+        submaps_apart: submaps that are joined with nothing.
         keyframes: see `KeyframeWitness.evidence`.
     """
     return replace(
         front,
         coverage=len(final) / max(len(log), 1),
-        pieces_apart=pieces_apart,
+        submaps_apart=submaps_apart,
         sigma_m=log.worst_position_sigma_m,
         apart=_apart(log, final, states) if front.has_imu and front.is_started else None,
         loops_accepted=sum(report.decision is LoopDecision.ACCEPTED for report in reports),
@@ -165,7 +172,7 @@ def whole_evidence(
 
 
 def contradicting(reports: Sequence[EdgeReport]) -> int:
-    """Return how many loops the graph tested and does not believe; those that wait for their piece were not tested."""
+    """Return how many loops the graph tested and does not believe; those that wait for their submap were not tested."""
     refused = [report for report in reports if report.decision is not LoopDecision.ACCEPTED]
     return sum(report.decision is LoopDecision.REJECTED or isfinite(report.chi2) for report in refused)
 

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.messages import Array, ImageU8, LoopDecision
 from vislam.loop.table import LoopRow
-from vislam.messages import Array, ImageU8, LoopDecision
-from vislam.runfolder import storage
-from vislam.slam import KeyframeStep
+from vislam.pipeline.steps import KeyframeStep
+from vislam.run.folder import storage
 
 FOLDER = "loops"
 _WIDTH_PX = 300  # of one image
@@ -25,7 +25,7 @@ _MAX_MATCHED = 20_000  # candidates whose matches are kept: 13 MB
 _ACCEPTED = 12  # pictures of each kind
 _OTHERS = 12
 _PER_REASON = 4
-_COLORS = {"accepted": (90, 190, 60), "parked": (60, 180, 230), "rejected": (70, 70, 220)}  # BGR
+_COLORS = {"accepted": (90, 190, 60), "pending": (60, 180, 230), "rejected": (70, 70, 220)}  # BGR
 
 
 class LoopGallery:
@@ -111,7 +111,7 @@ def chosen(rows: Sequence[LoopRow], known: Sequence[int]) -> list[int]:
 
     accepted = sorted((k for k in known if rows[k].decision == LoopDecision.ACCEPTED), key=moved)
     others = sorted((k for k in known if rows[k].decision != LoopDecision.ACCEPTED), key=close)
-    taken = {(rows[k].from_id, rows[k].to_id) for k in accepted}  # parked first, accepted later: is told there
+    taken = {(rows[k].from_id, rows[k].to_id) for k in accepted}  # pending first, accepted later: is told there
     reasons: Counter[str] = Counter()
     shown: list[int] = []
     for k in others:

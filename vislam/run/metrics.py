@@ -6,11 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vislam.errors import DataError, TrackingLostError, VislamError
-from vislam.front import FrontReport
-from vislam.runfolder import RunLog
+from vislam.core.errors import DataError, TrackingLostError, VislamError
+from vislam.pipeline.front_report import FrontReport
+from vislam.run.folder import RunLog
+from vislam.run.verdict import Evidence, Verdict
 from vislam.trajectory import Alignment, Trajectory, evaluate
-from vislam.verdict import Evidence, Verdict
 
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
@@ -29,6 +29,24 @@ def accuracy(
             except VislamError as error:
                 warnings.append(f"{name}: {error}")
     return errors, warnings
+
+
+def in_metres(final: Trajectory, from_ns: int, first_ns: int) -> tuple[Trajectory, str]:
+    """Return what of a trajectory has metres, and what is said of the rest.
+
+    One camera may see for a while before anybody knows how large that is.
+
+    Args:
+        final: the graph's, from the recording's first frame on.
+        from_ns: when scale was known.
+        first_ns: of the first frame.
+    """
+    keep, length_s = final.t_ns >= from_ns, (from_ns - first_ns) * 1e-9
+    warning = (
+        f"{int((~keep).sum())} frames in the first {length_s:.1f} s are not in trajectory_graph: scale was found "
+        "later and does not reach back so far; begin at rest or with more acceleration"
+    )
+    return Trajectory(final.t_ns[keep], final.T_world_body[keep]), warning
 
 
 def initialisation(front: FrontReport, first_ns: int | None) -> dict[str, Any]:

@@ -7,19 +7,21 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.clock import StageClock
-from vislam.factors.gate import EdgeReport
-from vislam.front import FrontReport
+from vislam.core.clock import StageClock
+from vislam.core.memory import EdgeReport, FrontNews, SlamMemory, StartFacts
+from vislam.core.messages import Array, GraphUpdate, NavState
 from vislam.mapping.mapper import Mapper
-from vislam.memory import FrontNews, SlamMemory, StartFacts
-from vislam.messages import Array, GraphUpdate, NavState
-from vislam.slam import Finish
+from vislam.pipeline.front_report import FrontReport
+from vislam.pipeline.steps import Finish
 
 
 class Pipeline(Protocol):
     """What a run asks of the pipeline beside its steps: `Slam`, or processes that do the same."""
 
-    counters: dict[str, int]
+    @property
+    def counters(self) -> dict[str, int]:
+        """How often the place in the map was lost and found again."""
+        ...
 
     @property
     def clock(self) -> StageClock:

@@ -1,16 +1,14 @@
 """The simulated world: smooth motion, sensor models and rendered images, with exact truth for everything."""
 
-from vislam.sim.motions import POINT_WORLDS
+from vislam.sim.motion.motions import POINT_WORLDS
 from vislam.sim.points import MeasuredInertial, PointOptions, PointRecording, open_points
-from vislam.sim.simulation import SimOptions, Simulation, TrueStates, open_world
-from vislam.sim.worlds import WORLD_NAMES, WORLDS
+from vislam.sim.worlds.simulation import SimOptions, Simulation, TrueStates, open_world
+from vislam.sim.worlds.table import WORLD_NAMES, WORLDS
 
-WORLD_DESCRIPTIONS: dict[str, str] = {name: world.description for name, world in WORLDS.items()}
 POINT_WORLD_NAMES: tuple[str, ...] = (*POINT_WORLDS, *WORLDS)
 
 __all__ = [
     "POINT_WORLD_NAMES",
-    "WORLD_DESCRIPTIONS",
     "WORLD_NAMES",
     "MeasuredInertial",
     "PointOptions",

@@ -1,5 +1,6 @@
 """Trajectories: the value, its files, and how one is judged against another."""
 
+from vislam.core.trajectory import Trajectory
 from vislam.trajectory.consistency import Consistency, anees, nees
 from vislam.trajectory.evaluation import (
     Alignment,
@@ -14,17 +15,14 @@ from vislam.trajectory.evaluation import (
     rpe,
     scale_error,
 )
-from vislam.trajectory.files import (
+from vislam.trajectory.formats import (
     read_euroc,
     read_kitti,
     read_trajectory,
     read_tum,
-    write_euroc,
     write_kitti,
-    write_text,
     write_tum,
 )
-from vislam.trajectory.poses import Trajectory
 from vislam.trajectory.states import read_states_csv, write_states_csv
 
 __all__ = [
@@ -48,9 +46,7 @@ __all__ = [
     "read_tum",
     "rpe",
     "scale_error",
-    "write_euroc",
     "write_kitti",
     "write_states_csv",
-    "write_text",
     "write_tum",
 ]

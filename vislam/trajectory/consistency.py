@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
-from vislam.errors import DataError
-from vislam.messages import NavState
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.errors import DataError
+from vislam.core.messages import Array, NavState
+from vislam.core.trajectory import Trajectory
 from vislam.trajectory.evaluation import associate
-from vislam.trajectory.poses import Trajectory
-
-Array = NDArray[np.float64]
 
 _HALF_WINDOW_NS = 150_000_000  # of the fit that gives true velocities: 1 mm of noise at 200 Hz becomes 4 mm/s
 _MAX_HALF_WINDOW_NS = 500_000_000  # a rarer truth says nothing about velocity
@@ -41,7 +39,7 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
     freedom = count * dof
     if freedom < 1:
         raise ValueError("an average needs at least one value")
-    low, high = (float(chi2.ppf(share, freedom)) / freedom for share in (0.025, 0.975))
+    low, high = (chi_square_limit(share, freedom) / freedom for share in (0.025, 0.975))
     return Consistency(total / freedom, low, high, count)
 
 

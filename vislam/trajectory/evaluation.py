@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vislam.errors import DataError, UsageError
-from vislam.geometry import align_points, invert, invert_many, sim3, sim3_parts
-from vislam.trajectory.poses import Trajectory
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import align_points, invert, invert_many, sim3, sim3_parts
+from vislam.core.messages import Array
+from vislam.core.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Alignment = Literal["se3", "sim3", "yaw", "first", "none"]
 Association = Literal["interpolate", "nearest"]
 

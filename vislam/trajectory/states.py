@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vislam.errors import DataError
-from vislam.geometry import quaternion_xyzw_from_rotation
-from vislam.messages import NavState
-from vislam.trajectory.files import read_table, stamp_ns, write_text
+from vislam.core.errors import DataError
+from vislam.core.files import write_text
+from vislam.core.geometry import quaternion_xyzw_from_rotation
+from vislam.core.messages import NavState
+from vislam.trajectory.formats import read_table, stamp_ns
 
 _UPPER = np.triu_indices(15)
 _POSE_COLUMNS = 8  # after the stamp: keyframe id, position, quaternion; they are always known

@@ -1,6 +1,6 @@
 """Tight coupling: a sliding window of keyframe states and landmarks, optimised by Gauss-Newton."""
 
-from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowTilt, WindowUpdate
+from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
 from vislam.window.window import SlidingWindow
 
-__all__ = ["CalibrationEstimate", "SlidingWindow", "WindowEdge", "WindowTilt", "WindowUpdate"]
+__all__ = ["CalibrationEstimate", "SlidingWindow", "WindowEdge", "WindowGravity", "WindowUpdate"]

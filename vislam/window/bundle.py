@@ -13,16 +13,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Rig
 from vislam.config import WindowConfig
-from vislam.geometry import so3_exp
+from vislam.core.camera import Rig
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import Array, Observations
 from vislam.imu import ImuNoise, Preintegrated
-from vislam.messages import Array, Observations
-from vislam.window import inertial, visual
-from vislam.window.layout import CALIBRATION, STATE, Camera, Links, Prior, Views
-from vislam.window.linear import joint_covariance
+from vislam.window.equations import (
+    CALIBRATION,
+    STATE,
+    Camera,
+    Links,
+    Prior,
+    Problem,
+    Room,
+    Solution,
+    Views,
+    inertial,
+    joint_covariance,
+    optimise,
+    visual,
+)
 from vislam.window.posterior import pose, scale_sigma
-from vislam.window.solver import Problem, Room, Solution, optimise
 from vislam.window.spans import information, jacobian_by_bias
 from vislam.window.tracks import RHO_START, TrackTable
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import WindowConfig
-from vislam.messages import Array
+from vislam.core.messages import Array
 from vislam.window.messages import CalibrationEstimate
 
 _MAX_OFFSET_S = 0.1  # a residual time offset beyond this is a wrong clock, not a late camera

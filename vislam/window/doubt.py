@@ -8,13 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.chi_square import chi_square_limit
 from vislam.config import WindowConfig
-from vislam.messages import Array
-from vislam.window import gate, visual
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.messages import Array
+from vislam.window import gate
+from vislam.window.equations import Camera, Solution, visual
 from vislam.window.keyframes import Keyframes
-from vislam.window.layout import Camera
-from vislam.window.solver import Solution
 from vislam.window.tracks import RHO_START, Selection, TrackTable
 
 _CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of wrong tracks, ...

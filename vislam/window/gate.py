@@ -7,22 +7,28 @@ it is too late, for a crowd of tracks that agree with each other moves the solut
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from vislam.messages import Array
-from vislam.window import inertial
-from vislam.window.layout import CALIBRATION, Camera, Links, Views
-from vislam.window.projection import (
+from vislam.core.jit import njit
+from vislam.core.messages import Array
+from vislam.window.equations import (
     CALIBRATED,
+    CALIBRATION,
     COLUMNS,
     ERROR,
     POINT,
     SEEN,
+    Camera,
     Hosted,
+    Links,
     Measured,
     Mount,
+    Normal,
     Place,
+    States,
+    Views,
     hosted,
+    inertial,
+    invert,
     lens,
     linearised,
     measured,
@@ -32,7 +38,6 @@ from vislam.window.projection import (
     shift,
     sight,
 )
-from vislam.window.schur import invert
 
 _MAX_RHO = 20.0  # 1/m: nothing is seen nearer than 5 cm
 _DEPTH_STEPS = 4
@@ -54,9 +59,8 @@ def predicted_covariance(known: Array, X: Array, links: Links, gravity_m_s2: flo
     """
     last = Links(*(a[-2:] if name == "rest_weight" else a[-1:] for name, a in links._asdict().items()))
     A, where = np.zeros((30, 30)), np.arange(30).reshape(2, 15)
-    inertial.linearise(
-        X[-2:], X[-2:], np.zeros(2, dtype=np.bool_), last, gravity_m_s2, where, 1, 0, A, np.zeros(30)
-    )  # fmt: skip
+    states = States(X[-2:], X[-2:], np.zeros(2, dtype=np.bool_))
+    inertial.linearise(states, last, gravity_m_s2, where, 1, 0, Normal(A, np.zeros(30)))
     A = A + np.triu(A, 1).T
     try:
         noise = np.linalg.inv(A[15:, 15:])
@@ -98,7 +102,7 @@ def innovations(
     mount, J = mounted(camera, calibration), np.zeros((3, COLUMNS))
     newest, width = len(X) - 1, 6 * len(X) + CALIBRATION
     own_block, inverse, cross = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, width))
-    H, spread = np.empty((2, width)), np.empty((2, width))
+    scratch = np.empty((2, 2, width))
     first, hosts, keyframes, cameras, values = views
     cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
     squares[:] = np.nan
@@ -115,7 +119,7 @@ def innovations(
                 seen = sight(landmark, at, mount, cam)
                 ahead, error = residual(seen.in_cam, rho, view)
                 if ahead:
-                    linearised(landmark, seen, mount, view, active, k == host, error, camera.huber_k, J)
+                    linearised(landmark, seen, view, active, k == host, error, camera.huber_k, J)
                     _add_older(J, view.depth_weight > 0.0, host, k, len(X), own_block, cross)
                 continue
             squares[n] = np.inf
@@ -125,16 +129,16 @@ def innovations(
             best = _best_depth(landmark, rho_information, mount, at, cam, view, active, J)
             if not np.isfinite(best):
                 continue
-            squares[n] = _square(J, host, k, len(X), own_block, cross, covariance, H, spread)
+            squares[n] = _square(J, host, k, len(X), own_block, cross, covariance, scratch)
             squares[n] += rho_information * (best - rho) ** 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _square(
-    J: Array, host: int, seen: int, count: int, own_block: Array, cross: Array, covariance: Array, H: Array,
-    spread: Array,
-) -> float:  # fmt: skip
+    J: Array, host: int, seen: int, count: int, own_block: Array, cross: Array, covariance: Array, scratch: Array
+) -> float:
     """Return the squared error of a view whose derivative is J, by the spread that bearing and poses leave it."""
+    H, spread = scratch[0], scratch[1]
     known, inverse = own_block.copy(), np.empty((3, 3))
     known[2, 2] += _DEPTH_IS_TAKEN
     if not invert(known, 0.0, inverse):
@@ -171,7 +175,7 @@ def _best_depth(
         ahead, error = residual(seen.in_cam, rho, view)
         if not ahead:
             return np.nan
-        linearised(trial, seen, mount, view, active, False, error, np.inf, J)
+        linearised(trial, seen, view, active, False, error, np.inf, J)
         if step < _DEPTH_STEPS:
             slope = J[0, POINT + 2] * error[0] + J[1, POINT + 2] * error[1] + rho_information * (rho - landmark.rho)
             curvature = J[0, POINT + 2] * J[0, POINT + 2] + J[1, POINT + 2] * J[1, POINT + 2] + rho_information

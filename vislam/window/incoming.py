@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.errors import DataError
-from vislam.messages import Array, ImuSpan, KeyframePacket, NavState
+from vislam.core.errors import DataError
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState
 from vislam.window.tracks import check_observations
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.geometry import interpolate, invert
-from vislam.messages import Array, KeyframePacket, Tracking
-from vislam.window.layout import STATE, Ints
+from vislam.core.geometry import interpolate, invert
+from vislam.core.messages import Array, KeyframePacket, Tracking
+from vislam.window.equations import STATE, Ints
 from vislam.window.posterior import pose
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.window.layout import Ints
+from vislam.window.equations import Ints
 from vislam.window.tracks import TrackTable
 
 _STAY = 2  # observations that a living track keeps, so that it goes on tying keyframes together

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.messages import Array, NavState
+from vislam.core.messages import Array, NavState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class WindowEdge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WindowTilt:
+class WindowGravity:
     """Which way is up for a keyframe that left the window."""
 
     id: int
@@ -54,7 +54,7 @@ class WindowUpdate:
     T_local_body: Array  # [M, 4, 4]
     newest: NavState | None  # None without an IMU
     odometry: tuple[WindowEdge, ...]  # settled edges first, then a provisional one for every pair in the window
-    tilts: tuple[WindowTilt, ...]  # of keyframes that left; empty without an IMU
+    tilts: tuple[WindowGravity, ...]  # of keyframes that left; empty without an IMU
     states: tuple[tuple[int, NavState], ...]  # of keyframes that left; empty without an IMU
     calibration: CalibrationEstimate
     scale_sigma: float  # relative, 1 sigma: one camera with an IMU; 0 where scale is measured directly

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.messages import Array
-from vislam.window.layout import Links
+from vislam.core.messages import Array
+from vislam.window.equations import Links
 
 _EXTENT_M = 0.1  # of the held keyframes about their mean, root of the sum of squares: less has no scale to agree on
 

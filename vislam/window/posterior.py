@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.geometry import skew, tangent_basis, transform
-from vislam.messages import Array, NavState
-from vislam.window.linear import trailing_covariance
-from vislam.window.messages import WindowTilt
+from vislam.core.geometry import skew, tangent_basis, transform
+from vislam.core.messages import Array, NavState
+from vislam.window.equations import trailing_covariance
+from vislam.window.messages import WindowGravity
 
 _NO_MOTION_M = 1e-3
 
@@ -84,12 +84,12 @@ def nav_state(t_ns: int, x: Array, covariance: Array) -> NavState:
     return NavState(t_ns, pose(x), x[12:15].copy(), x[15:18].copy(), x[18:21].copy(), 0.5 * (covariance + covariance.T))
 
 
-def tilt(keyframe_id: int, x: Array, rotation_covariance: Array) -> WindowTilt:
+def tilt(keyframe_id: int, x: Array, rotation_covariance: Array) -> WindowGravity:
     """Return the direction of up in body axes, with its covariance; the rotation's [3, 3] is on the body side."""
     up = x[6:9].copy()  # last row of R_world_body
     J = tangent_basis(up).T @ skew(up)  # up in the body moves by -[w] up = [up] w
     P = J @ rotation_covariance @ J.T
-    return WindowTilt(keyframe_id, up, float(np.sqrt(np.linalg.eigvalsh(P)[-1])), P)
+    return WindowGravity(keyframe_id, up, float(np.sqrt(np.linalg.eigvalsh(P)[-1])), P)
 
 
 def scale_sigma(X: Array, poses: Array) -> float:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from vislam.config import WindowConfig
+from vislam.core.messages import Array, ImuSpan
 from vislam.imu import ImuNoise, Preintegrated, preintegrate
-from vislam.messages import Array, ImuSpan
-from vislam.window.layout import Links
+from vislam.window.equations import Links
 
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.camera import Camera, Rig
 from vislam.config import WindowConfig
-from vislam.errors import DataError
-from vislam.messages import Array, Observations
-from vislam.window.layout import Ints, Views
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import Array, Observations
+from vislam.window.equations import Ints, Views
 
 RHO_START = 0.2  # 1/m: 5 m, where nothing is known
 _VALUES = 9  # of a view, see Views

@@ -9,25 +9,37 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.camera import Rig
 from vislam.config import WindowConfig
-from vislam.errors import DataError, UsageError
-from vislam.geometry import invert
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import invert
+from vislam.core.messages import Array, KeyframePacket, NavState
 from vislam.imu import ImuNoise
-from vislam.messages import Array, KeyframePacket, NavState
-from vislam.window import gate, visual
+from vislam.window import gate
 from vislam.window.calibration import Calibration
 from vislam.window.doubt import Doubt
+from vislam.window.equations import (
+    STATE,
+    Camera,
+    Leaving,
+    Prior,
+    Problem,
+    Room,
+    Solution,
+    first_pose_prior,
+    first_prior,
+    joint_covariance,
+    marginalise,
+    optimise,
+    touched,
+    visual,
+)
 from vislam.window.incoming import check_packet, check_state
 from vislam.window.keyframes import Keyframes
-from vislam.window.layout import STATE, Camera, Prior
 from vislam.window.leaving import split
-from vislam.window.linear import joint_covariance
-from vislam.window.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
-from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowTilt, WindowUpdate
+from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
 from vislam.window.one_scale import at_first_scale, excitation_m_s2
 from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma, tilt
-from vislam.window.solver import Problem, Room, Solution, optimise
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import RHO_START, Selection, TrackTable
 
@@ -256,7 +268,7 @@ class SlidingWindow:
         )
         self._sure = self._sure or not self._full or self._found_its_feet()
         settled: list[WindowEdge] = []
-        tilts: list[WindowTilt] = []
+        tilts: list[WindowGravity] = []
         states: list[tuple[int, NavState]] = []
         if len(keyframes) > self._config.keyframes:
             settled, tilts, states = self._settle(solution, T_edges[0], P_edges[0])
@@ -291,7 +303,7 @@ class SlidingWindow:
 
     def _settle(
         self, solution: Solution, T: Array, P: Array
-    ) -> tuple[list[WindowEdge], list[WindowTilt], list[tuple[int, NavState]]]:
+    ) -> tuple[list[WindowEdge], list[WindowGravity], list[tuple[int, NavState]]]:
         """Return what is final about the oldest keyframe."""
         keyframes = self._keyframes
         oldest, after = int(keyframes.ids[0]), int(keyframes.ids[1])

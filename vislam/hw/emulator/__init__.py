@@ -3,9 +3,9 @@
 from vislam.hw.emulator.board import emulated_gy85
 from vislam.hw.emulator.bus import EmulatedBus, emulated_bus
 from vislam.hw.emulator.chips import VirtualAdxl345, VirtualItg3205
-from vislam.hw.emulator.clock import SteppedClock
 from vislam.hw.emulator.magnetometers import VirtualHmc5883l, VirtualQmc5883
 from vislam.hw.emulator.sensing import SensorError, Truth
+from vislam.hw.emulator.stepped_clock import SteppedClock
 
 __all__ = [
     "EmulatedBus",

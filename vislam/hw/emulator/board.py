@@ -10,9 +10,9 @@ import numpy as np
 from vislam.config import SensorCalibration
 from vislam.hw.emulator.bus import EmulatedBus
 from vislam.hw.emulator.chips import Chip, NowNs, VirtualAdxl345, VirtualItg3205
-from vislam.hw.emulator.clock import SteppedClock
 from vislam.hw.emulator.magnetometers import VirtualHmc5883l, VirtualQmc5883
 from vislam.hw.emulator.sensing import SensorError, Truth
+from vislam.hw.emulator.stepped_clock import SteppedClock
 
 MagnetometerKind = Literal["HMC5883L", "DA5883", "QMC5883L", "QMC5883P", "none"]
 _DEG = np.pi / 180.0

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from vislam.hw.bridge_protocol import SAMPLE_WIRE_BYTES, Chips, Hello, RawSample, Status, encode
+from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Chips, Hello, RawSample, Status, encode
 from vislam.hw.emulator.sensing import Sensing, SensorError, Truth, quantised
 
 _NS = 1_000_000_000

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from vislam.hw.emulator.chips import Chip
-from vislam.hw.emulator.clock import SteppedClock
+from vislam.hw.emulator.stepped_clock import SteppedClock
 
 _I2C_FUNC_I2C, _I2C_FUNC_SMBUS = 0x1, 0x0EFF0008
 _RETRIES, _TIMEOUT, _SLAVE, _SLAVE_FORCE, _FUNCS, _RDWR, _SMBUS = 0x701, 0x702, 0x703, 0x706, 0x705, 0x707, 0x720

@@ -21,7 +21,11 @@ class Chip:
         is_frozen: the chip hangs: it answers, and its data never change.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, truth: Truth, now_ns: NowNs, error: SensorError = IDEAL, seed: int = 0) -> None:
+        """Take the motion, the host's clock and the errors, and power up."""
+        self._truth, self._now_ns = truth, now_ns
+        self._sense = Sensing(error, seed)
+        self._rate = 1.0 + error.rate_error
         self.registers = bytearray(256)
         self.is_frozen = False
         self._pointer = 0
@@ -76,10 +80,8 @@ class VirtualAdxl345(Chip):
         self_test_g: Triple = (0.9, -0.9, 1.2),
     ) -> None:
         """Take the motion, the host's clock and the errors; `self_test_g` is the push (0.9 g: typical at 3.3 V)."""
-        self._truth, self._now_ns, self._self_test_g = truth, now_ns, self_test_g
-        self._sense = Sensing(error, seed)
-        self._rate_error = error.rate_error
-        super().__init__()
+        self._self_test_g = self_test_g
+        super().__init__(truth, now_ns, error, seed)
 
     def power_cycle(self) -> None:
         """Go to standby with an empty FIFO."""
@@ -90,7 +92,7 @@ class VirtualAdxl345(Chip):
         self._next_ns = math.inf
 
     def _period_ns(self) -> float:
-        return 1e9 * 2 ** (15 - (self.registers[0x2C] & 0x0F)) / (3200.0 * (1.0 + self._rate_error))
+        return 1e9 * 2 ** (15 - (self.registers[0x2C] & 0x0F)) / (3200.0 * self._rate)
 
     def _write_register(self, register: int, value: int) -> None:
         self._run()
@@ -157,19 +159,6 @@ class VirtualItg3205(Chip):
 
     _BANDWIDTHS_HZ = (256.0, 188.0, 98.0, 42.0, 20.0, 10.0, 5.0, 5.0)
     _DELAYS_NS = (980_000, 1_900_000, 2_800_000, 4_800_000, 8_300_000, 13_400_000, 18_600_000, 18_600_000)
-
-    def __init__(
-        self,
-        truth: Truth,
-        now_ns: NowNs,
-        error: SensorError = IDEAL,
-        seed: int = 0,
-    ) -> None:
-        """Take the motion, the host's clock and the errors."""
-        self._truth, self._now_ns = truth, now_ns
-        self._sense = Sensing(error, seed)
-        self._rate = 1.0 + error.rate_error
-        super().__init__()
 
     def power_cycle(self) -> None:
         """Come up with the reserved range, internal clock, no filter."""

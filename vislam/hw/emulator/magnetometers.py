@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from vislam.hw.emulator.chips import Chip, NowNs
-from vislam.hw.emulator.sensing import IDEAL, Sensing, SensorError, Triple, Truth, quantised
+from vislam.hw.emulator.sensing import IDEAL, SensorError, Triple, Truth, quantised
 
 _UT_PER_GA = 100.0
 
@@ -26,10 +26,8 @@ class VirtualHmc5883l(Chip):
         coil_ga: Triple = (1.16, 1.16, 1.08),
     ) -> None:
         """Take the motion, the host's clock and the errors; without a working status it is a DA5883."""
-        self._truth, self._now_ns, self._status_works, self._coil_ga = truth, now_ns, status_works, coil_ga
-        self._sense = Sensing(error, seed)
-        self._rate = 1.0 + error.rate_error
-        super().__init__()
+        self._status_works, self._coil_ga = status_works, coil_ga
+        super().__init__(truth, now_ns, error, seed)
 
     def power_cycle(self) -> None:
         """Come up in single-measurement mode with gain 1."""
@@ -105,11 +103,9 @@ class VirtualQmc5883(Chip):
         variant: str = "L",
     ) -> None:
         """Take the motion, the host's clock and the errors."""
-        self._truth, self._now_ns, self._is_p = truth, now_ns, variant == "P"
-        self._sense = Sensing(error, seed)
-        self._rate = 1.0 + error.rate_error
+        self._is_p = variant == "P"
         self._data, self._status, self._control = (0x01, 0x09, 0x0A) if self._is_p else (0x00, 0x06, 0x09)
-        super().__init__()
+        super().__init__(truth, now_ns, error, seed)
 
     def power_cycle(self) -> None:
         """Come up suspended."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.messages import Array
+from vislam.core.messages import Array
 
 Triple = tuple[float, float, float]
 # t_ns -> rate (rad/s), specific force (m/s^2), field (uT), all [3] in the body frame, and temperature in deg C

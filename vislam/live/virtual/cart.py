@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from vislam.config import Config, Gy85Config
-from vislam.errors import DataError
+from vislam.core.errors import DataError
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.imu import ImuNoise
-from vislam.live.child import Life
 from vislam.live.epoch import Epoch
 from vislam.live.frames import FrameSource, NoCamera
-from vislam.live.slot import remove
-from vislam.live.virtual.camera import VirtualCamera, run_camera
+from vislam.live.processes.child import Life
 from vislam.live.virtual.imu import VirtualGy85
 from vislam.live.virtual.motion import Drive, Segment, locate
 from vislam.live.virtual.pilot import CommandReader, PathFollower
 from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, course, virtual_rig
-from vislam.messages import Frame, ImuSample, MagSample
+from vislam.live.virtual.virtual_camera import VirtualCamera, run_camera
+from vislam.live.wire.slot import remove
 from vislam.trajectory import Trajectory
 
 _NS = 1_000_000_000
@@ -70,6 +70,9 @@ class VirtualCart:
     def command_name(self) -> str:
         """Name of the shared memory in which commands are looked for."""
         return f"{self._shared}-command"
+
+    def check(self) -> None:
+        """Do nothing: its sensors are simulated."""
 
     def inertial(self) -> Callable[[], VirtualGy85]:
         """Return what opens its GY-85."""

@@ -7,12 +7,12 @@ import time
 from contextlib import ExitStack
 
 from vislam.config import Gy85Config
+from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.emulator import Truth, emulated_bus, emulated_gy85
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
 from vislam.live.virtual.motion import Follower
-from vislam.messages import Array, ImuSample, MagSample
 
 _NS = 1_000_000_000
 _FIELD_UT = (18.2, -10.5, -43.0)  # central Europe, z up

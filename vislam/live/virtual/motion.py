@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vislam.errors import DataError
-from vislam.geometry import so3_exp, transform
-from vislam.live.slot import SlotReader, SlotWriter, wait_for
-from vislam.messages import Array
+from vislam.core.errors import DataError
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.messages import Array
+from vislam.live.wire.slot import SlotReader, SlotWriter, wait_for
 
 SEGMENT_S = 0.05
 LEAD = 2  # segments decided ahead: a command takes 0.1 to 0.15 s to act, as on a real cart

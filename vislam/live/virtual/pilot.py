@@ -7,9 +7,9 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.errors import DataError
-from vislam.live.slot import SlotReader, SlotWriter
-from vislam.messages import Array
+from vislam.core.errors import DataError
+from vislam.core.messages import Array
+from vislam.live.wire.slot import SlotReader, SlotWriter
 
 _COMMAND = struct.Struct("<2d")
 

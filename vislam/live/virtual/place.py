@@ -8,13 +8,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from vislam.camera import Rig
-from vislam.messages import Array
-from vislam.sim import hall
-from vislam.sim.bake import bake
-from vislam.sim.path import rounded_path
-from vislam.sim.scene import Scene
-from vislam.sim.worlds import WORLDS, make_rig
+from vislam.core.camera import Rig
+from vislam.core.messages import Array
+from vislam.sim.motion.path import rounded_path
+from vislam.sim.scene import Scene, bake
+from vislam.sim.worlds import hall
+from vislam.sim.worlds.table import WORLDS, make_rig
 
 BODY_HEIGHT_M = 0.3
 _LAP = [(4.55, -2.65), (4.6, 2.6), (-0.4, 2.75), (-4.6, 2.55), (-4.55, -2.6)]

@@ -2,7 +2,7 @@
 //
 // For AVR (Nano, Uno, Mega, Leonardo) and ESP32 with their Arduino cores; no library but Wire. Connect 5 V or 3.3 V as
 // your GY-85 is made for, GND, SDA and SCL (Nano and Uno: A4 and A5; ESP32: 21 and 22). docs/cart.md of vislam has the
-// protocol, which vislam/hw/bridge_protocol.py reads. Any change of a frame's layout needs a new PROTOCOL_VERSION.
+// protocol, which vislam/hw/bridge/protocol.py reads. Any change of a frame's layout needs a new PROTOCOL_VERSION.
 
 #include <Arduino.h>
 #include <Wire.h>

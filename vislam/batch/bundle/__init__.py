@@ -1,0 +1,1 @@
+"""Visual-inertial bundle adjustment of whole runs."""

@@ -1,0 +1,274 @@
+"""A finished run estimated again, all at once: visual-inertial bundle adjustment over its factor log.
+
+Poses, velocities and biases of all keyframes, and the points that their tracks saw, under projection, depth, inertial,
+rest and loop factors. Loops are chosen first, as of pose-graph files (`graph_auto`); tracks are judged between rounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from vislam.batch.bundle.adjust import L, Solution, VisualNoise, covariances, solve, visual_factors
+from vislam.batch.bundle.chain import Chain
+from vislam.batch.bundle.loops import Loops, LoopVerdict
+from vislam.batch.bundle.rays import Mask, Tracks, collect, residuals, triangulate
+from vislam.batch.bundle.shutter import ReadoutSearch, camera_twists, readout_change_s, shear
+from vislam.config import BatchConfig, Config
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array, NavState
+from vislam.factors.factor_log import FactorLog
+from vislam.factors.keys import B, V, X, nearest_rigid
+
+_MEDIAN_CHI2_2, _MEDIAN_CHI2_1 = 1.386, 0.455  # medians of chi-square with two degrees of freedom and with one
+_GLOBAL_S = 0.004  # a shorter readout than this counts as a global shutter: one that has none came out at 3.5 ms
+_MIN_LANDMARK_SEEN = 2  # keyframes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchResult:
+    """A run estimated in batch."""
+
+    T_map_body: Array  # [K, 4, 4]
+    states: list[NavState]  # [K]; NaN in what was not estimated and where gtsam gives no covariance
+    cost_before: float  # of the last round's factors at the run's own poses and biases
+    cost_after: float
+    iterations: int
+    landmarks: int
+    observations: int
+    rejected_observations: int  # that did not fit, of tracks that were used or not
+    rejected_depths: int  # whose pixel stayed
+    sigma_px: float  # noise of the tracks as the residuals show it
+    depth_factor: float  # the same for depth, times what was assumed
+    readout_s: float  # of a rolling shutter; 0: global
+    loops: list[LoopVerdict]
+    tied_by_odometry: list[int]  # keyframes that saw too few landmarks
+    note: str  # what was out of the ordinary
+
+
+def optimize_run(log: FactorLog, config: Config) -> BatchResult:
+    """Estimate a run anew from its factor log; deterministic.
+
+    Raises DataError when the log cannot be used or no solver finds a solution.
+    """
+    return _Batch(log, config).run()
+
+
+class _Batch:
+    """The state of one optimisation: current values, and which measurements still count."""
+
+    def __init__(self, log: FactorLog, config: Config) -> None:
+        self._log = log
+        self._config: BatchConfig = config.batch
+        self._chain = Chain(log, config.graph)
+        self._T_body_cam0 = log.rig.T_body_cams[0]
+        self._loops = Loops(log.edges, self._chain, config.graph, self._T_body_cam0[:3, 3])
+        self._tracks = collect(log, config.frontend)
+        self._values = self._chain.initial()
+        self._points: Array = np.zeros((self._tracks.points, 3))
+        self._keep: Mask = np.zeros(len(self._tracks), dtype=bool)
+        self._with_depth: Mask = np.isfinite(self._tracks.rho)
+        self._sigma_px = config.frontend.track_sigma_px
+        self._readout_s = config.frontend.readout_s or 0.0
+        self._learns_readout = config.frontend.readout_s is None
+        self._readout = ReadoutSearch()
+        self._raw_xy = self._tracks.xy
+        self._depth_factor = 1.0
+        self._tied: list[int] = []
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._iterations = 0
+        self._notes: list[str] = []
+
+    def run(self) -> BatchResult:
+        """Choose loops, then alternate between judging tracks and optimising."""
+        config, start = self._config, gtsam.Values(self._values)
+        try:
+            if undecided := self._loops.choose(self._chain, config):
+                self._notes.append(undecided)
+        except (DataError, UsageError) as error:
+            self._notes.append(f"no loop was used: {error}")
+        solution = None
+        for round_number in range(config.rounds):
+            self._judge(first=round_number == 0)
+            solution = self._optimise(first=round_number == 0)
+            self._values = solution.values
+            self._points = self._landmarks()
+            if round_number > 0:
+                self._loops.drop_contradicted(self._poses())
+            self._undo_shutter()
+            self._estimate_noise()
+        if solution is None:
+            raise DataError(f"batch.rounds is {config.rounds}; one at least is needed")
+        return self._result(solution, start)
+
+    def _poses(self) -> Array:
+        count = len(self._chain.records)
+        return np.array([nearest_rigid(self._values.atPose3(X(k)).matrix()) for k in range(count)])
+
+    def _cameras(self) -> Array:
+        return np.asarray(self._poses() @ self._T_body_cam0)
+
+    def _judge(self, first: bool) -> None:
+        """Triangulate every track anew and decide which observations and depths count.
+
+        In the first round poses are the run's: what is grossly off leaves, the worst of a track before the rest is
+        triangulated again.
+        """
+        tracks, config, cameras = self._tracks, self._config, self._cameras()
+        candidates = np.ones(len(tracks), dtype=bool) if first else self._keep
+        limit_px, limit_rho = (np.sqrt(chi_square_limit(config.gate_probability, n)) for n in (2, 1))
+        gate_px = config.start_gate_px if first else self._sigma_px * limit_px
+        gate_rho = np.inf if first else self._depth_factor * limit_rho
+        keep = candidates
+        for _ in range(3):
+            placed = triangulate(tracks, keep, cameras, self._sigma_px)
+            error = residuals(tracks, placed.points_m, cameras)
+            bad = keep & (error.px > gate_px)
+            if not bad.any():
+                break
+            worst = np.zeros(tracks.points)
+            np.maximum.at(worst, tracks.point[keep], error.px[keep])
+            keep = keep & ~(bad & (error.px >= worst[tracks.point]))
+        if not first:  # where the optimised point is, is known better than by its rays alone
+            error = residuals(tracks, self._points, cameras)
+            keep = self._keep
+        keep = keep & (error.px <= gate_px)
+        with np.errstate(invalid="ignore"):
+            self._with_depth &= ~(np.abs(error.rho) > gate_rho)
+        placed = triangulate(tracks, keep, cameras, self._sigma_px)
+        good = (placed.relative_sigma < config.max_relative_sigma) & (tracks.counts(keep) >= _MIN_LANDMARK_SEEN)
+        keep = keep & good[tracks.point]
+        self._keep = _bounded(tracks, keep, config.max_observations)
+        self._points = placed.points_m
+
+    def _optimise(self, first: bool) -> Solution:
+        tracks, config, keep = self._tracks, self._config, self._keep
+        estimators = gtsam.noiseModel.mEstimator
+        weaker = config.vision_inflation  # the kernel bends where it would without
+        cauchy, huber = (
+            estimators.Cauchy.Create(config.start_cauchy / weaker),
+            estimators.Huber.Create(config.huber_k / weaker),
+        )
+        noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, cauchy if first else huber)
+        count = len(self._chain.records)
+        seen = np.bincount(tracks.keyframe[keep], minlength=count)
+        factors, self._tied = self._chain.factors(self._values, seen, config.min_seen)
+        factors += visual_factors(tracks, keep, self._with_depth, self._T_body_cam0, noise)
+        factors += self._loops.factors(self._poses())
+        graph, values, states = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
+        for factor in factors:
+            graph.add(factor)
+        for k in range(count):
+            values.insert(X(k), self._values.atPose3(X(k)))
+            states.append(X(k))
+            if self._chain.has_imu:
+                values.insert(V(k), self._values.atVector(V(k)))
+                values.insert(B(k), self._values.atConstantBias(B(k)))
+                states += [V(k), B(k)]
+        for j in np.unique(tracks.point[keep]).tolist():
+            values.insert(L(j), self._points[j])
+        solution = solve(graph, values, states, config.iterations)
+        self._graph = graph
+        self._iterations += solution.iterations
+        if solution.note:
+            self._notes.append(solution.note)
+        return solution
+
+    def _landmarks(self) -> Array:
+        points = self._points.copy()
+        for j in np.unique(self._tracks.point[self._keep]).tolist():
+            points[j] = self._values.atPoint3(L(j))
+        return points
+
+    @property
+    def _applied_readout_s(self) -> float:
+        return self._readout_s if not self._learns_readout or self._readout_s > _GLOBAL_S else 0.0
+
+    def _undo_shutter(self) -> None:
+        """Estimate the readout of a rolling shutter and bring what was seen to the instant of the middle row."""
+        tracks, poses = self._tracks, self._poses()
+        if not self._learns_readout and self._readout_s == 0.0:
+            return
+        t_ns = np.array([record.t_ns for record in self._chain.records], dtype=np.int64)
+        times = dict(enumerate(t_ns.tolist()))
+        twists = camera_twists(self._log.frames.placed(times, dict(enumerate(poses))), t_ns, self._T_body_cam0)
+        error = residuals(tracks, self._points, poses @ self._T_body_cam0)
+        if self._learns_readout:
+            left_s = readout_change_s(tracks, self._keep, error.xy, error.predicted_rho, twists)
+            self._readout_s = self._readout.next_s(self._readout_s, left_s)
+        xy = self._raw_xy - self._applied_readout_s * shear(tracks, error.predicted_rho, twists)
+        self._tracks = replace(tracks, xy=xy)
+
+    def _estimate_noise(self) -> None:
+        """Take the noise of pixels and depths from the medians of their residuals, three unknowns per point counted."""
+        tracks, keep, config = self._tracks, self._keep, self._config
+        if not keep.any():
+            return
+        error = residuals(tracks, self._points, self._cameras())
+        deep = keep & self._with_depth
+        numbers = 2 * int(keep.sum()) + int(deep.sum())
+        share = max(1.0 - 3.0 * len(np.unique(tracks.point[keep])) / numbers, 0.2)
+        sigma = float(np.sqrt(np.median(error.px[keep] ** 2) / _MEDIAN_CHI2_2 / share))
+        self._sigma_px = float(np.clip(sigma, config.pixel_sigma_min_px, config.pixel_sigma_max_px))
+        if deep.any():
+            factor = float(np.sqrt(np.median(error.rho[deep] ** 2) / _MEDIAN_CHI2_1 / share))
+            self._depth_factor = float(np.clip(factor, 0.5, 5.0))
+
+    def _result(self, solution: Solution, start: gtsam.Values) -> BatchResult:
+        tracks, keep = self._tracks, self._keep
+        poses = self._poses()
+        usable = np.isfinite(tracks.rho)
+        return BatchResult(
+            T_map_body=poses,
+            states=self._states(poses),
+            cost_before=self._cost_at(start),
+            cost_after=solution.cost_after,
+            iterations=self._iterations,
+            landmarks=len(np.unique(tracks.point[keep])),
+            observations=int(keep.sum()),
+            rejected_observations=len(tracks) - int(keep.sum()),
+            rejected_depths=int((keep & usable & ~self._with_depth).sum()),
+            sigma_px=self._sigma_px,
+            depth_factor=self._depth_factor,
+            readout_s=self._applied_readout_s,
+            loops=[self._loops.verdicts[i] for i in sorted(self._loops.verdicts)],
+            tied_by_odometry=self._tied,
+            note="; ".join(self._notes),
+        )
+
+    def _cost_at(self, start: gtsam.Values) -> float:
+        """Return the cost of the last factors at the run's own states, with points triangulated from its poses."""
+        tracks, count = self._tracks, len(self._chain.records)
+        poses = np.array([start.atPose3(X(k)).matrix() for k in range(count)])
+        placed = triangulate(tracks, self._keep, poses @ self._T_body_cam0, self._sigma_px)
+        values = gtsam.Values(start)
+        for j in np.unique(tracks.point[self._keep]).tolist():
+            values.insert(L(j), placed.points_m[j])
+        return float(self._graph.error(values))
+
+    def _states(self, poses: Array) -> list[NavState]:
+        count, has_imu = len(poses), self._chain.has_imu
+        known = np.full((count, 15, 15), np.nan)
+        if self._config.covariances:
+            known = covariances(self._graph, self._values, count, has_imu)
+        states = []
+        for k, record in enumerate(self._chain.records):
+            velocity = gyro = accel = np.full(3, np.nan)
+            if has_imu:
+                bias = self._values.atConstantBias(B(k))
+                velocity = np.array(self._values.atVector(V(k)))
+                gyro, accel = np.array(bias.gyroscope()), np.array(bias.accelerometer())
+            states.append(NavState(record.t_ns, poses[k], velocity, gyro, accel, known[k]))
+        return states
+
+
+def _bounded(tracks: Tracks, keep: Mask, most: int) -> Mask:
+    """Return at most so many observations, those of the longest tracks."""
+    counts = tracks.counts(keep)
+    order = np.argsort(-counts, kind="stable")
+    chosen = np.zeros(tracks.points, dtype=bool)
+    chosen[order[np.cumsum(counts[order]) <= most]] = True
+    return np.asarray(keep & chosen[tracks.point])

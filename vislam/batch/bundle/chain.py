@@ -1,0 +1,191 @@
+"""Factors along the chain of keyframes: first state, IMU, rest, and odometry where too few landmarks were seen."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.config import GraphConfig
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert
+from vislam.core.messages import Array
+from vislam.factors import motion
+from vislam.factors.factor_log import FactorLog
+from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
+from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
+from vislam.factors.noise_models import gaussian, huber, of_vision
+from vislam.factors.preintegration import Preintegrator
+from vislam.factors.priors import start_factors
+from vislam.factors.visual import direction_as_pose, pose_factor
+
+Factors = list[gtsam.NonlinearFactor]
+
+
+class Chain:
+    """The validated measurements between keyframes of a run, and the factors that they make.
+
+    Raises DataError when a keyframe of the log cannot be used.
+    """
+
+    def __init__(self, log: FactorLog, config: GraphConfig) -> None:
+        """Check everything in the log but its tracks."""
+        if not log.keyframes:
+            raise DataError("the run has no keyframe to optimise; see tracking.csv for why none was taken")
+        self._config = config
+        self._lever_m = log.rig.T_body_cams[0][:3, 3]
+        self.has_imu = log.first_state is not None and log.noise is not None
+        first = log.first_state if self.has_imu else None
+        self.start = start_record(first, _rigid(log.keyframes[0].T_map_body, "keyframe 0"))
+        self._preintegrator = None
+        if self.has_imu and log.noise is not None:
+            self._preintegrator = Preintegrator(config, log.noise, log.gravity_m_s2)
+        self.records: list[KeyframeRecord] = []
+        for keyframe in log.keyframes:
+            self.records.append(keyframe_record(keyframe.packet, self.records[-1] if self.records else None))
+        self.poses = np.array([_rigid(k.T_map_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
+        odom = np.array([_rigid(k.T_odom_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
+        self._odometry = np.array([invert(a) @ b for a, b in pairwise(odom)]).reshape(-1, 4, 4)
+        if not self.has_imu and any(not r.has_scale for r in self.records[1:]):
+            raise DataError("the run is of one camera without an IMU: nothing in it tells scale")
+        self._log = log
+
+    def initial(self) -> gtsam.Values:
+        """Return the run's own last estimate: poses, and with an IMU velocities and biases."""
+        values = gtsam.Values()
+        for k, T in enumerate(self.poses):
+            values.insert(X(k), gtsam.Pose3(T))
+        if not self.has_imu:
+            return values
+        gyro, accel = self.start.gyro_bias_rad_s, self.start.accel_bias_m_s2
+        for k, logged in enumerate(self._log.keyframes):
+            velocity = self._slope(k)
+            if logged.velocity_map_m_s is not None and np.all(np.isfinite(logged.velocity_map_m_s)):
+                velocity = logged.velocity_map_m_s
+            if logged.gyro_bias_rad_s is not None and logged.accel_bias_m_s2 is not None:
+                both = np.concatenate([logged.gyro_bias_rad_s, logged.accel_bias_m_s2])
+                if np.all(np.isfinite(both)):
+                    gyro, accel = both[:3], both[3:]
+            values.insert(V(k), np.asarray(velocity, dtype=np.float64))
+            values.insert(B(k), bias_of(gyro, accel))
+        return values
+
+    def factors(self, values: gtsam.Values, seen: NDArray[np.int64], min_seen: int) -> tuple[Factors, list[int]]:
+        """Return the factors at the biases of `values`, and the keyframes that odometry had to tie.
+
+        `seen` [K] is how many landmarks tie each keyframe; the others count on their own measurement of the motion.
+        """
+        factors: Factors = list(start_factors(self.start, self._config))
+        tied = []
+        for before, record in pairwise(self.records):
+            k, duration_s = record.id, _duration_s(before, record)
+            has_imu = self.has_imu and self._inertial(factors, record, before, values, duration_s)
+            if record.begins_submap:
+                factors.append(self._weak_link(k))
+            elif seen[k] < min_seen:
+                tied.append(k)
+                factors += self._odometry_factors(record, values, duration_s, has_imu)
+            if record.rest_from is not None:
+                factors.append(motion.no_motion(record.rest_from, k, self._config))
+                if self.has_imu:
+                    factors.append(motion.zero_velocity(k, self._config.rest_speed_sigma_m_s))
+        return factors, tied
+
+    def odometry_edges(self, scale_sigma: float) -> list[gtsam.BetweenFactorPose3]:
+        """Return the run's odometry as metric edges; `scale_sigma` is the relative one where vision had no scale."""
+        edges = []
+        for record in self.records[1:]:
+            duration_s = _duration_s(self.records[record.id - 1], record)
+            T = self._odometry[record.id - 1]
+            if record.begins_submap:
+                edges.append(self._weak_link(record.id))
+                continue
+            if record.T_previous_body is None or record.covariance is None:
+                edges.append(motion.loose_motion(record.id, T, *self._loose(duration_s)))
+                continue
+            T, covariance = self._metric(record, T, scale_sigma)
+            model = gaussian(covariance, self._config.covariance_ratio_max)
+            edges.append(pose_factor(X(record.id - 1), X(record.id), T, model))
+        return edges
+
+    def _inertial(
+        self, factors: Factors, record: KeyframeRecord, before: KeyframeRecord, values: gtsam.Values, duration_s: float
+    ) -> bool:
+        """Add the IMU factor of a span, or what keeps velocity and biases bounded without; return whether it is one."""
+        assert self._preintegrator is not None
+        k = record.id
+        bias = values.atConstantBias(B(k - 1))
+        integrated = self._preintegrator.integrate(record.imu, before.t_ns, record.t_ns, bias)
+        if integrated is not None:
+            factors.append(self._preintegrator.factor(k, integrated))
+            return True
+        walk = self._preintegrator.bias_walk_sigmas(duration_s)
+        factors.append(motion.loose_velocity(k, self._slope(k), self._config.lost_speed_sigma_m_s))
+        factors.append(motion.bias_walk(k, walk))
+        return False
+
+    def _odometry_factors(
+        self, record: KeyframeRecord, values: gtsam.Values, duration_s: float, has_imu: bool
+    ) -> Factors:
+        """Return what ties a keyframe that saw few landmarks to the one before."""
+        k = record.id
+        factors: Factors = []
+        moved = nearest_rigid(invert(values.atPose3(X(k - 1)).matrix()) @ values.atPose3(X(k)).matrix())
+        if record.T_previous_body is not None and record.covariance is not None:
+            T, covariance = self._metric(record, moved, self._config.direction_scale_sigma)
+            model = gaussian(covariance, self._config.covariance_ratio_max)
+            factors.append(pose_factor(X(k - 1), X(k), T, huber(model, self._config.huber_k)))
+        if not has_imu and not (factors and record.has_scale):
+            factors.append(motion.loose_motion(k, self._odometry[k - 1], *self._loose(duration_s)))
+        return factors
+
+    def _metric(self, record: KeyframeRecord, T_expected: Array, scale_sigma: float) -> tuple[Array, Array]:
+        """Return measured odometry as a metric motion with covariance; without scale `T_expected` lends its length."""
+        assert record.T_previous_body is not None
+        assert record.covariance is not None
+        config, T = self._config, record.T_previous_body
+        covariance = of_vision(record, config)
+        if record.has_scale:
+            return T, covariance
+        lever = self._lever_m
+        step_m = float(np.linalg.norm(T_expected[:3, 3] + T_expected[:3, :3] @ lever - lever))
+        return direction_as_pose(
+            T, covariance, lever, max(step_m, config.direction_soft_m),
+            floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=scale_sigma,
+        )  # fmt: skip
+
+    def _weak_link(self, k: int) -> gtsam.BetweenFactorPose3:
+        """Return what keeps a submap near where the run had it, should no loop tie it."""
+        config = self._config
+        T = nearest_rigid(invert(self.poses[k - 1]) @ self.poses[k])
+        return motion.loose_motion(k, T, np.deg2rad(config.submap_sigma_deg), config.submap_sigma_m)
+
+    def _loose(self, duration_s: float) -> tuple[float, float]:
+        config = self._config
+        return np.deg2rad(config.lost_rate_sigma_deg_s) * duration_s, config.lost_speed_sigma_m_s * duration_s
+
+    def _slope(self, k: int) -> Array:
+        """Return the velocity [3] of keyframe k in map by differences of the run's poses."""
+        last = len(self.poses) - 1
+        a = k if k == 0 or self.records[k].begins_submap else k - 1
+        b = k if k == last or self.records[k + 1].begins_submap else k + 1
+        if a == b:
+            return self.start.velocity_map_m_s
+        duration_s = (self.records[b].t_ns - self.records[a].t_ns) * 1e-9
+        return np.asarray((self.poses[b, :3, 3] - self.poses[a, :3, 3]) / duration_s)
+
+
+def _duration_s(before: KeyframeRecord, record: KeyframeRecord) -> float:
+    """Return the seconds between two keyframes; before a new submap, whose clock may have begun anew, at least one."""
+    duration_s = (record.t_ns - before.t_ns) * 1e-9
+    return max(duration_s, 1.0) if record.begins_submap else duration_s
+
+
+def _rigid(T: Array, what: str) -> Array:
+    """Return a pose of the log made exactly rigid; raises DataError on damage."""
+    R = T[:3, :3]
+    if not np.all(np.isfinite(T)) or np.max(np.abs(R.T @ R - np.eye(3))) > 1e-3 or np.linalg.det(R) < 0.0:
+        raise DataError(f"{what}: the pose in the factor log is not a rigid motion; run the recording again")
+    return nearest_rigid(T)

@@ -1,0 +1,62 @@
+"""Pose-graph files of every format: which one it is, and its reader and writer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from vislam.batch.posegraph.g2o import read_g2o, write_g2o
+from vislam.batch.posegraph.isam import read_isam, write_isam
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.toro import read_toro, write_toro
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array
+from vislam.core.reading import open_file
+
+GraphFormat = Literal["g2o", "toro", "isam"]
+
+_READERS: dict[GraphFormat, Callable[[Path, bool], PoseGraphProblem]] = {
+    "g2o": read_g2o, "toro": read_toro, "isam": read_isam,
+}  # fmt: skip
+_WRITERS: dict[GraphFormat, Callable[[PoseGraphProblem, Path, Array | None], None]] = {
+    "g2o": write_g2o, "toro": write_toro, "isam": write_isam,
+}  # fmt: skip
+_ENDINGS: dict[str, GraphFormat] = {".g2o": "g2o", ".toro": "toro", ".isam": "isam"}
+_TAGS: dict[str, GraphFormat] = {
+    "VERTEX_SE2": "g2o", "VERTEX_SE3:QUAT": "g2o", "EDGE_SE2": "g2o", "EDGE_SE3:QUAT": "g2o",
+    "VERTEX2": "toro", "VERTEX3": "toro", "ODOMETRY": "isam", "Constraint2": "isam", "POSE3D_INIT": "isam",
+}  # fmt: skip
+_LOOKED_AT_BYTES = 1 << 20
+
+
+def graph_format(path: Path) -> GraphFormat:
+    """Return the format of a file by its ending .g2o, .toro or .isam, else by the first telling line in its first MiB.
+
+    Raises UsageError where neither tells: EDGE2 and EDGE3 alone mean one thing to TORO and another one to iSAM.
+    """
+    by_name = _ENDINGS.get(path.suffix.lower())
+    if by_name is not None:
+        return by_name
+    try:
+        with open_file(path) as file:
+            text = file.read(_LOOKED_AT_BYTES)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    for line in text.splitlines():
+        tag = line.split(maxsplit=1)[:1]
+        if tag and (found := _TAGS.get(tag[0].decode("utf-8", errors="replace"))) is not None:
+            return found
+    raise UsageError(
+        f"{path}: neither name nor contents tell g2o, TORO and iSAM apart; end the name in .g2o, .toro or .isam"
+    )
+
+
+def read_pose_graph(path: Path, repair: bool = False) -> PoseGraphProblem:
+    """Read a pose graph of any format; see `graph_format` and the readers. `repair`: make its information positive."""
+    return _READERS[graph_format(path)](path, repair)
+
+
+def write_pose_graph(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
+    """Write a pose graph in the format that the name ends in, g2o where it tells none; see the writers."""
+    _WRITERS[_ENDINGS.get(path.suffix.lower(), "g2o")](problem, path, poses)

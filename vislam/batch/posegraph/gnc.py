@@ -1,0 +1,194 @@
+"""Which loops of a pose graph are false: gates that narrow as loops are taken, then graduated non-convexity.
+
+Graduated non-convexity alone, from odometry that drifted far, ends with false loops kept: the true ones pull as weakly
+at first as the false ones. So loops enter first that odometry can tell, in the order of their evidence: each must pass
+a chi-square gate of its innovation, and be far likelier true than a false loop, which may say anything in the space of
+the trajectory. Every loop taken narrows the gates of the others.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.solver import Progress, levenberg_marquardt
+from vislam.batch.posegraph.starts import odometry_start
+from vislam.batch.posegraph.structure import NormalEquations, Structure, adjoints
+from vislam.config import PoseGraphConfig
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert_many
+from vislam.core.messages import Array
+
+Mask = NDArray[np.bool_]
+
+_EVIDENCE = (16.0, 12.0, 9.0, 6.0, 4.0)  # log-odds of a loop that enters; lower ones once there is nothing above
+_ROUNDS_MAX = 60
+_CLOSEST = 0.1  # of the loops, taken as the closest fifth of true ones when half of all are false
+_LOOPS_FOR_SCALE = 30  # from which on the cost per degree of freedom tells the scale
+_SCALE_MIN = 1e-10
+_INNER_TOLERANCE = 1e-6
+_GROWTH = 1.4  # of the control parameter of graduated non-convexity per step, as in the paper
+_STEPS_MAX = 60
+_INNER = 2  # iterations of a step: the next one asks something else anyway
+_LEAST_INFORMATION = 1e-9  # of the trace: what makes a matrix with unknown directions invertible
+_NEAR = 25.0  # times the limit: rejected loops that graduated non-convexity looks at again
+_TAILS = 4.0  # times the limit at the end: errors of real loops have heavier tails than a Gaussian
+_SETTLED = 1e-3  # weights this close to 0 or 1 are decided
+
+
+def doubtful_edges(problem: PoseGraphProblem) -> Mask:
+    """Return which edges [E] may be false: those that do not join successive ids."""
+    return np.abs(problem.edges[:, 1] - problem.edges[:, 0]) != 1
+
+
+def reject_false_edges(structure: Structure, config: PoseGraphConfig, progress: Progress | None = None) -> Array:
+    """Return the weights [E] of edges: 1 kept, 0 rejected. Edges between successive ids are never doubted.
+
+    Where these leave the graph in parts, as few others as join it are believed too.
+    """
+    problem = structure.problem
+    trusted = ~doubtful_edges(problem)
+    trusted |= joining_edges(problem, trusted)
+    limit = chi_square_limit(config.inlier_probability, problem.tangent)
+    poses, candidates, scale = _gated(problem, trusted, limit, progress)
+    weights = candidates.astype(np.float64)
+    weights[candidates] = graduated_non_convexity(
+        Structure(problem.with_edges(candidates)), poses, trusted[candidates], _TAILS * limit * scale, progress
+    )
+    return weights
+
+
+def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraphConfig) -> Array:
+    """Return the weights [E] of edges, 1 kept, 0 rejected, of which only `suspects` [E] are doubted.
+
+    For a problem whose poses are good already, as those of sessions that several loops agreed to bring together.
+    """
+    limit = _TAILS * chi_square_limit(config.inlier_probability, problem.tangent)
+    return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)
+
+
+def joining_edges(problem: PoseGraphProblem, trusted: Mask) -> Mask:
+    """Return edges [E] that join what the trusted ones leave apart, in the order of the file."""
+    labels = problem.with_edges(trusted).components()
+    out = np.zeros(len(trusted), dtype=np.bool_)
+    for e in np.flatnonzero(labels[problem.edges[:, 0]] != labels[problem.edges[:, 1]]).tolist():
+        a, b = labels[problem.edges[e]].tolist()
+        if a != b:
+            labels[labels == b] = a
+            out[e] = True
+    return out
+
+
+def _gated(
+    problem: PoseGraphProblem, trusted: Mask, limit: float, progress: Progress | None
+) -> tuple[Array, Mask, float]:
+    """Return poses by the edges that passed the gates, these edges with others not far off, and the noise's scale.
+
+    Many files state variances that are far too large, by which nothing could be told from anything. So all variances
+    are multiplied by what the agreement of loops with odometry shows, and later the cost per degree of freedom; never
+    by more than 1.
+    """
+    k = problem.tangent
+    kept = trusted.copy()
+    chain = problem.with_edges(trusted)
+    poses = odometry_start(chain, chain.anchors())
+    volume = _log_volume(problem, poses)
+    level, scale = 0, 0.0
+    for _ in range(_ROUNDS_MAX):
+        structure = Structure(problem.with_edges(kept))
+        ones = np.ones(int(kept.sum()))
+        poses = levenberg_marquardt(structure, poses, ones, iterations=10, tolerance=1e-4).poses
+        cost = structure.problem.chi2(poses)
+        if progress is not None:
+            progress(0, cost)
+        rest = np.flatnonzero(~kept)
+        if not len(rest):
+            break
+        distance, log_density = _tested(structure, problem, poses, rest)
+        loops = len(structure.problem.edges) - len(structure.free)
+        if loops >= _LOOPS_FOR_SCALE:
+            scale = cost / (k * loops)
+        elif scale == 0.0:
+            scale = float(np.quantile(distance, _CLOSEST) / chi_square_limit(2.0 * _CLOSEST, k))
+        scale = min(1.0, max(scale, _SCALE_MIN))
+        evidence = volume + log_density - 0.5 * (k * math.log(scale) + distance / scale)
+        passed = distance <= limit * scale
+        enters = rest[passed & (evidence >= _EVIDENCE[level])]
+        while not len(enters) and level + 1 < len(_EVIDENCE):
+            level += 1
+            enters = rest[passed & (evidence >= _EVIDENCE[level])]
+        if not len(enters):
+            kept[rest[distance <= _NEAR * limit * scale]] = True
+            break
+        kept[enters] = True
+    return poses, kept, scale or 1.0
+
+
+def _log_volume(problem: PoseGraphProblem, poses: Array) -> float:
+    """Return the logarithm of the space in which a false loop may put a pose: angles, and the trajectory's box."""
+    d = problem.dimension
+    extent = np.maximum(np.ptp(poses[:, :d, d], axis=0), 1.0)
+    angles = 2.0 * math.pi if d == 2 else 8.0 * math.pi**2
+    return float(np.sum(np.log(extent))) + math.log(angles)
+
+
+def _tested(
+    structure: Structure, problem: PoseGraphProblem, poses: Array, edges: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Return squared Mahalanobis distances of edges not in the structure, and the log-density at distance zero."""
+    k = problem.tangent
+    factor = structure.factor(k)
+    equations = NormalEquations(structure, factor)
+    equations.linearise(poses, np.ones(len(structure.problem.edges)))
+    if not equations.factorise(1e-9):
+        return np.full(len(edges), np.inf), np.full(len(edges), -np.inf)
+    ends = problem.edges[edges]
+    jacobians = np.empty((len(edges), 2, k, k))
+    jacobians[:, 1] = np.eye(k)
+    jacobians[:, 0] = -adjoints(
+        invert_many(poses[ends[:, 1]]) @ poses[ends[:, 0]]
+    )  # with Jr(r) = I: false loops are far off
+    S = factor.edge_covariances(structure.index[ends], jacobians)
+    information = problem.information[edges]
+    floor = _LEAST_INFORMATION * np.einsum("eii->e", information)
+    innovation = S + np.linalg.inv(information + floor[:, None, None] * np.eye(k))
+    r = problem.residuals(poses)[edges]
+    distance = np.einsum("ea,ea->e", r, np.linalg.solve(innovation, r[:, :, None])[:, :, 0])
+    return distance, -0.5 * (np.linalg.slogdet(innovation)[1] + k * math.log(2.0 * math.pi))
+
+
+def graduated_non_convexity(
+    structure: Structure, poses: Array, trusted: Mask, limit: float, progress: Progress | None = None
+) -> Array:
+    """Return the weights [E], 0 or 1, that minimise the least squares, truncated at `limit`, of what is not trusted.
+
+    Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, section IV.
+    """
+    problem = structure.problem
+    weights = np.ones(len(problem.edges))
+    if trusted.all():
+        return weights
+    errors = problem.edge_chi2(poses)
+    worst = float(errors[~trusted].max(initial=0.0))
+    control = limit / max(2.0 * worst - limit, limit)
+    for _ in range(_STEPS_MAX):
+        weights[~trusted] = _weights(errors[~trusted], limit, control)
+        descent = levenberg_marquardt(structure, poses, weights, iterations=_INNER, tolerance=_INNER_TOLERANCE)
+        poses, errors = descent.poses, problem.edge_chi2(descent.poses)
+        if progress is not None:
+            progress(0, descent.costs[-1])
+        if control > 1.0 and np.all((weights < _SETTLED) | (weights > 1.0 - _SETTLED)):
+            break
+        control *= _GROWTH
+    weights[~trusted] = errors[~trusted] <= limit
+    return weights
+
+
+def _weights(errors: Array, limit: float, control: float) -> Array:
+    """Return the weights of truncated least squares at a control parameter (equation 14 of the paper)."""
+    upper, lower = (control + 1.0) / control * limit, control / (control + 1.0) * limit
+    between = np.sqrt(limit * control * (control + 1.0) / np.maximum(errors, 1e-300)) - control
+    return np.where(errors >= upper, 0.0, np.where(errors <= lower, 1.0, np.clip(between, 0.0, 1.0)))

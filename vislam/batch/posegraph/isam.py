@@ -1,0 +1,112 @@
+"""iSAM's text files: edges with the square root of their information, poses only in space.
+
+iSAM's residual is the difference of the numbers x y angle, or x y z yaw pitch roll, of the predicted and the measured
+motion (`Pose2d_Pose2d_Factor`, `Pose3d_Pose3d_Factor`): of translations in the first pose's frame, and of Euler angles.
+Information is carried into our tangent at the measurement and back, so that both costs agree to second order; at a
+pitch of 90 degrees Euler angles have no rates, and such an edge is refused.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vislam.batch.posegraph.angles import (
+    choose_dimension,
+    edge_lines,
+    numbers_of,
+    planar_tangent,
+    pose_lines,
+    poses_of,
+    refuse_other_tags,
+    refuse_what_is_lost,
+)
+from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_lines
+from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
+from vislam.batch.posegraph.tagged_lines import Rows, TaggedLines, read_tagged_lines
+from vislam.core.errors import DataError, UsageError
+from vislam.core.files import write_text
+from vislam.core.messages import Array
+
+_EDGES_2D = ("ODOMETRY", "EDGE2", "Constraint2")
+_COLUMNS = dict.fromkeys(_EDGES_2D, (2, 9)) | {"EDGE3": (2, 27), "POSE3D_INIT": (1, 6)}
+_IGNORED = ("SOLVE", "EDGE3_INIT", "EDGE3_TRUE", "POSE3D_TRUE")  # orders to the program and yardsticks, no measurements
+_UPRIGHT = 1e-6  # cosine of the pitch
+
+
+def read_isam(path: Path, repair: bool = False) -> PoseGraphProblem:
+    """Read ODOMETRY, EDGE2 and Constraint2, or EDGE3 and POSE3D_INIT; there are no poses of the plane to start from.
+
+    Edges are in the order of the file. Raises DataError with the line number on damage of any kind, on both dimensions
+    in one file, on landmarks and on other tags; see `problem_from_lines` for the rest.
+    """
+    found = read_tagged_lines(path, _COLUMNS)
+    kept = [(line, text) for line, text in found.others if text.split()[0] not in _IGNORED]
+    refuse_other_tags(path, TaggedLines(found.rows, kept), _COLUMNS)
+    plane, space = _joined([found.rows[tag] for tag in _EDGES_2D]), (found.rows["POSE3D_INIT"], found.rows["EDGE3"])
+    vertices, edges, two = choose_dimension(path, (_joined([]), plane), space)
+    measured, k = poses_of(edges.numbers, two), 3 if two else 6
+    R = np.zeros((len(edges.ids), k, k))
+    a, b = np.triu_indices(k)
+    R[:, a, b] = edges.numbers[:, k:]
+    J = _file_tangent(path, measured, edges.lines)
+    with np.errstate(over="ignore", invalid="ignore"):
+        information = (R @ J).transpose(0, 2, 1) @ (R @ J)
+    if not np.isfinite(information).all():
+        line = edges.lines[int(np.argmin(np.isfinite(information).all(axis=(1, 2))))]
+        raise DataError(f"{path}:{line}: the square of the square root of the information is not finite")
+    information = 0.5 * (information + information.transpose(0, 2, 1))
+    poses = PoseLines(vertices.ids.reshape(-1), poses_of(vertices.numbers, two), vertices.lines)
+    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
+    return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+
+
+def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
+    """Write a problem with 17 digits; in space with poses, `poses` [N, d + 1, d + 1] in the place of its own.
+
+    Raises UsageError for what the format cannot hold (fixed poses, landmarks, information without a square root, a
+    measured pitch of 90 degrees), StorageError.
+    """
+    refuse_what_is_lost(problem, path, "iSAM")
+    J = _file_tangent(path, problem.measurements, np.arange(1, len(problem.edges) + 1), UsageError)
+    inverse = np.linalg.inv(J)
+    try:
+        R = np.linalg.cholesky(inverse.transpose(0, 2, 1) @ problem.information @ inverse).transpose(0, 2, 1)
+    except np.linalg.LinAlgError as error:
+        raise UsageError(
+            f"{path}: an edge's information is singular and has no square root; write a g2o file"
+        ) from error
+    a, b = np.triu_indices(problem.tangent)
+    two = problem.dimension == 2
+    lines = [] if two else list(pose_lines(problem, poses, "POSE3D_INIT"))
+    write_text(path, "\n".join([*lines, *edge_lines(problem, R[:, a, b], "EDGE2" if two else "EDGE3")]) + "\n")
+
+
+def _joined(parts: list[Rows]) -> Rows:
+    """Return rows in the order of their lines."""
+    if not parts:
+        return Rows(np.empty((0, 1), dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64))
+    ids, numbers, lines = (np.concatenate([getattr(p, name) for p in parts]) for name in ("ids", "numbers", "lines"))
+    order = np.argsort(lines)
+    return Rows(ids[order], numbers[order], lines[order])
+
+
+def _file_tangent(path: Path, measured: Array, lines: Ids, error: type[DataError | UsageError] = DataError) -> Array:
+    """Return the derivatives [E, k, k] of the file's numbers by our tangent (rotation first) at measurements."""
+    if measured.shape[1] == 3:
+        return planar_tangent(measured)
+    J = np.zeros((len(measured), 6, 6))
+    J[:, :3, 3:] = measured[:, :3, :3]
+    roll, pitch = numbers_of(measured)[:, 3:5].T
+    cos_pitch = np.cos(pitch)
+    upright = np.abs(cos_pitch) < _UPRIGHT
+    if upright.any():
+        where = f"{path}:{lines[int(np.argmax(upright))]}"
+        raise error(f"{where}: at a pitch of 90 degrees Euler angles say nothing of small rotations; write a g2o file")
+    s, c, t = np.sin(roll), np.cos(roll), np.tan(pitch)
+    J[:, 3, 0] = 1.0
+    J[:, 3, 1], J[:, 3, 2] = s * t, c * t
+    J[:, 4, 1], J[:, 4, 2] = c, -s
+    J[:, 5, 1], J[:, 5, 2] = s / cos_pitch, c / cos_pitch
+    return J

@@ -1,0 +1,260 @@
+"""Judging loops one by one against the others: noise calibrated on those that agree, loops let in and taken back.
+
+Every loop is tested by its innovation, the error that it has against a solution without it: for a loop that is in, the
+solution's own residual and covariance give that (studentised residuals; Foerstner and Wrobel 2016, section 4.6). What
+speaks for it is a Bayes factor: the density of the innovation if the loop is true, against that of a false one, which
+may say anything in the space of the trajectory, times the share of true loops. Directions of which a loop knows
+nothing, as the heading of one from places that only look alike, neither speak for it nor against it.
+
+Loops between the same two places err together: what looked alike once looks alike in the next image, too. So however
+many they are, they weigh as one, and a place that was seen often does not outweigh several that were seen once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vislam.batch.posegraph.noise import covariances_of_edges, spread_out
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.solver import levenberg_marquardt
+from vislam.batch.posegraph.structure import Structure
+from vislam.core.chi_square import chi_square_limits
+from vislam.core.messages import Array
+
+Mask = NDArray[np.bool_]
+
+_LEVELS = (16.0, 12.0, 8.0, 4.0, 2.0, 0.0)  # log-odds of a loop that enters; lower ones once there is nothing above
+_ROUNDS_MAX = 40
+_KNOWN = 10.0  # information times the square of the space's spread: below, a direction is not known
+_TAILS = 4.0  # times the chi-square limit: errors of real loops have heavier tails than a Gaussian
+_WORST = 0.3  # of the worst score: the loops that leave with it; a bad one makes its neighbours look bad
+_ODDS = math.log(3.0)  # a loop is believed that is three times likelier true than false: a false one harms more
+_BACK = 2.0  # log-odds more for every time that it was taken back
+_BORDER = 1.0  # log-odds: covariances of loops nearer to a decision are computed in every round
+_CHANGED = 0.05  # of the loops kept: so many changes, and those of all are
+_SAMPLE = 150  # edges of each kind whose covariances tell the scales
+_CALIBRATIONS = 4
+_SETTLED = 0.2  # of the logarithm of a scale
+_SCALE_MIN, _ODOMETRY_SCALE_MAX, _LOOP_SCALE_MAX = 1e-10, 4.0, 1.0
+_SHARE_MIN = 0.1  # redundancy of odometry over its numbers: below, loops say little about its noise
+_REDUNDANCY_MIN = 5.0
+_LEVERAGE_MAX = 1.0 - 1e-9
+_ITERATIONS, _TOLERANCE = 10, 1e-5
+_PLACE_WAY = 0.05  # of the extent: as far along the way a place reaches
+
+PLACE = 20  # successive poses that make one place, at most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """Loops and poses that agree with each other, and what speaks for each loop."""
+
+    poses: Array  # [N, d + 1, d + 1]
+    kept: Mask  # [E]
+    odometry_scale: float  # factors on the stated variances
+    loop_scale: float
+    objective: float  # minus twice the logarithm of the marginal likelihood: lower explains more
+    evidence: Array  # [E] log-odds that an edge is true; inf of those trusted
+    leverage: Array  # [E] share of a kept loop in what it says: near 1 nothing else confirms it; 0 of those left out
+
+
+class Judge:
+    """Judges sets of loops of one problem, with one idea of how large its space is."""
+
+    def __init__(self, problem: PoseGraphProblem, trusted: Mask, poses: Array, probability: float) -> None:
+        """Take the extent of `poses` [N, d + 1, d + 1] as the space in which a false loop may put a pose."""
+        self._problem, self._trusted = problem, trusted
+        self._loops = np.flatnonzero(~trusted)
+        self._space_m = extent(problem, poses)
+        self._at = _along(problem, poses, _PLACE_WAY * self._space_m)
+        d, k = problem.dimension, problem.tangent
+        spread = np.full(k, self._space_m / math.sqrt(2.0 * math.pi))  # a Gaussian with a box's density at its peak
+        spread[: k - d] = (2.0 * math.pi if d == 2 else (8.0 * math.pi**2) ** (1.0 / 3.0)) / math.sqrt(2.0 * math.pi)
+        self._spread = spread
+        values, self._axes = np.linalg.eigh(problem.information * np.outer(spread, spread))
+        self._known = values > _KNOWN
+        self._values = np.where(self._known, values, 1.0)
+        self._dof = self._known.sum(axis=1)
+        self._limit = _TAILS * chi_square_limits(probability, np.maximum(self._dof, 1))
+        self._medians = chi_square_limits(0.5, np.maximum(self._dof, 1))
+
+    def settle(self, poses: Array, kept: Mask) -> Judgement:
+        """Return what letting in and taking back ends with, from poses [N, d + 1, d + 1] and edges kept [E]."""
+        scales, level, changed, at = (1.0, 1.0), 0, 0, self._loops
+        S, judged_with = np.zeros((len(at), len(self._spread), len(self._spread))), scales
+        stale, score, share = np.ones(len(at), dtype=np.bool_), np.zeros(len(at)), np.zeros(len(at))
+        times_out = np.zeros(len(at))
+        for _ in range(_ROUNDS_MAX):
+            structure, poses, scales, _ = self._calibrated(poses, kept, scales)
+            if _apart(scales, judged_with) > _SETTLED or changed > _CHANGED * kept[at].sum():
+                stale[:], changed, judged_with = True, 0, scales
+            weights = (self._counts_for(kept) / self._variances(scales))[kept]
+            S[stale], _ = covariances_of_edges(structure, self._problem, poses, weights, at[stale], kept[at[stale]])
+            score, share = self._scores(poses, kept, scales, S)
+            inside, was_fresh = kept[at], stale.all()
+            leaves = _leaving(inside, score)
+            enters = np.zeros(len(at), dtype=np.bool_)
+            if leaves.sum() <= max(1, 0.01 * inside.sum()):
+                enters, level = _entering(inside, score - _BACK * times_out, level)
+            if not np.any(leaves | enters):
+                if was_fresh or changed == 0:
+                    break
+                changed, stale[:] = 0, True
+                continue
+            times_out[leaves] += 1.0
+            kept = kept.copy()
+            kept[at[leaves]], kept[at[enters]] = False, True
+            changed += int(np.sum(leaves | enters))
+            stale = leaves | enters | (np.abs(score) < _BORDER)
+        _, poses, scales, objective = self._calibrated(poses, kept, scales)
+        evidence, leverage = np.full(len(kept), np.inf), np.zeros(len(kept))
+        evidence[at], leverage[at] = score + _ODDS, np.where(kept[at], share, 0.0)
+        return Judgement(poses, kept, *scales, objective, evidence, leverage)
+
+    def objective(self, poses: Array, kept: Mask) -> tuple[float, Array]:
+        """Return the objective (see `Judgement`) of edges kept [E] and their optimum near poses."""
+        _, poses, _, objective = self._calibrated(poses, kept, (1.0, 1.0))
+        return objective, poses
+
+    def _variances(self, scales: tuple[float, float]) -> Array:
+        return np.where(self._trusted, scales[0], scales[1])
+
+    def _counts_for(self, kept: Mask) -> Array:
+        """Return what share of itself each edge [E] counts for: kept loops between the same two places make one."""
+        out = np.ones(len(kept))
+        at = self._loops[kept[self._loops]]
+        out[at] = 1.0 / self._alike(at)
+        return out
+
+    def _alike(self, loops: NDArray[np.int64]) -> Array:
+        """Return how many of the loops [M] (indices of edges) join the same two places as each, itself among them."""
+        if not len(loops):
+            return np.ones(0)
+        ends = self._at[np.sort(self._problem.edges[loops], axis=1)].reshape(-1, 4)
+        return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
+
+    def _calibrated(
+        self, poses: Array, kept: Mask, scales: tuple[float, float]
+    ) -> tuple[Structure, Array, tuple[float, float], float]:
+        """Return the optimum of the edges kept, with variances scaled by what their residuals show."""
+        edges = np.flatnonzero(kept)
+        structure, trusted = Structure(self._problem.with_edges(edges)), self._trusted[edges]
+        sample = np.concatenate([spread_out(edges[trusted], _SAMPLE), spread_out(edges[~trusted], _SAMPLE)])
+        counts_for = self._counts_for(kept)
+        for _ in range(_CALIBRATIONS):
+            variances = self._variances(scales)
+            weights = (counts_for / variances)[edges]
+            poses = levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
+            S, log_determinant = covariances_of_edges(structure, self._problem, poses, weights, sample, kept[sample])
+            z, L = self._whitened(poses, S, variances, sample)
+            before, scales = scales, self._scales(z, L, counts_for[sample], sample, scales)
+            if _apart(scales, before) < _SETTLED:
+                break
+        squares = np.sum(self._errors(poses, variances, edges) ** 2, axis=1)
+        terms = squares + self._dof[edges] * np.log(variances[edges]) - np.log(self._values[edges]).sum(axis=1)
+        terms *= counts_for[edges]
+        rest = self._loops[~kept[self._loops]]
+        share, held = self._share(kept), float(counts_for[edges[~trusted]].sum())
+        lost = float(np.sum(1.0 / self._alike(rest)))
+        rate = -2.0 * (held * math.log(share) + lost * math.log(1.0 - share))
+        return structure, poses, scales, float(terms.sum()) + log_determinant + rate
+
+    def _scales(
+        self, z: Array, L: Array, counts_for: Array, edges: NDArray[np.int64], scales: tuple[float, float]
+    ) -> tuple[float, float]:
+        """Return new factors on variances: of odometry by chi2 over redundancy, of loops by the median."""
+        odometry, loops = scales
+        trusted, dof = self._trusted[edges], self._dof[edges]
+        free = dof - counts_for * np.einsum("eaa->e", L)
+        if float(free[trusted].sum()) > max(_REDUNDANCY_MIN, _SHARE_MIN * float(dof[trusted].sum())):
+            odometry *= float(np.sum(z[trusted] ** 2)) / float(free[trusted].sum())
+        judged = ~trusted & (free >= 0.5 * dof)
+        if judged.sum() > _REDUNDANCY_MIN:
+            studentised = _studentised(z[judged], L[judged], counts_for[judged])[0]
+            loops *= float(np.median(studentised / self._medians[edges][judged]))
+        return (
+            min(max(odometry, _SCALE_MIN), _ODOMETRY_SCALE_MAX),
+            min(max(loops, _SCALE_MIN), _LOOP_SCALE_MAX),
+        )
+
+    def _scores(self, poses: Array, kept: Mask, scales: tuple[float, float], S: Array) -> tuple[Array, Array]:
+        """Return log-odds of all loops above those asked for, and leverages, given covariances S [L, k, k]."""
+        at, variances = self._loops, self._variances(scales)
+        z, L = self._whitened(poses, S, variances, at)
+        taken = np.where(kept, self._counts_for(kept), 0.0)[at]
+        distance, spread = _studentised(z, L, taken)
+        stated = np.log(self._values[at]).sum(axis=1) - self._dof[at] * np.log(variances[at])
+        # the space as it is now: that of odometry may be many times too large
+        smaller = math.log(extent(self._problem, poses) / self._space_m)
+        share = self._share(kept)
+        evidence = 0.5 * (stated - spread - distance) + math.log(share / (1.0 - share))
+        evidence += np.minimum(self._dof[at], self._problem.dimension) * min(smaller, 0.0)
+        leverage = taken * np.einsum("eaa->e", L) / np.maximum(self._dof[at], 1)
+        return np.minimum(evidence, 0.5 * (self._limit[at] - distance)) - _ODDS, leverage
+
+    def _share(self, kept: Mask) -> float:
+        count, held = len(self._loops), int(kept[self._loops].sum())
+        return min(max((held + 1.0) / (count + 2.0), 0.02), 0.98)
+
+    def _whitened(self, poses: Array, S: Array, variances: Array, at: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return errors [M, k] in standard deviations along known axes, and S in the same units [M, k, k]."""
+        V = self._axes[at]
+        root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
+        inner = V.transpose(0, 2, 1) @ (S / np.outer(self._spread, self._spread)) @ V
+        return self._errors(poses, variances, at), inner * root[:, :, None] * root[:, None, :]
+
+    def _errors(self, poses: Array, variances: Array, at: NDArray[np.int64]) -> Array:
+        r = self._problem.residuals(poses)[at] / self._spread
+        root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
+        return np.einsum("eab,ea->eb", self._axes[at], r) * root
+
+
+def extent(problem: PoseGraphProblem, poses: Array) -> float:
+    """Return the geometric mean of the sides of the box around poses, none shorter than a tenth of the longest."""
+    d = problem.dimension
+    sides = np.ptp(poses[:, :d, d], axis=0)
+    return float(np.exp(np.mean(np.log(np.maximum(sides, max(0.1 * sides.max(initial=0.0), 1e-9))))))
+
+
+def _along(problem: PoseGraphProblem, poses: Array, place_m: float) -> Array:
+    """Return where poses are in the sequence and along the way [N, 2], in places."""
+    d = problem.dimension
+    steps = np.linalg.norm(np.diff(poses[:, :d, d], axis=0, prepend=poses[:1, :d, d]), axis=1)
+    return np.column_stack([np.arange(len(poses)) / (PLACE / 2), np.cumsum(steps) / place_m])
+
+
+def _studentised(z: Array, L: Array, taken: Array) -> tuple[Array, Array]:
+    """Return the squared length of innovations [M] in their standard deviations, and log det of their covariance.
+
+    z [M, k] are errors and L [M, k, k] covariances of the solution, in the loop's standard deviations; the solution has
+    taken the loop with the weight `taken` [M] (0: not at all), which is undone.
+    """
+    values, axes = np.linalg.eigh(L)
+    values = np.maximum(values, 0.0)
+    without = np.maximum(1.0 - taken[:, None] * values, 1.0 - _LEVERAGE_MAX)
+    variances = 1.0 + values / without
+    innovations = np.einsum("eab,ea->eb", axes, z) / without
+    return np.sum(innovations**2 / variances, axis=1), np.log(variances).sum(axis=1)
+
+
+def _leaving(inside: Mask, score: Array) -> Mask:
+    """Return the worst of the loops that are in and should not be."""
+    bad = inside & (score < 0.0)
+    return bad & (score <= _WORST * score[bad].min(initial=0.0))
+
+
+def _entering(inside: Mask, score: Array, level: int) -> tuple[Mask, int]:
+    """Return the loops of the highest level that has any to let in, and that level."""
+    score = np.where(inside, -np.inf, score)
+    while level + 1 < len(_LEVELS) and not np.any(score > _LEVELS[level]):
+        level += 1
+    return score > _LEVELS[level], level
+
+
+def _apart(scales: tuple[float, float], others: tuple[float, float]) -> float:
+    return max(abs(math.log(a / b)) for a, b in zip(scales, others, strict=True))

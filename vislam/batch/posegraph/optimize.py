@@ -1,0 +1,156 @@
+"""A pose graph optimised: where to start, by which method, and which edges to believe."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
+from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
+from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
+from vislam.batch.posegraph.structure import Structure
+from vislam.config import PoseGraphConfig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseGraphSolution:
+    """What the optimisation of a pose graph came to."""
+
+    poses: Array  # [N, d + 1, d + 1]
+    start: Array  # [N, d + 1, d + 1] from which it went
+    start_name: str
+    start_costs: dict[str, float]  # of each start that was tried
+    costs: tuple[float, ...]  # chi2 at the start and after each iteration, of the edges kept
+    converged: bool
+    weights: Array  # [E] 1 kept, 0 rejected
+    anchors: Ids  # poses (indices) that kept their value
+    parts: int  # connected parts, each with an anchor
+    notes: tuple[str, ...]
+    solve_s: float  # process time
+    robust_reason: str = ""  # why these edges were kept
+    undecided: tuple[int, ...] = ()  # edges left out because nothing tells whether they are true
+
+    @property
+    def rejected(self) -> NDArray[np.int64]:
+        """Indices of the edges that were found false."""
+        return np.flatnonzero(self.weights == 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """Which edges to believe, and why."""
+
+    poses: Array | None  # [N, d + 1, d + 1] near their optimum; None: not known
+    weights: Array  # [E] 1 kept, 0 rejected
+    reason: str  # the method that was taken and what speaks for it
+    undecided: NDArray[np.int64] = field(default_factory=lambda: np.array([], dtype=np.int64))  # edges left out so
+    warning: str = ""  # empty where everything was decided
+
+
+def optimize_pose_graph(
+    problem: PoseGraphProblem, config: PoseGraphConfig | None = None, progress: Progress | None = None
+) -> PoseGraphSolution:
+    """Return the poses of lowest chi2 (see `PoseGraphProblem`) that the method finds from the chosen start.
+
+    One pose of each connected part keeps its value, fixed poses all do. Deterministic. Raises DataError when the graph
+    has no finite cost anywhere or the method fails, UsageError for a start that the graph cannot have, and where the
+    search for false edges needs a factor that does not fit.
+    """
+    config = config or PoseGraphConfig()
+    begun = time.process_time()
+    if not problem.of_poses and (config.robust != "none" or config.method not in ("lm", "dogleg")):
+        asked = f"--robust {config.robust}" if config.robust != "none" else f"--method {config.method}"
+        raise UsageError(
+            f"{asked} knows no landmarks and no priors, which this graph has; use --robust none, --method lm or dogleg"
+        )
+    structure, decision = Structure(problem, config.equations), None
+    weights = np.ones(len(problem.edges))
+    if config.robust != "none":
+        decision = _decision(structure, config, progress)
+        weights = decision.weights
+        structure = Structure(problem.with_edges(weights != 0.0), config.equations)
+    if decision is not None and decision.poses is not None and config.start == "auto":
+        start_name, start = "robust", decision.poses
+        start_costs = {start_name: structure.problem.chi2(start)}
+    else:
+        start_name, start, start_costs = _start(structure, config)
+    descent = _descend(structure, start, config, progress)
+    parts = structure.parts
+    notes = list(problem.notes)
+    if decision is not None and decision.warning:
+        notes.append(decision.warning)
+    if parts > 1:
+        notes.append(f"{parts} parts that no edge joins, each with a pose of its own that keeps its value")
+    if not descent.converged:
+        notes.append("not converged: give more --iterations, another --start or --method")
+    return PoseGraphSolution(
+        descent.poses, start, start_name, start_costs, descent.costs, descent.converged, weights, structure.anchors,
+        parts, tuple(notes), time.process_time() - begun,
+        "" if decision is None else decision.reason, () if decision is None else tuple(decision.undecided.tolist()),
+    )  # fmt: skip
+
+
+def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress | None) -> Decision:
+    """Return what the route that was asked for says about the edges."""
+    from vislam.batch.posegraph.auto import decide, decide_by_kernel
+    from vislam.batch.posegraph.gnc import reject_false_edges
+
+    if config.robust == "auto":
+        return decide(structure.problem, config, progress)
+    if config.robust in ("cauchy", "geman-mcclure", "dcs"):
+        return decide_by_kernel(structure.problem, config.robust, progress)
+    return Decision(None, reject_false_edges(structure, config, progress), "graduated non-convexity, as asked for")
+
+
+def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, dict[str, float]]:
+    """Return the name, the poses and the costs of the starts asked for; of several the one of lowest cost."""
+    problem = structure.problem
+    ones = np.ones(len(problem.edges))
+    makers: dict[str, Callable[[], Array]] = {
+        "chordal": lambda: chordal_start(structure, ones),
+        "angles": lambda: angles_start(structure, ones),
+        "tree": lambda: tree_start(problem, structure.anchors),
+        "odometry": lambda: odometry_start(problem, structure.anchors),
+        "file": lambda: file_start(problem),
+    }
+    if problem.dimension == 3:
+        del makers["angles"]
+    if config.start != "auto" and config.start not in makers:
+        raise UsageError(f"start '{config.start}' is for graphs in the plane; for this one: {', '.join(makers)}")
+    if config.start != "auto":
+        makers = {config.start: makers[config.start]}
+    elif not problem.has_pose.any():
+        del makers["file"]
+    best: tuple[float, str, Array] | None = None
+    costs: dict[str, float] = {}
+    for name, make in makers.items():
+        poses = make()
+        poses[problem.is_point, :-1, :-1] = np.eye(problem.dimension)
+        costs[name] = problem.chi2(poses)
+        if np.isfinite(costs[name]) and (best is None or costs[name] < best[0]):
+            best = (costs[name], name, poses)
+    if best is None:
+        raise DataError("the graph has no finite cost at any start; are its measurements too large?")
+    return best[1], best[2], costs
+
+
+def _descend(structure: Structure, start: Array, config: PoseGraphConfig, progress: Progress | None) -> Descent:
+    problem, weights = structure.problem, np.ones(len(structure.problem.edges))
+    if config.method in ("lm", "dogleg"):
+        native = levenberg_marquardt if config.method == "lm" else dogleg
+        return native(
+            structure, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
+        )  # fmt: skip
+    from vislam.batch.posegraph.gtsam import gtsam_levenberg_marquardt, isam2_replay
+
+    if config.method == "isam2":
+        return isam2_replay(problem, start, weights, progress=progress)
+    return gtsam_levenberg_marquardt(
+        problem, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
+    )  # fmt: skip

@@ -1,0 +1,70 @@
+"""TORO files.
+
+In the plane the cost is TORO's own (`TreeOptimizer2::error`; see `graph_angles`). In space information is taken as of
+the measured second pose's frame and of rotation vectors, as everybody who reads these files does; TORO's own residual
+there is of the world's frame, so it is no function of relative motion.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vislam.batch.posegraph.angles import (
+    choose_dimension,
+    edge_lines,
+    planar_tangent,
+    pose_lines,
+    poses_of,
+    refuse_other_tags,
+    refuse_what_is_lost,
+)
+from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_lines, symmetric
+from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.tagged_lines import read_tagged_lines
+from vislam.core.files import write_text
+from vislam.core.messages import Array
+
+_COLUMNS = {"VERTEX2": (1, 3), "EDGE2": (2, 9), "VERTEX3": (1, 6), "EDGE3": (2, 27)}
+_ROWS_OF_TORO = [0, 1, 4, 2, 5, 3]  # its ff fs ss rr fr sr as an upper triangle in rows
+_ORDER_3D = (3, 4, 5, 0, 1, 2)  # files have translation first
+
+
+def read_toro(path: Path, repair: bool = False) -> PoseGraphProblem:
+    """Read VERTEX2 and EDGE2 or VERTEX3 and EDGE3.
+
+    Raises DataError with the line number on damage of any kind, on both dimensions in one file and on other tags (EQUIV
+    among them: merge those poses first); see `problem_from_lines` for the rest.
+    """
+    found = read_tagged_lines(path, _COLUMNS)
+    refuse_other_tags(path, found, _COLUMNS)
+    rows = found.rows
+    vertices, edges, two = choose_dimension(path, (rows["VERTEX2"], rows["EDGE2"]), (rows["VERTEX3"], rows["EDGE3"]))
+    measured = poses_of(edges.numbers, two)
+    if two:
+        J = planar_tangent(measured)
+        information = J.transpose(0, 2, 1) @ symmetric(edges.numbers[:, 3:][:, _ROWS_OF_TORO], (0, 1, 2)) @ J
+    else:
+        information = symmetric(edges.numbers[:, 6:], _ORDER_3D)
+    poses = PoseLines(vertices.ids[:, 0], poses_of(vertices.numbers, two), vertices.lines)
+    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
+    return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+
+
+def write_toro(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
+    """Write a problem with 17 digits, with `poses` [N, d + 1, d + 1] in the place of its own.
+
+    Raises UsageError for what the format cannot hold (fixed poses, landmarks), StorageError.
+    """
+    refuse_what_is_lost(problem, path, "TORO")
+    a, b = np.triu_indices(problem.tangent)
+    if problem.dimension == 2:
+        J = np.linalg.inv(planar_tangent(problem.measurements))
+        upper = (J.transpose(0, 2, 1) @ problem.information @ J)[:, a, b][:, np.argsort(_ROWS_OF_TORO)]
+        tags = "VERTEX2", "EDGE2"
+    else:
+        back = np.argsort(_ORDER_3D)
+        upper, tags = problem.information[:, back[a], back[b]], ("VERTEX3", "EDGE3")
+    lines = [*pose_lines(problem, poses, tags[0]), *edge_lines(problem, upper, tags[1])]
+    write_text(path, "\n".join(lines) + "\n")

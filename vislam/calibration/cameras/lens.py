@@ -1,0 +1,237 @@
+"""Intrinsics of a camera from views of a board: Zhang's method through OpenCV, then our own refinement with sigmas.
+
+Zhang, "A flexible new technique for camera calibration", PAMI 2000. OpenCV tells no sigmas for fisheye lenses and none
+that hold when the errors of one view belong together (a bent board, blur). Here both models are refined by
+Gauss-Newton on `vislam.core.camera.Camera`, the poses eliminated; sigmas come from the scatter of residuals, or from
+leaving out one view at a time (a jackknife of one step) where that says more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from vislam.calibration.cameras.board import View
+from vislam.core.camera import Camera
+from vislam.core.errors import DataError
+from vislam.core.geometry import se3_exp, so3_exp, transform
+from vislam.core.messages import Array, Bools
+
+Model = Literal["radtan", "radtan5", "equidistant"]
+
+_COEFFICIENTS = {"radtan": 4, "radtan5": 5, "equidistant": 4}
+_ITERATIONS = 30
+_CONVERGED = 1e-4  # px: of all residuals together that a step still changes
+_OUTLIER_SIGMAS = 5.0
+_MIN_SIGMA_PX = 0.02  # corners are not found better
+_STEP = 1e-6  # of numerical derivatives, relative for focal lengths
+_DAMPING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensFit:
+    """A calibrated camera and how well it is known."""
+
+    camera: Camera
+    covariance: Array  # [P, P] of fx, fy, cx, cy, then the coefficients
+    T_cam_board: tuple[Array, ...]  # [4, 4] per view
+    residuals_px: tuple[Array, ...]  # [N, 2] per view, NaN where left out as outlier
+    rms_px: float  # over both coordinates of a corner together, as OpenCV tells it
+    outliers: int
+    grouping: float  # variance between views over that which independent corners explain; 1 when they are independent
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the parameters."""
+        k = ["k1", "k2", "k3", "k4"] if self.camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
+        return ["fx", "fy", "cx", "cy", *k[: len(self.camera.coefficients)]]
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations [P] of the parameters."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def fit_lens(views: list[View], size: tuple[int, int], model: Model) -> LensFit:
+    """Calibrate a camera of `size` (width, height); raises DataError when the views do not determine it at all."""
+    camera, poses = _start(views, size, model)
+    good = [np.ones(len(view.points_m), dtype=np.bool_) for view in views]
+    for _ in range(2):
+        camera, poses = _refine(camera, poses, views, good)
+        residuals = [_residuals(camera, T, view) for T, view in zip(poses, views, strict=True)]
+        every = np.concatenate(residuals)
+        scatter = max(1.4826 * float(np.nanmedian(np.abs(every))), _MIN_SIGMA_PX)
+        good = [np.all(np.abs(r) < _OUTLIER_SIGMAS * scatter, axis=1) for r in residuals]  # NaN is no good either
+        if all(g.all() for g in good) or min(int(g.sum()) for g in good) < 4:
+            break
+    else:
+        camera, poses = _refine(camera, poses, views, good)
+    return _judge(camera, poses, views, good)
+
+
+def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Camera, list[Array]]:
+    points = [view.points_m.astype(np.float32)[:, None] for view in views]
+    pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
+    try:
+        if model == "equidistant":
+            owner: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4 and 5
+            flags = owner.CALIB_RECOMPUTE_EXTRINSIC | owner.CALIB_FIX_SKEW
+            _, K, k, rotations, translations = cv2.fisheye.calibrate(
+                [p.transpose(1, 0, 2) for p in points], [p.transpose(1, 0, 2) for p in pixels], size,
+                np.eye(3), np.zeros(4), flags=flags,
+            )  # fmt: skip
+        else:
+            flags = 0 if model == "radtan5" else cv2.CALIB_FIX_K3
+            _, K, k, rotations, translations, _, _, _ = cv2.calibrateCameraExtended(
+                points, pixels, size, np.eye(3), np.zeros(5), flags=flags
+            )
+        coefficients = tuple(np.ravel(k)[: _COEFFICIENTS[model]].tolist())
+        camera = Camera(
+            size[0], size[1], K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0.0,
+            "equidistant" if model == "equidistant" else "radtan", coefficients,
+        )  # fmt: skip
+    except (cv2.error, DataError) as error:
+        raise DataError(
+            f"the views do not give a {model} camera: {' '.join(str(error).split())[:120]}; tilt the board more, show "
+            "it everywhere in the image, or try another --model"
+        ) from error
+    poses = [
+        transform(so3_exp(np.ravel(r).astype(np.float64)), np.ravel(t).astype(np.float64))
+        for r, t in zip(rotations, translations, strict=True)
+    ]
+    return camera, poses
+
+
+def parameters_of(camera: Camera) -> Array:
+    """Return fx, fy, cx, cy and the coefficients [P]."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients])
+
+
+def with_parameters(camera: Camera, x: Array) -> Camera:
+    """Return the camera with other parameters [P]."""
+    fx, fy, cx, cy, *k = x.tolist()
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(k))
+
+
+def by_parameters(camera: Camera, points_cam_m: Array) -> Array:
+    """Return the derivative [N, 2, P] of pixels by the camera's parameters at points [N, 3]."""
+    x = parameters_of(camera)
+    steps = _STEP * np.where(np.arange(len(x)) < 4, np.maximum(np.abs(x), 1.0), 1.0)
+    out = np.empty((len(points_cam_m), 2, len(x)))
+    for p, step in enumerate(steps):
+        d = np.zeros(len(x))
+        d[p] = step
+        ahead, behind = with_parameters(camera, x + d), with_parameters(camera, x - d)
+        out[:, :, p] = (ahead.project(points_cam_m) - behind.project(points_cam_m)) / (2.0 * step)
+    return out
+
+
+def _residuals(camera: Camera, T_cam_board: Array, view: View) -> Array:
+    return np.asarray(view.pixels - camera.project(view.points_m @ T_cam_board[:3, :3].T + T_cam_board[:3, 3]))
+
+
+@dataclass(slots=True)
+class _Block:
+    """One view linearised: what it says of the parameters once its pose is eliminated."""
+
+    H: Array  # [P, P]
+    g: Array  # [P]
+    solve_pose: Array  # [6, rows]
+    A: Array  # [rows, P]
+    r: Array  # [rows]
+
+
+def _blocks(camera: Camera, poses: list[Array], views: list[View], good: list[Bools]) -> list[_Block]:
+    """Linearise all views; the cameras with other parameters are made once for all of them."""
+    points = [v.points_m[g] @ T[:3, :3].T + T[:3, 3] for T, v, g in zip(poses, views, good, strict=True)]
+    ends = np.cumsum([len(p) for p in points])[:-1]
+    every = np.split(by_parameters(camera, np.concatenate(points)), ends)
+    return [
+        _block(camera, T, view, g, p, A) for T, view, g, p, A in zip(poses, views, good, points, every, strict=True)
+    ]
+
+
+def _block(camera: Camera, T: Array, view: View, good: Bools, points: Array, by_parameter: Array) -> _Block:
+    r = (view.pixels[good] - camera.project(points)).ravel()
+    A = by_parameter.reshape(len(r), -1)
+    by_point = camera.project_jacobian(points)  # [N, 2, 3]
+    board = view.points_m[good]
+    turned = np.zeros((len(board), 3, 6))  # T exp(xi): rotation of the board's points on its own side
+    turned[:, 0, 1], turned[:, 0, 2] = board[:, 2], -board[:, 1]
+    turned[:, 1, 0], turned[:, 1, 2] = -board[:, 2], board[:, 0]
+    turned[:, 2, 0], turned[:, 2, 1] = board[:, 1], -board[:, 0]
+    turned[:, :, 3:] = np.eye(3)
+    B = np.einsum("nij,jk,nkl->nil", by_point, T[:3, :3], turned).reshape(len(r), 6)
+    usable = np.isfinite(r) & np.isfinite(A).all(axis=1) & np.isfinite(B).all(axis=1)
+    A, B, r = A[usable], B[usable], r[usable]
+    solve_pose = np.linalg.pinv(B)
+    reduced = A - B @ (solve_pose @ A)
+    return _Block(reduced.T @ reduced, reduced.T @ r, solve_pose, A, r)
+
+
+def _refine(camera: Camera, poses: list[Array], views: list[View], good: list[Bools]) -> tuple[Camera, list[Array]]:
+    for _ in range(_ITERATIONS):
+        blocks = _blocks(camera, poses, views, good)
+        H = np.sum([block.H for block in blocks], axis=0)
+        g = np.sum([block.g for block in blocks], axis=0)
+        scale = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+        try:
+            step = np.linalg.solve(H / np.outer(scale, scale) + _DAMPING * np.eye(len(g)), g / scale) / scale
+            camera = with_parameters(camera, parameters_of(camera) + step)
+        except (np.linalg.LinAlgError, DataError) as error:
+            raise DataError("the views do not determine the camera; tilt the board to all sides") from error
+        poses = [
+            T @ se3_exp(block.solve_pose @ (block.r - block.A @ step)) for T, block in zip(poses, blocks, strict=True)
+        ]
+        if float(np.max(np.abs(step * scale))) < _CONVERGED:
+            break
+    return camera, poses
+
+
+def _judge(camera: Camera, poses: list[Array], views: list[View], good: list[Bools]) -> LensFit:
+    blocks = _blocks(camera, poses, views, good)
+    H = np.sum([block.H for block in blocks], axis=0)
+    if np.linalg.matrix_rank(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) < len(H):
+        raise DataError("the views do not determine the camera; tilt the board to all sides")
+    squares = float(sum(block.r @ block.r for block in blocks))
+    rows = sum(len(block.r) for block in blocks)
+    white = squares / max(rows - len(H) - 6 * len(views), 1) * np.linalg.inv(H)
+    moves = np.array([np.linalg.lstsq(H - block.H, block.g, rcond=None)[0] for block in blocks])
+    moves -= moves.mean(axis=0)
+    jackknife = (len(views) - 1) / len(views) * np.sum(moves**2, axis=0)
+    grouping = max(1.0, float(np.median(jackknife / np.diag(white))))
+    residuals = []
+    for T, view, g in zip(poses, views, good, strict=True):
+        r = _residuals(camera, T, view)
+        r[~g] = np.nan
+        residuals.append(r)
+    outliers = int(sum((~g).sum() for g in good))
+    rms = float(np.sqrt(squares / (rows / 2.0)))
+    return LensFit(camera, white * grouping, tuple(poses), tuple(residuals), rms, outliers, grouping)
+
+
+def direction_sigma_px(fit: LensFit, columns: int, rows: int) -> Array:
+    """Return by how many pixels (1 sigma) rays are off over a grid [rows, columns], but for a turn of them all.
+
+    A turn that all rays share is no error of a lens: the pose of the camera takes it up.
+    """
+    camera = fit.camera
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows))
+    rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()]))
+    seen = np.isfinite(rays).all(axis=1)
+    out = np.full(len(rays), np.nan)
+    J = by_parameters(camera, rays[seen])
+    by_point = camera.project_jacobian(rays[seen])
+    x, y, z = rays[seen].T
+    turn = np.zeros((len(x), 3, 3))
+    turn[:, 0, 1], turn[:, 0, 2], turn[:, 1, 0] = z, -y, -z
+    turn[:, 1, 2], turn[:, 2, 0], turn[:, 2, 1] = x, y, -x
+    by_turn = (by_point @ turn).reshape(-1, 3)
+    flat = J.reshape(-1, J.shape[2])
+    left = (flat - by_turn @ np.linalg.lstsq(by_turn, flat, rcond=None)[0]).reshape(J.shape)
+    variance = np.einsum("nip,pq,niq->n", left, fit.covariance, left)
+    out[seen] = np.sqrt(np.maximum(variance, 0.0))
+    return out.reshape(rows, columns)

@@ -1,0 +1,1 @@
+"""How cameras and inertial unit sit to each other, in space and time."""

@@ -1,0 +1,79 @@
+"""How verbs understand their arguments: tyro on a dataclass of options, whose comments are the --help."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache, partial
+from pathlib import Path
+from typing import TypeVar
+
+from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.brief import Brief, brief_help
+from vislam.config.ranges import check_ranges
+from vislam.core.collector import while_importing
+from vislam.core.compiling import tell_of_compilation
+from vislam.core.errors import UsageError
+
+Options = TypeVar("Options")
+
+
+def parse(
+    options: type[Options],
+    arguments: list[str],
+    verb: str,
+    default: Options | None = None,
+    brief: Brief | None = None,
+    summary: str = "",
+) -> Options:
+    """Parse the arguments of a verb into its options; wrong ones leave with exit code 2, --help with 0.
+
+    With `brief`, --help tells what people change and --help-all the rest. Raises UsageError for a number out of range.
+    """
+    if brief is not None and {"-h", "--help"} & {*arguments}:
+        print(brief_help(verb, options, brief))
+        raise SystemExit(0)
+    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
+    import tyro
+
+    start = tyro.MISSING_NONPROP if default is None else default
+    described = summary or VERBS[verb].summary
+    parsed = tyro.cli(options, prog=f"vislam {verb}", description=described, args=arguments, default=start)
+    check_ranges(parsed)
+    _announce_compilation(verb)
+    return parsed
+
+
+@cache
+def _announce_compilation(verb: str) -> None:
+    """Say on stderr when this process begins to compile, and about how long that takes where it was measured."""
+    about_s = VERBS[verb.partition(" ")[0]].compile_s
+    if about_s == 0:
+        return
+    with while_importing():
+        tell_of_compilation(partial(_say_compiling, verb, about_s))
+
+
+def _say_compiling(verb: str, about_s: int | None) -> None:
+    how_long = "" if about_s is None else f"; all that {verb} needs takes about {about_s} s of CPU"
+    print(f"vislam: compiling for this processor, once{how_long} ...", file=sys.stderr, flush=True)
+
+
+def take_option(arguments: list[str], name: str) -> str | None:
+    """Remove `--name VALUE` or `--name=VALUE` from the arguments and return the value."""
+    for i, argument in enumerate(arguments):
+        if argument == name:
+            if i + 1 == len(arguments):
+                raise UsageError(f"{name} needs a value")
+            value = arguments[i + 1]
+            del arguments[i : i + 2]
+            return value
+        if argument.startswith(f"{name}="):
+            del arguments[i]
+            return argument.partition("=")[2]
+    return None
+
+
+def take_path(arguments: list[str], name: str) -> Path | None:
+    """Remove an option as `take_option` and return its value as a path."""
+    value = take_option(arguments, name)
+    return Path(value) if value else None

@@ -1,0 +1,136 @@
+"""`vislam live`: the pipeline on live sensors, in processes, with the pose published."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from vislam.cli.verbs.arguments import parse, take_option, take_path
+from vislam.cli.verbs.brief import COMMON, Brief
+from vislam.cli.verbs.results import print_metrics, written_up
+from vislam.cli.verbs.terminal import rewritten_line
+from vislam.config import Config, SensorsConfig, load, load_sensors
+from vislam.config.ranges import Positive
+from vislam.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from vislam.live.run_live import LiveRun
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Options of `vislam live`; `--resume RUN` goes on with a run, whose source, sensors and settings it takes."""
+
+    out: Path
+    """Folder to make for everything that the run leaves"""
+    source: str = "virtual-cart"
+    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, serial:PORT+webcam, gy85+none"""
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    seconds: Positive | None = None
+    """How long; None: until Ctrl-C, or the end of a replay"""
+    overwrite: bool = False
+    """Replace the run that the folder holds"""
+    map: Path | None = None
+    """Session (RUN/session.db or RUN) of an earlier run in whose map this one begins; it is not written"""
+    localize_only: bool = False
+    """With --map: find the way in it, and leave its keyframes and clouds as they are"""
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Options of `vislam live --resume RUN`; source, sensors and settings are those that the run began with."""
+
+    seconds: Positive | None = None
+    """How long; None: until Ctrl-C, or the end of a replay"""
+    json: bool = False
+    """Print the metrics as JSON instead of the table"""
+
+
+OPTIONS = (LiveOptions, ResumeOptions)
+TAKEN = {
+    "--config FILE": "TOML file of settings; options go before it",
+    "--profile pi": "settings for a small computer; file and options go before it",
+    "--sensors FILE": "TOML file of sensors; options go before it",
+    "--resume RUN": "go on with that run",
+}
+BRIEF = Brief(
+    "--out RUN [options]",
+    (
+        "vislam live --source virtual-cart --out runs/live",
+        "vislam live --source gy85+webcam --calibration.camera camera.yaml --out runs/cart",
+        "vislam live --source serial:/dev/ttyUSB0+webcam --out runs/cart --map runs/hall --localize-only",
+        "vislam live --resume runs/cart",
+    ),
+    (
+        *COMMON, "live.send_to", "live.allow_remote", "live.ros2_domain", "live.mavlink", "live.realtime_priority",
+        "power_up.memory", "sensors.gy85.bus", "sensors.serial.port", "sensors.webcam.device",
+    ),
+    TAKEN,
+)  # fmt: skip
+
+
+def main(arguments: list[str]) -> int:
+    """Run live until the time is over, the source ends or a signal comes."""
+    command = ["vislam", "live", *arguments]
+    resumed = take_path(arguments, "--resume")
+    if resumed is not None:
+        return _resume(resumed, arguments, command)
+    settings = load(take_path(arguments, "--config"), profile_name=take_option(arguments, "--profile"))
+    sensors = load_sensors(take_path(arguments, "--sensors"))
+    defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
+    options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
+    if options.localize_only and options.map is None:
+        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    from vislam.live.beginning import in_map
+    from vislam.live.run_live import LiveRun
+    from vislam.live.sources import open_live
+    from vislam.run.folder import MapChoice, prepare
+
+    source, settings = open_live(options.source, options.settings, options.sensors)
+    base = None if options.map is None else MapChoice(options.map, options.localize_only)
+    beginning = None if base is None else in_map(base, source, settings)
+    live = LiveRun(source, settings, options.out, options.source, command, base, beginning)
+    prepare(options.out, options.overwrite, base)
+    seconds = source.duration_s if options.seconds is None else options.seconds
+    return _execute(live, command, options.out, options.sensors, seconds, options.json)
+
+
+def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
+    """Go on with the run in a folder, whatever ended it."""
+    from vislam.live.beginning import in_map, resumed
+    from vislam.live.run_live import LiveRun
+    from vislam.live.sources import open_live, stored_sensors
+    from vislam.run.folder import prepare, read_setup
+
+    options = parse(ResumeOptions, arguments, "live")
+    asked, config, base = read_setup(out)
+    sensors = stored_sensors(out)
+    source, settings = open_live(asked, config, sensors)
+    beginning = resumed(out, source, settings)
+    is_new = beginning is None  # there was nothing yet to go on from
+    if is_new and base is not None:
+        beginning = in_map(base, source, settings)
+    live = LiveRun(source, settings, out, asked, command, base, beginning)
+    if is_new:
+        prepare(out, overwrite=True)
+    seconds = source.duration_s if options.seconds is None else options.seconds
+    return _execute(live, command, out, sensors, seconds, options.json)
+
+
+def _execute(
+    live: LiveRun, command: list[str], out: Path, sensors: SensorsConfig, seconds: float | None, as_json: bool
+) -> int:
+    from vislam.core.files import write_json
+    from vislam.live.status import status_line
+
+    with written_up(out, command), rewritten_line() as show:
+        write_json(out / "sensors.json", asdict(sensors))
+        metrics = live.execute(lambda run: show(status_line(run)), seconds)
+    print_metrics(metrics, out, as_json)
+    return 0

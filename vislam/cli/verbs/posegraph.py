@@ -1,0 +1,78 @@
+"""`vislam posegraph`: the best estimate of a pose graph from a file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from vislam.cli.verbs.arguments import parse
+from vislam.cli.verbs.terminal import progress_bar
+from vislam.config import PoseGraphConfig
+from vislam.core.collector import while_importing
+from vislam.core.errors import TrackingLostError, printable
+from vislam.core.log import log_to
+
+
+@dataclass(frozen=True)
+class PoseGraphOptions:
+    """Options of `vislam posegraph FILE`: a pose graph in g2o, TORO or iSAM format."""
+
+    file: Positional[Path]
+    """Pose graph; what is no format's ending .g2o, .toro or .isam is told by its contents"""
+    settings: Annotated[PoseGraphConfig, tyro.conf.arg(name="")] = field(default_factory=PoseGraphConfig)
+    out: Path | None = None
+    """Folder for optimized.g2o, trajectory.tum, trajectory_kitti.txt, poses.csv, edges.csv, summary.json and
+    report.html; None: NAME_optimized in the working folder"""
+    report: bool = True
+    """Write report.html, with pictures of before and after"""
+    json: bool = False
+    """Print summary.json instead of the summary"""
+
+
+OPTIONS = (PoseGraphOptions,)
+
+
+def main(arguments: list[str]) -> int:
+    """Optimise a pose-graph file."""
+    options = parse(PoseGraphOptions, arguments, "posegraph")
+    out = options.out or Path(f"{options.file.stem}_optimized")
+    with log_to(out, ["vislam", "posegraph", *arguments]):
+        return _optimize(options, out)
+
+
+def _optimize(options: PoseGraphOptions, out: Path) -> int:
+    with while_importing():  # it takes longer than solving most files
+        from vislam.report.graph_page import write_graph_report
+        from vislam.run.offline.optimize_graph import optimize_graph_file
+
+    limit = options.settings.iterations
+    with progress_bar(options.file.stem, "iterations") as bar:
+        result = optimize_graph_file(
+            options.file, out, options.settings, lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}")
+        )
+    if options.report:
+        write_graph_report(result.problem, result.solution, options.file.stem, out / "report.html", result.certificate)
+    summary = result.summary
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(
+            f"{summary['poses']} poses, {summary['edges']} edges ({len(summary['rejected'])} found false); chi2 "
+            f"{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
+            f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
+        )
+        if summary["robust"]:
+            print(f"robust: {summary['robust']}")
+        for kind in result.noise:
+            print(f"noise of {kind.text}")
+        if result.certificate is not None:
+            print(result.certificate.text)
+        for warning in summary["warnings"]:
+            print(f"warning: {printable(warning)}")
+        print(f"results: {out}")
+    return 0 if summary["converged"] else TrackingLostError.exit_code

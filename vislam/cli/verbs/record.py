@@ -1,0 +1,59 @@
+"""`vislam record`: the cart's IMU and camera into a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from vislam.cli.verbs.arguments import parse, take_path
+from vislam.cli.verbs.terminal import rewritten_line
+from vislam.config import RecordConfig, SensorsConfig, load_sensors
+from vislam.config.ranges import Positive
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """Options of `vislam record`."""
+
+    out: Path
+    """Folder to make for the recording (ASL layout)"""
+    imu: str = "gy85"
+    """gy85[:/dev/i2c-1], serial[:/dev/ttyUSB0] (without a path as the settings say), or none"""
+    camera: str = "webcam"
+    """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), a video file in place of a camera, or none"""
+    seconds: Positive | None = None
+    """How long; None: until Ctrl-C"""
+    settings: Annotated[RecordConfig, tyro.conf.arg(name="")] = field(default_factory=RecordConfig)
+    sensors: Annotated[SensorsConfig, tyro.conf.arg(name="")] = field(default_factory=SensorsConfig)
+    full_speed: bool = False
+    """Read a video as fast as it can be written, not in its own time"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+OPTIONS = (RecordOptions,)
+TAKEN = {"--config FILE": "TOML file of sensors; options go before it"}
+
+
+def main(arguments: list[str]) -> int:
+    """Record until the time is over or a signal comes."""
+    base = RecordOptions(out=tyro.MISSING, sensors=load_sensors(take_path(arguments, "--config")))
+    options = parse(RecordOptions, arguments, "record", base)
+    from vislam.run.record import record
+
+    with rewritten_line() as show:
+        recorded = record(
+            options.out, options.imu, options.camera, options.sensors, options.settings, options.seconds,
+            not options.full_speed, progress=lambda recorded: show(recorded.line()),
+        )  # fmt: skip
+    if options.json:
+        print((options.out / "recording.json").read_text(encoding="utf-8"), end="")
+        return 0
+    print(recorded.line())
+    for note in (*recorded.notes, recorded.ended):
+        print(note)
+    print(f"next: vislam doctor {options.out}")
+    return 0

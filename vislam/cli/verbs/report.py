@@ -1,0 +1,30 @@
+"""`vislam report`: report.html of a run again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from vislam.cli.verbs.arguments import parse
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of `vislam report`."""
+
+    run: Positional[Path]
+    """Run folder"""
+
+
+OPTIONS = (ReportOptions,)
+
+
+def main(arguments: list[str]) -> int:
+    """Write the report of a run again."""
+    options = parse(ReportOptions, arguments, "report")
+    from vislam.report import write_report
+
+    print(write_report(options.run))
+    return 0

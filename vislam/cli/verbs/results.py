@@ -1,0 +1,105 @@
+"""What a run leaves, shown: its report in the folder, its metrics on the terminal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from vislam.cli.verbs.terminal import number, print_table
+from vislam.core.errors import VislamError, printable
+from vislam.core.log import log_to
+
+
+@contextmanager
+def written_up(out: Path, command: Sequence[str]) -> Iterator[None]:
+    """Keep the log of a run and write its report afterwards, whatever happened on the way but an interrupt."""
+    from vislam.report import write_report
+
+    with log_to(out, command):
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise  # whoever interrupts does not wait for a report
+        except BaseException:
+            with suppress(VislamError):  # what went wrong first is what is told
+                if (out / "metrics.json").is_file():
+                    write_report(out)
+            raise
+        write_report(out)
+
+
+def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
+    """Print what a run in `out` measured: as JSON, or as a table with its warnings and where its files are."""
+    from vislam.core.files import plain
+
+    if as_json:
+        print(json.dumps(plain(metrics)))
+        return
+    console, loops = Console(), metrics["loops"]
+    _print_verdict(console, metrics.get("verdict", {}))
+    if metrics["accuracy"]:
+        _print_accuracy(metrics)
+    console.print(
+        f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {loops['accepted']} loops of "
+        f"{loops['candidates']} candidates, {number(metrics['realtime_factor'], 1)} x real time"
+    )
+    _print_cost(console, metrics["cost"])
+    for warning in metrics["warnings"]:
+        console.print(f"warning: {printable(warning)}", style="yellow", markup=False)
+    for name, title in (("report.html", "report"), ("run.rrd", "Rerun recording"), ("map", "map")):
+        if (out / name).exists():
+            console.print(f"{title}: {out / name}", soft_wrap=True)
+
+
+def _print_cost(console: Console, cost: dict[str, Any]) -> None:
+    """Print what the run cost; `number` shows a dash for what is not known."""
+    compiled = f", after {cost['compile_cpu_s']:.0f} s of compilation" if cost["compile_cpu_s"] >= 1.0 else ""
+    console.print(
+        f"{number(cost['cpu_ms_per_frame'], 0)} ms of CPU per frame{compiled}, {number(cost['peak_memory_mb'], 0)} MB, "
+        f"first pose after {number(cost['first_pose_s'], 2)} s of the recording",
+        highlight=False,
+    )
+
+
+def print_evaluation(results: dict[str, dict[str, Any]]) -> None:
+    """Print the errors of trajectories, as `evaluate` returns them, by name."""
+    columns = {
+        "ATE rmse [m]": "ate_rmse_m", "median": "ate_median_m", "max": "ate_max_m", "RPE 1 s [m]": "rpe_1s_m",
+        "RPE 1 s [deg]": "rpe_1s_deg", "scale": "scale",
+    }  # fmt: skip
+    rows = []
+    for name, entry in results.items():
+        numbers = [number(entry[key], 4) for key in columns.values()]
+        rows.append((name, *numbers, f"{entry['matched']}/{entry['total']}", f"{entry['coverage']:.0%}"))
+    print_table(("trajectory", *columns, "matched", "covered"), rows)
+
+
+def _print_verdict(console: Console, verdict: dict[str, Any]) -> None:
+    """Print what the run is worth, and under it what its calibration found."""
+    if verdict:
+        from vislam.run.verdict import verdict_sentence
+
+        style = "green" if verdict["state"] == "trusted" else "red"
+        console.print(f"{printable(verdict_sentence(verdict))}.", style=style, soft_wrap=True, markup=False)
+    for moved in verdict.get("moved", []):
+        console.print(f"found out: {printable(moved)}", soft_wrap=True, markup=False)
+
+
+def _print_accuracy(metrics: dict[str, Any]) -> None:
+    odometry = "EKF alone, causal" if metrics["has_imu"] else "odometry, causal"
+    titles = {"ekf": odometry, "live": "graph, causal", "graph": "graph, final"}
+    columns = {
+        "ATE rmse [m]": "ate_rmse_m", "ATE max [m]": "ate_max_m", "RPE 1 s [m]": "rpe_1s_m",
+        "RPE 1 s [deg]": "rpe_1s_deg",
+    }  # fmt: skip
+    rows = [
+        (titles.get(name, name), *(number(entry[key], 3) for key in columns.values()), f"{entry['coverage']:.0%}")
+        for name, entry in metrics["accuracy"].items()
+    ]
+    title = f"{metrics['name']} ({metrics['mode']}{', inertial' if metrics['has_imu'] else ''})"
+    print_table(("trajectory", *columns, "covered"), rows, title)

@@ -1,0 +1,337 @@
+"""Cameras and rigs: projection, unprojection, undistortion of points and images, stereo rectification.
+
+Two distortion models on a pinhole with pixel skew: radial-tangential (Brown; k1, k2, p1, p2[, k3], as in OpenCV) and
+equidistant (Kannala-Brandt, PAMI 2006; k1..k4, as in OpenCV's fisheye and in Kalibr).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.core.errors import DataError
+from vislam.core.geometry import invert
+from vislam.core.jit import njit
+from vislam.core.messages import Array
+
+MapF32 = NDArray[np.float32]
+Distortion = Literal["none", "radtan", "equidistant"]
+
+_MODEL_CODES = {"none": 0, "radtan": 1, "equidistant": 2}
+_COEFFICIENT_COUNTS = {"none": (0,), "radtan": (4, 5), "equidistant": (4,)}
+_MAX_NEWTON_STEPS = 20
+_MIN_Z_M = 1e-6
+
+
+@njit(cache=True, nogil=True)
+def _distort(x: float, y: float, model: int, k: Array) -> tuple[float, float, float, float, float, float]:
+    """Return the distorted point and its Jacobian (du/dx, du/dy, dv/dx, dv/dy) on the plane z = 1."""
+    r2 = x * x + y * y
+    if model == 1:
+        radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+        slope = 2.0 * (k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2))
+        u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
+        v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
+        ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
+        uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
+        vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
+        return u, v, ux, uy, uy, vy
+    if model == 2:
+        r = np.sqrt(r2)
+        if r < 1e-9:
+            return x, y, 1.0, 0.0, 0.0, 1.0
+        theta = np.arctan(r)
+        t2 = theta * theta
+        bent = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+        slope = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
+        scale = bent / r
+        # d(scale)/dr divided by r, so that multiplying by x and y gives the gradient of scale
+        change = (slope / (1.0 + r2) - scale) / r2
+        return x * scale, y * scale, scale + change * x * x, change * x * y, change * x * y, scale + change * y * y
+    return x, y, 1.0, 0.0, 0.0, 1.0
+
+
+@njit(cache=True, nogil=True)
+def _project(points: Array, pinhole: Array, model: int, k: Array, max_r2: float) -> Array:
+    out = np.full((len(points), 2), np.nan)
+    fx, fy, cx, cy, skew = pinhole
+    for i in range(len(points)):
+        z = points[i, 2]
+        if not z > _MIN_Z_M:
+            continue
+        x, y = points[i, 0] / z, points[i, 1] / z
+        if not x * x + y * y <= max_r2:  # NaN too
+            continue
+        u, v, _, _, _, _ = _distort(x, y, model, k)
+        out[i, 0] = fx * u + skew * v + cx
+        out[i, 1] = fy * v + cy
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _project_jacobian(points: Array, pinhole: Array, model: int, k: Array) -> Array:
+    out = np.full((len(points), 2, 3), np.nan)
+    fx, fy, _, _, skew = pinhole
+    for i in range(len(points)):
+        z = points[i, 2]
+        if not z > _MIN_Z_M:
+            continue
+        x, y = points[i, 0] / z, points[i, 1] / z
+        _, _, ux, uy, vx, vy = _distort(x, y, model, k)
+        px, py = fx * ux + skew * vx, fx * uy + skew * vy
+        qx, qy = fy * vx, fy * vy
+        out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = px / z, py / z, -(px * x + py * y) / z
+        out[i, 1, 0], out[i, 1, 1], out[i, 1, 2] = qx / z, qy / z, -(qx * x + qy * y) / z
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: float) -> Array:
+    """Invert the projection by Newton's method with halved steps; NaN where no ray gives the pixel."""
+    out = np.full((len(pixels), 2), np.nan)
+    fx, fy, cx, cy, skew = pinhole
+    for i in range(len(pixels)):
+        v0 = (pixels[i, 1] - cy) / fy
+        u0 = (pixels[i, 0] - cx - skew * v0) / fx
+        if not (np.isfinite(u0) and np.isfinite(v0)):
+            continue
+        x, y = u0, v0
+        if model == 2:
+            # start on the undistorted side: theta ~ bent radius
+            bent = np.sqrt(u0 * u0 + v0 * v0)
+            if bent >= 1.5:
+                continue
+            if bent > 1e-9:
+                x, y = u0 * np.tan(bent) / bent, v0 * np.tan(bent) / bent
+        u, v, ux, uy, vx, vy = _distort(x, y, model, k)
+        error = (u - u0) ** 2 + (v - v0) ** 2
+        for _ in range(_MAX_NEWTON_STEPS):
+            if error < 1e-24:
+                break
+            det = ux * vy - uy * vx
+            if abs(det) < 1e-12:
+                break
+            dx = (vy * (u0 - u) - uy * (v0 - v)) / det
+            dy = (ux * (v0 - v) - vx * (u0 - u)) / det
+            step = 1.0
+            improved = False
+            while step > 1e-3:
+                xn, yn = x + step * dx, y + step * dy
+                un, vn, uxn, uyn, vxn, vyn = _distort(xn, yn, model, k)
+                new_error = (un - u0) ** 2 + (vn - v0) ** 2
+                if new_error < error:
+                    x, y, u, v, ux, uy, vx, vy, error = xn, yn, un, vn, uxn, uyn, vxn, vyn, new_error
+                    improved = True
+                    break
+                step *= 0.5
+            if not improved:
+                break
+        if error < 1e-18 and x * x + y * y <= max_r2:
+            out[i, 0], out[i, 1] = x, y
+    return out
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera: pinhole with skew and a distortion model; pixels are raw image coordinates.
+
+    Raises DataError when the numbers cannot be a calibration.
+    """
+
+    width: int
+    height: int
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px
+    cy: float  # px
+    skew_px: float = 0.0  # the s of K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]
+    distortion: Distortion = "none"
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = np.array([self.fx, self.fy, self.cx, self.cy, self.skew_px, *self.coefficients], dtype=np.float64)
+        if not np.all(np.isfinite(numbers)) or self.fx <= 0.0 or self.fy <= 0.0:
+            raise DataError(f"camera intrinsics must be finite with positive focal lengths, got {numbers.tolist()}")
+        if self.width <= 0 or self.height <= 0:
+            raise DataError(f"camera image size must be positive, got {self.width}x{self.height}")
+        if self.distortion not in _MODEL_CODES:
+            raise DataError(f"camera distortion '{self.distortion}' is unknown; known: {', '.join(_MODEL_CODES)}")
+        allowed = _COEFFICIENT_COUNTS[self.distortion]
+        if len(self.coefficients) not in allowed:
+            raise DataError(f"{self.distortion} distortion takes {allowed} coefficients, got {len(self.coefficients)}")
+
+    @property
+    def K(self) -> Array:
+        """The intrinsic matrix [3, 3]."""
+        return np.array([[self.fx, self.skew_px, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @cached_property
+    def _pinhole(self) -> Array:
+        return np.array([self.fx, self.fy, self.cx, self.cy, self.skew_px])
+
+    @cached_property
+    def _model(self) -> int:
+        return _MODEL_CODES[self.distortion]
+
+    @cached_property
+    def _k(self) -> Array:
+        k = np.zeros(5)
+        k[: len(self.coefficients)] = self.coefficients
+        return k
+
+    @cached_property
+    def _max_r2(self) -> float:
+        """Squared radius on z = 1 up to which distortion is monotonic; beyond it two rays share a pixel."""
+        if self.distortion == "none":
+            return float("inf")
+        k = self._k
+        if self.distortion == "radtan":
+            slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[4]])
+            limit = _smallest_positive_root(slope)
+            return limit if np.isfinite(limit) else float("inf")
+        slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]])
+        theta = min(float(np.sqrt(_smallest_positive_root(slope))), np.deg2rad(89.5))
+        return float(np.tan(theta) ** 2)
+
+    def project(self, points_cam_m: Array) -> Array:
+        """Return raw pixels [N, 2] of points [N, 3] in the camera frame; NaN behind the camera or beyond the model."""
+        return _project(_rows(points_cam_m, 3), self._pinhole, self._model, self._k, self._max_r2)
+
+    def project_jacobian(self, points_cam_m: Array) -> Array:
+        """Return d(pixel)/d(point) [N, 2, 3] at points [N, 3] in the camera frame; NaN behind the camera."""
+        return _project_jacobian(_rows(points_cam_m, 3), self._pinhole, self._model, self._k)
+
+    def normalise(self, pixels: Array) -> Array:
+        """Return undistorted coordinates [N, 2] on the plane z = 1 of raw pixels [N, 2]; NaN where none exist."""
+        return _normalise(_rows(pixels, 2), self._pinhole, self._model, self._k, self._max_r2)
+
+    def unproject(self, pixels: Array) -> Array:
+        """Return rays [N, 3] with z = 1 of raw pixels [N, 2]; multiply by z-depth to get points."""
+        xy = self.normalise(pixels)
+        return np.column_stack([xy, np.ones(len(xy))])
+
+    def resampling_maps(self, K_inverse: Array, R_cam_new: Array, size: tuple[int, int]) -> tuple[MapF32, MapF32]:
+        """Return maps [h, w] for `cv2.remap` to a pinhole view of `size` (w, h), turned by R_cam_new."""
+        u, v = np.meshgrid(np.arange(size[0], dtype=np.float64), np.arange(size[1], dtype=np.float64))
+        rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ (R_cam_new @ K_inverse).T
+        pixels = np.nan_to_num(self.project(rays), nan=-1.0).astype(np.float32).reshape(size[1], size[0], 2)
+        return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+
+    def check_image(self, image: NDArray[np.generic]) -> None:
+        """Raise DataError unless the image [H, W(, 3)] has the size the camera was calibrated for."""
+        if image.shape[:2] != (self.height, self.width):
+            raise DataError(
+                f"image is {image.shape[1]}x{image.shape[0]} but the calibration is for {self.width}x{self.height}; "
+                "correct the calibration's resolution or the images"
+            )
+
+    def contains(self, pixels: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
+        """Return which pixels [N, 2] lie inside the image, at least `margin_px` from its border; NaN is outside."""
+        x, y = pixels[:, 0], pixels[:, 1]
+        inside_x = (x >= margin_px) & (x <= self.width - 1 - margin_px)
+        return np.asarray(inside_x & (y >= margin_px) & (y <= self.height - 1 - margin_px))
+
+    def scaled(self, factor: float) -> Camera:
+        """Return the camera of the same image resized by `factor` (pixel centres at integers, as in OpenCV)."""
+        return replace(
+            self,
+            width=round(self.width * factor),
+            height=round(self.height * factor),
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=(self.cx + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * factor - 0.5,
+            skew_px=self.skew_px * factor,
+        )
+
+
+def _rows(values: Array, columns: int) -> Array:
+    return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)
+
+
+def _smallest_positive_root(polynomial: np.polynomial.Polynomial) -> float:
+    roots = polynomial.trim().roots()
+    positive = [float(root.real) for root in np.asarray(roots, dtype=complex) if abs(root.imag) < 1e-9 < root.real]
+    return min(positive, default=float("inf"))
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a recording and where they sit on the body; depth, if any, is registered to cam0."""
+
+    cameras: tuple[Camera, ...]
+    T_body_cams: tuple[Array, ...]  # [4, 4] each
+    has_depth: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.cameras or len(self.cameras) != len(self.T_body_cams):
+            raise DataError(f"a rig needs one pose per camera, got {len(self.cameras)} and {len(self.T_body_cams)}")
+        for index, T in enumerate(self.T_body_cams):
+            R = T[:3, :3]
+            if T.shape != (4, 4) or not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
+                raise DataError(f"extrinsics of cam{index} are not a rigid transform: {np.asarray(T).tolist()}")
+
+    @property
+    def is_stereo(self) -> bool:
+        """Whether there is a second camera."""
+        return len(self.cameras) > 1
+
+    @property
+    def T_cam0_cam1(self) -> Array:
+        """Pose [4, 4] of the second camera in the first."""
+        return invert(self.T_body_cams[0]) @ self.T_body_cams[1]
+
+
+@dataclass(frozen=True)
+class StereoRectification:
+    """A stereo pair as two parallel ideal cameras with common K: same rows, disparity = K[0, 0] * baseline / z."""
+
+    K: Array  # [3, 3]
+    baseline_m: float
+    maps0: tuple[MapF32, MapF32]
+    maps1: tuple[MapF32, MapF32]
+    R_rect_cam0: Array  # [3, 3]
+    size: tuple[int, int]  # width, height
+
+    def apply(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return both images [h, w] resampled into the rectified view."""
+        return (
+            np.asarray(cv2.remap(left, *self.maps0, cv2.INTER_LINEAR), dtype=np.uint8),
+            np.asarray(cv2.remap(right, *self.maps1, cv2.INTER_LINEAR), dtype=np.uint8),
+        )
+
+
+def rectify(rig: Rig, scale: float = 1.0) -> StereoRectification:
+    """Return the rectification of a rig's first two cameras at `scale` times cam0's image size.
+
+    The rotation that both cameras share halfway is taken, then x is turned onto the baseline (Bouguet's method, by
+    OpenCV); the maps come from our own projection, so every camera model works. Raises DataError without a second
+    camera or when cam1 is not to the right of cam0.
+    """
+    if not rig.is_stereo:
+        raise DataError("stereo rectification needs two cameras, the rig has one")
+    T_cam1_cam0 = invert(rig.T_cam0_cam1)
+    first, second = rig.cameras[0].scaled(scale), rig.cameras[1].scaled(scale)
+    size = (first.width, first.height)
+    none = np.zeros(4)
+    R0, R1, P0, P1 = cv2.stereoRectify(
+        first.K, none, second.K, none, size, T_cam1_cam0[:3, :3].copy(), T_cam1_cam0[:3, 3:].copy(),
+        flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
+    )[:4]  # fmt: skip
+    baseline_m = float(-P1[0, 3] / P1[0, 0])
+    if baseline_m <= 0.0:
+        raise DataError(f"cam1 must be to the right of cam0, got a baseline of {baseline_m:.3f} m; swap the cameras")
+    K_inverse = np.linalg.inv(P0[:3, :3])
+    return StereoRectification(
+        K=np.array(P0[:3, :3]),
+        baseline_m=baseline_m,
+        maps0=first.resampling_maps(K_inverse, R0.T, size),
+        maps1=second.resampling_maps(K_inverse, R1.T, size),
+        R_rect_cam0=np.array(R0),
+        size=size,
+    )

@@ -1,0 +1,58 @@
+"""Files that are either whole or not there: written beside their name, then renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from vislam.core.errors import StorageError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for writing that takes the place of `path` when the block ends well, and vanishes when it does not.
+
+    Raises StorageError when it cannot be written: full disk, missing folder or permission.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # two processes may write the same file
+    try:
+        with partial.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException as error:
+        with suppress(OSError):
+            partial.unlink()
+        if not isinstance(error, OSError):
+            raise
+        reason = error.strerror or error
+        raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file of UTF-8 text; the old file or none is left when that fails. Raises StorageError."""
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write plain data as JSON, atomically; numbers that are not finite become null."""
+    write_text(path, json.dumps(plain(data), indent=1) + "\n")
+
+
+def plain(data: Any) -> Any:
+    """Return data as JSON has it: no numpy, and null for numbers that are not finite."""
+    if isinstance(data, dict):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [plain(value) for value in data]
+    if isinstance(data, (float, np.floating)):
+        return float(data) if np.isfinite(data) else None
+    return data.item() if isinstance(data, np.generic) else data

@@ -1,0 +1,266 @@
+"""The values that flow between the rooms: frozen, numpy only, and nothing else crosses a room's wall.
+
+Conventions: `T_a_b` maps points of frame b into frame a (`p_a = T_a_b @ p_b`). Frames: `map` (gravity-aligned, z up,
+corrected by loops), `odom` (gravity-aligned, continuous), `body` (the IMU), `cam0`, `cam1` (x right, y down, z
+forward).
+Tangents and 6x6 covariances are ordered rotation, then translation, with the perturbation on the body side:
+`T_perturbed = T @ se3_exp(xi)`. Time is integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+ImageU8 = NDArray[np.uint8]
+ImageF32 = NDArray[np.float32]
+
+
+class Tracking(StrEnum):
+    """How far a front end trusts the motion it reports."""
+
+    OK = "ok"
+    DEGRADED = "degraded"
+    LOST = "lost"
+
+
+class Localisation(StrEnum):
+    """Whether the place in the map is known."""
+
+    TRACKING = "tracking"
+    LOST = "lost"  # vision is lost, or what it follows is a submap that is not joined with the map
+    RELOCALISED = "relocalised"  # just now the submap was joined
+
+
+class LoopDecision(StrEnum):
+    """What became of a loop candidate."""
+
+    ACCEPTED = "accepted"
+    PENDING = "pending"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """One inertial sample: calibrated angular rate and specific force in the body frame (+g up at rest)."""
+
+    t_ns: int
+    gyro_rad_s: Array  # [3]
+    accel_m_s2: Array  # [3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MagSample:
+    """One magnetometer sample in the body frame."""
+
+    t_ns: int
+    field_ut: Array  # [3]
+
+
+class NoiseScale(NamedTuple):
+    """White noise densities over those of the IMU's noise model."""
+
+    gyro: float
+    accel: float
+
+
+AS_MODELLED = NoiseScale(1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSpan:
+    """IMU samples that cover `[t_ns[0], t_ns[-1]]` exactly: the first and last are interpolated to the asked times."""
+
+    t_ns: NDArray[np.int64]  # [N], strictly increasing
+    gyro_rad_s: Array  # [N, 3]
+    accel_m_s2: Array  # [N, 3]
+    noise: NoiseScale = AS_MODELLED  # what the samples around it show
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Tracked features seen in one frame; pixels are raw (distorted) image coordinates."""
+
+    track_ids: NDArray[np.int64]  # [N]
+    pixels_px: Array  # [N, 2] in cam0
+    right_px: Array | None = None  # [N, 2] in cam1, NaN where not matched
+    depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
+    instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
+    descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
+    noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are told
+
+
+def no_observations() -> Observations:
+    """Return observations of nothing."""
+    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """Images taken at one instant: a grey image per camera of the rig, with colour and registered depth if any."""
+
+    t_ns: int
+    index: int
+    images: tuple[ImageU8, ...]  # [H, W] each, cam0 first
+    color: ImageU8 | None = None  # [H, W, 3] BGR of cam0
+    depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
+    tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoMeasurement:
+    """Motion of the body since a keyframe. Without scale the translation is a unit direction, or zero: no parallax."""
+
+    t_ns: int
+    keyframe_id: int
+    T_keyframe_body: Array | None  # [4, 4]; None when lost
+    covariance: Array  # [6, 6]; unscaled translation: covariance of the unit direction, singular along it
+    has_scale: bool
+    tracking: Tracking
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A frame that stays: its features for loop closing and its geometry for mapping."""
+
+    id: int
+    t_ns: int
+    frame: Frame
+    keypoints_px: Array  # [N, 2] raw pixels of the described features in cam0
+    descriptors: NDArray[np.uint8]  # [N, 32] ORB
+    points_body_m: Array | None  # [N, 3] of the described features in the body frame, NaN where unknown; None: no depth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframePacket:
+    """Everything the back end needs of one keyframe, so that its answer cannot depend on timing."""
+
+    keyframe: Keyframe
+    vo: VoMeasurement  # relative to the previous keyframe; for keyframe 0, identity
+    observations: Observations
+    imu: ImuSpan | None  # since the previous keyframe; None for keyframe 0 or without an IMU
+    mag: MagSample | None = None
+    at_rest: bool = False  # zero velocity held over the span, decided by IMU and image together
+    time_offset_s: float = 0.0  # what has been added to the camera's own stamp to get the IMU's time
+    begins_submap: bool = False  # nothing measured the motion since the previous keyframe: a new submap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopCandidate:
+    """One candidate and what was decided about it; every candidate is recorded, with its reason."""
+
+    from_id: int  # the older keyframe
+    to_id: int  # the newer keyframe
+    source: str  # "appearance", "odometry" or "tag"
+    score: float
+    inliers: int
+    decision: LoopDecision
+    reason: str
+    sigma_m: float = float("nan")
+    consistency: int = 0  # by appearance: how many keyframes before this one pointed at the same place in a row
+    supporters: int = 0  # matches that agree with the refined pose
+    T_from_to: Array | None = None  # [4, 4] that verification found; None: no pose. A unit direction without scale
+    matches_px: Array | None = None  # [M, 4] some of the matches: x, y in the older keyframe, x, y in the newer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RetrievedKeyframe:
+    """An old keyframe that the index found to look like a new one, before anything else was asked of it."""
+
+    from_id: int  # the older keyframe
+    to_id: int  # the newer keyframe
+    score: float  # 0..1
+    island_score: float  # sum over the retrieved keyframes around it
+    consistency: int  # how many keyframes before the newer one pointed at that place in a row
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopEdge:
+    """A verified relative pose from an older to a newer keyframe."""
+
+    id: int
+    from_id: int
+    to_id: int
+    T_from_to: Array  # [4, 4] body to body
+    covariance: Array  # [6, 6]
+    has_scale: bool
+    inliers: int
+    score: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavState:
+    """Full inertial state; error order of the covariance: rotation, position, velocity, gyro bias, accel bias."""
+
+    t_ns: int
+    T_world_body: Array  # [4, 4]; world is odom (EKF) or map (graph)
+    velocity_world_m_s: Array  # [3]
+    gyro_bias_rad_s: Array  # [3]
+    accel_bias_m_s2: Array  # [3]
+    covariance: Array  # [15, 15]; rotation perturbed on the body side, position and velocity in world axes
+
+
+@dataclass(frozen=True, slots=True)
+class Submaps:
+    """Submaps: stretches of consecutive keyframes that odometry ties, and which of them loops have joined.
+
+    Poses of keyframes in submaps that are not joined mean nothing to each other.
+    """
+
+    first_ids: tuple[int, ...] = (0,)  # the keyframe with which each submap begins
+    groups: tuple[int, ...] = (0,)  # of each submap: the oldest submap that it is joined with, itself when with none
+
+    def begun(self, keyframe_id: int) -> Submaps:
+        """Return these submaps and a new one that begins with a keyframe."""
+        return Submaps((*self.first_ids, keyframe_id), (*self.groups, len(self.groups)))
+
+    def joined_by(self, pairs: Iterable[tuple[int, int]]) -> Submaps:
+        """Return these submaps joined by exactly these pairs of keyframes."""
+        groups = list(range(len(self.first_ids)))
+        for one, other in pairs:
+            low, high = sorted((groups[self.of(one)], groups[self.of(other)]))
+            if low != high:
+                groups = [low if group == high else group for group in groups]
+        return replace(self, groups=tuple(groups))
+
+    def of(self, keyframe_id: int) -> int:
+        """Return the submap of a keyframe."""
+        return bisect_right(self.first_ids, keyframe_id) - 1
+
+    def group(self, keyframe_id: int) -> int:
+        """Return the group of a keyframe: the oldest submap that its own is joined with."""
+        return self.groups[self.of(keyframe_id)]
+
+    def are_joined(self, one: int, other: int) -> bool:
+        """Return whether two keyframes are in one submap, or in submaps that are joined."""
+        return self.group(one) == self.group(other)
+
+    def groups_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the groups [N] of keyframes [N]."""
+        places = np.searchsorted(np.array(self.first_ids), ids, side="right") - 1
+        return np.array(self.groups, dtype=np.int64)[places]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphUpdate:
+    """What one graph update changed; consumers keep the newest revision."""
+
+    revision: int
+    ids: NDArray[np.int64]  # [M] keyframes that moved
+    T_map_body: Array  # [M, 4, 4]
+    T_map_odom: Array  # [4, 4]
+    newest: NavState | None  # state of the newest keyframe (biases for the EKF); None without IMU
+    accepted_loop_ids: tuple[int, ...] = ()
+    rejected_loop_ids: tuple[int, ...] = ()
+    note: str = ""  # what happened when a plain update was not possible
+    details: dict[str, Any] | None = None
+    submaps: Submaps = Submaps()

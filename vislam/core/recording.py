@@ -1,0 +1,53 @@
+"""What every source of measurements offers: dataset readers, the simulated world, live sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from vislam.core.camera import Rig
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.trajectory import Trajectory
+
+
+class Recording(Protocol):
+    """A recording as a stream of values in time order.
+
+    Problems that can be lived with (an unreadable image, a backward stamp, an unpaired stereo frame) are skipped and
+    counted in `problems`; what makes the whole recording unusable raises DataError.
+    """
+
+    name: str
+    rig: Rig
+    imu_noise: ImuNoise | None  # None: no IMU
+    frame_count: int  # frames that `events` will yield if nothing is damaged
+    problems: dict[str, int]  # what was skipped so far, by kind, for the report
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        """Yield samples and frames in time order; can be called again for a second pass.
+
+        Frames before `from_ns` may be left out, where reading them takes time.
+        """
+        ...
+
+    def truth(self) -> Trajectory | None:
+        """Return the true body trajectory in a world frame, or None."""
+        ...
+
+
+class WrappedRecording:
+    """A recording that has what another one has; who wraps one yields its values otherwise."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Take over everything but the values."""
+        self._recording = recording
+        self.name = recording.name
+        self.rig = recording.rig
+        self.imu_noise: ImuNoise | None = recording.imu_noise
+        self.frame_count = recording.frame_count
+        self.problems: dict[str, int] = recording.problems
+
+    def truth(self) -> Trajectory | None:
+        """Return the recording's truth."""
+        return self._recording.truth()

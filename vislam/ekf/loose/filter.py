@@ -1,0 +1,101 @@
+"""The error-state EKF: a continuous pose at IMU rate in `odom`, corrected by motion relative to a cloned keyframe.
+
+The nominal state is that of Karpov et al. 2026, 16 numbers: position, velocity, quaternion, two biases; the error state
+has the 15 degrees of freedom behind them, plus 6 of the clone. Unlike there, visual odometry enters as relative motion:
+an accumulated visual pose taken as an absolute one makes the filter certain of its own drift. `vision = "accumulated"`
+does that all the same, for comparison: motions are chained from the pose of the filter at the start, and again from its
+pose after every loss of vision; where there is no observation the correction is skipped, as the paper has it.
+Corrections are those of an invariant filter, which heading and position need to stay consistent (`kernels.correct`).
+By default `odom` is continuous: a metric motion corrects where the body is against its keyframe, not where the keyframe
+is. With `odom = "corrected"` all that is learned moves the past too: the best estimate, in larger steps. Directions do
+so always, for without scale the past is as long as what is learned later says.
+Measurements may come late and in any order: the filter goes back to their time and runs forward again, so the answer
+depends only on the set of measurements, not on when they came.
+"""
+
+from __future__ import annotations
+
+from vislam.config import EkfConfig
+from vislam.core.messages import Array, NavState, Observations, Tracking, VoMeasurement
+from vislam.ekf.history import AtRest, Event
+from vislam.ekf.loose.core import LooseCore, LooseMeasurement
+from vislam.ekf.loose.measurements import NewKeyframe, OnWheels
+from vislam.ekf.loose.state import LooseState
+from vislam.ekf.loose.visual_motion import why_unusable
+from vislam.ekf.timeline import Timeline, UpdateResult
+from vislam.imu import ImuNoise
+
+
+class Ekf(Timeline[LooseState, LooseMeasurement]):
+    """The timeline with the loose core, and the doors of its measurements.
+
+    Attributes:
+        counters: samples and measurements by what became of them, gaps, rewinds and soft resets.
+    """
+
+    def __init__(
+        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None = None
+    ) -> None:
+        """Set up an uninitialised filter.
+
+        Args:
+            config: see `EkfConfig`.
+            noise: of the IMU, until `follow_noise` tells what the samples show.
+            gravity_m_s2: magnitude, down in `odom`.
+            T_body_camera: [4, 4]; its lever arm turns a direction seen by one camera into motion of the body.
+                None: camera and IMU coincide. Not used for metric visual odometry.
+        """
+        self._loose = LooseCore(config, noise, float(gravity_m_s2), T_body_camera)
+        super().__init__(self._loose, self._loose.blank(), config, config.history_s)
+
+    @property
+    def position_variance_m2(self) -> float:
+        """Of the three axes together, as `state` has it."""
+        return self._loose.position_variance_m2(self._state)
+
+    def initialise(self, state: NavState, vo: VoMeasurement | None = None) -> None:
+        """Set the state, at any time, and run it through the samples that are already here. Forgets the past.
+
+        Args:
+            state: pose in `odom`, with its covariance.
+            vo: metric visual motion at the time of `state`. It places the keyframe it refers to, so that the motions
+                that follow can be used before there is a new keyframe. Without it the filter waits for `add_keyframe`.
+
+        Raises:
+            ValueError: the state is not finite, or its covariance not positive semidefinite.
+        """
+        usable = vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo)
+        self._begin(state.t_ns, self._loose.begin(state, vo if usable else None, self._state.ledger.noise))
+
+    def add_keyframe(self, keyframe_id: int, t_ns: int) -> UpdateResult:
+        """Clone the pose at `t_ns`: visual motions at later times may refer to this keyframe."""
+        return self._insert(Event(t_ns, NewKeyframe(keyframe_id)))
+
+    def update_vo(self, vo: VoMeasurement) -> UpdateResult:
+        """Correct the state at the time of a visual motion relative to the cloned keyframe.
+
+        Metric motion corrects six degrees; without scale, rotation and direction; without parallax, rotation. A motion
+        that is lost, that refers to another keyframe or that fails the gate is counted and changes nothing.
+        """
+        if vo.tracking is Tracking.LOST:
+            return self._refuse("vo_lost", "tracking lost")
+        reason = why_unusable(vo)
+        if reason:
+            return self._refuse("vo_invalid", reason)
+        return self._insert(Event(vo.t_ns, vo))
+
+    def update_vision(self, vo: VoMeasurement, observations: Observations) -> UpdateResult:
+        """Take what vision made of a frame; loosely coupled, its motion counts and its tracks do not."""
+        return self.update_vo(vo)
+
+    def update_zero_velocity(self, t_ns: int) -> UpdateResult:
+        """Tell the filter that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""
+        return self._insert(Event(t_ns, AtRest()))
+
+    def update_nonholonomic(self, t_ns: int) -> UpdateResult:
+        """Tell the filter that a cart's axle goes neither sideways nor up at `t_ns`, and that its floor is level.
+
+        See `ekf.nonholonomic_sigma_m_s`, `ekf.axle_m` and `ekf.floor_sigma_m`. Ten times a second is enough: slip goes
+        on for a while, and more of the same would be taken for news.
+        """
+        return self._insert(Event(t_ns, OnWheels()))

@@ -1,0 +1,411 @@
+"""Compiled arithmetic of tracks: where a point is, what its pixels say about the poses they were seen from.
+
+One observation is a row [15]: direction x, y on z = 1; d(pixel)/d(x, y) [2, 2] by rows; the same six numbers for the
+right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read; its standard deviations
+over those told. NaN where not measured.
+Residuals are whitened: left pixels; right minus left pixels (matching left to right is better than following a corner
+over time, and both share the error of the corner); inverse depth.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.core.geometry import skew, so3_exp
+from vislam.core.jit import njit
+from vislam.core.messages import Array
+from vislam.core.small import by, in_a_row, minus, plus, times, turned
+
+COLUMNS = 15
+ROWS_MAX = 5  # of one observation
+_STEPS = 10
+_CONVERGED = 1e-4  # of the cost
+_FAR_RHO = 1e-3  # 1/m: no parallax tells such points from infinity
+_NEAR_RHO = 20.0  # 1/m
+_KERNEL = 3.0  # Cauchy, in standard deviations, while the point is found
+
+USED, FEW, PARALLAX, RANGE, GATED = 0, 1, 2, 3, 4
+
+
+class Sensor(NamedTuple):
+    """What the cameras measure with."""
+
+    sigmas: Array  # [3] pixels, disparity in pixels, inverse depth in 1/m
+    R_cam1_cam0: Array  # [3, 3] rotation into the right camera
+    t_cam1_cam0: Array  # [3] origin of cam0 in the right camera
+
+
+class Views(NamedTuple):
+    """Observations, and where each was made from."""
+
+    at: NDArray[np.int64]  # [M] clone
+    seen: Array  # [M, 15] rows as above
+    R_cam: Array  # [M, 3, 3] R_cam_world
+    centres: Array  # [M, 3] of the camera
+
+
+class Prior(NamedTuple):
+    """What is known before a frame of the part of the state that tracks hang on."""
+
+    P: Array  # [n, n]
+    change: Array  # [n] since then; residuals are brought back to it
+
+
+class Bounds(NamedTuple):
+    """Which tracks are of use."""
+
+    min_rho: float  # 1/m
+    max_rho: float  # 1/m
+    max_ratio: float  # sigma of inverse depth over it
+    outlier_sigmas: float
+    min_views: float
+
+
+class Tracks(NamedTuple):
+    """What became of tracks, F of them."""
+
+    status: NDArray[np.int64]  # [F]
+    points: Array  # [F, 3] m
+    tests: Array  # [F, 3] NIS, degrees of freedom, relative sigma of inverse depth
+    fixing: Array  # [F, 3, 3 + 6 C + 1] the rows that fix each point, as in `linearise`
+    H_points: Array  # [F, 3, 3] and by the point
+    rows: Array  # [m, 3 + 6 C + 1] the projected rows of all used tracks, stacked
+
+
+@njit(cache=True, nogil=True)
+def observe(y: Array, seen: Array, sensor: Sensor, r: Array, J: Array) -> int:
+    """Write the whitened residuals r [5] and d(prediction)/dy J [5, 3] of a point y [3] in cam0; return their number.
+
+    0 rows: the point is not in front of the camera.
+    """
+    if not y[2] > 1e-6:
+        return 0
+    sigmas, R_cam1_cam0, t_cam1_cam0 = sensor
+    pixel, disparity, depth = sigmas[0] * seen[14], sigmas[1] * seen[14], sigmas[2] * seen[14]
+    z = 1.0 / y[2]
+    ex = seen[0] - y[0] * z
+    ey = seen[1] - y[1] * z
+    for i in range(2):
+        a, b = seen[2 + 2 * i], seen[3 + 2 * i]
+        r[i] = a * ex + b * ey
+        J[i, 0], J[i, 1], J[i, 2] = a * z, b * z, -(a * y[0] + b * y[1]) * z * z
+    rows = 2
+    if np.isfinite(seen[6]):
+        R1, t1 = R_cam1_cam0, t_cam1_cam0
+        y10 = R1[0, 0] * y[0] + R1[0, 1] * y[1] + R1[0, 2] * y[2] + t1[0]
+        y11 = R1[1, 0] * y[0] + R1[1, 1] * y[1] + R1[1, 2] * y[2] + t1[1]
+        y12 = R1[2, 0] * y[0] + R1[2, 1] * y[1] + R1[2, 2] * y[2] + t1[2]
+        if not y12 > 1e-6:
+            return 0
+        z1 = 1.0 / y12
+        ex, ey = seen[6] - y10 * z1, seen[7] - y11 * z1
+        for i in range(2):
+            a, b = seen[8 + 2 * i], seen[9 + 2 * i]
+            r[rows] = (a * ex + b * ey - r[i]) / disparity
+            d0, d1, d2 = a * z1, b * z1, -(a * y10 + b * y11) * z1 * z1
+            for k in range(3):
+                J[rows, k] = (d0 * R1[0, k] + d1 * R1[1, k] + d2 * R1[2, k] - J[i, k]) / disparity
+            rows += 1
+    if np.isfinite(seen[12]):
+        r[rows] = (seen[12] - z) / depth
+        J[rows, 0], J[rows, 1], J[rows, 2] = 0.0, 0.0, -z * z / depth
+        rows += 1
+    for i in range(2):
+        r[i] /= pixel
+        for k in range(3):
+            J[i, k] /= pixel
+    return rows
+
+
+@njit(cache=True, nogil=True)
+def camera_poses(
+    at: NDArray[np.int64],
+    seen: Array,
+    R: Array,
+    p: Array,
+    rate: Array,
+    velocity: Array,
+    R_body_cam: Array,
+    p_body_cam: Array,
+) -> tuple[Array, Array]:
+    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 15] made from the clones `at` [M].
+
+    Clones: R [C, 3, 3], p [C, 3], body rate [C, 3], world velocity [C, 3]; the last two carry the pose to the time at
+    which a rolling shutter read the row.
+    """
+    out_R = np.empty((len(at), 3, 3))
+    out_c = np.empty((len(at), 3))
+    for m in range(len(at)):
+        i = at[m]
+        R_world_body, centre = R[i].copy(), p[i].copy()
+        if seen[m, 13] != 0.0:
+            R_world_body = R_world_body @ so3_exp(rate[i] * seen[m, 13])
+            centre = centre + velocity[i] * seen[m, 13]
+        out_c[m] = centre + R_world_body @ p_body_cam
+        out_R[m] = (R_world_body @ R_body_cam).T
+    return out_R, out_c
+
+
+@njit(cache=True, nogil=True)
+def triangulate(views: Views, sensor: Sensor) -> tuple[Array, float, float]:
+    """Return a point [3] in the world, its inverse depth in the first view and that one's sigma (1/m).
+
+    A linear start, then Levenberg-Marquardt on direction and inverse depth (Montiel et al., RSS 2006) with a Cauchy
+    kernel, since one bad pixel must not decide where a point is.
+    """
+    seen = views.seen
+    R_a = np.ascontiguousarray(views.R_cam[0].T)
+    state = np.array([seen[0, 0], seen[0, 1], _first_rho(views, sensor)])
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    damping = 1e-3
+    cost, A, g = _normal(state, views, R_a, sensor, r, J)
+    for _ in range(_STEPS):
+        damped = A.copy()
+        for k in range(3):
+            damped[k, k] += damping * A[k, k] + 1e-12
+        trial = state + np.linalg.solve(damped, g)
+        trial[2] = min(max(trial[2], _FAR_RHO), _NEAR_RHO)
+        new_cost, new_A, new_g = _normal(trial, views, R_a, sensor, r, J)
+        if new_cost < cost:
+            done = cost - new_cost < _CONVERGED * (cost + 1e-3)
+            state, cost, A, g = trial, new_cost, new_A, new_g
+            damping *= 0.1
+            if done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+    point = views.centres[0] + R_a @ np.array([state[0], state[1], 1.0]) / state[2]
+    for k in range(3):
+        A[k, k] += 1e-12
+    variance = np.linalg.inv(A)[2, 2]
+    return point, state[2], np.sqrt(max(variance, 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _first_rho(views: Views, sensor: Sensor) -> float:
+    """Return an inverse depth in the first view: as measured, or where the rays meet best on the first one."""
+    _, seen, R_cam, centres = views
+    total, weight = 0.0, 0.0
+    base = np.array([seen[0, 0], seen[0, 1], 1.0])
+    ray = R_cam[0].T @ base
+    for m in range(len(seen)):
+        if m == 0 and np.isfinite(seen[m, 12]):
+            return min(max(seen[m, 12], _FAR_RHO), _NEAR_RHO)
+        # (direction seen) x (rho (c0 - c) + ray) = 0 in camera m is linear in rho
+        a, b = R_cam[m] @ ray, R_cam[m] @ (centres[0] - centres[m])
+        d = np.array([seen[m, 0], seen[m, 1], 1.0])
+        u, w = np.cross(d, a), np.cross(d, b)
+        total -= float(u @ w)
+        weight += float(w @ w)
+        if np.isfinite(seen[m, 6]):
+            d = np.array([seen[m, 6], seen[m, 7], 1.0])
+            u, w = np.cross(d, sensor.R_cam1_cam0 @ a), np.cross(d, sensor.R_cam1_cam0 @ b + sensor.t_cam1_cam0)
+            total -= float(u @ w)
+            weight += float(w @ w)
+    rho = total / weight if weight > 1e-12 else 0.2
+    return min(max(rho, 0.02), _NEAR_RHO)
+
+
+@njit(cache=True, nogil=True)
+def _normal(state: Array, views: Views, R_a: Array, sensor: Sensor, r: Array, J: Array) -> tuple[float, Array, Array]:
+    _, seen, R_cam, centres = views
+    A = np.zeros((3, 3))
+    g = np.zeros(3)
+    cost = 0.0
+    away = 1.0 / state[2]
+    y, G, JG = np.empty(3), np.empty((3, 3)), np.empty(3)
+    rows_a, first = in_a_row(R_a), (centres[0, 0], centres[0, 1], centres[0, 2])
+    offset = times(away, by(rows_a, (state[0], state[1], 1.0)))
+    for m in range(len(seen)):
+        R = in_a_row(R_cam[m])
+        y[0], y[1], y[2] = by(R, minus(plus(offset, first), (centres[m, 0], centres[m, 1], centres[m, 2])))
+        rows = observe(y, seen[m], sensor, r, J)
+        if rows == 0:
+            cost += 100.0
+            continue
+        by_ray, along = turned(R, rows_a), by(R, offset)
+        for i in range(3):
+            G[i, 0], G[i, 1], G[i, 2] = by_ray[3 * i] * away, by_ray[3 * i + 1] * away, -along[i] * away
+        squared = 0.0
+        for i in range(rows):
+            squared += r[i] * r[i]
+        scale = _KERNEL * _KERNEL
+        weight = 1.0 / (1.0 + squared / scale)
+        cost += scale * np.log1p(squared / scale)
+        for i in range(rows):
+            for k in range(3):
+                JG[k] = J[i, 0] * G[0, k] + J[i, 1] * G[1, k] + J[i, 2] * G[2, k]
+            for k in range(3):
+                g[k] += weight * JG[k] * r[i]
+                for c in range(3):
+                    A[k, c] += weight * JG[k] * JG[c]
+    return cost, A, g
+
+
+@njit(cache=True, nogil=True)
+def linearise(point: Array, views: Views, sensor: Sensor, clones: int) -> tuple[Array, Array, int]:
+    """Return A [rows, 3 + 6 C + 1] and H_f [rows, 3] of one point, and the rows; 0: it is behind a camera.
+
+    A holds the derivatives of the prediction by the extrinsic rotation (camera side) and by the clones (right-
+    invariant, rotation then position each), then the residual. H_f: by the point, in world axes.
+    """
+    at, seen, R_cam, centres = views
+    width = 3 + 6 * clones + 1
+    A = np.zeros((ROWS_MAX * len(at), width))
+    H_f = np.zeros((ROWS_MAX * len(at), 3))
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    S = skew(point)
+    n = 0
+    for m in range(len(at)):
+        y = R_cam[m] @ (point - centres[m])
+        rows = observe(y, seen[m], sensor, r, J)
+        if rows == 0:
+            return A, H_f, 0
+        by_point = J[:rows] @ R_cam[m]
+        by_turn = by_point @ S
+        by_mount = J[:rows] @ skew(y)
+        first = 3 + 6 * at[m]
+        for i in range(rows):
+            for k in range(3):
+                A[n + i, k] = by_mount[i, k]
+                A[n + i, first + k] = by_turn[i, k]
+                A[n + i, first + 3 + k] = -by_point[i, k]
+                H_f[n + i, k] = by_point[i, k]
+            A[n + i, width - 1] = r[i]
+        n += rows
+    return A[:n], H_f[:n], n
+
+
+@njit(cache=True, nogil=True)
+def project_out(A: Array, H_f: Array) -> None:
+    """Rotate the rows of A and H_f [rows, 3] in place so that only the first three of H_f are not zero.
+
+    Householder: the rows of A from the fourth on are its projection onto the left nullspace of H_f.
+    """
+    rows, width = A.shape
+    v = np.empty(rows)
+    for c in range(3):
+        norm = 0.0
+        for i in range(c, rows):
+            norm += H_f[i, c] * H_f[i, c]
+        norm = np.sqrt(norm)
+        if norm == 0.0:
+            continue
+        alpha = -norm if H_f[c, c] >= 0.0 else norm
+        size = 0.0
+        for i in range(c, rows):
+            v[i] = H_f[i, c] - (alpha if i == c else 0.0)
+            size += v[i] * v[i]
+        if size == 0.0:
+            continue
+        for j in range(c, 3):
+            dot = 0.0
+            for i in range(c, rows):
+                dot += v[i] * H_f[i, j]
+            dot *= 2.0 / size
+            for i in range(c, rows):
+                H_f[i, j] -= dot * v[i]
+        dots = np.zeros(width)
+        for i in range(c, rows):
+            for j in range(width):
+                dots[j] += v[i] * A[i, j]
+        for i in range(c, rows):
+            factor = 2.0 / size * v[i]
+            for j in range(width):
+                A[i, j] -= factor * dots[j]
+
+
+@njit(cache=True, nogil=True)
+def gate(H: Array, r: Array, P: Array) -> float:
+    """Return the normalised innovation squared of whitened rows; infinite where it cannot be computed."""
+    S = H @ P @ H.T
+    for i in range(len(r)):
+        S[i, i] += 1.0
+    nis = float(r @ np.linalg.solve(S, r))
+    return nis if np.isfinite(nis) and nis >= 0.0 else np.inf
+
+
+@njit(cache=True, nogil=True)
+def _fitting(point: Array, views: Views, sensor: Sensor, outlier: float) -> NDArray[np.int64]:
+    """Return which observations of a point are not farther from it than an outlier (in standard deviations)."""
+    _, seen, R_cam, centres = views
+    keep = np.zeros(len(seen), dtype=np.bool_)
+    r = np.empty(ROWS_MAX)
+    J = np.empty((ROWS_MAX, 3))
+    for m in range(len(seen)):
+        y = R_cam[m] @ (point - centres[m])
+        rows = observe(y, seen[m], sensor, r, J)
+        keep[m] = rows > 0 and r[0] * r[0] + r[1] * r[1] < outlier * outlier
+    return np.flatnonzero(keep)
+
+
+@njit(cache=True, nogil=True)
+def process(
+    starts: NDArray[np.int64], views: Views, sensor: Sensor, prior: Prior, bounds: Bounds, limits: Array
+) -> Tracks:
+    """Find, linearise, project and gate every track.
+
+    Args:
+        starts: [F + 1] first observation of each track in what follows.
+        views: of all tracks.
+        sensor: see there.
+        prior: of extrinsic rotation and clones, n = 3 + 6 C.
+        bounds: of tracks that are used.
+        limits: [d] chi-square limit of d degrees of freedom.
+    """
+    at, seen, R_cam, centres = views
+    P, change = prior
+    count = len(starts) - 1
+    width = len(P) + 1
+    clones = (len(P) - 3) // 6
+    status = np.full(count, FEW)
+    points = np.zeros((count, 3))
+    tests = np.zeros((count, 3))
+    fixing = np.zeros((count, 3, width))
+    H_points = np.zeros((count, 3, 3))
+    stack = np.empty((ROWS_MAX * len(at), width))
+    n = 0
+    for f in range(count):
+        s, e = starts[f], starts[f + 1]
+        own = Views(at[s:e], seen[s:e], R_cam[s:e], centres[s:e])
+        point, rho, sigma = triangulate(own, sensor)
+        chosen = s + _fitting(point, own, sensor, bounds.outlier_sigmas)
+        enough = 0
+        for m in chosen:
+            enough += 3 if np.isfinite(seen[m, 6]) or np.isfinite(seen[m, 12]) else 1
+        if len(chosen) < 2 or enough < bounds.min_views:
+            continue
+        tests[f, 2] = sigma / rho
+        if not tests[f, 2] < bounds.max_ratio:
+            status[f] = PARALLAX
+            continue
+        if not bounds.min_rho < rho < bounds.max_rho:
+            status[f] = RANGE
+            continue
+        points[f] = point
+        fit = Views(at[chosen], seen[chosen], R_cam[chosen], centres[chosen])
+        A, H_f, rows = linearise(point, fit, sensor, clones)
+        if rows < 4:
+            continue
+        project_out(A, H_f)
+        rest = np.ascontiguousarray(A[3:, : width - 1])
+        A[3:, width - 1] += rest @ change
+        residual = np.ascontiguousarray(A[3:, width - 1])
+        tests[f, 1] = rows - 3
+        tests[f, 0] = gate(rest, residual, P)
+        if not tests[f, 0] <= limits[rows - 3]:
+            status[f] = GATED
+            continue
+        status[f] = USED
+        fixing[f] = A[:3]
+        H_points[f] = H_f[:3]
+        stack[n : n + rows - 3] = A[3:]
+        n += rows - 3
+    return Tracks(status, points, tests, fixing, H_points, stack[:n])

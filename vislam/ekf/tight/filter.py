@@ -1,0 +1,94 @@
+"""The tight filter: tracks of corners correct the inertial state directly, by the poses they were seen from.
+
+A multi-state constraint Kalman filter: past poses are cloned into the state, a track that ends is triangulated over
+them and its point projected out, so that its pixels constrain the poses alone (Mourikis and Roumeliotis, ICRA 2007).
+Long tracks stay as points in the state (Li and Mourikis, RSS 2012; Geneva et al., "OpenVINS", ICRA 2020). Errors are
+right-invariant, which keeps the unobservable directions unobservable (`kernels`). The time offset of the camera
+and its rotation in the body are estimated with the rest (Li and Mourikis, "Online temporal calibration", IJRR 2014).
+As in `Ekf`, measurements may come late and in any order.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vislam.config import EkfConfig
+from vislam.core.geometry import so3_log
+from vislam.core.messages import NavState, Observations, Tracking, VoMeasurement
+from vislam.ekf.history import AtRest, Event
+from vislam.ekf.tight.core import CameraCalibration, TightCore, TightState
+from vislam.ekf.tight.state import MOUNT, TIME
+from vislam.ekf.tight.tracks import FrameTracks, prepare
+from vislam.ekf.timeline import Timeline, UpdateResult
+from vislam.imu import ImuNoise
+
+if TYPE_CHECKING:  # the fast path must not load OpenCV
+    from vislam.core.camera import Rig
+
+
+class MsckfEkf(Timeline[TightState, FrameTracks]):
+    """The timeline with the tight core. Times of states are by the IMU's clock, those of frames by the camera's."""
+
+    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+        """Set up an uninitialised filter.
+
+        Args:
+            config: see `EkfConfig`.
+            noise: of the IMU, until `follow_noise` tells what the samples show.
+            gravity_m_s2: magnitude, down in `odom`.
+            rig: cameras; observations may also hold right pixels (two cameras) or depth.
+        """
+        self._rig = rig
+        self._readout_s = config.tight_readout_s or 0.0
+        self._tight = TightCore(config, noise, float(gravity_m_s2), rig)
+        super().__init__(self._tight, self._tight.blank(), config, config.tight_history_s)
+
+    @property
+    def calibration(self) -> CameraCalibration:
+        """The camera's time offset and rotation as estimated so far."""
+        window = self._state.window
+        sigmas = np.sqrt(np.maximum(np.diag(window.P), 0.0))
+        turned = so3_log(np.ascontiguousarray(self._tight.R_configured.T @ window.R_body_cam))
+        return CameraCalibration(window.time_offset_s, float(sigmas[TIME]), turned, sigmas[MOUNT].copy())
+
+    def initialise(
+        self, state: NavState, vo: VoMeasurement | None = None, camera: CameraCalibration | None = None
+    ) -> None:
+        """Set the state, at any time, and run it through the samples that are already here. Forgets the past.
+
+        Args:
+            state: pose in `odom`, with its covariance.
+            vo: not needed here; tracks begin with the frames that follow.
+            camera: what an earlier run found out about the camera; None: what is configured.
+
+        Raises:
+            ValueError: the state is not finite.
+        """
+        self._begin(state.t_ns, self._tight.begin(state, camera, self._state.window.noise))
+
+    def add_keyframe(self, keyframe_id: int, t_ns: int) -> UpdateResult:
+        """Count a keyframe; every frame is cloned anyway."""
+        self._counts["keyframes"] += 1
+        return UpdateResult(True, float("nan"), "")
+
+    def update_vision(self, vo: VoMeasurement, observations: Observations, shows_scale: bool = True) -> UpdateResult:
+        """Take the tracks of a frame; its motion only says when it was and whether vision is lost.
+
+        `nis` of the result is that of all rows used, after compression. A frame may use nothing, since tracks are used
+        when they end or have been followed through the whole window. No new point is kept in the state while the motion
+        does not show scale.
+        """
+        if vo.tracking is Tracking.LOST:
+            return self._refuse("vision_lost", "tracking lost")
+        if self._history is not None and self._history.holds(vo.t_ns, FrameTracks):
+            return self._refuse("vision_duplicate", f"a frame of {vo.t_ns} ns is here already")
+        frame = prepare(vo.t_ns, observations, self._rig, self._readout_s, shows_scale)
+        if not len(frame.ids):
+            return self._refuse("vision_invalid", "no track with finite pixels inside the camera model")
+        return self._insert(Event(vo.t_ns, frame))
+
+    def update_zero_velocity(self, t_ns: int) -> UpdateResult:
+        """Tell the filter that the body is at rest at a frame: no velocity, and the pose where rest began."""
+        return self._insert(Event(t_ns, AtRest()))

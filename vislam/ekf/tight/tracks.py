@@ -1,0 +1,114 @@
+"""Tracks as the tight filter keeps them: what each frame saw, and which tracks are ripe to be used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.core.messages import Array, Observations
+from vislam.ekf.tight.features import COLUMNS
+
+if TYPE_CHECKING:  # the fast path must not load OpenCV
+    from vislam.core.camera import Camera, Rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTracks:
+    """What one frame saw, ready for the filter."""
+
+    t_ns: int  # stamp of the frame
+    ids: NDArray[np.int64]  # [N] ascending
+    pixels_px: Array  # [N, 2]
+    seen: Array  # [N, 15] rows of `features`
+    unused: NDArray[np.bool_]  # [N] each observation is used once
+    shows_scale: bool = True  # False: the motion before it was too uniform for one camera to see how large things are
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ripe:
+    """Tracks to be used now, and their observations one after the other."""
+
+    ids: NDArray[np.int64]  # [F]
+    starts: NDArray[np.int64]  # [F + 1]
+    at: NDArray[np.int64]  # [M] clone
+    row: NDArray[np.int64]  # [M] within the frame of that clone
+    alive: NDArray[np.bool_]  # [F] still followed
+
+
+def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float, shows_scale: bool = True) -> FrameTracks:
+    """Return the usable observations of a frame: finite, one per track, with a ray in the camera model."""
+    ids, first = np.unique(np.asarray(observations.track_ids, dtype=np.int64), return_index=True)
+    at_once = observations.instant_px is not None
+    given = observations.instant_px if observations.instant_px is not None else observations.pixels_px
+    pixels = np.asarray(given, dtype=np.float64).reshape(-1, 2)[first]
+    seen = np.full((len(ids), COLUMNS), np.nan)
+    camera = rig.cameras[0]
+    seen[:, :6] = _rays(camera, pixels)
+    if observations.right_px is not None and rig.is_stereo:
+        seen[:, 6:12] = _rays(rig.cameras[1], np.asarray(observations.right_px, dtype=np.float64)[first])
+    if observations.depth_m is not None:
+        depth = np.asarray(observations.depth_m, dtype=np.float64)[first]
+        good = np.isfinite(depth) & (depth > 0.0)
+        seen[good, 12] = 1.0 / depth[good]
+    rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
+    seen[:, 13] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
+    seen[:, 14] = observations.noise
+    fit = np.isfinite(seen[:, :6]).all(axis=1) & np.isfinite(seen[:, 13])
+    return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_), shows_scale)
+
+
+def _rays(camera: Camera, pixels: Array) -> Array:
+    xy = camera.normalise(pixels)
+    by_ray = camera.project_jacobian(np.column_stack((xy, np.ones(len(xy)))))
+    return np.column_stack((xy, by_ray[:, :, :2].reshape(-1, 4)))
+
+
+def ripe_tracks(frames: tuple[FrameTracks, ...], leaving: int | None, least: int, most: int) -> Ripe:
+    """Return the tracks that ended, and those whose first observation is in the clone that leaves; longest first.
+
+    Args:
+        frames: of the clones, oldest first; the last is the newest frame.
+        leaving: clone that will be dropped; None: none yet.
+        least: observations of a track to be of use.
+        most: tracks.
+    """
+    ids = np.concatenate([f.ids[f.unused] for f in frames])
+    at = np.concatenate([np.full(int(f.unused.sum()), i, dtype=np.int64) for i, f in enumerate(frames)])
+    row = np.concatenate([np.flatnonzero(f.unused) for f in frames])
+    order = np.argsort(ids, kind="stable")
+    ids, at, row = ids[order], at[order], row[order]
+    found, starts, counts = np.unique(ids, return_index=True, return_counts=True)
+    if not len(found):
+        nothing = np.zeros(0, dtype=np.int64)
+        return Ripe(nothing, np.zeros(1, dtype=np.int64), nothing, nothing, np.zeros(0, dtype=np.bool_))
+    alive = at[starts + counts - 1] == len(frames) - 1
+    ripe = ~alive
+    if leaving is not None:
+        ripe |= at[starts] == leaving
+    chosen = np.flatnonzero(ripe & (counts >= least))
+    chosen = chosen[np.argsort(-counts[chosen], kind="stable")][:most]
+    members = [np.arange(starts[k], starts[k] + counts[k]) for k in chosen]
+    flat = np.concatenate(members) if members else np.zeros(0, dtype=np.int64)
+    bounds = np.concatenate(([0], np.cumsum(counts[chosen]))).astype(np.int64)
+    return Ripe(found[chosen], bounds, at[flat], row[flat], alive[chosen])
+
+
+def marked(frames: tuple[FrameTracks, ...], at: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[FrameTracks, ...]:
+    """Return the frames with these observations marked as used."""
+    out = list(frames)
+    for i in np.unique(at):
+        unused = out[i].unused.copy()
+        unused[row[at == i]] = False
+        out[i] = replace(out[i], unused=unused)
+    return tuple(out)
+
+
+def image_motion_px(before: FrameTracks, after: FrameTracks) -> float:
+    """Return the median motion of the tracks that both frames saw; infinite without any."""
+    _, i, j = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
+    if not len(i):
+        return float("inf")
+    return float(np.median(np.linalg.norm(after.pixels_px[j] - before.pixels_px[i], axis=1)))

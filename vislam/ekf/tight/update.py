@@ -1,0 +1,422 @@
+"""What a frame, a moment of rest and a known bias do to the tight filter. Settings only; the state comes and goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.config import EkfConfig
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert, skew, so3_log
+from vislam.core.jit import njit
+from vislam.core.messages import Array
+from vislam.ekf.filter_core import REST_PAUSE_NS, reset_sigmas
+from vislam.ekf.history import Outcome
+from vislam.ekf.loose.kernels import pose
+from vislam.ekf.tight import features
+from vislam.ekf.tight.kernels import from_nav_error
+from vislam.ekf.tight.state import (
+    CLONES,
+    Rest,
+    Window,
+    cloned,
+    compressed,
+    corrected,
+    depth_ratios,
+    gain_step,
+    moved,
+    with_points,
+    without_clone,
+    without_points,
+)
+from vislam.ekf.tight.tracks import FrameTracks, image_motion_px, marked, ripe_tracks
+from vislam.imu import ImuNoise
+
+if TYPE_CHECKING:  # the fast path must not load OpenCV
+    from vislam.core.camera import Rig
+
+_STATUS = {
+    features.USED: "tracks_used",
+    features.FEW: "tracks_few",
+    features.PARALLAX: "tracks_no_parallax",
+    features.RANGE: "tracks_range",
+    features.GATED: "tracks_gated",
+}
+_CONTRADICTED = 0.25  # of the tested tracks agree at most: the state is wrong, not the tracks
+_MIN_TESTED = 5
+_SMALL_SHARE = 0.05  # of the window's extent
+_SHORT_M = 0.02
+_SMALL_RAD = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """What a frame brings: whitened rows, the observations behind them, and tracks that may stay as points."""
+
+    H: Array  # [m, n]
+    r: Array  # [m] against the state before the frame
+    at: NDArray[np.int64]  # [M] clone of each observation used
+    row: NDArray[np.int64]  # [M]
+    misses: NDArray[np.int64]  # [S]
+    ids: NDArray[np.int64]  # [K], best known depth first
+    points: Array  # [K, 3]
+    ratios: Array  # [K]
+    fixing: Array  # [K, 3, 3 + 6 C + 1] see `with_points`
+    H_points: Array  # [K, 3, 3]
+
+
+class Updater:
+    """Applies measurements: the same one on the same state gives the same answer, however often it is replayed."""
+
+    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+        """Take the settings and the rig."""
+        self._config = config
+        self._gravity = gravity_m_s2
+        self._p_body_cam = np.ascontiguousarray(rig.T_body_cams[0][:3, 3], dtype=np.float64)
+        T_cam1_cam0 = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
+        sigmas = np.array([config.tight_pixel_sigma_px, config.tight_stereo_sigma_px, config.tight_depth_sigma_rho])
+        into_right = np.ascontiguousarray(T_cam1_cam0[:3, :3]), np.ascontiguousarray(T_cam1_cam0[:3, 3])
+        self._sensor = features.Sensor(sigmas, *into_right)
+        self._point_sensor = features.Sensor(sigmas * np.array([config.tight_point_inflation, 1.0, 1.0]), *into_right)
+        self._bounds = features.Bounds(
+            min_rho=1.0 / config.tight_max_range_m,
+            max_rho=1.0 / config.tight_min_range_m,
+            max_ratio=float(config.tight_max_depth_ratio),
+            outlier_sigmas=float(config.tight_outlier_sigmas),
+            min_views=float(config.tight_min_observations),
+        )
+        # one metric observation and another fix a point and leave something over
+        self._least = 2 if rig.is_stereo or rig.has_depth else config.tight_min_observations
+        most = features.ROWS_MAX * (config.tight_clones + 2)
+        self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
+        self._white_rate_sigma = float(noise.gyro_noise_density * np.sqrt(noise.rate_hz))
+        self._reset_sigmas = reset_sigmas(config)
+
+    # -- a frame -----------------------------------------------------------------------------------------------------
+
+    def see(
+        self, window: Window, x: Array, gyro_rad_s: Array, ago_s: float, frame: FrameTracks
+    ) -> tuple[Window, Outcome]:
+        """Clone the pose for a frame and use the points it sees and the tracks that became ripe with it.
+
+        Iterated (Bell and Cathey, 1993): while velocity is badly known, poses in the window are wrong by as much as
+        they are apart, and one linear step would take the wrong parallax for knowledge.
+        """
+        R = np.ascontiguousarray(pose(x, 0, 6)[:3, :3])
+        if frame.t_ns - window.rested_t_ns > REST_PAUSE_NS:
+            window = replace(window, rest=None)
+        prior = cloned(window, x, R, gyro_rad_s, ago_s, self._gravity, frame)
+        leaving = self._leaving(prior)
+        before = x.copy()
+        window, change, P = prior, np.zeros(len(prior.P)), prior.P
+        for _ in range(self._config.tight_iterations):
+            out = Outcome()
+            rows = self._rows(window, leaving, change, out)
+            if not len(rows.r):
+                x[:], window, P = before, prior, prior.P
+                break
+            step, P, out.nis = gain_step(prior.P, rows.H, rows.r)
+            x[:] = before
+            later = moved(prior, x, step)
+            rows.fixing[:, :, -1] -= rows.fixing[:, :, :-1] @ (step - change)[16 : prior.first_point]
+            done = _is_small(window, later, step - change)
+            window, change, out.accepted = later, step, True
+            if done:
+                break
+        window = replace(window, P=P, misses=rows.misses, frames=marked(prior.frames, rows.at, rows.row))
+        if out.accepted:
+            window = replace(window, last_vision_t_ns=frame.t_ns)
+            window = self._keep_points(window, rows, out)
+        if leaving is not None:
+            window = without_clone(window, leaving)
+        window = self._watch(window, x, frame.t_ns, out)
+        out.count("vision_used" if out.accepted else "vision_idle")
+        out.reason = out.reason or ("" if out.accepted else "no track was ripe or passed its test")
+        return without_points(window, window.misses > self._config.tight_point_misses), out
+
+    def _leaving(self, window: Window) -> int | None:
+        """Return which clone goes: the oldest, unless the last but one is where the one before it was."""
+        count = len(window.frames)
+        if count <= self._config.tight_clones:
+            return None
+        kept, candidate = window.frames[-3], window.frames[-2]
+        still = image_motion_px(kept, candidate) < self._config.tight_still_px
+        still = still or candidate.t_ns - kept.t_ns < self._config.tight_min_interval_s * 1e9
+        rests = window.rest is not None and window.rested_t_ns >= candidate.t_ns
+        began_t_ns = None if window.rest is None else window.rest.t_ns
+        if (still or rests) and candidate.t_ns != began_t_ns:
+            return count - 2
+        return 0 if window.frames[0].t_ns != began_t_ns else 1
+
+    def _rows(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
+        """Return what the newest frame says of its points of the state, and the tracks that are ripe with it.
+
+        The window is where to linearise; its covariance is that before the frame, `change` [n] what lies between.
+        """
+        newest = len(window.frames) - 1
+        frame = window.frames[newest]
+        row = np.minimum(np.searchsorted(frame.ids, window.point_ids), len(frame.ids) - 1)
+        found = np.flatnonzero(frame.ids[row] == window.point_ids)
+        row = row[found]
+        at = np.full(len(found), newest, dtype=np.int64)
+        views = self._views(window, at, frame.seen[row])
+        prior = features.Prior(window.P, change)
+        H_points, r_points, tests = _point_rows(
+            found, window.points, views, self._point_sensor, prior, len(window.frames), self._limits
+        )
+        good = tests[:, 1] > 0
+        misses = window.misses + 1
+        misses[found[good]] = 0
+        out.count("points_used", int(good.sum()))
+        out.count("points_gated", int((~good).sum()))
+        out.test("points", int(good.sum()), float(tests[good, 0].sum()), int(tests[good, 1].sum()))
+        unused = replace(window, frames=marked(window.frames, at, row))
+        tracks = self._use_tracks(unused, leaving, change, out)
+        return replace(
+            tracks,
+            H=np.vstack((H_points, tracks.H)),
+            r=np.concatenate((r_points, tracks.r)),
+            at=np.concatenate((at, tracks.at)),
+            row=np.concatenate((row, tracks.row)),
+            misses=misses,
+        )
+
+    def _use_tracks(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
+        """Return the projected rows of the ripe tracks; those still followed may become points of the state."""
+        oldest = leaving if leaving is not None and leaving < len(window.frames) - 2 else None
+        ripe = ripe_tracks(window.frames, oldest, self._least, self._config.tight_max_tracks)
+        n, visible = len(window.P), slice(16, window.first_point)
+        width = visible.stop - visible.start
+        if not len(ripe.ids):
+            nothing = np.zeros(0)
+            nobody = np.zeros(0, dtype=np.int64)
+            return _Rows(
+                np.zeros((0, n)), nothing, nobody, nobody, nobody, nobody, np.zeros((0, 3)), nothing,
+                np.zeros((0, 3, width + 1)), np.zeros((0, 3, 3)),
+            )  # fmt: skip
+        seen = np.concatenate([window.frames[i].seen[j][None] for i, j in zip(ripe.at, ripe.row, strict=True)])
+        views = self._views(window, ripe.at, seen)
+        prior = features.Prior(np.ascontiguousarray(window.P[visible, visible]), np.ascontiguousarray(change[visible]))
+        status, points, tests, fixing, H_points, stack = features.process(
+            ripe.starts, views, self._sensor, prior, self._bounds, self._limits
+        )
+        for code, name in _STATUS.items():
+            out.count(name, int((status == code).sum()))
+        used = status == features.USED
+        out.test("tracks", int(used.sum()), float(tests[used, 0].sum()), int(tests[used, 1].sum()))
+        H_stack, r_stack = compressed(stack[:, :-1], stack[:, -1])
+        H = np.zeros((len(r_stack), n))
+        H[:, visible] = H_stack
+        fit = np.flatnonzero(used & ripe.alive)
+        fit = fit[np.argsort(tests[fit, 2], kind="stable")]
+        return _Rows(
+            H,
+            r_stack,
+            ripe.at,
+            ripe.row,
+            window.misses,
+            ripe.ids[fit],
+            points[fit],
+            tests[fit, 2],
+            fixing[fit],
+            H_points[fit],
+        )
+
+    def _keep_points(self, window: Window, rows: _Rows, out: Outcome) -> Window:
+        """Take the tracks whose depth is known best into the state, as far as there is room.
+
+        How well the poses are known counts too: as long as scale is not, a point in the state would be linearised at
+        the wrong place for good. And where the motion does not show scale, the noise of one point after the other would
+        be taken for it.
+        """
+        if not window.frames[-1].shows_scale:
+            return window
+        free = max(self._config.tight_points - len(window.point_ids), 0)
+        if not len(rows.ids) or not free:
+            return window
+        ratios = depth_ratios(window, rows.points, rows.fixing, rows.H_points)
+        fit = np.flatnonzero(ratios < self._config.tight_point_depth_ratio)[:free]
+        if not len(fit):
+            return window
+        out.count("points_started", len(fit))
+        return with_points(window, rows.ids[fit], rows.points[fit], rows.fixing[fit], rows.H_points[fit])
+
+    def _views(self, window: Window, at: NDArray[np.int64], seen: Array) -> features.Views:
+        R_cam, centres = features.camera_poses(
+            at,
+            seen,
+            window.R,
+            window.p,
+            window.rate,
+            window.velocity,
+            np.ascontiguousarray(window.R_body_cam),
+            self._p_body_cam,
+        )
+        return features.Views(at, seen, R_cam, centres)
+
+    def _watch(self, window: Window, x: Array, t_ns: int, out: Outcome) -> Window:
+        """Inflate the covariance when frame after frame contradicts the state."""
+        config = self._config
+        good = out.counts.get("tracks_used", 0) + out.counts.get("points_used", 0)
+        bad = out.counts.get("tracks_gated", 0) + out.counts.get("points_gated", 0)
+        if good + bad < _MIN_TESTED:
+            return window
+        if good > _CONTRADICTED * (good + bad):
+            return replace(window, rejects=0)
+        since = t_ns if window.rejects == 0 else window.rejects_since_ns
+        rejects = window.rejects + 1
+        if rejects < config.reset_rejects or t_ns - since < config.reset_s * 1e9:
+            return replace(window, rejects=rejects, rejects_since_ns=since)
+        out.count("soft_resets")
+        out.reason = f"{rejects} frames in a row contradict the state, covariance inflated"
+        M = from_nav_error(x) * self._reset_sigmas
+        P = window.P.copy()
+        P[:15, :15] += M @ M.T
+        # points that no longer fit would only contradict again
+        fresh = replace(window, P=P, rejects=0)
+        return without_points(fresh, np.ones(len(window.point_ids), dtype=np.bool_))
+
+    # -- rest and biases ---------------------------------------------------------------------------------------------
+
+    def rest(self, window: Window, x: Array, gyro_rad_s: Array, t_ns: int) -> tuple[Window, Outcome]:
+        """Use that the body is at rest: no velocity, the gyro shows its bias, the pose is that where rest began."""
+        out = Outcome()
+        config = self._config
+        R = pose(x, 0, 6)[:3, :3]
+        H = np.zeros((6, len(window.P)))
+        H[:3, 6:9] = R.T / config.zero_velocity_sigma_m_s
+        rate_sigma = max(config.zero_rate_sigma_rad_s, self._white_rate_sigma * window.noise.gyro)
+        H[3:, 9:12] = np.eye(3) / rate_sigma
+        r = np.concatenate((-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / rate_sigma))
+        if not self._passes("zero_velocity", window, H, r, out):
+            return replace(window, rest=None), out
+        window = replace(corrected(window, x, H, r), rested_t_ns=t_ns)
+        stamps = [frame.t_ns for frame in window.frames]
+        if window.rest is not None and window.rest.t_ns in stamps:
+            window = self._hold(window, x, stamps.index(window.rest.t_ns), out)
+        elif t_ns in stamps:
+            R = pose(x, 0, 6)[:3, :3]
+            window = replace(window, rest=Rest(t_ns, R, np.eye(3)))
+        if window.rest is not None:
+            to_first = np.ascontiguousarray(window.rest.R @ pose(x, 0, 6)[:3, :3].T)
+            window = replace(window, rest=replace(window.rest, to_first=to_first))
+        return window, out
+
+    def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
+        config = self._config
+        sigmas = np.repeat([np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m], 3)
+        T = pose(x, 0, 6)
+        H = np.zeros((6, len(window.P)))
+        at = CLONES + 6 * index
+        here = np.eye(6)
+        here[3:, :3] = -skew(window.p[index])
+        H[:, :6] = here / sigmas[:, None]
+        H[:, at : at + 6] = -here / sigmas[:, None]
+        turned = so3_log(window.R[index] @ np.ascontiguousarray(T[:3, :3].T))
+        r = np.concatenate((turned, window.p[index] - T[:3, 3])) / sigmas
+        if not self._passes("hold", window, H, r, out):
+            return replace(window, rest=None)
+        return corrected(window, x, H, r)
+
+    def _passes(self, kind: str, window: Window, H: Array, r: Array, out: Outcome) -> bool:
+        S = H @ window.P @ H.T + np.eye(len(r))
+        nis = float(r @ np.linalg.solve(S, r))
+        accepted = nis <= self._limits[len(r)]
+        out.count(f"{kind}_{'accepted' if accepted else 'gated'}")
+        if np.isnan(out.nis):
+            out.accepted, out.nis = accepted, nis
+        if accepted:
+            out.test(kind, 1, nis, len(r))
+        else:
+            out.reason = f"innovation {nis:.1f} of at most {self._limits[len(r)]:.1f}"
+        return accepted
+
+    def known_bias(self, window: Window, x: Array, bias: Array) -> tuple[Window, Outcome]:
+        """Take biases [12] (gyro, accel, their sigmas) found elsewhere; only the biases move (Schmidt-Kalman)."""
+        out = Outcome()
+        H = np.zeros((6, len(window.P)))
+        H[:, 9:15] = np.diag(1.0 / bias[6:])
+        r = np.concatenate((bias[:3] - x[13:16], bias[3:6] - x[10:13])) / bias[6:]
+        if not self._passes("bias", window, H, r, out):
+            return window, out
+        HP = H @ window.P
+        S = HP @ H.T + np.eye(6)
+        K = np.zeros((len(window.P), 6))
+        K[9:15] = np.linalg.solve(S, HP[:, 9:15]).T
+        KHP = K @ HP
+        P = window.P - KHP - KHP.T + K @ S @ K.T
+        return moved(replace(window, P=0.5 * (P + P.T)), x, K @ r), out
+
+
+def _is_small(before: Window, after: Window, change: Array) -> bool:
+    """Whether a step changed so little of the window's shape that linearising again would change nothing."""
+    apart = np.abs(before.p - before.p[-1]).max()
+    moved_m = np.abs((after.p - after.p[-1]) - (before.p - before.p[-1])).max()
+    return bool(moved_m < _SMALL_SHARE * max(apart, _SHORT_M) and np.abs(change[:3]).max() < _SMALL_RAD)
+
+
+@njit(cache=True, nogil=True)
+def _point_rows(
+    which: NDArray[np.int64],
+    points: Array,
+    views: features.Views,
+    sensor: features.Sensor,
+    prior: features.Prior,
+    clones: int,
+    limits: Array,
+) -> tuple[Array, Array, Array]:
+    """Return whitened rows H [m, n] and r [m] of points of the state seen from the newest clone, and tests [K, 2].
+
+    A test is NIS and degrees of freedom; the latter 0 where it failed.
+    """
+    _, seen, R_cam, centres = views
+    P, change = prior
+    n = len(P)
+    H = np.zeros((features.ROWS_MAX * len(which), n))
+    r_all = np.empty(features.ROWS_MAX * len(which))
+    tests = np.zeros((len(which), 2))
+    r = np.empty(features.ROWS_MAX)
+    J = np.empty((features.ROWS_MAX, 3))
+    clone = 19 + 6 * (clones - 1)
+    columns = np.empty(15, dtype=np.int64)
+    small = np.empty((15, 15))
+    m = 0
+    for k in range(len(which)):
+        f = points[which[k]]
+        y = R_cam[k] @ (f - centres[k])
+        rows = features.observe(y, seen[k], sensor, r, J)
+        if rows == 0:
+            continue
+        by_point = J[:rows] @ R_cam[k]
+        by_turn = by_point @ skew(f)
+        h = np.zeros((rows, 15))
+        h[:, 0:3] = -by_turn
+        h[:, 3:6] = J[:rows] @ skew(y)
+        h[:, 6:9] = by_turn
+        h[:, 9:12] = -by_point
+        h[:, 12:15] = by_point
+        for i in range(3):
+            columns[i], columns[3 + i] = i, 16 + i
+            columns[6 + i], columns[9 + i] = clone + i, clone + 3 + i
+            columns[12 + i] = 19 + 6 * clones + 3 * which[k] + i
+        for i in range(15):
+            for j in range(15):
+                small[i, j] = P[columns[i], columns[j]]
+        residual = r[:rows].copy()
+        for i in range(rows):
+            for j in range(15):
+                residual[i] += h[i, j] * change[columns[j]]
+        nis = features.gate(h, residual, small)
+        tests[k, 0] = nis
+        if not nis <= limits[rows]:
+            continue
+        tests[k, 1] = rows
+        for i in range(rows):
+            for j in range(15):
+                H[m + i, columns[j]] = h[i, j]
+            r_all[m + i] = residual[i]
+        m += rows
+    return H[:m], r_all[:m], tests

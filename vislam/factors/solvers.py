@@ -1,0 +1,167 @@
+"""Solvers of the graph: incremental (iSAM2), and batch for where incremental elimination fails.
+
+gtsam 4.3.0 rejects some healthy systems, and an ISAM2 object that threw is unusable. Nothing here repairs one: an
+exception passes through, and the owner builds a new solver from its journal.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+import gtsam
+import numpy as np
+
+from vislam.config import GraphConfig
+from vislam.core.messages import Array
+
+Factorization = Literal["CHOLESKY", "QR"]
+FAILURES = (RuntimeError, ValueError, IndexError, KeyError)  # what gtsam's bindings are known to raise
+
+_BATCH_ITERATIONS = 20
+
+
+class Solver(Protocol):
+    """What the pose graph needs of a solver."""
+
+    name: str
+    reads_all: bool  # whether `estimate` always gives all variables
+
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
+    ) -> list[int]:
+        """Add factors and new values, remove factors by slot, improve the estimate; return the slots of what is new.
+
+        `last` is the variable to which the next factors will come, by default those of these factors.
+        """
+
+    def around(self, keys: list[int]) -> list[int]:
+        """Return the slots of the factors that touch any of some variables, ascending."""
+
+    def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+        """Return the factors in some slots."""
+
+    def iterate(self, count: int) -> None:
+        """Improve the estimate by up to `count` steps."""
+
+    def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
+        """Return the current estimate of variables, by default of all."""
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """Return the joint marginal covariance of variables, in the order of `keys`."""
+
+
+class IncrementalSolver:
+    """iSAM2 with Gauss-Newton steps and per-type relinearisation thresholds."""
+
+    def __init__(self, config: GraphConfig, factorization: Factorization) -> None:
+        """Start empty."""
+        self.name = f"isam2-{factorization.lower()}"
+        self.reads_all = False
+        params = gtsam.ISAM2Params()
+        params.setFactorization(factorization)
+        params.relinearizeSkip = config.relinearize_skip
+        params.findUnusedFactorSlots = True
+        thresholds = gtsam.ISAM2ThresholdMap()
+        pose = np.repeat([config.relinearize_rotation_rad, config.relinearize_translation_m], 3)
+        thresholds.insert(("x", pose))
+        thresholds.insert(("v", np.full(3, config.relinearize_velocity_m_s)))
+        thresholds.insert(("b", np.full(6, config.relinearize_bias)))
+        params.setRelinearizeThreshold(thresholds)
+        self._isam = gtsam.ISAM2(params)
+
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
+    ) -> list[int]:
+        """See Solver."""
+        groups = None
+        if last is not None:
+            groups = gtsam.KeyGroupMap()
+            groups.insert2(last, 1)
+        result = self._isam.update(graph, values, remove, groups)
+        return [int(slot) for slot in result.getNewFactorsIndices()]
+
+    def around(self, keys: list[int]) -> list[int]:
+        """See Solver."""
+        index = self._isam.getVariableIndex()
+        return sorted({int(slot) for key in keys for slot in index.at(key)})
+
+    def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+        """See Solver."""
+        return _some(self._isam.getFactorsUnsafe(), slots)
+
+    def iterate(self, count: int) -> None:
+        """See Solver."""
+        for _ in range(count):
+            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], None, None, None, True)
+
+    def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
+        """See Solver."""
+        return self._isam.calculateEstimate() if keys is None else self._isam.calculateEstimate(keys)
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """See Solver."""
+        return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
+
+
+class BatchSolver:
+    """Levenberg-Marquardt over the whole graph at each update: slow, but damping makes it hard to stop."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.name = "batch-lm"
+        self.reads_all = True
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._values = gtsam.Values()
+
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
+    ) -> list[int]:
+        """See Solver."""
+        self._values.insert(values)
+        first = self._graph.size()
+        for slot in remove:
+            self._graph.remove(slot)
+        self._graph.push_back(graph)
+        self.iterate(_BATCH_ITERATIONS)
+        return list(range(first, self._graph.size()))
+
+    def around(self, keys: list[int]) -> list[int]:
+        """See Solver."""
+        wanted, graph = set(keys), self._graph
+        return [n for n in range(graph.size()) if graph.exists(n) and not wanted.isdisjoint(graph.at(n).keys())]
+
+    def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+        """See Solver."""
+        return _some(self._graph, slots)
+
+    def iterate(self, count: int) -> None:
+        """See Solver; keeps the values it has when even LM fails."""
+        try:
+            self._values = optimize(self._graph, self._values, count)
+        except FAILURES:
+            return
+
+    def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
+        """See Solver; always all, for its update looks at all of them anyway."""
+        return gtsam.Values(self._values)
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """See Solver."""
+        joint = gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(keys)
+        return np.asarray(joint.fullMatrix())
+
+
+def optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
+    """Return the values after Levenberg-Marquardt over the whole graph."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(iterations)
+    params.setRelativeErrorTol(1e-7)
+    params.setlambdaUpperBound(1e9)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _some(graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> gtsam.NonlinearFactorGraph:
+    some = gtsam.NonlinearFactorGraph()
+    for slot in slots:
+        some.add(graph.at(slot))
+    return some

@@ -1,0 +1,7 @@
+"""Visual odometry of a cart by the floor: one camera at a known height."""
+
+from vislam.frontend.planar.odometry import PlanarFrontEnd
+
+__all__ = [
+    "PlanarFrontEnd",
+]

@@ -1,0 +1,106 @@
+"""Where a frame is on the floor: how sure that is, and whether it can be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.config import FrontEndConfig, PlanarConfig
+from vislam.core.messages import Array, Bools
+from vislam.frontend.planar.course import Course
+from vislam.frontend.planar.fit import Fit, scale_sigma
+
+_LENS_YAW_RAD = 0.001  # of a yaw between keyframe and frame by the gyroscope: scale, axes, time
+_GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
+_DEGRADED_VARIANCE = 25.0  # of residuals over what is expected: five times as noisy as a sharp floor
+_SCALE_BY_TILT = 2.9  # per rad: half a degree of tilt is 2.5 % of the way
+_UNEXPLAINED_RATIO = 0.3  # of the points that should be on the floor; fewer agree, and something else moves
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where a frame is relative to the keyframe."""
+
+    T_key_cam: Array  # [4, 4]
+    covariance: Array  # [6, 6] of the camera's motion
+    fit: Fit
+    pixels: Array  # [N, 2] of all tracks, NaN where not found
+    xy: Array  # [N, 2] on z = 1
+    candidates: int  # tracks that should be on the floor
+    good: Bools  # [N] tracks that agree with the motion, on the floor or off it
+    failure: str
+    weakness: str
+
+    @property
+    def agreeing(self) -> int:
+        """How many points on the floor agree on the motion."""
+        return int(np.count_nonzero(self.fit.inliers))
+
+
+def yaw_prior(course: Course) -> tuple[float, float] | None:
+    """Return the yaw since the keyframe by the gyroscope, and the sigma with which a fit may use it."""
+    if not course.knows_yaw:
+        return None
+    return course.yaw_rad, _GYRO_KNOWN_ALREADY * (_LENS_YAW_RAD + course.yaw_sigma_rad)
+
+
+def by_tilt(fit: Fit, T_key_cam: Array, tilt_covariance: Array, config: PlanarConfig) -> Array:
+    """Return the covariance [6, 6] by which errors of the mean tilt, which last, exceed those of each motion.
+
+    Their share of the way adds up over `correlation_m`, while a filter takes errors of motions for independent.
+    """
+    way = T_key_cam[:3, :3].T @ T_key_cam[:3, 3]
+    length = float(np.linalg.norm(way))
+    out = np.zeros((6, 6))
+    if length < 1e-6:
+        return out
+    if config.method == "split":
+        relative = float(_SCALE_BY_TILT * np.sqrt(tilt_covariance[1, 1]))
+    else:
+        relative = scale_sigma(fit, tilt_covariance)
+    out[3:, 3:] = relative**2 * max(length, config.correlation_m) / length * np.outer(way, way)
+    return out
+
+
+def by_jitter(rate: Array, R_level_cam: Array, jitter_s: float) -> Array:
+    """Return the covariance [6, 6] of a motion whose ends were stamped a little early or late, at a rate [3]."""
+    turning, moving = R_level_cam[2] * rate[0], rate[1:] @ R_level_cam[:2]
+    step = np.concatenate([turning, moving]) * jitter_s
+    return 2.0 * np.outer(step, step)
+
+
+def failure(fit: Fit, candidates: int, course: Course, config: PlanarConfig) -> str:
+    """Return why a fit cannot be believed, or an empty string."""
+    if fit.failure:
+        return fit.failure
+    agree, is_split = int(np.count_nonzero(fit.inliers)), config.method == "split"
+    if agree < config.min_points and not is_split:
+        return f"only {agree} of {candidates} points on the floor agree on a motion"
+    if agree < _UNEXPLAINED_RATIO * candidates:
+        return f"only {agree} of {candidates} points that should be on the floor agree on a motion"
+    if is_split or not course.knows_yaw:
+        return ""
+    # the prior pulls: what is left of a contradiction is the smaller, the weaker the floor is
+    jitter_rad = np.sqrt(2.0) * config.stamp_jitter_s * course.rate[0]  # of the stamps at both ends
+    gyro_rad = _LENS_YAW_RAD + course.yaw_sigma_rad
+    sigma_rad = float(np.sqrt(fit.covariance[0, 0] + gyro_rad**2 + jitter_rad**2))
+    limit = max(config.yaw_gate_sigmas * sigma_rad, np.deg2rad(config.yaw_gate_deg))
+    off = abs(float(fit.motion[0]) - course.yaw_rad)
+    if off > limit:
+        return f"the floor turned by {np.rad2deg(off):.2f} deg more or less than the gyroscope says"
+    return ""
+
+
+def weakness(fit: Fit, candidates: int, cells: int, config: FrontEndConfig) -> str:
+    """Return why the tracking is degraded, or an empty string; `cells` of the floor hold points that agree."""
+    agree = int(np.count_nonzero(fit.inliers))
+    if cells < config.planar.min_cells:
+        return f"points on the floor in only {cells} of 8 parts of the image"
+    if agree < config.degraded_inliers:
+        return f"only {agree} points on the floor agree"
+    if agree < config.degraded_inlier_ratio * candidates:
+        return f"only {agree} of {candidates} points that should be on the floor agree"
+    if fit.variance > _DEGRADED_VARIANCE:
+        return f"points on the floor are {np.sqrt(fit.variance):.0f} times as noisy as expected"
+    return ""

@@ -1,0 +1,65 @@
+"""The first state from rest: gravity and gyro bias are the means of what the IMU says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.config import InitConfig
+from vislam.core.geometry import skew
+from vislam.core.messages import Array, ImuSpan
+from vislam.imu import ImuNoise
+
+_NS = 1_000_000_000
+_CHOSEN = 1e-3  # sigma, rad and m, of heading and position where odom is defined to be zero
+_REST_SIGMA_M_S = 0.02  # a body at rest still sways
+_CORRELATED_S = 0.05  # vibration at rest averages out over samples this far apart
+
+
+def rest_variance(values: Array, rested_s: float) -> float:
+    """Return the variance of the mean of one axis of `values` [N, 3]; vibration is correlated for a while."""
+    return float(values.var(axis=0).max()) / max(rested_s / _CORRELATED_S, 1.0)
+
+
+def rest_accel_bias(span: ImuSpan, gravity_m_s2: float, config: InitConfig) -> Array:
+    """Return the accelerometer bias [3]: only its part along gravity shows at rest."""
+    rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
+    force = span.accel_m_s2.mean(axis=0)
+    norm = float(np.linalg.norm(force))
+    prior, measured = config.accel_bias_sigma_m_s2**2, rest_variance(span.accel_m_s2, rested_s)
+    return np.asarray(force / norm * ((norm - gravity_m_s2) * prior / (prior + measured)))
+
+
+def rest_covariance(span: ImuSpan, R: Array, gravity_m_s2: float, config: InitConfig, noise: ImuNoise) -> Array:
+    """Return the covariance [15, 15] of a state at rest with attitude R [3, 3].
+
+    Tilt and accelerometer bias cannot be told apart; their correlation says so.
+    """
+    rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
+    sigma_gyro = np.sqrt(rest_variance(span.gyro_rad_s, rested_s)) + noise.gyro_noise_density
+    sigma_force = np.sqrt(rest_variance(span.accel_m_s2, rested_s)) + noise.accel_noise_density
+    information = np.zeros((6, 6))  # rotation, accel bias
+    heading = R[2]  # rotation about the vertical, on the body side
+    information[:3, :3] = np.outer(heading, heading) / _CHOSEN**2 + np.eye(3)  # and tilt within 1 rad
+    information[3:, 3:] = np.eye(3) / config.accel_bias_sigma_m_s2**2
+    J = np.hstack([skew(R.T @ np.array([0.0, 0.0, gravity_m_s2])), np.eye(3)])
+    information += J.T @ J / sigma_force**2
+    both = np.linalg.inv(information)
+    covariance = np.diag(np.repeat([0.0, _CHOSEN**2, _REST_SIGMA_M_S**2, sigma_gyro**2, 0.0], 3))
+    covariance[:3, :3], covariance[:3, 12:] = both[:3, :3], both[:3, 3:]
+    covariance[12:, :3], covariance[12:, 12:] = both[3:, :3], both[3:, 3:]
+    return covariance
+
+
+def level_covariance(force_error_m_s2: float, R: Array, gravity_m_s2: float, config: InitConfig) -> Array:
+    """Return the covariance [15, 15] of a body taken as level by a few samples, while it may move, with attitude R.
+
+    `force_error_m_s2` is by how much the norm of the force differs from gravity: so much acceleration is certain.
+    """
+    acceleration = max(config.level_accel_sigma_m_s2, abs(force_error_m_s2))
+    tilt = float(np.hypot(acceleration, config.accel_bias_sigma_m_s2)) / gravity_m_s2
+    covariance = np.zeros((15, 15))
+    heading = np.outer(R[2], R[2])  # about the vertical, on the body side
+    covariance[:3, :3] = tilt**2 * (np.eye(3) - heading) + _CHOSEN**2 * heading
+    sigmas = _CHOSEN, config.level_speed_sigma_m_s, config.gyro_bias_sigma_rad_s, config.accel_bias_sigma_m_s2
+    covariance[3:, 3:] = np.diag(np.repeat(np.square(sigmas), 3))
+    return covariance

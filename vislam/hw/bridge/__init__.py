@@ -1,0 +1,1 @@
+"""A microcontroller on a serial port that reads the chips on time: protocol, clock, driver."""

@@ -1,0 +1,377 @@
+"""Inertial samples from a microcontroller on a serial port, which reads the chips on time where a host cannot."""
+
+from __future__ import annotations
+
+import errno
+import select
+import termios
+import time
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vislam.config import SerialConfig
+from vislam.core.errors import HardwareError
+from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.hw.affine import Affine
+from vislam.hw.bridge.clock import DeviceClock
+from vislam.hw.bridge.protocol import (
+    PROTOCOL_VERSION,
+    SAMPLE_WIRE_BYTES,
+    Chips,
+    FrameDecoder,
+    Hello,
+    OtherVersion,
+    RawSample,
+    Status,
+)
+from vislam.hw.gyro_zero import GyroZero
+from vislam.hw.health import Health
+
+if TYPE_CHECKING:
+    import serial
+
+_NS = 1_000_000_000
+# pyserial raises all of them at a device that goes away; its own SerialException is an OSError
+_PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
+_READ_BYTES = 4096
+_GLANCE_S = 0.05  # while the first sample is waited for, a port that cannot be opened is told so soon
+_BITS_PER_BYTE = 10  # start, eight, stop
+_NOMINAL_HZ = 400.0  # until the device says it
+_SEQUENCES = 2**16
+_TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
+_CHIP_NAMES = {Health.ACCEL_FAULT: "the accelerometer", Health.GYRO_FAULT: "the gyro"}
+
+
+class SerialBridge:
+    """Satisfies `InertialSource`. Frames come from firmware/vislam_bridge; `bridge_protocol` says what is in them.
+
+    What a plug, a cable or a wrong port can cause is told by `health`, `counters` and, in words, `problem`. A port that
+    goes away is looked for every `config.reopen_s`; one that gives no sample for `config.start_s` is opened anew, which
+    starts an Arduino anew. Nothing is ever written to it. One thread only.
+    """
+
+    def __init__(self, config: SerialConfig, must_be_there: bool = True) -> None:
+        """Open the port and wait for the first sample, `config.start_s` and a second at most.
+
+        With `must_be_there` False nothing is waited for and nothing that is missing is an error.
+
+        Raises:
+            HardwareError: no sample came, and why; pyserial is not installed.
+        """
+        self._serial = _load_pyserial()
+        self._config = config
+        self.rate_hz = _NOMINAL_HZ
+        self.problem = f"{config.port} has not been opened"
+        self._maps: tuple[Affine, Affine, Affine] | None = None  # gyro, accel, mag
+        wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
+        self._delay_ns = round((wire_s + config.chips_s + config.filter_s) * _NS)
+        self._mag_delay_ns = round((wire_s + config.chips_s + config.mag_delay_s) * _NS)
+        self._decoder = FrameDecoder()
+        self._clock = DeviceClock(config.clock)
+        self._port: serial.Serial | None = None
+        self._retry_ns = 0  # when to open the port
+        self._patience_ns = 0  # until when a frame must have come
+        self._hello: Hello | None = None
+        self._other_version: int | None = None
+        self._sequence: int | None = None
+        self._counts: Counter[str] = Counter()
+        self._events = Health(0)
+        self._steps_told = 0
+        self._faults = Health(0)  # that the last frames tell
+        self._newest_ns = 0  # when the last inertial sample came
+        self._accel_watch, self._gyro_watch = _Watch(), _Watch()
+        self._temperature_c: float | None = None
+        self._zero = GyroZero(config.calibrated_at_c)
+        self._first: list[ImuSample | MagSample] = []
+        if must_be_there:
+            self._wait_for_sample()
+
+    @property
+    def temperature_c(self) -> float | None:
+        """Temperature of the gyro, smoothed over a second; None before the first sample."""
+        return self._temperature_c
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        self._zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
+
+    @property
+    def hello(self) -> Hello | None:
+        """What the device said about itself; None before it did."""
+        return self._hello
+
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what was captured, see `InertialSource`; waits for the first sample, `timeout_s` at most."""
+        if self._first:
+            first, self._first = self._first, []
+            return first
+        now = time.monotonic_ns()
+        deadline = now + round(timeout_s * _NS)
+        while True:
+            if self._port is None and now >= self._retry_ns:
+                self._open(now)
+            if self._port is None:
+                time.sleep(max(min(deadline, self._retry_ns) - now, 0) / _NS)
+            else:
+                until = min(deadline, self._patience_ns)
+                samples = self._received(self._port, max(until - now, 0) / _NS)
+                if samples:
+                    return samples
+            now = time.monotonic_ns()
+            if now >= deadline:
+                return []
+
+    def health(self) -> Health:
+        """Return the sensor bits that hold now and the events since the last call."""
+        word, self._events = self._events | self._faults, Health(0)
+        if self._clock.steps > self._steps_told:
+            self._steps_told = self._clock.steps
+            word |= Health.CLOCK_STEP
+        if time.monotonic_ns() - self._newest_ns > self._config.missing_s * _NS:
+            word |= Health.IMU_MISSING
+        if self._zero.is_far(self._temperature_c, self._config.max_temperature_change_c):
+            word |= Health.TEMPERATURE_DRIFT
+        return word
+
+    def counters(self) -> dict[str, int]:
+        """Return how often each fault occurred since the start."""
+        found = self._counts + Counter(
+            bad_frames=self._decoder.bad, clock_steps=self._clock.steps, stamps_doubted=self._clock.doubted
+        )
+        return dict(found)
+
+    def close(self) -> None:
+        """Close the port; may be called twice."""
+        port, self._port = self._port, None
+        if port is not None:
+            try:
+                port.close()
+            except _PORT_ERRORS:
+                self._counts["close_failures"] += 1
+
+    # ---- the port ---------------------------------------------------------------------------------------------
+
+    def _open(self, now: int) -> None:
+        """Try to open the port; what keeps it from opening is in `problem`."""
+        config = self._config
+        self._retry_ns = now + round(config.reopen_s * _NS)
+        try:
+            # exclusive: two programs on one port would each get half of the bytes
+            self._port = self._serial.Serial(config.port, config.baud, timeout=0, exclusive=True)
+        except _PORT_ERRORS as error:
+            self._counts["open_failures"] += 1
+            self.problem = why_not_open(config, error)
+            return
+        self._counts["opened"] += 1
+        self._patience_ns = now + round(config.start_s * _NS)
+        self._decoder.reset()
+        self._clock.restart()
+        self._hello = self._other_version = self._sequence = None
+
+    def _wait_for_sample(self) -> None:
+        end_ns = time.monotonic_ns() + round((self._config.start_s + 1.0) * _NS)
+        found: list[ImuSample | MagSample] = []
+        while not self._newest_ns:
+            left_ns = end_ns - time.monotonic_ns()
+            found += self.read(min(max(left_ns / _NS, 0.0), _GLANCE_S))
+            hopeless = self._other_version is not None or (self._port is None and self._counts["opened"] == 0)
+            if left_ns <= 0 or hopeless:
+                problem = self.problem if self._port is None else self._diagnosis()[1]
+                self.close()
+                raise HardwareError(problem)
+        self._first = found
+
+    def _lose(self, what: str, problem: str) -> None:
+        self._counts[what] += 1
+        self.problem = problem
+        self.close()
+
+    def _diagnosis(self) -> tuple[str, str]:
+        """Return why an open port gives no sample: a counter's name and words."""
+        port, decoder = self._config.port, self._decoder
+        if self._other_version is not None:
+            return "other_version", (
+                f"{port} speaks version {self._other_version} of the protocol, this vislam speaks {PROTOCOL_VERSION}; "
+                "put the sketch of this vislam on the board, docs/cart.md says how"
+            )
+        if self._hello is not None:
+            missing = [name for bit, name in _CHIP_NAMES.items() if bit in self._faults]
+            what = f"has no answer from {' and '.join(missing)}" if missing else "gives no sample"
+            return "no_sample", f"{port}: the board runs and {what}; check the chips' power, SDA and SCL"
+        if decoder.bytes_since_good > 0:
+            return "no_valid_frame", (
+                f"{port} sends bytes that are no frames: another device, or another rate than {self._config.baud} "
+                "baud; set serial.baud to what is in the sketch"
+            )
+        return "silent", f"{port} is silent; is the board powered and the sketch on it? docs/cart.md says how"
+
+    def _received(self, port: serial.Serial, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return the samples in what the port has, waiting for the first byte; an unplugged port is closed."""
+        config = self._config
+        try:
+            ready, _, _ = select.select([port.fileno()], [], [], timeout_s)
+            data = port.read(_READ_BYTES) if ready else b""
+        except _PORT_ERRORS as error:
+            self._lose("port_lost", f"{config.port} went away: {error}; plug it in again")
+            return []
+        arrival_ns = time.monotonic_ns()
+        bad = self._decoder.bad
+        samples: list[ImuSample | MagSample] = []
+        for message in self._decoder.feed(data):
+            samples += self._taken(message, arrival_ns)
+        if self._decoder.bad > bad:
+            self._events |= Health.BUS_FAULT
+        if samples:
+            self._patience_ns = arrival_ns + round(config.start_s * _NS)
+            self.problem = ""
+        elif arrival_ns >= self._patience_ns:
+            self._lose(*self._diagnosis())
+        samples.sort(key=lambda sample: sample.t_ns)
+        return samples
+
+    # ---- messages ---------------------------------------------------------------------------------------------
+
+    def _taken(self, message: RawSample | Hello | OtherVersion, arrival_ns: int) -> list[ImuSample | MagSample]:
+        if isinstance(message, OtherVersion):
+            self._other_version = message.version
+            self._hello = None
+            self._events |= Health.BUS_FAULT
+            return []
+        if isinstance(message, Hello):
+            self._greet(message)
+            return []
+        self._follow(message.sequence)
+        if self._hello is None or self._maps is None:
+            self._counts["before_hello"] += 1
+            return []
+        return self._sampled(message, self._hello, self._maps, arrival_ns)
+
+    def _greet(self, hello: Hello) -> None:
+        """Take what the device says about itself."""
+        if Chips.STARTED in hello.chips and self._hello is not None:
+            self._counts["device_restarts"] += 1
+            self._clock.restart()
+            self._sequence = None
+        self._follow(hello.sequence)
+        if self._hello is None or hello.accel_nm_s2 != self._hello.accel_nm_s2:
+            c = self._config.calibration
+            self._maps = (
+                Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, hello.gyro_nrad_s * 1e-9),
+                Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, hello.accel_nm_s2 * 1e-9),
+                Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, hello.mag_pt * 1e-6),
+            )
+        self._hello = hello
+        self.rate_hz = float(hello.rate_hz)
+
+    def _follow(self, sequence: int) -> None:
+        """Count frames that are missing before this one."""
+        if self._sequence is not None:
+            lost = (sequence - self._sequence - 1) % _SEQUENCES
+            if lost:
+                self._counts["frames_lost"] += lost
+                self._events |= Health.IMU_GAP
+        self._sequence = sequence
+
+    def _sampled(
+        self, raw: RawSample, hello: Hello, maps: tuple[Affine, Affine, Affine], arrival_ns: int
+    ) -> list[ImuSample | MagSample]:
+        stamp_ns = self._clock.stamp(raw.t_us, arrival_ns)
+        self._note_status(raw, hello)
+        if stamp_ns is None:
+            self._counts["unstamped"] += 1
+            return []
+        gyro_map, accel_map, mag_map = maps
+        samples: list[ImuSample | MagSample] = []
+        if Status.MAG_NEW in raw.status and max(map(abs, raw.mag)) < hello.mag_limit:
+            field_ut = mag_map.matrix @ np.array(raw.mag, dtype=np.float64) + mag_map.offset
+            samples.append(MagSample(stamp_ns - self._mag_delay_ns, field_ut))
+        if raw.status & (Status.ACCEL_ERROR | Status.GYRO_ERROR):
+            self._events |= Health.IMU_GAP | Health.BUS_FAULT
+            return samples
+        rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
+        rate -= self._zero.drift_rad_s(self._temperature_c)
+        force = accel_map.matrix @ np.array(raw.accel, dtype=np.float64) + accel_map.offset
+        samples.append(ImuSample(stamp_ns - self._delay_ns, rate, force))
+        self._newest_ns = arrival_ns
+        return samples
+
+    def _note_status(self, raw: RawSample, hello: Hello) -> None:
+        """Count what a sample says about itself, and what its counts say."""
+        faults, counts, stuck = Health(0), self._counts, round(self._config.stuck_s * hello.rate_hz)
+        if Status.MISSED in raw.status:
+            counts["device_late"] += 1
+            self._events |= Health.IMU_GAP
+        for error, name, bit in (
+            (Status.ACCEL_ERROR, "accel_errors", Health.ACCEL_FAULT),
+            (Status.GYRO_ERROR, "gyro_errors", Health.GYRO_FAULT),
+            (Status.MAG_ERROR, "mag_errors", Health.MAG_FAULT),
+        ):
+            if error in raw.status:
+                counts[name] += 1
+                faults |= bit
+        if Status.ACCEL_ERROR not in raw.status:
+            if max(map(abs, raw.accel)) >= hello.accel_limit:
+                counts["accel_saturated"] += 1
+                self._events |= Health.ACCEL_SATURATED
+            if self._accel_watch.repeats(raw.accel) >= stuck:
+                counts["accel_stuck"] += 1
+                faults |= Health.ACCEL_FAULT
+        if Status.GYRO_ERROR not in raw.status:
+            if max(map(abs, raw.gyro)) >= hello.gyro_limit:
+                counts["gyro_saturated"] += 1
+                self._events |= Health.GYRO_SATURATED
+            if self._gyro_watch.repeats((*raw.gyro, raw.temperature)) >= stuck:
+                counts["gyro_stuck"] += 1
+                faults |= Health.GYRO_FAULT
+            self._take_temperature(raw.temperature * hello.temperature_nk * 1e-9 + hello.temperature_mc * 1e-3)
+        if Status.MAG_NEW in raw.status and max(map(abs, raw.mag)) >= hello.mag_limit:
+            counts["mag_overflow"] += 1
+            self._events |= Health.MAG_FAULT
+        self._faults = faults
+
+    def _take_temperature(self, temperature_c: float) -> None:
+        if self._temperature_c is None:
+            self._temperature_c = temperature_c
+        gain = min(1.0 / (_TEMPERATURE_TAU_S * self.rate_hz), 1.0)
+        self._temperature_c += gain * (temperature_c - self._temperature_c)
+
+
+class _Watch:
+    """Counts how often values came again to the last bit; noise makes that impossible, a hung chip does it."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, ...] | None = None
+        self._repeats = 0
+
+    def repeats(self, values: tuple[int, ...]) -> int:
+        self._repeats = self._repeats + 1 if values == self._last else 0
+        self._last = values
+        return self._repeats
+
+
+def _load_pyserial() -> Any:
+    try:
+        import serial as module
+    except ImportError as error:
+        raise HardwareError("the serial bridge needs pyserial; install it: pip install 'vislam[hw]'") from error
+    return module
+
+
+def why_not_open(config: SerialConfig, error: Exception) -> str:
+    """Return what keeps a port from opening, and what to do about it."""
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT:
+        from serial.tools import list_ports
+
+        there = ", ".join(port.device for port in list_ports.comports()) or "none"
+        return f"there is no port {config.port}; there are: {there}. Plug the board in, or name another port"
+    if number in (errno.EACCES, errno.EPERM):
+        return (
+            f"{config.port} may not be opened; add yourself to the group that owns it (usually: "
+            "sudo usermod -aG dialout $USER) and log in again"
+        )
+    if number in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK):
+        return f"{config.port} is used by another program; close it (the Arduino IDE's monitor?)"
+    return f"{config.port} cannot be opened as a serial port at {config.baud} baud: {error}"

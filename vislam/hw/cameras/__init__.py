@@ -1,0 +1,1 @@
+"""Cameras: a webcam, or a video file in its place."""

@@ -1,0 +1,25 @@
+"""The magnetometer of a GY-85, whichever of four it is."""
+
+from __future__ import annotations
+
+from vislam.hw.chips import hmc5883l
+from vislam.hw.chips.bus import I2cBus
+from vislam.hw.chips.field import Magnetometer
+from vislam.hw.chips.qmc5883 import QMC5883L, QMC5883P, Qmc5883
+
+
+def find_magnetometer(bus: I2cBus, range_ga: float) -> Magnetometer | None:
+    """Return the magnetometer that answers by its address and its id, not yet set up; None if none does.
+
+    A DA5883 says it is an HMC5883L and shows itself by its status only; see `Hmc5883l.name`. Raises BusError.
+    """
+    address = hmc5883l.ADDRESS
+    if bus.answers(address, hmc5883l.ID_REGISTER) and bus.read(address, hmc5883l.ID_REGISTER, 3) == hmc5883l.IDS:
+        return hmc5883l.Hmc5883l(bus, range_ga)
+    for variant in (QMC5883L, QMC5883P):
+        if (
+            bus.answers(variant.address, variant.id_register)
+            and bus.read(variant.address, variant.id_register, 1)[0] == variant.id_value
+        ):
+            return Qmc5883(bus, range_ga, variant)
+    return None

@@ -1,0 +1,1 @@
+"""The published pose on other wires: ROS 2 and MAVLink."""

@@ -1,0 +1,235 @@
+"""The published pose for ROS 2: nav_msgs/Odometry, tf and the health word over DDS, without ROS.
+
+Only its own process imports this.
+
+Needs cyclonedds. The structs below are those of ROS's message packages, field by field; names, topics and the encoding
+are those of https://design.ros2.org/articles/topic_and_service_names.html and of rmw_cyclonedds.
+"""
+
+import time
+from dataclasses import dataclass
+
+import cyclonedds.idl.annotations as annotate
+import numpy as np
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, float64, int32, sequence, uint32
+from cyclonedds.pub import DataWriter, Publisher
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from vislam.core.geometry import quaternion_xyzw_from_rotation
+from vislam.core.messages import Array as Matrix
+from vislam.hw.health import Health
+from vislam.live.wire.published_pose import PublishedPose
+
+_NS = 1_000_000_000
+# Peers are asked one by one, as the loopback interface has no multicast.
+LOOPBACK = """<CycloneDDS><Domain Id="any">
+  <General><AllowMulticast>false</AllowMulticast>
+    <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>
+  <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+QOS = Qos(
+    Policy.Reliability.Reliable(duration(milliseconds=100)),
+    Policy.History.KeepLast(10),
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
+
+
+@dataclass
+@annotate.final
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    """When."""
+
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+@annotate.final
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    """When and in which frame."""
+
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+@annotate.final
+class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
+    """A position."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+@annotate.final
+class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
+    """A direction."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+@annotate.final
+class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
+    """A rotation."""
+
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+@annotate.final
+class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
+    """Where."""
+
+    position: Point
+    orientation: Quaternion
+
+
+@dataclass
+@annotate.final
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
+    """Where, and how sure; rows of x, y, z, rotation about X, Y, Z, in axes of the header's frame."""
+
+    pose: Pose
+    covariance: array[float64, 36]
+
+
+@dataclass
+@annotate.final
+class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
+    """How fast."""
+
+    linear: Vector3
+    angular: Vector3
+
+
+@dataclass
+@annotate.final
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::TwistWithCovariance_"):
+    """How fast, and how sure; in axes of the child's frame."""
+
+    twist: Twist
+    covariance: array[float64, 36]
+
+
+@dataclass
+@annotate.final
+class Odometry(IdlStruct, typename="nav_msgs::msg::dds_::Odometry_"):
+    """nav_msgs/Odometry."""
+
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+
+
+@dataclass
+@annotate.final
+class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
+    """T_a_b."""
+
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+@annotate.final
+class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformStamped_"):
+    """T_a_b: a is the header's frame, b the child's."""
+
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+@annotate.final
+class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
+    """What goes over /tf."""
+
+    transforms: sequence[TransformStamped]
+
+
+@dataclass
+@annotate.final
+class UInt32(IdlStruct, typename="std_msgs::msg::dds_::UInt32_"):
+    """std_msgs/UInt32: the health word, of which an Odometry has no field."""
+
+    data: uint32
+
+
+class Ros2:
+    """Owns the DDS entities that write /odom, /tf and /vislam/health."""
+
+    def __init__(self, domain: int, allow_remote: bool = False) -> None:
+        """Join a domain.
+
+        Args:
+            domain: what ROS_DOMAIN_ID is for the others.
+            allow_remote: use the interfaces that CYCLONEDDS_URI or the system names; else the loopback one alone.
+        """
+        self._domain = None if allow_remote else Domain(domain, LOOPBACK)
+        self._participant = DomainParticipant(domain)
+        publisher = Publisher(self._participant)
+        self._odom = DataWriter(publisher, Topic(self._participant, "rt/odom", Odometry, qos=QOS), qos=QOS)
+        self._tf = DataWriter(publisher, Topic(self._participant, "rt/tf", TFMessage, qos=QOS), qos=QOS)
+        self._health = DataWriter(publisher, Topic(self._participant, "rt/vislam/health", UInt32, qos=QOS), qos=QOS)
+
+    def send(self, pose: PublishedPose) -> None:
+        """Write all; of a pose not to steer by the health word alone, as an Odometry cannot say so."""
+        self._health.write(UInt32(int(pose.health)))
+        if Health.INVALID in pose.health or not np.isfinite(pose.pose_covariance).all():
+            return
+        stamp_ns = pose.t_ns + max(time.time_ns() - time.monotonic_ns() for _ in range(3))  # less when interrupted
+        self._odom.write(odometry(pose, stamp_ns))
+        self._tf.write(transforms(pose, stamp_ns))
+
+    def close(self) -> None:
+        """Leave the domain; may be called twice."""
+        vars(self).clear()  # an entity leaves when it is let go
+
+
+def odometry(pose: PublishedPose, stamp_ns: int) -> Odometry:
+    """Return the message: pose in `odom`, twist in `base_link`; the stamp is of CLOCK_REALTIME, as ROS's are."""
+    T = pose.T_odom_base
+    return Odometry(
+        Header(_time(stamp_ns), "odom"),
+        "base_link",
+        PoseWithCovariance(Pose(Point(*T[:3, 3].tolist()), _quaternion(T)), pose.pose_covariance.ravel().tolist()),
+        TwistWithCovariance(
+            Twist(Vector3(*pose.velocity_m_s.tolist()), Vector3(*pose.rate_rad_s.tolist())),
+            pose.twist_covariance.ravel().tolist(),
+        ),
+    )
+
+
+def transforms(pose: PublishedPose, stamp_ns: int) -> TFMessage:
+    """Return map -> odom, which loops correct, and odom -> base_link, which never jumps."""
+    frames = (("map", "odom", pose.T_map_odom), ("odom", "base_link", pose.T_odom_base))
+    return TFMessage(
+        [
+            TransformStamped(
+                Header(_time(stamp_ns), parent), child, Transform(Vector3(*T[:3, 3].tolist()), _quaternion(T))
+            )
+            for parent, child, T in frames
+        ]
+    )
+
+
+def _time(t_ns: int) -> Time:
+    return Time(*divmod(t_ns, _NS))
+
+
+def _quaternion(T: Matrix) -> Quaternion:
+    return Quaternion(*quaternion_xyzw_from_rotation(T[:3, :3]).tolist())

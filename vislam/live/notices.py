@@ -1,0 +1,52 @@
+"""What the processes tell each other, beside measurements. Plain values; nothing here loads a heavy package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vislam.core.messages import Array, NavState, NoiseScale, VoMeasurement
+from vislam.ekf.correction import Correction
+from vislam.hw.health import Health
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Gravity is known: the first state, and the motion seen there."""
+
+    state: NavState
+    vo: VoMeasurement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rebase:
+    """The state that a tight filter has after a frame; too much work for the fast process itself."""
+
+    state: NavState
+    is_tracking: bool
+    at_rest: bool
+    noise: NoiseScale  # of the IMU from now on
+
+
+@dataclass(frozen=True, slots=True)
+class CameraHealth:
+    """What the camera says of itself, when it changes."""
+
+    health: Health
+
+
+@dataclass(frozen=True, slots=True)
+class Doubted:
+    """Whether the verdict on the run so far is anything but trusted, when it changes."""
+
+    is_doubtful: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapMoved:
+    """Where `odom` is in `map` since a revision of the graph."""
+
+    revision: int
+    T_map_odom: Array  # [4, 4]
+
+
+ToFast = Start | Correction | Rebase | CameraHealth | Doubted | MapMoved

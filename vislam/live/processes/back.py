@@ -1,0 +1,91 @@
+"""The process of loops and graph: as slow as it has to be, and nobody waits for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from multiprocessing.connection import Connection
+
+import cv2
+
+from vislam.config import Config
+from vislam.core.camera import Rig
+from vislam.core.clock import StageClock
+from vislam.imu import ImuNoise
+from vislam.live.beginning import Beginning, recalled
+from vislam.live.handover import BackBegun, BackEnded, EndedGraph, KeyframeOut
+from vislam.live.notices import MapMoved
+from vislam.live.processes.child import Life
+from vislam.live.rehearsal import rehearse
+from vislam.live.wire.mail import Inbox, Outbox
+from vislam.pipeline.back import Back
+
+_WAIT_S = 0.1
+
+
+def run(
+    life: Life, config: Config, rig: Rig, noise: ImuNoise, keyframes: Connection, to_fast: Connection,
+    to_map: Connection, beginning: Beginning | None,
+) -> None:  # fmt: skip
+    """Take keyframes until the front process ends them; then finish the graph and hand it over.
+
+    Args:
+        life: of this process.
+        config: of the run; the map belongs to another process.
+        rig: the cameras.
+        noise: of the IMU, as it is rehearsed with.
+        keyframes: `KeyframeOut` from the front process, until it closes it or is killed.
+        to_fast: `MapMoved`, one per revision.
+        to_map: `BackBegun` if there is a `beginning`, `KeyframeStep`, then `BackEnded`.
+        beginning: the session that the run goes on from.
+    """
+    cv2.setNumThreads(1)
+    config = replace(config, map=replace(config.map, enabled=False))
+    rehearse(config, rig, noise)
+    clock = StageClock()
+    back: Back | None = None
+    inbox, outbox = Inbox(keyframes), Outbox(to_map, config.live.keyframe_queue)
+    begins_recording = beginning is not None
+    if beginning is not None:
+        memory = recalled(beginning)
+        back = Back(config, rig, noise, clock, memory.first_state, memory.T_start)
+        _put(life, outbox, BackBegun(back.restore(memory)))
+        del memory
+    life.ready()
+    while (keyframe := _next(life, inbox)) is not None:
+        if back is None:
+            back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, keyframe.odometry.T_odom_body)
+        if begins_recording:
+            begins_recording = not back.begin_recording(keyframe.first_state, keyframe.odometry.T_odom_body)
+            if begins_recording:
+                continue  # ended before gravity was known
+        step = back.add(keyframe.odometry, [])
+        _tell(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
+        _put(life, outbox, step)
+    if back is None:
+        ended = BackEnded(None, None, None, {}, clock.summary_ms())
+    else:
+        update = back.finish()
+        graph = EndedGraph(back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports())
+        ended = BackEnded(graph, update, back.graph.take_news(), back.counters, clock.summary_ms())
+    _put(life, outbox, ended)
+    outbox.close()
+
+
+def _next(life: Life, keyframes: Inbox) -> KeyframeOut | None:
+    while not (keyframes.is_over or life.is_orphan):
+        keyframe: KeyframeOut | None = keyframes.get(_WAIT_S)
+        if keyframe is not None:
+            return keyframe
+    return None
+
+
+def _tell(to_fast: Connection, message: MapMoved) -> None:
+    try:
+        to_fast.send(message)
+    except OSError:  # the pose is not published any more; the map is finished all the same
+        return
+
+
+def _put(life: Life, box: Outbox, value: object) -> None:
+    while not (box.put(value, _WAIT_S) or life.is_orphan):
+        continue

@@ -1,0 +1,167 @@
+"""What every process of a live run does alike: report, notice the end, and carry its failure home whole."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import pickle
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import RawValue
+from typing import Any
+
+from vislam.core import interrupts
+from vislam.core.errors import VislamError, storage_failure
+from vislam.core.log import log_through
+
+_POLL_S = 0.005
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Everything is loaded and compiled."""
+
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something to tell the user while it runs."""
+
+    role: str
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """How a process ended that should not have."""
+
+    role: str
+    error: Exception | None  # as it was raised, if that can travel
+    traceback: str
+
+
+class Flag:
+    """A byte in shared memory that only ever rises: unlike an Event it has no lock that a killed process could keep."""
+
+    def __init__(self) -> None:
+        """Begin low; travels to a process that is spawned with it."""
+        self._byte = RawValue("b", 0)
+
+    def set(self) -> None:
+        """Raise it."""
+        self._byte.value = 1
+
+    def is_set(self) -> bool:
+        """Return whether it was raised."""
+        return bool(self._byte.value)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Return whether it was raised, waiting at most so long for that."""
+        deadline = time.monotonic() + timeout_s
+        while not self.is_set() and time.monotonic() < deadline:
+            time.sleep(_POLL_S)
+        return self.is_set()
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """What the parent tells all."""
+
+    go: Flag  # every process is ready
+    stop: Flag
+
+
+class Life:
+    """Tells a child whether to go on, and its parent how it is."""
+
+    def __init__(self, role: str, report: Connection, signals: Signals) -> None:
+        """Keep the parent's id: with another parent, the old one is dead."""
+        self.role = role
+        self._report = report
+        self._sending = threading.Lock()  # threads that read sensors may warn
+        self._signals = signals
+        self._parent = os.getppid()
+        self._asked = 0.0
+        self._is_orphan = False
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the run is to end, because somebody said so or the parent is gone."""
+        return self._signals.stop.is_set() or self.is_orphan
+
+    @property
+    def is_orphan(self) -> bool:
+        """Whether the parent is gone; asked of the system four times a second."""
+        now = time.monotonic()
+        if now - self._asked > 0.25:
+            self._asked, self._is_orphan = now, os.getppid() != self._parent
+        return self._is_orphan
+
+    def ready(self) -> bool:
+        """Say that everything is loaded, wait for the others; False when the run ends before."""
+        self.tell(Ready(self.role))
+        _die_with_parent(False)  # from now on it looks after that itself, and ends in order
+        while not self._signals.go.wait(0.1):
+            if self.stopped:
+                return False
+        return True
+
+    def note(self, **values: Any) -> None:
+        """Tell the parent something to show."""
+        self.tell(Note(self.role, values))
+
+    def tell(self, message: Ready | Note | Failure | logging.LogRecord) -> None:
+        """Send a message; a parent that is gone needs none."""
+        try:
+            with self._sending:
+                self._report.send(message)
+        except OSError:
+            self._is_orphan = True
+
+
+def guarded(
+    role: str, report: Connection, signals: Signals, body: Callable[[Life], None], log_level: str = "info"
+) -> None:
+    """Run a child's body; report what it logs and whatever it raises, and leave with exit code 1 then.
+
+    Ctrl-C reaches every process of a terminal; only the parent acts on it.
+    """
+    interrupts.ignore()
+    _die_with_parent(True)
+    life = Life(role, report, signals)
+    try:
+        with log_through(life.tell, log_level):
+            body(life)
+    except Exception as error:
+        life.tell(Failure(role, _portable(error), traceback.format_exc()))
+        raise SystemExit(1) from None
+
+
+def _die_with_parent(is_on: bool) -> None:
+    """Have the system kill this process when its parent dies: what compiles for minutes does not look."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL if is_on else 0)
+    parent = parent_process()
+    if is_on and parent is not None and not parent.is_alive():
+        os._exit(1)
+
+
+def _portable(error: Exception) -> Exception | None:
+    """Return an error that the parent can load: one of ours, as it is, or what the system refused as one of ours."""
+    if isinstance(error, OSError):
+        return storage_failure(error)
+    if not isinstance(error, VislamError):
+        return None
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 what this very process wrote
+    except Exception:
+        return None
+    return error

@@ -1,0 +1,269 @@
+"""The process that sees: frames and samples through the front half, corrections to the pose, keyframes to the back."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vislam.config import Config
+from vislam.core.camera import Rig
+from vislam.core.clock import StageClock
+from vislam.core.errors import DataError, HardwareError
+from vislam.core.messages import Array, Frame, ImuSample, Keyframe, Tracking, no_observations
+from vislam.ekf.correction import Hint
+from vislam.frontend.start import Initialisation
+from vislam.hw.health import Health
+from vislam.imu import ImuNoise
+from vislam.live.beginning import Beginning
+from vislam.live.frames import FrameSource
+from vislam.live.handover import FrontEnded, KeyframeOut, Seen
+from vislam.live.notices import CameraHealth, Doubted, Rebase, Start, ToFast
+from vislam.live.pace import Pace
+from vislam.live.processes.child import Life
+from vislam.live.rehearsal import rehearse_front
+from vislam.live.wire.mail import Outbox
+from vislam.live.wire.publisher import PoseReader
+from vislam.live.wire.stream import SampleReceiver, Value
+from vislam.pipeline.back import makes_depth, seen_between
+from vislam.pipeline.front import Front
+from vislam.pipeline.front_report import FrontReport
+from vislam.pipeline.steps import FrontStep
+from vislam.run.evidence import front_evidence
+from vislam.run.verdict import Trust, Verdict, judge
+
+_LOG = logging.getLogger(__name__)
+_READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
+_PUT_S = 0.1
+_JUDGE_NS = 1_000_000_000  # of frames between verdicts: one costs a millisecond
+_STEPS = 4096  # frames that may wait for the map process: minutes; then it is stuck
+
+
+def run(
+    life: Life,
+    config: Config,
+    rig: Rig,
+    noise: ImuNoise,
+    open_camera: Callable[[], FrameSource],
+    samples: socket.socket,
+    to_fast: Connection,
+    to_back: Connection,
+    to_map: Connection,
+    beginning: Beginning | None,
+) -> None:
+    """Process frames until the samples end; then tell the back and the map process that there are no more.
+
+    Args:
+        life: of this process.
+        config: of the run.
+        rig: the cameras.
+        noise: of the IMU.
+        open_camera: opens them, in this process.
+        samples: from the fast process.
+        to_fast: corrections.
+        to_back: `KeyframeOut`.
+        to_map: `Seen`, then `FrontEnded`.
+        beginning: the session that the run goes on from.
+    """
+    cv2.setNumThreads(1)
+    rehearse_front(config, rig, noise)
+    camera = open_camera()
+    try:
+        back, follower = Outbox(to_back, config.live.keyframe_queue), Outbox(to_map, _STEPS)
+        process = FrontProcess(life, config, rig, noise, to_fast, back, follower)
+        if beginning is not None:
+            process.front.begin_in_map(beginning.first_id, beginning.next_track_id)
+        if life.ready():
+            process.loop(camera, SampleReceiver(samples))
+            process.end()
+        process.closing(camera.counters())
+    finally:
+        camera.close()
+
+
+class FrontProcess:
+    """Owns the front half of this run and the ends of its wires."""
+
+    def __init__(
+        self, life: Life, config: Config, rig: Rig, noise: ImuNoise, to_fast: Connection, to_back: Outbox,
+        to_map: Outbox,
+    ) -> None:  # fmt: skip
+        self.clock = StageClock()
+        self.front = Front(config, rig, noise, self.clock)
+        self._life, self._config = life, config
+        self._to_fast, self._to_back, self._to_map = to_fast, to_back, to_map
+        self._frames: deque[Frame] = deque()
+        self._told_start: Initialisation | None = None
+        self._begins_back = True
+        self._camera_health = Health(0)
+        self._verdict = Verdict(Trust.TRUSTED)
+        self._judged_t_ns = 0
+        self._frames_taken = 0
+        self._feeds_depth = makes_depth(config, rig)
+        self._poses: PoseReader | None = None
+        self._counters = {"crowded_frames": 0, "waits_for_back": 0}
+        self._pace, self._told_every = Pace(noise.rate_hz), 1
+
+    def loop(self, camera: FrameSource, samples: SampleReceiver) -> None:
+        """Take frames and samples until the samples end."""
+        while not samples.ended and not self._life.is_orphan:
+            samples.receive(self._take)
+            frame = camera.read(_READ_S)
+            if frame is not None and self._pace.wants(frame):
+                self._frames.append(frame)
+            self._follow_camera(camera.health())
+            self._follow_pace()
+            while self._frames and self.front.is_ready(self._frames[0].t_ns, self._frames[-1].t_ns):
+                samples.receive(self._take)
+                self._process(self._frames.popleft())
+
+    def end(self) -> None:
+        """Process what still waits."""
+        while self._frames:
+            self._process(self._frames.popleft())
+        for odometry in self.front.give_up_waiting():
+            self._put_keyframe(KeyframeOut(odometry, *self._first()))
+
+    def closing(self, camera_counters: dict[str, int]) -> None:
+        """Say good-bye to the others; what happened goes to the map process, which writes it down."""
+        self._to_back.close()
+        report = self._report()
+        report = replace(report, counters={**report.counters, "camera": camera_counters})
+        ended = FrontEnded(report, self.front.start, self.front.news, self.clock.summary_ms())
+        self._put(self._to_map, ended)
+        self._to_map.close()
+
+    def _take(self, value: Value) -> None:
+        if isinstance(value, Hint):
+            self.front.add_hint(value)
+        else:
+            if isinstance(value, ImuSample):
+                self._pace.add_sample(value)
+            self.front.add(value)
+
+    def _report(self) -> FrontReport:
+        """Return what the front half has to say, and how it kept up."""
+        report = self.front.report()
+        return replace(report, counters={**report.counters, "live": {**self._counters, **self._pace.counters}})
+
+    def _process(self, frame: Frame) -> None:
+        begun_ns = time.monotonic_ns()
+        self._see(frame)
+        self._pace.took(frame, begun_ns, time.monotonic_ns())
+
+    def _see(self, frame: Frame) -> None:
+        is_crowded = self._pace.every > 1 or len(self._to_back) >= self._config.live.keyframe_queue // 2
+        self.front.frontend.keyframe_spacing = self._config.live.crowded_spacing if is_crowded else 1.0
+        self._counters["crowded_frames"] += is_crowded
+        step = self.front.process(frame)
+        self._correct(step)
+        self._judge(frame.t_ns)
+        for odometry in step.keyframes:
+            self._put_keyframe(KeyframeOut(odometry, *self._first()))
+        shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
+        self._frames_taken += 1
+        seen = Seen(light(step, shows, self._feeds_depth), self._T_map_odom(), self.front.start, self.front.news)
+        if not self._to_map.put(seen):
+            raise HardwareError(
+                "the map process does not take frames any more; is the disk of --out stuck, or the machine too slow?"
+            )
+
+    def _correct(self, step: FrontStep) -> None:
+        """Tell the fast process's filter what this one was told."""
+        found = self.front.newest_start
+        if found is not self._told_start and found is not None and found.last is not None:
+            self._told_start = found
+            self._send(Start(found.last, step.track.vo))
+        if self.front.ekf_coupling == "tight":
+            if step.state is not None:
+                is_tracking = step.track.vo.tracking is not Tracking.LOST
+                at_rest = any(correction.at_rest for correction in step.corrections)
+                self._send(Rebase(step.state, is_tracking, at_rest, self.front.noise_scale))
+            return
+        for correction in step.corrections:
+            self._send(replace(correction, observations=no_observations()))
+
+    def _judge(self, t_ns: int) -> None:
+        """Tell the pose whether the run so far is to be doubted, and people why; nothing while it begins."""
+        if self.front.initialisation is None or t_ns - self._judged_t_ns < _JUDGE_NS:
+            return
+        self._judged_t_ns = t_ns
+        verdict = judge(front_evidence(self._report(), self._config.imu), self._config.verdict)
+        if verdict.state != self._verdict.state:
+            self._send(Doubted(verdict.state is not Trust.TRUSTED))
+        if verdict != self._verdict:
+            self._life.note(verdict={"state": str(verdict.state), "reasons": list(verdict.reasons)})
+        self._verdict = verdict
+
+    def _follow_camera(self, health: Health) -> None:
+        if health != self._camera_health:
+            self._camera_health = health
+            self._send(CameraHealth(health))
+
+    def _follow_pace(self) -> None:
+        """Say when frames are left out, and when all are taken again."""
+        every = self._pace.every
+        if every == self._told_every:
+            return
+        how = "keeps up with" if every < self._told_every else "is too slow for"
+        _LOG.warning("vision %s its camera: one frame in %d is taken from now on", how, every)
+        self._told_every = every
+        self._life.note(every=every)
+
+    def _send(self, message: ToFast) -> None:
+        try:
+            self._to_fast.send(message)
+        except OSError:  # the fast process has ended; the end of the samples says so in a moment
+            return
+
+    def _first(self) -> tuple[Any, Any]:
+        """Return what the back end has to know before its first keyframe."""
+        if not self._begins_back:
+            return None, None
+        self._begins_back = False
+        return self.front.noise, self.front.first_state
+
+    def _put_keyframe(self, keyframe: KeyframeOut) -> None:
+        """Hand a keyframe to the back end; where it has too many, vision waits and the pose is dead reckoning."""
+        self._counters["waits_for_back"] += len(self._to_back) >= self._config.live.keyframe_queue
+        self._put(self._to_back, keyframe)
+
+    def _put(self, box: Outbox, value: object) -> None:
+        while not (box.put(value, _PUT_S) or self._life.is_orphan):
+            continue
+
+    def _T_map_odom(self) -> Array:
+        """Return where `odom` is in `map` as it is published now."""
+        if self._poses is None:
+            try:
+                self._poses = PoseReader(self._config.live.name)
+            except DataError:
+                return np.eye(4)
+        pose = self._poses.latest()
+        return np.eye(4) if pose is None else pose.T_map_odom
+
+
+def light(step: FrontStep, shows: bool, feeds_depth: bool = False) -> FrontStep:
+    """Return a step without what comes to the map process from the back end.
+
+    With pictures only if it `shows` them, or `feeds_depth` from one camera.
+    """
+    frame, track = step.frame, step.track
+    bare = replace(frame, images=(), color=None, depth_m=None, tracks=None)
+    if feeds_depth and seen_between(step):
+        bare = replace(bare, images=frame.images[:1])
+    keyframe = track.keyframe
+    if keyframe is not None:
+        keyframe = Keyframe(keyframe.id, keyframe.t_ns, bare, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
+    observations = track.observations if shows else no_observations()
+    track = replace(track, keyframe=keyframe, observations=observations)
+    shown = replace(frame, depth_m=None, tracks=None) if shows else bare
+    return replace(step, frame=shown, track=track, keyframes=[], corrections=[])

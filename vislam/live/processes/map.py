@@ -1,0 +1,279 @@
+"""The process of map, viewer and run folder: it follows what front and back tell, and writes everything down."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from vislam.config import Config
+from vislam.core.clock import StageClock
+from vislam.core.errors import HardwareError
+from vislam.core.memory import FrontNews, SlamMemory, StartFacts
+from vislam.core.messages import Array, GraphUpdate, Submaps
+from vislam.core.recording import Recording
+from vislam.live.beginning import Beginning
+from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
+from vislam.live.processes.child import Life
+from vislam.live.wire.mail import Inbox
+from vislam.mapping.depth.mono import SeenFrame
+from vislam.mapping.mapper import Mapper
+from vislam.mapping.stage import MapStage
+from vislam.pipeline.back import MAX_SEEN, map_stage, seen_between
+from vislam.pipeline.front_report import FrontReport
+from vislam.pipeline.in_map import localised
+from vislam.pipeline.steps import Finish, KeyframeStep, Step
+from vislam.run import Progress, Run, begun
+from vislam.run.folder import MapChoice
+from vislam.run.session import Session, SessionWriter
+
+_WAIT_S = 0.05
+
+
+def run(
+    life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
+    keyframes: Connection, beginning: Beginning | None, base: MapChoice | None, has_camera: bool,
+) -> None:  # fmt: skip
+    """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
+
+    Args:
+        life: of this process.
+        config: of the run.
+        recording: names the sensors; its truth, if any, is asked for at the end.
+        out: an existing folder; that of the run itself where it is resumed.
+        source: what was asked for.
+        command: as it was typed.
+        frames: `Seen` from the front process, then `FrontEnded`.
+        keyframes: `BackBegun` if there is a `beginning`, `KeyframeStep` from the back process, then `BackEnded`.
+        beginning: the session that the run goes on from.
+        base: the map among them, if it is that of another run.
+        has_camera: False where no frame can come, and none is asked for.
+    """
+    clock = StageClock()
+    stage = map_stage(config, recording.rig, clock)
+    pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes))
+    if beginning is not None:
+        pipeline.wait_for_back()
+    make = partial(_LiveRun, recording, config, out, pipeline, has_camera)
+    live: Run
+    if beginning is not None and beginning.is_own:
+        live = resumed = make(SessionWriter.reopen(out / "session.db"))
+        resumed.go_on_from(beginning)
+    else:
+        live = begun(recording, config, out, source, command, base, make)
+    life.ready()
+    metrics = live.execute()
+    life.note(metrics=metrics)
+
+
+class _LiveRun(Run):
+    """A run whose steps come from other processes."""
+
+    def __init__(
+        self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, has_camera: bool,
+        session: SessionWriter,
+    ) -> None:  # fmt: skip
+        super().__init__(recording, config, out, session, followed)
+        self._followed = followed
+        self.wants_frames = has_camera
+        if not has_camera:
+            self.warnings.append("there was no camera: attitude alone was published, and there is no trajectory")
+
+    def go_on_from(self, beginning: Beginning) -> None:
+        """Go on in the run's own session, whose map is the one to be found again: the cart may stand elsewhere."""
+        stored = Session(beginning.session)
+        try:
+            self.go_on(stored)
+        finally:
+            stored.close()
+        self.base = {"path": str(beginning.session), "keyframes": beginning.first_id, "localize_only": False}
+
+    def _feed(self, progress: Progress | None) -> None:
+        for step in self._followed.steps():
+            was_found = self.joined_t_ns is not None
+            self._take(step)
+            if self.joined_t_ns is not None and not was_found:
+                self._followed.life.note(found_in_map=True)
+
+
+class _Front:
+    """What is known here of the front half."""
+
+    def __init__(self) -> None:
+        self.start: StartFacts | None = None
+        self.news = FrontNews()
+        self.ended: FrontEnded | None = None
+
+    def report(self) -> FrontReport:
+        """Return its last word, or that it died without one."""
+        if self.ended is None:
+            return FrontReport("unknown", None, self.start, "the front process died", {}, {}, [], {}, 0.0, {})
+        return self.ended.report
+
+
+class _Back:
+    """What is known here of the back end, and the map."""
+
+    def __init__(self, stage: MapStage | None) -> None:
+        self.stage = stage
+        self.graph = EndedGraph(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), [], [])
+        self._counters: dict[str, dict[str, int]] = {}
+
+    @property
+    def mapper(self) -> Mapper | None:
+        """The map; None where it is off."""
+        return None if self.stage is None else self.stage.mapper
+
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Counters of its rooms, and of the map here."""
+        return self._counters | ({} if self.stage is None else self.stage.counters)
+
+    def end(self, ended: BackEnded) -> None:
+        """Take its last word."""
+        self._counters = ended.counters
+        if ended.graph is not None:
+            self.graph = ended.graph
+
+
+class FollowedPipeline:
+    """The pipeline as the other processes tell it; see `vislam.run.Pipeline`.
+
+    Keyframes come when the graph has them, later than their frames; the frame that is at hand then carries them.
+    """
+
+    def __init__(self, life: Life, clock: StageClock, stage: MapStage | None, frames: Inbox, keyframes: Inbox) -> None:
+        """Follow two queues, and feed a map."""
+        self.clock = clock
+        self.counters = {"frames_lost": 0, "relocalised": 0}
+        self.front = _Front()
+        self.life = life
+        self._map = _Back(stage)
+        self._frames, self._keyframes = frames, keyframes
+        self._late: deque[KeyframeStep] = deque()  # whose frame has not come yet
+        self._back_ended: BackEnded | None = None
+        self._begun: GraphUpdate | None = None
+        self._submaps = Submaps()
+        self._newest_id = -1
+        self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # whose keyframe has not come yet
+
+    @property
+    def back(self) -> _Back | None:
+        """The back end; None before the first keyframe."""
+        return self._map if self._newest_id >= 0 else None
+
+    def wait_for_back(self) -> None:
+        """Wait until the back process has taken over the earlier session; raises HardwareError when it died."""
+        while self._begun is None:
+            message = self._keyframes.get(_WAIT_S)
+            if isinstance(message, BackBegun):
+                self._begun = message.update
+            elif self._keyframes.is_over or self.life.is_orphan:
+                raise HardwareError("the back process died before it had read the earlier session")
+
+    def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
+        """Begin where the back process did; return all its poses."""
+        assert self._begun is not None, "wait_for_back comes before"
+        update, first_id = self._begun, memory.front.keyframe_id + 1
+        if self._map.stage is not None:
+            self._map.stage.restore(memory.scans, memory.graph.T_map_body, memory.held > 0)
+            self._map.stage.move(update)
+        self._map.graph = EndedGraph(update.ids, update.T_map_body, [], [])
+        self._submaps = update.submaps.begun(first_id)
+        self._newest_id = first_id - 1
+        return update
+
+    def resume(self, memory: SlamMemory) -> GraphUpdate:
+        """Go on in an own session as in the map of another: where the cart is now, loops have to say."""
+        return self.begin_in_map(memory)
+
+    def steps(self) -> Iterator[Step]:
+        """Yield a step per frame, until the front process ends."""
+        while self.front.ended is None and not self.life.is_orphan:
+            self._take_keyframes()
+            message = self._frames.get(_WAIT_S)
+            if message is None:
+                if self._frames.is_over:
+                    raise HardwareError("the front process died; what it had not told yet is lost")
+                continue
+            if isinstance(message, FrontEnded):
+                self.front.ended, self.front.start, self.front.news = message, message.start, message.news
+            else:
+                yield self._step(message)
+
+    def finish(self) -> Finish:
+        """Wait for the back process's last word; return what came after the last frame."""
+        while self._back_ended is None and not (self.life.is_orphan or self._keyframes.is_over):
+            self._take_keyframes(_WAIT_S)
+        ended = self._back_ended
+        self._newest_id = 1 << 62
+        keyframes = self._ripe()
+        timings = {} if self.front.ended is None else self.front.ended.timings
+        if ended is None or ended.graph is None:
+            self._newest_id = -1  # there is no graph to ask
+        if ended is None:
+            self.clock.add(timings)
+            return Finish([], keyframes, None, None)
+        self.clock.add(timings | ended.timings)
+        if ended.update is not None and self._map.stage is not None:
+            self._map.stage.move(ended.update)
+            self._map.stage.finish()
+        return Finish([], keyframes, ended.update, ended.news)
+
+    def _step(self, seen: Seen) -> Step:
+        front = seen.step
+        self.front.start, self.front.news = seen.start, seen.news
+        self._newest_id = max(self._newest_id, front.keyframe_id)
+        if self._map.stage is not None and self._map.stage.wants_frames:
+            self._seen += seen_between(front)
+        keyframes = self._ripe()
+        before = self._submaps
+        if keyframes:
+            self._submaps = keyframes[-1].update.submaps
+        localisation = localised(before, self._submaps, front.track.vo.tracking, self.counters)
+        T_map_body = None if front.T_odom_body is None else seen.T_map_odom @ front.T_odom_body
+        return Step(front, T_map_body, localisation, len(self._submaps.groups) - 1, keyframes)
+
+    def _take_keyframes(self, wait_s: float = 0.0) -> None:
+        while self._back_ended is None and (message := self._keyframes.get(wait_s)) is not None:
+            if isinstance(message, BackEnded):
+                self._back_ended = message
+                self._map.end(message)
+            else:
+                self._late.append(message)
+            wait_s = 0.0
+
+    def _ripe(self) -> list[KeyframeStep]:
+        """Return the keyframes whose frames are known, after the map has them; poses that moved twice move once."""
+        ripe = []
+        while self._late and self._late[0].odometry.packet.keyframe.id <= self._newest_id:
+            ripe.append(self._late.popleft())
+        stage = self._map.stage
+        if not ripe or stage is None:
+            return ripe
+        update, scans = coalesced([step.update for step in ripe]), []
+        stage.move(update)
+        poses = dict(zip(update.ids.tolist(), update.T_map_body, strict=True))
+        for step in ripe:
+            odometry, keyframe_id = step.odometry, step.odometry.packet.keyframe.id
+            seen = []
+            while self._seen and self._seen[0].keyframe_id < keyframe_id:
+                seen.append(self._seen.popleft())
+            T_map_body = poses.get(keyframe_id, update.T_map_odom @ odometry.T_odom_body)
+            scans.append(stage.add(odometry, T_map_body, seen))
+        return [replace(step, scans=scan) for step, scan in zip(ripe, scans, strict=True)]
+
+
+def coalesced(updates: list[GraphUpdate]) -> GraphUpdate:
+    """Return one update for several, oldest first: the newest pose of every keyframe, and the newest revision."""
+    poses: dict[int, Array] = {}
+    for update in updates:
+        poses.update(zip(update.ids.tolist(), update.T_map_body, strict=True))
+    ids = np.array(sorted(poses), dtype=np.int64)
+    T_map_body = np.array([poses[i] for i in ids.tolist()]).reshape(-1, 4, 4)
+    return replace(updates[-1], ids=ids, T_map_body=T_map_body)

@@ -1,0 +1,162 @@
+"""Which sensors a live run reads: the virtual cart, a recording in real time, or a cart's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from vislam.config import Config, SensorCalibration, SensorsConfig, validated
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.reading import read_json
+from vislam.datasets.calibrated import with_clock
+from vislam.datasets.camera_files import read_cameras
+from vislam.datasets.imu_files import read_noise
+from vislam.hw.sensors import calibration_of, check_devices, open_camera, open_inertial
+from vislam.hw.source import InertialSource
+from vislam.imu import ImuNoise
+from vislam.live.frames import NO_CAMERA, FrameSource, NoCamera, OneCamera
+from vislam.live.processes.child import Life
+from vislam.live.replay import ReplaySource
+from vislam.live.run_live import LiveSource
+from vislam.live.virtual.cart import VirtualCart
+from vislam.live.virtual.place import PlaceOptions
+from vislam.trajectory import Trajectory
+
+
+def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveSource, Config]:
+    """Return the sensors that are asked for, and the settings with what those know better.
+
+    Args:
+        asked: `virtual-cart[,option=value]`, `replay:SOURCE`, or IMU and camera: `gy85+webcam`, `serial:PORT+0`.
+        config: of the run.
+        sensors: of the cart.
+
+    Raises:
+        UsageError: there is no such source, or an option of it is wrong.
+        DataError: a calibration file or recording cannot be used.
+    """
+    kind, _, rest = asked.partition(",")
+    if kind == "virtual-cart":
+        cart = VirtualCart(_place_options(rest), config.imu.gravity_m_s2)
+        return cart, cart.settings(config)
+    if asked.startswith("replay:"):
+        return ReplaySource(asked.removeprefix("replay:"), config.seed), config
+    inertial, _, camera = asked.partition("+")
+    if not camera or inertial.partition(":")[0] not in ("gy85", "serial"):
+        raise UsageError(
+            f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
+            "(a camera's index or path in place of webcam, or none: attitude by the IMU alone)"
+        )
+    return CartSensors(inertial, camera, config, sensors), with_clock(config)
+
+
+def stored_sensors(out: Path) -> SensorsConfig:
+    """Return the sensors of the live run in a folder; raises DataError when their file cannot be used."""
+    path = out / "sensors.json"
+    try:
+        data = read_json(path)
+        if not isinstance(data, dict):
+            raise ValueError("it holds something else than settings")
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} does not tell the sensors of a live run: {error}; begin with --map {out}") from error
+    return validated(SensorsConfig, data, str(path))
+
+
+def _place_options(text: str) -> PlaceOptions:
+    values: dict[str, object] = {}
+    for part in filter(None, text.split(",")):
+        name, equals, value = part.partition("=")
+        if not equals:
+            raise UsageError(f"'{part}' is no option of the virtual cart; write virtual-cart,option=value")
+        values[name] = _outages(value) if name.endswith("_out") else value
+    return validated(PlaceOptions, values, "virtual-cart")
+
+
+def _outages(text: str) -> tuple[tuple[float, float], ...]:
+    """Return `20:25/40:41` as intervals in seconds."""
+    try:
+        pairs = [part.split(":") for part in text.split("/")]
+        return tuple((float(begin), float(end)) for begin, end in pairs)
+    except ValueError as error:
+        raise UsageError(f"'{text}' is no list of outages; write 20:25 (from 20 s to 25 s), or 20:25/40:41") from error
+
+
+class CartSensors:
+    """Satisfies `LiveSource`: an inertial source and a camera of this machine."""
+
+    def __init__(self, inertial: str, camera: str, config: Config, sensors: SensorsConfig) -> None:
+        """Read the calibration files; the devices are opened by the processes that read them.
+
+        Raises UsageError where a camera has no calibration, DataError when a file cannot be used.
+        """
+        for name, path in (("imu", config.calibration.imu), ("mag", config.calibration.mag)):
+            if path is not None:
+                raise UsageError(
+                    "live drivers take the calibration of their chips from the sensors file (--sensors FILE, section "
+                    f"calibration of gy85 or serial), not from --calibration.{name}"
+                )
+        self.name = f"live {inertial}+{camera}"
+        self.has_camera = camera != "none"
+        told, ideal = calibration_of(inertial, sensors), SensorCalibration()
+        self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
+        self.rig = _rig(config.calibration.camera) if self.has_camera else NO_CAMERA
+        rate_hz = sensors.gy85.rate_hz
+        self.imu_noise: ImuNoise | None = ImuNoise(
+            sensors.gyro_noise_density, sensors.accel_noise_density, sensors.gyro_bias_walk, sensors.accel_bias_walk,
+            rate_hz,
+        )  # fmt: skip
+        if config.calibration.imu_noise is not None:
+            self.imu_noise = replace(read_noise(Path(config.calibration.imu_noise)), rate_hz=rate_hz)
+        self.frame_count, self.problems = 0, dict[str, int]()
+        self.duration_s: float | None = None
+        self._inertial, self._camera, self._sensors = inertial, camera, sensors
+
+    def check(self) -> None:
+        """Raise HardwareError where a device is missing or may not be opened."""
+        check_devices(self._inertial, self._camera, self._sensors)
+
+    def inertial(self) -> Callable[[], InertialSource]:
+        """Return what opens the IMU."""
+        return partial(open_inertial, self._inertial, self._sensors)
+
+    def cameras(self) -> Callable[[], FrameSource]:
+        """Return what opens the camera."""
+        return partial(_open_one, self._camera, self._sensors) if self.has_camera else NoCamera
+
+    def helpers(self) -> dict[str, Callable[[Life], None]]:
+        """Return nothing: real sensors need no processes."""
+        return {}
+
+    def close(self) -> None:
+        """Do nothing: no memory is shared."""
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        """Raise DataError: live sensors cannot be read twice."""
+        raise DataError(f"{self.name} is not recorded; `vislam record` does that")
+
+    def truth(self) -> Trajectory | None:
+        """Return nothing: nobody knows it."""
+        return None
+
+
+def _rig(calibration: str | None) -> Rig:
+    if calibration is None:
+        raise UsageError(
+            "a live camera needs its calibration: --calibration.camera FILE, which `vislam calibrate camera` writes; "
+            "without a camera, attitude alone: +none in its place"
+        )
+    found = read_cameras(Path(calibration))[0]
+    if found.T_body_cam is None:
+        raise DataError(
+            f"{calibration} does not say where the camera is on the body (T_cam_imu, T_BS); add it, "
+            "or run `vislam calibrate camera-imu`"
+        )
+    return Rig((found.camera,), (found.T_body_cam,))
+
+
+def _open_one(name: str, sensors: SensorsConfig) -> OneCamera:
+    return OneCamera(open_camera(name, sensors))

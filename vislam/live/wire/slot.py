@@ -1,0 +1,126 @@
+"""A place in shared memory that holds the newest value of one writer, for any number of readers.
+
+A sequence counter before and after the value (a seqlock) tells a reader that the writer came in between; a checksum
+tells the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import time
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+from vislam.core.errors import DataError, StorageError
+
+_HEAD = struct.Struct("<QII")  # sequence, length of the value, its CRC-32
+_TAIL = struct.Struct("<Q")  # sequence again
+_TRIES = 8  # a reader that met the writer so often in a row meets one that is stuck half way
+_FOLDER = Path("/dev/shm")
+
+
+class SlotWriter:
+    """Owns the memory: makes it, replaces what a killed process left there, and removes it when closed."""
+
+    def __init__(self, name: str, capacity: int) -> None:
+        """Make `/dev/shm/NAME` for values of at most `capacity` bytes.
+
+        Raises StorageError when it cannot be made.
+        """
+        self._path = _FOLDER / name
+        self._capacity = capacity
+        self._sequence = 0
+        fresh = self._path.with_name(f".{name}.{os.getpid()}")
+        try:
+            descriptor = os.open(fresh, os.O_CREAT | os.O_RDWR | os.O_TRUNC, 0o644)
+            try:
+                os.ftruncate(descriptor, _HEAD.size + capacity + _TAIL.size)
+                self._memory = mmap.mmap(descriptor, _HEAD.size + capacity + _TAIL.size)
+            finally:
+                os.close(descriptor)
+            fresh.rename(self._path)  # readers of an older one keep it, and see that it gets no newer
+        except OSError as error:
+            said = f"shared memory {self._path} cannot be made: {error}; choose another --live.name"
+            raise StorageError(said) from error
+        self._inode = self._path.stat().st_ino
+
+    def write(self, value: bytes | memoryview) -> None:
+        """Replace the value. Raises ValueError when it is longer than the capacity."""
+        if len(value) > self._capacity:
+            raise ValueError(f"{len(value)} bytes do not fit into a slot of {self._capacity}")
+        self._sequence += 1
+        memory = self._memory
+        # not pack_into, which clears first: a reader would meet length 0 and CRC 0, a sound value of no bytes
+        memory[_HEAD.size + self._capacity :] = _TAIL.pack(self._sequence)
+        memory[_HEAD.size : _HEAD.size + len(value)] = bytes(value)
+        memory[: _HEAD.size] = _HEAD.pack(self._sequence, len(value), zlib.crc32(value))
+
+    def close(self) -> None:
+        """Remove the memory, unless another writer has taken its name; may be called twice."""
+        with suppress(FileNotFoundError):
+            if self._path.stat().st_ino == self._inode:
+                self._path.unlink()
+        self._memory.close()
+
+
+class SlotReader:
+    """Reads what a `SlotWriter` of another process wrote last."""
+
+    def __init__(self, name: str) -> None:
+        """Open `/dev/shm/NAME`. Raises DataError when nobody has made it."""
+        path = _FOLDER / name
+        try:
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                self._memory = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
+            finally:
+                os.close(descriptor)
+        except (OSError, ValueError) as error:
+            raise DataError(f"there is no shared memory {path}: {error}; is `vislam live` running?") from error
+        self._tail = len(self._memory) - _TAIL.size
+
+    @property
+    def sequence(self) -> int:
+        """Number of the newest value, 0 before the first; costs nothing."""
+        return int(_HEAD.unpack_from(self._memory, 0)[0])
+
+    def read(self) -> tuple[int, bytes] | None:
+        """Return the sequence number, from 1, and the newest value.
+
+        None before the first value, or when the writer was met in the middle of its work every time.
+        """
+        for _ in range(_TRIES):
+            sequence, length, checksum = _HEAD.unpack_from(self._memory, 0)
+            if sequence == 0:
+                return None
+            if length > self._tail - _HEAD.size:
+                continue
+            value = self._memory[_HEAD.size : _HEAD.size + length]
+            after = _TAIL.unpack_from(self._memory, self._tail)[0]
+            if after == sequence and zlib.crc32(value) == checksum:
+                return sequence, value
+        return None
+
+    def close(self) -> None:
+        """Let go of the memory; may be called twice."""
+        self._memory.close()
+
+
+def remove(name: str) -> None:
+    """Remove a slot whose writer was killed, if there is one."""
+    (_FOLDER / name).unlink(missing_ok=True)
+
+
+def wait_for(name: str, timeout_s: float = 60.0) -> SlotReader:
+    """Open a slot that another process is about to make. Raises DataError when it does not."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            return SlotReader(name)
+        except DataError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)

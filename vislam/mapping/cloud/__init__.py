@@ -1,0 +1,1 @@
+"""Clouds, surfels and meshes fused from keyframes."""

@@ -1,0 +1,92 @@
+"""What a keyframe can tell the map: depth from its sensor, from its second camera, or a few triangulated points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.config import MapConfig
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import ImageF32, ImageU8, Keyframe
+from vislam.mapping.cloud.store import Scan
+from vislam.mapping.depth.image import DepthView, filter_depth, mono_view, rgbd_view
+from vislam.mapping.depth.stereo import DenseStereo
+
+
+class ScanExtractor:
+    """Makes scans of keyframes, the richest that each offers; what it could not use is counted."""
+
+    def __init__(self, config: MapConfig, rig: Rig, one_camera: bool = False) -> None:
+        """Prepare for a rig; with `one_camera`, depth comes late, from `late`, and no other depth is used."""
+        self._config = config
+        self._cameras = rig.cameras
+        self._one_camera = one_camera
+        stereo = rig.is_stereo and not rig.has_depth and not one_camera
+        self._stereo = DenseStereo(rig, config) if stereo else None
+        one_camera_view = mono_view(rig, config.mono_depth) if one_camera else rgbd_view(rig, config)
+        self.view: DepthView = self._stereo.view if self._stereo else one_camera_view
+        self.counters = {"keyframes_dense": 0, "keyframes_sparse": 0, "keyframes_without_depth": 0}
+
+    def extract(self, keyframe: Keyframe) -> Scan | None:
+        """Return the keyframe's scan, or None when nothing of its geometry is known.
+
+        Raises DataError when an image or depth image does not have the size of its camera.
+        """
+        scan = self._dense(keyframe) or self._sparse(keyframe)
+        if scan is None:
+            self.counters["keyframes_without_depth"] += 1
+        else:
+            self.counters["keyframes_dense" if scan.depth is not None else "keyframes_sparse"] += 1
+        return scan
+
+    def late(self, depth_m: ImageF32, image: ImageU8) -> Scan:
+        """Return the scan of depth [h, w] that was made of several images, and of a grey or BGR image of that size.
+
+        Raises DataError when they do not have the size of the view.
+        """
+        if image.shape[:2] != depth_m.shape:
+            raise DataError(f"image is {image.shape[:2]} but its depth {depth_m.shape}; they must be alike")
+        scan = Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(image))
+        self.counters["keyframes_dense"] += 1
+        return scan
+
+    def _dense(self, keyframe: Keyframe) -> Scan | None:
+        frame = keyframe.frame
+        if self._stereo is not None:
+            if len(frame.images) < 2:
+                return None
+            for camera, picture in zip(self._cameras, frame.images, strict=False):
+                camera.check_image(picture)
+            depth_m, grey = self._stereo.match(frame.images[0], frame.images[1])
+            return Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(grey))
+        if frame.depth_m is None or self._one_camera:
+            return None
+        image = frame.images[0] if frame.color is None else frame.color
+        self._cameras[0].check_image(image)
+        depth = filter_depth(frame.depth_m, self._config.pixel_step, self.view, self._config)
+        return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
+
+    def _sparse(self, keyframe: Keyframe) -> Scan | None:
+        if keyframe.points_body_m is None:
+            return None
+        known = np.isfinite(keyframe.points_body_m).all(axis=1)
+        if not known.any():
+            return None
+        frame = keyframe.frame
+        if not frame.images:
+            return None
+        image = frame.images[0] if frame.color is None else frame.color
+        pixels = np.nan_to_num(np.round(keyframe.keypoints_px[known])).astype(np.int64)
+        rows = np.clip(pixels[:, 1], 0, image.shape[0] - 1)
+        colors = _rgb(image)[rows, np.clip(pixels[:, 0], 0, image.shape[1] - 1)]
+        return Scan(None, keyframe.points_body_m[known].astype(np.float32), colors)
+
+
+def _rgb(image: NDArray[np.generic]) -> ImageU8:
+    """Return a grey or BGR image as RGB [H, W, 3]."""
+    array = np.asarray(image, dtype=np.uint8)
+    if array.ndim == 2:
+        return np.repeat(array[..., None], 3, axis=2)
+    return np.ascontiguousarray(array[..., ::-1])

@@ -1,0 +1,1 @@
+"""Where a cart can drive: the drive grid and the navigation grid."""

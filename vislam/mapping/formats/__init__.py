@@ -1,0 +1,1 @@
+"""Files of clouds and meshes: PLY, PCD, glTF and OBJ."""

@@ -1,0 +1,236 @@
+"""The back half of the pipeline: what runs at the rate of keyframes, loop detector, graph and map."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+
+import numpy as np
+
+from vislam.config import Config
+from vislam.core import collector
+from vislam.core.camera import Rig
+from vislam.core.clock import StageClock
+from vislam.core.errors import UsageError
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.memory import GraphNews, SlamMemory, WordsMemory
+from vislam.core.messages import (
+    Array,
+    GraphUpdate,
+    LoopCandidate,
+    LoopEdge,
+    NavState,
+    Tracking,
+)
+from vislam.frontend import mode_for
+from vislam.graph import PoseGraph
+from vislam.loop.detector import LoopDetector
+from vislam.loop.injection import FalseLoops, as_candidate
+from vislam.mapping.depth.mono import SeenFrame
+from vislam.mapping.mapper import Mapper
+from vislam.mapping.stage import MapStage
+from vislam.pipeline.front import Front
+from vislam.pipeline.settings import without_gravity
+from vislam.pipeline.steps import FrontStep, KeyframeStep
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe
+
+MAX_SEEN = 120  # frames kept between two keyframes: 2 s at 60 Hz, 40 MB
+
+
+class Back:
+    """What runs at the rate of keyframes: loop detector, graph, mapper."""
+
+    def __init__(
+        self,
+        config: Config,
+        rig: Rig,
+        noise: ImuNoise | None,
+        clock: StageClock,
+        first_state: NavState | None,
+        T_map_body: Array,
+    ) -> None:
+        """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity.
+
+        `config` is as `settings.derived` gives it.
+        """
+        self._has_gravity = has_gravity = first_state is not None
+        graph = config.graph if has_gravity else without_gravity(config.graph, rig)
+        self.graph = PoseGraph(graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, config.window)
+        self.graph.initialise(first_state, T_map_body)
+        self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
+        self._false = None
+        if config.loop.inject_share > 0.0:
+            self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
+        self.map = map_stage(config, rig, clock)
+        self.clock = clock
+        self.T_map_odom = np.eye(4)
+        self._words_revision = 0
+
+    @property
+    def mapper(self) -> Mapper | None:
+        """The map; None where it is off."""
+        return None if self.map is None else self.map.mapper
+
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Counters of the rooms that there are."""
+        loops = {} if self.loops is None else {"loop": dict(self.loops.counters)}
+        return {**loops, **({} if self.map is None else self.map.counters)}
+
+    @collector.paused()
+    def restore(self, memory: SlamMemory) -> GraphUpdate:
+        """Take over an earlier run; return all its poses. Raises UsageError where loops are made up on purpose."""
+        if self._false is not None:
+            raise UsageError("what loop.inject_share made up is not remembered: such a run cannot be gone on with")
+        graph = memory.graph
+        update = self.graph.restore(graph)
+        if self.loops is not None:
+            self.loops.restore(memory.places)
+            self._words_revision = self.loops.words_revision
+        if self.map is not None:
+            self.map.restore(memory.scans, graph.T_map_body, memory.held > 0)
+        self._follow(update)
+        if memory.held:
+            self.graph.hold(memory.held)
+        return update
+
+    def begin_recording(self, state: NavState | None, T_odom_body: Array) -> bool:
+        """Prepare for the first keyframe of a new recording, whose axes are those of map until loops say otherwise.
+
+        False, and nothing begins, where the map knows gravity and the recording ended or gave up before it did.
+        """
+        if state is None and self._has_gravity:
+            return False
+        self.graph.begin_recording(state, T_odom_body)
+        self.T_map_odom = np.eye(4)
+        return True
+
+    def add(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> KeyframeStep:
+        """Take one keyframe and the frames before it in: find its loops, optimise, follow with the map."""
+        keyframe = odometry.packet.keyframe
+        edges: list[LoopEdge] = []
+        candidates: list[LoopCandidate] = []
+        if self.loops is not None:
+            with self.clock.measure("loop"):
+                edges, candidates = self.loops.detect(
+                    keyframe, self.T_map_odom @ odometry.T_odom_body, odometry.packet.begins_submap
+                )
+        if self._false is not None:
+            false = self._false.add(odometry.T_odom_body, edges)
+            edges, candidates = edges + false, candidates + [as_candidate(edge) for edge in false]
+        with self.clock.measure("graph"):
+            update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
+        self._follow(update)
+        scans = {} if self.map is None else self.map.add(odometry, self.T_map_odom @ odometry.T_odom_body, seen)
+        retrieved, tags = ([], ()) if self.loops is None else (self.loops.retrieved, self.loops.tags(keyframe.id))
+        news, words = self.graph.take_news(), self._new_words()
+        return KeyframeStep(odometry, update, edges, candidates, retrieved, news, scans, words, tags)
+
+    def finish(self) -> GraphUpdate:
+        """Optimise to convergence and bring the map to the final poses."""
+        if self.loops is not None:
+            self.loops.close()
+        with self.clock.measure("graph finish"):
+            update = self.graph.finish()
+        self._follow(update)
+        if self.map is not None:
+            self.map.finish()
+        return update
+
+    def _new_words(self) -> WordsMemory | None:
+        """Return the vocabulary if it is new since the last call."""
+        if self.loops is None or self.loops.words_revision == self._words_revision:
+            return None
+        self._words_revision = self.loops.words_revision
+        return self.loops.words()
+
+    def _follow(self, update: GraphUpdate) -> None:
+        self.T_map_odom = update.T_map_odom
+        if self.loops is not None:
+            self.loops.move(update)
+        if self.map is not None:
+            self.map.move(update)
+
+
+class KeyframeIntake:
+    """Hands keyframes to the stages of a run, which begin with the first one or with an earlier run."""
+
+    def __init__(self, rig: Rig, front: Front, clock: StageClock) -> None:
+        """Wait for the first keyframe of `front`."""
+        self._front = front
+        self._make = partial(Back, front.config, rig)
+        self._clock = clock
+        self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # since the newest keyframe
+        self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
+        self._begins_recording = False  # in a map, with the next keyframe
+        self.stages: Back | None = None
+
+    def resume(self, memory: SlamMemory) -> GraphUpdate:
+        """Go on where an earlier run was; return all its poses. Raises as `Back.restore`."""
+        self._seen_again = memory.front.keyframe_id
+        return self._restore(memory)
+
+    def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
+        """Begin in the map of earlier runs; return its poses. Raises as `Back.restore`."""
+        self._begins_recording = True
+        return self._restore(memory)
+
+    def see(self, front: FrontStep) -> None:
+        """Keep what depth from one camera can use of a frame."""
+        if self.stages is not None and self.stages.map is not None and self.stages.map.wants_frames:
+            self._seen += seen_between(front)
+
+    def add(self, keyframes: list[OdometryKeyframe]) -> list[KeyframeStep]:
+        """Take keyframes in; the one at which an earlier run is resumed is there already."""
+        steps = []
+        for odometry in keyframes:
+            if odometry.packet.keyframe.id == self._seen_again and self.stages is not None:
+                self.stages.graph.go_on(odometry.packet, odometry.T_odom_body)
+            elif self._enters(odometry):
+                steps.append(self._add_new(odometry))
+        return steps
+
+    def finish(self) -> tuple[GraphUpdate | None, GraphNews | None]:
+        """Optimise to convergence; None where no keyframe came."""
+        if self.stages is None:
+            return None, None
+        return self.stages.finish(), self.stages.graph.take_news()
+
+    def _restore(self, memory: SlamMemory) -> GraphUpdate:
+        self.stages = self._make(self._front.noise, self._clock, memory.first_state, memory.T_start)
+        return self.stages.restore(memory)
+
+    def _enters(self, odometry: OdometryKeyframe) -> bool:
+        """Return whether a keyframe can be added; into a map that knows gravity only if the recording does."""
+        if self._begins_recording and self.stages is not None:
+            self._begins_recording = not self.stages.begin_recording(self._front.first_state, odometry.T_odom_body)
+        return not self._begins_recording
+
+    def _add_new(self, odometry: OdometryKeyframe) -> KeyframeStep:
+        if self.stages is None:
+            self.stages = self._make(self._front.noise, self._clock, self._front.first_state, odometry.T_odom_body)
+        seen = list(self._seen)
+        self._seen.clear()
+        step = self.stages.add(odometry, seen)
+        self._front.feed_back(step.update)
+        return step
+
+
+def map_stage(config: Config, rig: Rig, clock: StageClock) -> MapStage | None:
+    """Return the map of a pipeline; None where it is off."""
+    return MapStage(config.map, rig, makes_depth(config, rig), clock) if config.map.enabled else None
+
+
+def makes_depth(config: Config, rig: Rig) -> bool:
+    """Whether the map takes depth from one moving camera."""
+    return config.map.enabled and config.map.mono_depth.enabled and mode_for(config.frontend, rig) == "mono"
+
+
+def seen_between(front: FrontStep) -> list[SeenFrame]:
+    """Return what depth from one camera can use of a step: a frame between keyframes of which odometry knows where."""
+    frame, T = front.frame, front.T_keyframe_body
+    is_known = T is not None and front.track.vo.tracking is not Tracking.LOST
+    if front.track.keyframe is not None or not is_known or not frame.images:
+        return []
+    assert T is not None
+    return [SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T)]

@@ -1,0 +1,58 @@
+"""The configuration that runs: what sensors and modes say of a setting is put into it once, before anything begins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vislam.config import Config, EkfConfig, GraphConfig
+from vislam.core.camera import Rig
+from vislam.core.errors import UsageError
+from vislam.core.imu_noise import ImuNoise
+from vislam.frontend import lasting_scale_sigma, mode_for
+
+
+def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
+    """Return the configuration with all that follows from the sensors; deriving it again changes nothing.
+
+    That is: the front end's mode and the filter's coupling where they are `auto`, the rolling shutter's readout where
+    it is the front end's, the error that all metres have in common, and the factor on motions over a floor. `noise` is
+    the IMU's, None without one. `Front` derives for itself; who writes settings down or sends them to other processes
+    does so before there is one. Raises UsageError for settings that contradict each other.
+    """
+    mode = mode_for(config.frontend, rig)
+    readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
+    lasting = lasting_scale_sigma(config.frontend, rig, noise)
+    by_imu = noise is not None and not rig.is_stereo and not rig.has_depth
+    graph = replace(config.graph, scale_sigma=max(config.graph.scale_sigma, lasting), edges_share_scale=by_imu)
+    return replace(
+        config,
+        frontend=replace(config.frontend, mode=mode),
+        ekf=config.ekf if noise is None else _filter(config, mode, lasting),
+        window=replace(config.window, readout_s=readout_s),
+        graph=graph if noise is not None else without_gravity(graph, rig),
+    )
+
+
+def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
+    """Return the graph's settings where no IMU tells gravity: nothing shares its scale.
+
+    And a window sees no scale in one camera; over a floor, the motions of odometry have it.
+    """
+    coupling = graph.coupling if rig.is_stereo or rig.has_depth else "loose"
+    return replace(graph, coupling=coupling, edges_share_scale=False)
+
+
+def _filter(config: Config, mode: str, lasting_scale_sigma: float) -> EkfConfig:
+    coupling = config.ekf.coupling
+    if coupling == "auto":
+        coupling = "tight" if mode == "mono" else "loose"
+    if config.ekf.nonholonomic and coupling == "tight":
+        raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
+    readout_s = config.ekf.tight_readout_s
+    return replace(
+        config.ekf,
+        coupling=coupling,
+        tight_readout_s=config.frontend.readout_s if readout_s is None else readout_s,
+        scale_sigma=max(config.ekf.scale_sigma, lasting_scale_sigma),
+        vo_inflation=config.frontend.planar.vo_inflation if mode == "planar" else config.ekf.vo_inflation,
+    )

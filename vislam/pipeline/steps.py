@@ -1,0 +1,80 @@
+"""What the halves of the pipeline answer: a step for every frame, one for every keyframe, and the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vislam.core.memory import GraphNews, PackedScan, TagSighting, WordsMemory
+from vislam.core.messages import (
+    Array,
+    Frame,
+    GraphUpdate,
+    Localisation,
+    LoopCandidate,
+    LoopEdge,
+    NavState,
+    RetrievedKeyframe,
+)
+from vislam.ekf import Correction
+from vislam.frontend import TrackResult
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Where odometry has the body at a frame."""
+
+    T_odom_before: Array  # [4, 4] by inertial data alone, from where it was at the last frame
+    T_odom_body: Array  # [4, 4] with all that is known
+    rate_sigma_rad_s: float  # of the gyroscope's bias; 0 without an IMU
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrontStep:
+    """What the front half made of one frame."""
+
+    frame: Frame
+    track: TrackResult
+    T_odom_body: Array | None  # as it is published, without jumps; None before initialisation
+    estimate: Estimate | None  # behind it; None before initialisation
+    state: NavState | None  # of the filter; None before initialisation or without an IMU
+    keyframe_id: int  # the newest keyframe
+    T_keyframe_body: Array | None  # relative to it; None: only known by interpolation between keyframes
+    keyframes: list[OdometryKeyframe]  # usually none or one; those that waited for gravity come together
+    corrections: list[Correction]  # what the filter was told with it, usually one; none before it has a state
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeStep:
+    """What the back end did with one keyframe."""
+
+    odometry: OdometryKeyframe
+    update: GraphUpdate
+    edges: list[LoopEdge]
+    candidates: list[LoopCandidate]
+    retrieved: list[RetrievedKeyframe]
+    news: GraphNews  # what the graph has to remember
+    scans: dict[int, PackedScan]  # what came into the map with it: its own scan, or depth that came late
+    words: WordsMemory | None  # the vocabulary, when it is new
+    tags: tuple[TagSighting, ...]  # that it saw
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """The answer to one frame: what the front half saw, the causal pose, and the keyframes that went to the back."""
+
+    front: FrontStep
+    T_map_body: Array | None  # None: no pose yet
+    localisation: Localisation
+    submap: int  # of the trajectory, from 0
+    keyframes: list[KeyframeStep]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finish:
+    """What came when the recording ended."""
+
+    steps: list[Step]
+    keyframes: list[KeyframeStep]  # those that had waited for gravity until the end
+    update: GraphUpdate | None  # None: not one keyframe reached the back end
+    news: GraphNews | None

@@ -1,0 +1,1 @@
+"""What goes wrong with sensors, put into any recording on purpose."""

@@ -1,0 +1,1 @@
+"""How simulated bodies move: smooth splines, measured paths, walks."""

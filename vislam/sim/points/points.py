@@ -1,0 +1,289 @@
+"""Simulated vision as a recording: inertial data, real or simulated, and tracks of landmarks around the true path.
+
+With the real IMU of a recording that has truth but no images, everybody can test an estimator on real inertial data;
+with a simulated motion, an hour costs seconds. Frames carry `tracks` and no images.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from vislam.config import validated
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array, Frame, ImuSample, Observations
+from vislam.imu import ImuNoise
+from vislam.sim.faults.disturbance import in_window
+from vislam.sim.inertial_source import InertialSource, RecordedImu, SimulatedImu
+from vislam.sim.motion.measured import MeasuredMotion
+from vislam.sim.motion.motions import POINT_WORLDS, vi_sensor_rig, world_motion, world_rig
+from vislam.sim.points.followed import Moves, SimulatedTracker, TrackNoise
+from vislam.sim.points.landmark_field import LandmarkField
+from vislam.sim.sensing import CONSUMER_IMU
+from vislam.sim.worlds.simulation import TrueStates
+from vislam.sim.worlds.table import WORLDS
+from vislam.trajectory import Trajectory
+from vislam.trajectory.truth_fit import TruthFit
+
+Stamps = NDArray[np.int64]
+_Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+_Seconds = Annotated[float, Field(ge=0.0)]
+
+_WORLD_ZERO_NS = 1_000_000_000_000
+_MARGIN_S = 0.05  # frames keep this distance from the ends of the motion
+_TRUTH_STEP_S = 0.01  # so dense that a straight line between poses is exact enough
+_PATH_STEP_S = 0.1  # of the path around which landmarks are placed
+_AXIS = np.array([0.6, -0.64, 0.48])  # about which told and true extrinsics differ, in the camera's axes
+_AT_ONCE = 2000  # poses evaluated in one go
+
+
+@dataclass(frozen=True, slots=True)
+class PointOptions:
+    """What can be chosen about simulated vision; times count from the first frame."""
+
+    rig: Literal["mono", "stereo", "rgbd"] = "stereo"
+    start_s: _Seconds = 0.0  # into the recording or motion
+    duration_s: Annotated[float, Field(ge=0.5)] | None = None  # None: all there is; for point worlds their usual
+    camera_hz: Annotated[float, Field(gt=0.1, le=120.0)] = 20.0
+    tracks: Annotated[int, Field(ge=0, le=2000)] = 200  # at any time, as far as landmarks are in view
+    pixel_sigma_px: Annotated[float, Field(ge=0.0, le=20.0)] = 1.0  # white, on every pixel
+    stereo_sigma_px: Annotated[float, Field(ge=0.0, le=20.0)] = 0.3  # of the match; the right pixel shares the left's
+    outlier_share: _Share = 0.05  # of the tracks: 70 % slipped onto another landmark and stay, 30 % jump for a frame
+    dropout_share: _Share = 0.02  # of the tracks: not found in a frame, but in the next
+    track_life_s: Annotated[float, Field(gt=0.05)] = 4.0  # mean, within the image
+    distortion: bool = True  # of the lenses
+    descriptors: bool = True  # that recognise a landmark when it is seen again; without, no loops
+    lost_share: _Share = 0.0  # of the frames: they never arrive
+    outage_begin_s: _Seconds = 0.0  # frames without a single track ...
+    outage_length_s: _Seconds = 0.0  # ... for so long ...
+    outage_every_s: _Seconds = 0.0  # ... and again after so long; 0: once
+    moving_share: _Share = 0.0  # of the image: filled by a person who walks to and fro
+    moving_begin_s: _Seconds = 0.0
+    moving_length_s: _Seconds | None = None  # None: to the end
+    time_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0  # to be added to a frame's stamp to get the IMU's
+    extrinsic_rotation_deg: Annotated[float, Field(ge=-20.0, le=20.0)] = 0.0  # between the rig told and the true one
+    readout_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0  # from first to last row; the stamp is the middle row's
+    imu_noise_factor: Annotated[float, Field(gt=0.0)] = 1.0  # what is told of the IMU's noise, relative to the truth
+    imu_noise: bool = True  # of a simulated IMU; False: exact
+    gravity_m_s2: float = 9.81  # of a simulated IMU
+    world_seed: int = 0  # of the landmarks; `seed` is that of motion and sensors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredInertial:
+    """A real recording without its images."""
+
+    name: str
+    t_ns: Stamps  # [N]
+    gyro_rad_s: Array  # [N, 3]
+    accel_m_s2: Array  # [N, 3]
+    noise: ImuNoise
+    truth: Trajectory  # of the body, which is the IMU
+    rig: Rig | None  # its own cameras, if it has any
+    truth_fit: TruthFit | None = None  # what was undone in `truth`; None: it is as it came
+
+
+def open_points(source: str | MeasuredInertial, seed: int = 0, **options: object) -> PointRecording:
+    """Return simulated vision in a world (by name, of `POINT_WORLDS` or `WORLDS`) or on a real recording's IMU.
+
+    Raises UsageError for an unknown world, and for an unknown or ill-typed option (see `PointOptions`); DataError when
+    the recording's truth does not suffice.
+    """
+    return PointRecording(source, seed, validated(PointOptions, options, "simulated vision"))
+
+
+class PointRecording:
+    """A recording (see `vislam.core.recording.Recording`) whose frames carry tracks; the same each time.
+
+    Attributes:
+        true_rig: the cameras that projected the landmarks; `rig` is what the estimator is told.
+        motion: the body's true motion; its seconds count from `zero_ns`.
+        field: the landmarks.
+    """
+
+    def __init__(self, source: str | MeasuredInertial, seed: int = 0, options: PointOptions | None = None) -> None:
+        """Prepare motion, landmarks and the times of frames; tracks and simulated samples are made while reading."""
+        self.options = options = options or PointOptions()
+        motion_seed, imu_seed, loss_seed, self._track_seed = np.random.SeedSequence(seed).spawn(4)
+        self.problems: dict[str, int] = {}
+        self.motion: Moves
+        self._imu: InertialSource
+        if isinstance(source, str):
+            self._take_world(source, np.random.default_rng(motion_seed), imu_seed)
+        else:
+            self._take_recording(source)
+        self._set_rigs()
+        t_s = self._frame_times()
+        lost = np.random.default_rng(loss_seed).random(len(t_s)) < options.lost_share
+        self._frame_s = t_s[~lost]
+        self.frame_count = len(self._frame_s)
+        path = self.motion.at(_steps(self._begin_s, self._end_s, _PATH_STEP_S)).T_world_body
+        cam0 = (path @ self.true_rig.T_body_cams[0])[:, :3, 3]
+        self.field = LandmarkField(cam0, np.random.default_rng(np.random.SeedSequence(options.world_seed)))
+
+    # -- where motion and inertial data come from --------------------------------------------------------------------
+
+    def _take_world(self, name: str, rng: np.random.Generator, imu_seed: np.random.SeedSequence) -> None:
+        options = self.options
+        if name not in POINT_WORLDS and name not in WORLDS:
+            raise UsageError(
+                f"no world '{name}'; there are: {', '.join((*POINT_WORLDS, *WORLDS))}, or give a recording"
+            )
+        wanted = None if options.duration_s is None else options.start_s + options.duration_s
+        motion = world_motion(name, rng, wanted)
+        self.name, self.motion, self.zero_ns = f"points-{name}", motion, _WORLD_ZERO_NS
+        self._set_span(0.0, motion.duration_s)
+        self._base_rig = world_rig(name)
+        disturbed = options.imu_noise
+        self._imu = SimulatedImu(
+            motion, self.zero_ns, (self._begin_s, self._end_s), CONSUMER_IMU, options.gravity_m_s2, imu_seed, disturbed
+        )
+        self.imu_noise: ImuNoise | None = _told(CONSUMER_IMU, options.imu_noise_factor)
+
+    def _take_recording(self, recorded: MeasuredInertial) -> None:
+        motion = MeasuredMotion(recorded.t_ns, recorded.gyro_rad_s, recorded.accel_m_s2, recorded.truth)
+        self.name, self.motion, self.zero_ns = f"points-{recorded.name}", motion, motion.zero_ns
+        self._set_span(motion.begin_s, motion.end_s)
+        own = recorded.rig
+        self._base_rig = own if own is not None and own.is_stereo else vi_sensor_rig()
+        span_ns = (self._ns(np.array([self._begin_s, self._end_s]))).tolist()
+        self._imu = RecordedImu(recorded.t_ns, recorded.gyro_rad_s, recorded.accel_m_s2, span_ns[0], span_ns[1])
+        self.imu_noise = _told(recorded.noise, self.options.imu_noise_factor)
+        if recorded.truth_fit is not None and recorded.truth_fit.told:
+            self.problems[f"{recorded.truth_fit.told}: undone"] = 1
+
+    def _set_span(self, begin_s: float, end_s: float) -> None:
+        options = self.options
+        self._begin_s = begin_s + options.start_s
+        self._end_s = end_s if options.duration_s is None else self._begin_s + options.duration_s
+        if self._end_s > end_s + 1e-6 or self._end_s - self._begin_s < 4.0 * _MARGIN_S:
+            raise UsageError(
+                f"{self.name} lasts {end_s - begin_s:.1f} s, asked for {options.duration_s or 0.0:g} s from "
+                f"{options.start_s:g} s on; choose another start_s or duration_s"
+            )
+        self._end_s = min(self._end_s, end_s)
+        self.duration_s = self._end_s - self._begin_s
+
+    def _set_rigs(self) -> None:
+        base, options = self._base_rig, self.options
+        cameras = base.cameras if options.distortion else tuple(_undistorted(camera) for camera in base.cameras)
+        count = 2 if options.rig == "stereo" else 1
+        self.true_rig = Rig(cameras[:count], base.T_body_cams[:count], has_depth=options.rig == "rgbd")
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(_AXIS * np.deg2rad(options.extrinsic_rotation_deg)).as_matrix()
+        first = base.T_body_cams[0] @ turn
+        told = (first, first @ base.T_cam0_cam1) if count == 2 else (first,)
+        self.rig = Rig(cameras[:count], told, has_depth=options.rig == "rgbd")
+
+    def _frame_times(self) -> Array:
+        shutter_s = 0.5 * self.options.readout_s
+        begin_s, end_s = self._begin_s + _MARGIN_S, self._end_s - _MARGIN_S
+        t_s = _steps(begin_s, end_s, 1.0 / self.options.camera_hz)
+        if isinstance(self.motion, MeasuredMotion):
+            known = self.motion.covers(t_s, shutter_s)
+            if not known.all():
+                self.problems["frames where truth or inertial data have a gap"] = int((~known).sum())
+            t_s = t_s[known]
+        if len(t_s) == 0:
+            raise DataError(f"{self.name}: the true motion is known at no frame; choose another start_s or duration_s")
+        return t_s
+
+    # -- the recording -----------------------------------------------------------------------------------------------
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | Frame]:
+        """Yield samples and frames in order of their stamps; can be called again and yields the same again.
+
+        Tracks depend on what was followed before, so nothing is left out before `from_ns`.
+        """
+        streams: list[Iterator[ImuSample | Frame]] = [self._imu.samples(), self._frames()]
+        yield from heapq.merge(*streams, key=lambda event: event.t_ns)
+
+    def tracker(self) -> SimulatedTracker:
+        """Return the tracker that makes the frames, at its beginning; for tests that want to know the truth."""
+        options = self.options
+        noise = TrackNoise(
+            tracks=options.tracks, pixel_sigma_px=options.pixel_sigma_px, stereo_sigma_px=options.stereo_sigma_px,
+            outlier_share=options.outlier_share, dropout_share=options.dropout_share,
+            track_life_s=options.track_life_s, readout_s=options.readout_s, moving_share=options.moving_share,
+            descriptors=options.descriptors,
+        )  # fmt: skip
+        return SimulatedTracker(self.true_rig, self.field, self.motion, noise, np.random.default_rng(self._track_seed))
+
+    def _frames(self) -> Iterator[Frame]:
+        options, tracker = self.options, self.tracker()
+        stamps = self._ns(self._frame_s - options.time_offset_s).tolist()
+        zero_s = self._begin_s + _MARGIN_S
+        for index, (t_s, t_ns) in enumerate(zip(self._frame_s.tolist(), stamps, strict=True)):
+            since_s = t_s - zero_s
+            if in_window(since_s, options.outage_begin_s, options.outage_length_s, options.outage_every_s):
+                tracks = _nothing(self.true_rig)
+            else:
+                length_s = np.inf if options.moving_length_s is None else options.moving_length_s
+                tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, length_s))
+            yield Frame(t_ns, index, (), tracks=tracks)
+
+    # -- truth -------------------------------------------------------------------------------------------------------
+
+    @property
+    def frame_times_ns(self) -> Stamps:
+        """True times [F] of the frames by the IMU's clock; stamps are earlier by `time_offset_s`."""
+        return self._ns(self._frame_s)
+
+    def truth(self) -> Trajectory:
+        """Return the true poses of the body by the IMU's clock, a hundred a second, where they are known."""
+        t_s = _steps(self._begin_s, self._end_s, _TRUTH_STEP_S)
+        if isinstance(self.motion, MeasuredMotion):
+            t_s = t_s[self.motion.covers(t_s)]
+        poses = [self.motion.at(part).T_world_body for part in _parts(t_s)]
+        return Trajectory(self._ns(t_s), np.concatenate(poses))
+
+    def true_states(self, t_ns: Stamps) -> TrueStates:
+        """Return the true states at times [N] by the IMU's clock; biases are NaN where a real IMU keeps them secret."""
+        t_s = (t_ns - self.zero_ns).astype(np.float64) * 1e-9
+        motions = [self.motion.at(part) for part in _parts(t_s)]
+        gyro_bias, accel_bias = self._imu.biases(t_ns)
+        return TrueStates(
+            t_ns, np.concatenate([m.T_world_body for m in motions]),
+            np.concatenate([m.velocity_world_m_s for m in motions]), gyro_bias, accel_bias,
+        )  # fmt: skip
+
+    def _ns(self, t_s: Array) -> Stamps:
+        return np.round(t_s * 1e9).astype(np.int64) + self.zero_ns
+
+
+def _told(noise: ImuNoise, factor: float) -> ImuNoise:
+    return replace(
+        noise,
+        gyro_noise_density=noise.gyro_noise_density * factor,
+        accel_noise_density=noise.accel_noise_density * factor,
+        gyro_bias_walk=noise.gyro_bias_walk * factor,
+        accel_bias_walk=noise.accel_bias_walk * factor,
+    )
+
+
+def _undistorted(camera: Camera) -> Camera:
+    return replace(camera, distortion="none", coefficients=())
+
+
+def _steps(begin_s: float, end_s: float, step_s: float) -> Array:
+    count = int(np.floor((end_s - begin_s) / step_s + 1e-9)) + 1
+    return np.asarray(begin_s + step_s * np.arange(max(count, 0)))
+
+
+def _parts(t_s: Array) -> Iterator[Array]:
+    for begin in range(0, max(len(t_s), 1), _AT_ONCE):
+        yield t_s[begin : begin + _AT_ONCE]
+
+
+def _nothing(rig: Rig) -> Observations:
+    right, depth = np.empty((0, 2)) if rig.is_stereo else None, np.empty(0) if rig.has_depth else None
+    descriptors = np.empty((0, 32), dtype=np.uint8)
+    return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)), right, depth, descriptors=descriptors)

@@ -1,0 +1,1 @@
+"""The simulated worlds by name, and a world as a recording."""

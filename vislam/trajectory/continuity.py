@@ -1,0 +1,92 @@
+"""The pose that is published: it follows the estimate and takes corrections in as the body moves, not as jumps.
+
+An estimator corrects itself whenever a measurement comes in: the pose of one instant is suddenly another one. Whoever
+steers by it takes that for motion. Here the published pose goes on as the body does, and what is still to be corrected
+is let go gradually: with the way and the turn that the body makes, and slowly in time. So at rest next to nothing
+moves, and while it moves a correction looks like an odometry that errs by so many percent for a while. A correction
+that is too large for that comes at once, for it is another belief about the place, not a better one.
+
+Position and rotation are kept apart: a turn of the frame moves the body where it turns it, not at a lever arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vislam.config import Config, PublishConfig
+from vislam.core.geometry import so3_exp, so3_log, transform
+from vislam.core.messages import Array
+
+_NS = 1_000_000_000
+
+
+class Continuity:
+    """Owns what a published pose is still to be corrected by. One per frame that is published.
+
+    Attributes:
+        owed_m: [3] published less estimated position, in axes of the frame.
+        owed_rad: [3] rotation vector, in axes of the frame: published = Exp(owed) estimated.
+    """
+
+    def __init__(self, config: PublishConfig) -> None:
+        """Start with nothing owed."""
+        self._config = config
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what is owed: the next pose is published as it is estimated."""
+        self.owed_m, self.owed_rad = np.zeros(3), np.zeros(3)
+        self._t_ns: int | None = None
+        self._T: Array = np.eye(4)
+
+    def follow(self, t_ns: int, T_before: Array, T_after: Array, rate_sigma_rad_s: float = 0.0) -> Array:
+        """Return the pose [4, 4] to publish at a time, which does not go back.
+
+        Args:
+            t_ns: of the estimate.
+            T_before: [4, 4] the estimate as it was before what came in with this call, carried on to `t_ns`.
+            T_after: [4, 4] the estimate of the same instant now.
+            rate_sigma_rad_s: how well the body's rate of turn is known: what the gyroscope may drift, nobody sees.
+        """
+        if self._t_ns is not None:
+            self._let_go(max(t_ns - self._t_ns, 0) / _NS, T_before, rate_sigma_rad_s)
+            self._owe(T_before, T_after)
+        self._t_ns, self._T = t_ns, T_after
+        return transform(so3_exp(self.owed_rad) @ T_after[:3, :3], T_after[:3, 3] + self.owed_m)
+
+    def _let_go(self, dt_s: float, T: Array, rate_sigma_rad_s: float) -> None:
+        """Pay back for the time and the motion since the last call, which brought the body to T [4, 4]."""
+        config = self._config
+        turn_rad = float(np.linalg.norm(so3_log(np.ascontiguousarray(self._T[:3, :3].T @ T[:3, :3]))))
+        way_m = float(np.linalg.norm(T[:3, 3] - self._T[:3, 3])) + config.reach_m * turn_rad
+        owed_m = float(np.linalg.norm(self.owed_m))
+        moving_m = min(max(config.way_share, owed_m / config.way_m) * way_m, owed_m * dt_s / config.fade_s)
+        resting_m = min(config.creep_m_s, owed_m / config.creep_s) * dt_s
+        self.owed_m = self.owed_m * _left(owed_m, moving_m + resting_m)
+        owed_rad = float(np.linalg.norm(self.owed_rad))
+        rate_rad_s = max(owed_rad / config.turn_s, config.gyro_share * rate_sigma_rad_s)
+        self.owed_rad = self.owed_rad * _left(owed_rad, min(rate_rad_s, owed_rad / config.fade_s) * dt_s)
+
+    def _owe(self, T_before: Array, T_after: Array) -> None:
+        """Take in that the estimate of one instant has changed."""
+        config = self._config
+        owed_m = self.owed_m + T_before[:3, 3] - T_after[:3, 3]
+        shown = so3_exp(self.owed_rad) @ T_before[:3, :3]
+        owed_rad = so3_log(np.ascontiguousarray(shown @ T_after[:3, :3].T))
+        far = np.linalg.norm(owed_m) > config.at_once_m or np.linalg.norm(owed_rad) > np.deg2rad(config.at_once_deg)
+        if far or not config.enabled:
+            owed_m, owed_rad = np.zeros(3), np.zeros(3)
+        self.owed_m, self.owed_rad = owed_m, owed_rad
+
+
+def in_odom(config: Config) -> Continuity:
+    """Return what makes `odom` continuous, where it is wanted so."""
+    wanted = config.publish.enabled and config.ekf.odom == "continuous"
+    return Continuity(replace(config.publish, enabled=wanted))
+
+
+def _left(owed: float, paid: float) -> float:
+    """Return the share of a debt that is left."""
+    return max(1.0 - paid / owed, 0.0) if owed > 0.0 else 1.0

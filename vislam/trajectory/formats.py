@@ -1,0 +1,209 @@
+"""Trajectory files: TUM, KITTI and EuRoC, read strictly and written atomically.
+
+A damaged line is an error with its file and line, never a pose that is quietly wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vislam.core.errors import DataError
+from vislam.core.files import write_text
+from vislam.core.geometry import quaternion_xyzw_from_rotation
+from vislam.core.messages import Array
+from vislam.core.reading import open_file
+from vislam.core.trajectory import Trajectory
+
+_MAX_BYTES = 512 * 2**20  # ten million poses; a larger file is not a trajectory
+_MAX_LINE_BYTES = 16_384  # a state line with its covariance has about 3000
+_MAX_STAMP_NS = 2**62
+_QUATERNION_NORM_TOLERANCE = 0.02  # files round to as few as 4 decimals
+_FARTHEST_M = 1e15  # beyond, a double knows no metre
+_ROTATION_TOLERANCE = 1e-3  # KITTI files round to 7 digits
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file: `t tx ty tz qx qy qz qw` in seconds and metres, `#` starts a comment.
+
+    Raises DataError with file and line on a damaged line, a zero quaternion, NaN or a backward stamp.
+    """
+    stamps, numbers, lines = read_table(path, separator=None, columns=(8,))
+    t_ns = np.array([stamp_ns(text, 1e9, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
+    return _trajectory(t_ns, numbers[:, 0:3], numbers[:, 3:7], path, lines)
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write a TUM file with exact nanoseconds; the file appears whole or not at all. Raises StorageError."""
+    q = _quaternions_xyzw(trajectory)
+    rows = ["# t_s tx ty tz qx qy qz qw\n"]
+    for t_ns, p, o in zip(trajectory.t_ns.tolist(), trajectory.positions_m.tolist(), q.tolist(), strict=True):
+        sign, (seconds, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
+        rows.append(f"{sign}{seconds}.{fraction:09d} " + " ".join(f"{value:.9f}" for value in (*p, *o)) + "\n")
+    write_text(path, "".join(rows))
+
+
+def read_kitti(path: Path, times: Path | NDArray[np.int64]) -> Trajectory:
+    """Read a KITTI pose file (12 numbers of a row-major 3x4 matrix per line) with its times file or times in ns [N]."""
+    _, numbers, lines = read_table(path, separator=None, columns=(12,), with_stamp=False)
+    t_ns = _read_kitti_times(times) if isinstance(times, Path) else np.asarray(times, dtype=np.int64)
+    if len(t_ns) != len(numbers):
+        raise DataError(f"{path} has {len(numbers)} poses but there are {len(t_ns)} times; give the times of this file")
+    _check_reach(numbers, path, lines)
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, :4] = numbers.reshape(-1, 3, 4)
+    U, _, Vt = np.linalg.svd(poses[:, :3, :3])
+    R = U @ Vt  # the nearest rotation: repairs the rounding of the file
+    wrong = (np.abs(R - poses[:, :3, :3]).max(axis=(1, 2)) > _ROTATION_TOLERANCE) | (np.linalg.det(R) < 0.0)
+    if wrong.any():
+        raise DataError(f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is not a rotation")
+    poses[:, :3, :3] = R
+    _check_increasing(t_ns, times if isinstance(times, Path) else path, lines)
+    return Trajectory(t_ns, poses)
+
+
+def write_kitti(trajectory: Trajectory, path: Path) -> None:
+    """Write a KITTI pose file; the format holds no times. Raises StorageError."""
+    rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12).tolist()
+    write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """Read EuRoC truth: 17 columns (state_groundtruth_estimate0) or 8 (mocap0): ns, position, quaternion w first.
+
+    Velocity and biases of the long layout are not part of a trajectory and are ignored once they are valid numbers.
+    """
+    stamps, numbers, lines = read_table(path, separator=",", columns=(8, 17))
+    t_ns = np.array([stamp_ns(text, 1, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
+    return _trajectory(t_ns, numbers[:, 0:3], numbers[:, [4, 5, 6, 3]], path, lines)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a TUM or EuRoC trajectory file, told apart by the comma in its first line of data."""
+    for _, line in _data_lines(path):
+        return read_euroc(path) if "," in line else read_tum(path)
+    raise DataError(f"{path} holds no poses")
+
+
+def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield (line number, stripped line) of what is neither empty nor a comment."""
+    try:
+        size = path.stat().st_size
+        if size > _MAX_BYTES:
+            raise DataError(f"{path} has {size / 2**20:.0f} MiB; a trajectory file has at most {_MAX_BYTES >> 20} MiB")
+        with open_file(path) as file:
+            number = 0
+            while raw := file.readline(_MAX_LINE_BYTES):
+                number += 1
+                if len(raw) == _MAX_LINE_BYTES:
+                    raise DataError(f"{path}:{number}: line longer than {_MAX_LINE_BYTES} bytes; not a trajectory file")
+                line = raw.decode("utf-8").strip()
+                if line and not line.startswith("#"):
+                    yield number, line
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}:{number}: not text ({error.reason}); is this a trajectory file?") from error
+
+
+def read_table(
+    path: Path,
+    separator: str | None,
+    columns: tuple[int, ...],
+    with_stamp: bool = True,
+    header: list[str] | None = None,
+    optional_from: int | None = None,
+) -> tuple[list[str], Array, list[int]]:
+    """Return the text of the first column, the finite numbers of the others [N, C] and the line numbers [N].
+
+    With `header`, the first line must be exactly these names. Numbers from column `optional_from` on may be NaN (not
+    estimated), but not infinite.
+    """
+    stamps: list[str] = []
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    width = 0
+    for number, line in _data_lines(path):
+        fields = line.split(separator)
+        if header is not None:
+            if fields != header:
+                raise DataError(f"{path}:{number}: the header is not that of this kind of file: {line[:60]}...")
+            header = None
+            continue
+        width = width or len(fields)
+        if len(fields) not in columns or len(fields) != width:
+            wanted = width if width in columns else " or ".join(str(count) for count in columns)
+            raise DataError(f"{path}:{number}: expected {wanted} columns, got {len(fields)}; is the line cut short?")
+        try:
+            if "_" in line:  # Python would read 1_0 as ten
+                raise ValueError("'_' is not part of a number")
+            rows.append([float(field) for field in (fields[1:] if with_stamp else fields)])
+        except ValueError as error:
+            raise DataError(f"{path}:{number}: {error}") from error
+        stamps.append(fields[0])
+        lines.append(number)
+    if not rows:
+        raise DataError(f"{path} holds no poses")
+    numbers = np.array(rows)
+    finite = np.isfinite(numbers[:, :optional_from]).all(axis=1) & ~np.isinf(numbers).any(axis=1)
+    if not finite.all():
+        raise DataError(f"{path}:{lines[int(np.argmin(finite))]}: NaN or infinity; remove or repair the line")
+    return stamps, numbers, lines
+
+
+def stamp_ns(text: str, unit_ns: float, path: Path, line: int) -> int:
+    """Return a stamp in ns without going through a float, which cannot hold today's nanoseconds. Raises DataError."""
+    try:
+        value = Decimal(text.strip())
+    except InvalidOperation as error:
+        raise DataError(f"{path}:{line}: '{text[:40]}' is not a time stamp") from error
+    limit = Decimal(_MAX_STAMP_NS / unit_ns)
+    if not value.is_finite() or not -limit <= value <= limit:  # comparing never overflows, abs() may
+        raise DataError(f"{path}:{line}: time stamp {text[:40]} is out of range")
+    return int((value * int(unit_ns)).to_integral_value())
+
+
+def _read_kitti_times(path: Path) -> NDArray[np.int64]:
+    stamps, _, lines = read_table(path, separator=None, columns=(1,))
+    t_ns = np.array([stamp_ns(text, 1e9, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
+    _check_increasing(t_ns, path, lines)
+    return t_ns
+
+
+def _trajectory(t_ns: NDArray[np.int64], positions: Array, q_xyzw: Array, path: Path, lines: list[int]) -> Trajectory:
+    _check_increasing(t_ns, path, lines)
+    _check_reach(positions, path, lines)
+    norms = np.linalg.norm(q_xyzw, axis=1)
+    wrong = np.abs(norms - 1.0) > _QUATERNION_NORM_TOLERANCE
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise DataError(f"{path}:{lines[i]}: quaternion has norm {norms[i]:.4g} instead of 1")
+    poses = np.tile(np.eye(4), (len(t_ns), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
+    poses[:, :3, 3] = positions
+    return Trajectory(t_ns, poses)
+
+
+def _check_reach(numbers: Array, path: Path, lines: list[int]) -> None:
+    near = (np.abs(numbers) <= _FARTHEST_M).all(axis=1)
+    if not near.all():
+        i = int(np.argmin(near))
+        raise DataError(f"{path}:{lines[i]}: {np.abs(numbers[i]).max():.3g} m are too far, {_FARTHEST_M:g} m at most")
+
+
+def _check_increasing(t_ns: NDArray[np.int64], path: Path, lines: list[int]) -> None:
+    backward = np.flatnonzero(np.diff(t_ns) <= 0)
+    if len(backward):
+        i = int(backward[0]) + 1
+        raise DataError(f"{path}:{lines[i]}: time stamp {t_ns[i]} ns does not follow {t_ns[i - 1]} ns; sort the file")
+
+
+def _quaternions_xyzw(trajectory: Trajectory) -> Array:
+    if not len(trajectory):
+        return np.empty((0, 4))
+    return quaternion_xyzw_from_rotation(trajectory.T_world_body[:, :3, :3])

@@ -1,0 +1,224 @@
+"""One view of a landmark: its whitened error and the derivative of that, by carrying the landmark through the frames.
+
+A landmark is a bearing [a, b, 1] and an inverse depth rho in camera 0 of its host at the time its row was read; on its
+way it is scaled by rho. A camera at time `dt` after its keyframe's stamp sits at `R @ exp(rate * dt), p + v * dt`.
+Vectors and rotations are tuples here, which the compiler keeps in registers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vislam.core.geometry import so3_exp
+from vislam.core.jit import njit
+from vislam.core.messages import Array
+from vislam.core.small import Mat, Vec, back, by, cross, dot, in_a_row, minus, plus, product, times, turned
+from vislam.window.equations.layout import CALIBRATION, Camera
+
+# Columns of a row of the derivative: by the host's pose, calibration and landmark, the error itself, by the pose that
+# sees. What belongs to a landmark comes first and together; the rest of the width is empty.
+CALIBRATED, POINT, ERROR, SEEN, COLUMNS = 6, 11, 14, 16, 24
+_MIN_Z = 0.02  # relative to the host's depth: nearer is beside or behind the camera
+
+
+class Measured(NamedTuple):
+    """A view as the front end measured it; see `layout.Views`."""
+
+    x: float
+    y: float
+    white_xx: float
+    white_xy: float
+    white_yx: float
+    white_yy: float
+    row: float
+    inverse_depth: float
+    depth_weight: float
+
+
+class Mount(NamedTuple):
+    """Camera 0 on the body, or another camera in camera 0."""
+
+    R: Mat
+    p: Vec
+
+
+class Place(NamedTuple):
+    """A body when a row was read, and how it moved."""
+
+    R: Mat
+    p: Vec
+    turn: Mat  # since the keyframe's stamp
+    rate: Vec
+    velocity: Vec
+
+
+class Hosted(NamedTuple):
+    """A landmark as its host has it."""
+
+    place: Place
+    row: float  # at which the host saw it
+    rho: float
+    bearing: Vec
+    in_host: Vec  # body axes
+    in_world: Vec  # world axes, from the host on
+
+
+class Sight(NamedTuple):
+    """A landmark as a camera sees it, and its way there."""
+
+    place: Place
+    mount: Mount
+    gap: Vec  # from this body to the host, world axes
+    in_seen: Vec  # body axes
+    in_cam0: Vec
+    cam: Mount
+    in_cam: Vec
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def measured(values: Array, n: int) -> Measured:
+    """Return view n."""
+    return Measured(
+        values[n, 0], values[n, 1], values[n, 2], values[n, 3], values[n, 4], values[n, 5], values[n, 6], values[n, 7],
+        values[n, 8],
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mounted(camera: Camera, calibration: Array) -> Mount:
+    """Return camera 0 on the body, turned by the calibration."""
+    R, T = product(camera.T_body_cam, so3_exp(calibration[1:4])), camera.T_body_cam
+    return Mount(in_a_row(R), (T[0, 3], T[1, 3], T[2, 3]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lens(T: Array, c: int) -> Mount:
+    """Return camera c in camera 0, of T_cam0_cams [C, 4, 4]."""
+    return Mount(in_a_row(T[c]), (T[c, 0, 3], T[c, 1, 3], T[c, 2, 3]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place(X: Array, k: int, rates: Array, dt: float) -> Place:
+    """Return where keyframe k's body is `dt` after its stamp; Rodrigues' series is good to 1e-8 rad at 0.1 rad."""
+    R = (X[k, 0], X[k, 1], X[k, 2], X[k, 3], X[k, 4], X[k, 5], X[k, 6], X[k, 7], X[k, 8])
+    velocity, rate = (X[k, 12], X[k, 13], X[k, 14]), (rates[k, 0], rates[k, 1], rates[k, 2])
+    a, b, c = times(dt, rate)
+    square = a * a + b * b + c * c
+    first, second = 1.0 - square / 6.0 * (1.0 - square / 20.0), 0.5 - square / 24.0
+    turn = (
+        1.0 - second * (b * b + c * c), second * a * b - first * c, second * a * c + first * b,
+        second * a * b + first * c, 1.0 - second * (a * a + c * c), second * b * c - first * a,
+        second * a * c - first * b, second * b * c + first * a, 1.0 - second * (a * a + b * b),
+    )  # fmt: skip
+    return Place(turned(R, turn), plus((X[k, 9], X[k, 10], X[k, 11]), times(dt, velocity)), turn, rate, velocity)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def hosted(at: Place, mount: Mount, row: float, a: float, b: float, rho: float) -> Hosted:
+    """Return a landmark of a host at a place."""
+    bearing = (a, b, 1.0)
+    in_host = plus(by(mount.R, bearing), times(rho, mount.p))
+    return Hosted(at, row, rho, bearing, in_host, by(at.R, in_host))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sight(landmark: Hosted, at: Place, mount: Mount, cam: Mount) -> Sight:
+    """Carry a landmark into a camera of a body at a place."""
+    rho, gap = landmark.rho, minus(landmark.place.p, at.p)
+    in_seen = back(at.R, plus(landmark.in_world, times(rho, gap)))
+    in_cam0 = back(mount.R, minus(in_seen, times(rho, mount.p)))
+    return Sight(at, mount, gap, in_seen, in_cam0, cam, back(cam.R, minus(in_cam0, times(rho, cam.p))))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def residual(in_cam: Vec, rho: float, view: Measured) -> tuple[bool, Vec]:
+    """Return whether a landmark is in front of the camera, and the view's whitened error: pixel and inverse depth."""
+    x, y, z = in_cam
+    if not z > _MIN_Z:
+        return False, (0.0, 0.0, 0.0)
+    ex, ey = x / z - view.x, y / z - view.y
+    depth = view.depth_weight * (rho / z - view.inverse_depth)
+    return True, (view.white_xx * ex + view.white_xy * ey, view.white_yx * ex + view.white_yy * ey, depth)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def robust(s: float, k: float) -> tuple[float, float]:
+    """Return Huber's weight and twice its cost for a squared error."""
+    if s <= k * k:
+        return 1.0, s
+    root = np.sqrt(s)
+    return k / root, 2.0 * k * root - k * k
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shift(applied_offset_s: Array, calibration: Array, k: int, row: float) -> float:
+    """Return the time from keyframe k's stamp to when a row was read."""
+    return calibration[0] - applied_offset_s[k] + row * calibration[4]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def linearised(
+    landmark: Hosted, seen: Sight, view: Measured, active: Array, same: bool, error: Vec, huber_k: float, J: Array
+) -> None:
+    """Fill J [3, 24] with a view's whitened error and its derivative at a sight, robustly weighted.
+
+    `same` says that the host itself sees it. The third row is filled where a depth is measured.
+    """
+    z = seen.in_cam[2]
+    x, y = seen.in_cam[0] / z, seen.in_cam[1] / z
+    weight = np.sqrt(robust(error[0] * error[0] + error[1] * error[1], huber_k)[0])
+    a, b = weight * view.white_xx / z, weight * view.white_xy / z
+    for k in range(3):  # in a loop, for numba would compile the row again for each constant
+        if k == 1:
+            a, b = weight * view.white_yx / z, weight * view.white_yy / z
+        by_cam = (a, b, -(a * x + b * y))
+        slope = 0.0
+        if k == 2:
+            if not view.depth_weight > 0.0:
+                break
+            weight = np.sqrt(robust(error[2] * error[2], huber_k)[0])
+            slope = weight * view.depth_weight / z
+            by_cam = (0.0, 0.0, -slope * landmark.rho / z)
+        _row(landmark, seen, view.row, active, same, by_cam, J, k)
+        if k == 2:
+            J[k, POINT + 2] += slope
+        J[k, ERROR] = weight * error[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _row(landmark: Hosted, seen: Sight, row: float, active: Array, same: bool, by_cam: Vec, J: Array, k: int) -> None:
+    """Carry the derivative by the camera's coordinates back through the frames into row k of J [3, 24].
+
+    The whole way depends on rho, for the landmark is scaled by it.
+    """
+    host, at, mount, rho = landmark.place, seen.place, seen.mount, landmark.rho
+    by_cam0 = by(seen.cam.R, by_cam)
+    by_seen = by(mount.R, by_cam0)
+    by_world = by(at.R, by_seen)
+    by_host = back(host.R, by_world)
+    by_bearing = back(mount.R, by_host)
+    J[k, POINT], J[k, POINT + 1] = by_bearing[0], by_bearing[1]
+    J[k, POINT + 2] = (
+        dot(minus(by_host, by_seen), mount.p) + dot(by_world, seen.gap) - dot(by_cam0, seen.cam.p)
+    )  # fmt: skip
+    if same:  # moving the body moves landmark and camera alike
+        J[k, :POINT] = 0.0
+        J[k, SEEN:] = 0.0
+        return
+    by_turn_host, by_turn = cross(landmark.in_host, by_host), cross(by_seen, seen.in_seen)  # when the rows were read
+    by_pose_host, by_pose, moved = by(host.turn, by_turn_host), by(at.turn, by_turn), times(rho, by_world)
+    by_mount = plus(cross(landmark.bearing, by_bearing), cross(by_cam0, seen.in_cam0))
+    by_time_host = dot(by_turn_host, host.rate) + dot(moved, host.velocity)
+    by_time = dot(by_turn, at.rate) - dot(moved, at.velocity)
+    J[k, 0], J[k, 1], J[k, 2] = by_pose_host
+    J[k, 3], J[k, 4], J[k, 5] = moved
+    J[k, SEEN], J[k, SEEN + 1], J[k, SEEN + 2] = by_pose
+    J[k, SEEN + 3], J[k, SEEN + 4], J[k, SEEN + 5] = -moved[0], -moved[1], -moved[2]
+    J[k, CALIBRATED] = by_time_host + by_time
+    J[k, CALIBRATED + 1], J[k, CALIBRATED + 2], J[k, CALIBRATED + 3] = by_mount
+    J[k, CALIBRATED + 4] = by_time_host * landmark.row + by_time * row
+    for i in range(CALIBRATION):
+        if not active[i]:
+            J[k, CALIBRATED + i] = 0.0
