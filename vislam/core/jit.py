@@ -14,6 +14,8 @@ from numba.core import config, event
 from numba.extending import overload
 from numba.np import arrayobj
 
+import vislam.core.kernel_loading  # noqa: F401
+
 
 def njit(**options: Any) -> Any:
     """Return numba's decorator for compiled functions, without the entry for C, through which nobody calls."""

@@ -75,10 +75,11 @@ def split_source(source: str) -> tuple[str, str, str]:
 
 def is_world(scheme: str, name: str) -> bool:
     """Whether a source's name is no path: it is simulated altogether, or comes with a package."""
-    from vislam.sim import POINT_WORLD_NAMES
+    if scheme == "points:":  # what is recorded does without the simulator in memory
+        from vislam.sim import POINT_WORLD_NAMES
 
-    is_shipped = scheme == "eqvio:" and name == _SHIPPED
-    return scheme == "sim:" or is_shipped or (scheme == "points:" and name in POINT_WORLD_NAMES)
+        return name in POINT_WORLD_NAMES
+    return scheme == "sim:" or (scheme == "eqvio:" and name == _SHIPPED)
 
 
 def measured_inertial(uri: str) -> MeasuredInertial:

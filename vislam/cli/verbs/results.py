@@ -18,7 +18,7 @@ from vislam.core.log import log_to
 @contextmanager
 def written_up(out: Path, command: Sequence[str]) -> Iterator[None]:
     """Keep the log of a run and write its report afterwards, whatever happened on the way but an interrupt."""
-    from vislam.report import write_report
+    from vislam import report  # what draws is loaded by the first use, when the run has given its memory back
 
     with log_to(out, command):
         try:
@@ -28,9 +28,9 @@ def written_up(out: Path, command: Sequence[str]) -> Iterator[None]:
         except BaseException:
             with suppress(VislamError):  # what went wrong first is what is told
                 if (out / "metrics.json").is_file():
-                    write_report(out)
+                    report.write_report(out)
             raise
-        write_report(out)
+        report.write_report(out)
 
 
 def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
