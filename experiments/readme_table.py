@@ -1,6 +1,7 @@
 """The README's table, measured: runs vislam on every recording of the table and writes down what came out.
 
     .venv/bin/python experiments/readme_table.py [--out results/readme_table] [--only NAME ...] [--reuse]
+    .venv/bin/python experiments/readme_table.py --profile pi --out results/readme_table_pi    # what a profile costs
 
 Each run is a process of its own, as a user would start it; simulated worlds are recorded first, so that rendering does
 not count. A recording that is missing or a run that fails stays in the
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vislam.config.profiles import PROFILES
 from vislam.core.files import write_text
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -99,8 +101,11 @@ def data_root() -> Path:
     return Path(os.environ.get("VISLAM_DATA", REPOSITORY.parent / "shared" / "data"))
 
 
-def measure(entry: Entry, out: Path, root: Path, reuse: bool = False) -> Outcome:
-    """Run one entry in a process of its own; with `reuse`, a finished run in `out` is taken as it is."""
+def measure(entry: Entry, out: Path, root: Path, reuse: bool = False, settings: Sequence[str] = ()) -> Outcome:
+    """Run one entry in a process of its own, under its options and `settings`.
+
+    With `reuse`, a finished run in `out` is taken as it is.
+    """
     kind, _, rest = entry.source.partition(":")
     name, *options = rest.split(",")
     if kind != "sim" and not (root / name).is_dir():
@@ -110,7 +115,7 @@ def measure(entry: Entry, out: Path, root: Path, reuse: bool = False) -> Outcome
         folder = out.parent / "recordings" / name if kind == "sim" else root / name
         failure = _call("simulate", name, "--out", str(folder)) if kind == "sim" and not folder.exists() else ""
         source = ",".join([f"points:{folder}", *options]) if kind == "points" else str(folder)
-        failure = failure or _call("run", source, "--out", str(out), *entry.options)
+        failure = failure or _call("run", source, "--out", str(out), *settings, *entry.options)
         failure = failure or _call("optimize", str(out))
         if failure:
             return Outcome(entry, None, failure)
@@ -193,16 +198,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=REPOSITORY / "results" / "readme_table", help="folder of the runs")
     parser.add_argument("--only", nargs="+", choices=[entry.name for entry in ENTRIES], help="leave the README alone")
     parser.add_argument("--reuse", action="store_true", help="take runs that are already there")
+    parser.add_argument("--profile", choices=sorted(PROFILES), help="run all under a profile, leave the README alone")
     options = parser.parse_args(arguments)
+    settings = () if options.profile is None else ("--profile", options.profile)
     options.out.mkdir(parents=True, exist_ok=True)
     outcomes = []
     for entry in ENTRIES:
         if options.only is None or entry.name in options.only:
-            outcomes.append(measure(entry, options.out / entry.name, data_root(), options.reuse))
+            outcomes.append(measure(entry, options.out / entry.name, data_root(), options.reuse, settings))
             print(" | ".join(row(outcomes[-1])), flush=True)
     text = table(outcomes)
     write_text(options.out.with_suffix(".md"), text)
-    if options.only is None:
+    if options.only is None and options.profile is None:
         readme = REPOSITORY / "README.md"
         write_text(readme, replace_block(readme.read_text(encoding="utf-8"), text))
     return 0 if all(outcome.metrics is not None for outcome in outcomes) else 1
