@@ -177,11 +177,11 @@ def test_the_data_counts_and_not_where_they_lie(tmp_path):
 
 
 def test_code_that_only_shows_results_does_not_make_them_new(tmp_path):
-    for name in ("cli.py", "slam.py", "report/page.py", "experiment/worker.py", "experiment/page.py"):
+    for name in ("cli/eval.py", "slam.py", "report/page.py", "experiment/worker.py", "experiment/page.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("a = 1\n")
     before = code_sha256(tmp_path)
-    for name in ("cli.py", "report/page.py", "experiment/page.py"):
+    for name in ("cli/eval.py", "report/page.py", "experiment/page.py"):
         (tmp_path / name).write_text("a = 2\n")
     assert code_sha256(tmp_path) == before
     for name in ("slam.py", "experiment/worker.py"):
@@ -204,7 +204,7 @@ def test_relative_paths_begin_at_the_plan(tmp_path):
         (('source = "points:laps"\n', ""), "sequences.0.source: "),
         (("members = 2", "members = 0"), "members must be at least 1"),
         (("members = 2", 'members = "two"'), "members: .* got 'two'"),
-        (('outputs = ["graph"]', 'outputs = ["final"]'), "estimators.1.outputs.0: "),
+        (('outputs = ["graph"]', 'outputs = ["best"]'), "estimators.1.outputs"),
         (('outputs = ["graph"]', "outputs = []"), "estimator 'tight' needs outputs"),
         (('name = "tight"', 'name = "loose"'), "two of kind estimator are called 'loose'"),
         (('outputs = ["graph"]', 'sequences = ["lap"]'), "estimator 'tight': no sequence 'lap' in laps, drone"),

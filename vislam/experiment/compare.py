@@ -17,7 +17,7 @@ from vislam.experiment import engines
 from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, expand, source_identities, unique
 from vislam.experiment.options import CompareOptions
-from vislam.experiment.plan import Plan, load_plan
+from vislam.experiment.plan import Plan, load_plan, plan_text
 from vislam.experiment.report.exports import latex, runs_csv, summary_csv, tests_csv
 from vislam.experiment.report.page import comparison_page
 from vislam.experiment.statistics import compare, groups
@@ -48,7 +48,7 @@ def run_comparison(options: CompareOptions, command: list[str], progress: Progre
         DataError, StorageError: recordings, store or output cannot be used.
     """
     _check(options)
-    plan = load_plan(options.plan)
+    plan = load_plan(options.plan, programs=options.estimator)
     jobs = expand(plan)
     if options.verify is not None:
         return _verify(options, plan, jobs, progress)
@@ -60,7 +60,7 @@ def run_comparison(options: CompareOptions, command: list[str], progress: Progre
         new = run_missing(jobs, store, options, progress)
         results = {job.key: result for job in unique(jobs) if (result := store.get(job.key)) is not None}
     out = options.out or Path("results") / plan.name
-    return write_results(plan, options.plan.read_text(encoding="utf-8"), jobs, results, out, command, new)
+    return write_results(plan, plan_text(options.plan, options.estimator), jobs, results, out, command, new)
 
 
 def run_missing(
@@ -92,7 +92,7 @@ def run_missing(
 
 def write_results(
     plan: Plan,
-    plan_text: str,
+    text: str,
     jobs: Sequence[Job],
     results: dict[str, dict[str, Any]],
     out: Path,
@@ -105,7 +105,7 @@ def write_results(
     found = trials(plan, jobs, results)
     grouped = groups(found)
     tests = [comparison for metric in TESTED for comparison in compare(found, metric)]
-    manifest = _manifest(plan_text, jobs, found, command)
+    manifest = _manifest(text, jobs, found, command)
     write_json(out / "manifest.json", manifest)
     write_text(out / "runs.csv", runs_csv(plan, found))
     write_text(out / "summary.csv", summary_csv(plan, grouped))
@@ -148,13 +148,13 @@ def _listing(jobs: Sequence[Job], store: ResultStore) -> Answer:
     return Answer(lines, {"jobs": listed})
 
 
-def _manifest(plan_text: str, jobs: Sequence[Job], found: Sequence[Trial], command: list[str]) -> dict[str, Any]:
+def _manifest(text: str, jobs: Sequence[Job], found: Sequence[Trial], command: list[str]) -> dict[str, Any]:
     return {
         "command": command,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "code_revision": code_revision(),
         "environment": environment(),
-        "plan_text": plan_text,
+        "plan_text": text,
         "sources": source_identities(jobs),
         "results": [
             {
@@ -187,7 +187,7 @@ def _verify(options: CompareOptions, plan: Plan, jobs: Sequence[Job], progress: 
                     progress(len(results), len(wanted), result["status"])
         return results
 
-    text = options.plan.read_text(encoding="utf-8")
+    text = plan_text(options.plan, options.estimator)
     verdicts, remarks = verify(plan, text, jobs, manifest, options.sample, rerun)
     counts = Counter(verdict.outcome for verdict in verdicts)
     lines = [f"remark: {remark}" for remark in remarks]

@@ -18,8 +18,8 @@ HARNESS_VERSION = 1  # of what a job does and measures beside the code below; a 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "llvmlite")
 # they show results or ask for them and cannot change a number; all other code can
-_WITHOUT_EFFECT = ("cli.py", "options.py", "__main__.py", "report/", "viewer/", "experiment/")
-_MEASURING = ("experiment/worker.py", "experiment/measures.py", "experiment/recordings.py")
+_WITHOUT_EFFECT = ("cli/", "__main__.py", "report/", "run/viewer/", "experiment/")
+_MEASURING = tuple(f"experiment/{name}.py" for name in ("worker", "measures", "recordings", "programs"))
 
 
 @cache

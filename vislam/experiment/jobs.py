@@ -11,6 +11,7 @@ from typing import Any
 from vislam.config import dump, from_data
 from vislam.experiment.identity import environment, sha256_of, source_identity
 from vislam.experiment.plan import Plan, Scalar, Sequence, nested
+from vislam.experiment.programs import identity
 from vislam.run.folder import fingerprint
 
 JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
@@ -30,6 +31,8 @@ class Job:
     source: str
     config: dict[str, Any]  # resolved, all of it
     batch: bool  # whether the batch solution is wanted too
+    program: str  # that is run in the place of the pipeline, see `programs`; empty: none
+    options: dict[str, Scalar]  # of the program
     timeout_s: float
 
     @property
@@ -45,13 +48,15 @@ class Job:
             "source": self.source,
             "config": self.config,
             "batch": self.batch,
+            "program": self.program,
+            "options": self.options,
             "timeout_s": self.timeout_s,
             "environment": environment(),
         }
 
 
 def expand(plan: Plan) -> list[Job]:
-    """Return every job of a plan, in its order. Raises UsageError when a combination is no valid configuration."""
+    """Return every job of a plan, in its order. Raises UsageError for a configuration or program that is none."""
     identities: dict[str, str] = {}
     jobs = []
     for sequence, variant in ((s, v) for s in plan.sequences for v in variants(plan, s.name)):
@@ -67,15 +72,16 @@ def expand(plan: Plan) -> list[Job]:
             for seed, member in itertools.product(plan.seeds, range(plan.members)):
                 config = dump(resolved) | {"seed": seed}
                 config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
-                batch = "batch" in estimator.outputs
+                batch = "batch" in estimator.compared
                 files = [fingerprint(Path(name)) for name in config["calibration"].values() if name is not None]
                 if (shaking := config["imu"]["vibration"]["recording"]) is not None:
                     files.append(identities.setdefault(shaking, source_identity(shaking)))
+                own = [identity(estimator.program), estimator.options] if estimator.program else []
                 jobs.append(
                     Job(
-                        sha256_of([identities[source], files, config, batch, environment()]),
+                        sha256_of([identities[source], files, config, batch, environment(), *own]),
                         sequence.name, variant, estimator.name, index, seed, member,
-                        source, config, batch, plan.timeout_s,
+                        source, config, batch, estimator.program, estimator.options, plan.timeout_s,
                     )
                 )  # fmt: skip
     return jobs

@@ -17,6 +17,8 @@ class CompareOptions:
 
     plan: Positional[Path]
     """TOML file that says what to compare on what; docs/experiments.md"""
+    estimator: tuple[str, ...] = ()
+    """More estimators for the plan: FILE.py, FILE.py:CLASS or MODULE:CLASS; docs/experiments.md, examples/09"""
     out: Path | None = None
     """Folder for report, tables and manifest; None: results/NAME of the plan"""
     workers: Count = 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import re
 import tomllib
@@ -18,7 +19,10 @@ from vislam.run.sources import is_world, split_source
 
 Scalar = bool | int | float | str
 Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.coupling": "tight"}
-Output = Literal["ekf", "live", "graph", "batch"]
+Output = Literal["ekf", "live", "graph", "batch", "causal", "final"]
+
+_OF_PIPELINE: tuple[Output, ...] = ("ekf", "live", "graph", "batch")
+_OF_PROGRAM: tuple[Output, ...] = ("causal", "final")
 
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?")
 _NAME = re.compile(r"[\w.,+ \[\]%-]{1,60}")
@@ -36,12 +40,21 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """One configuration of the pipeline, and which of its trajectories are compared."""
+    """One configuration of the pipeline, or a program of somebody else, and which of its trajectories are compared."""
 
     name: str
     config: Settings = field(default_factory=dict)
-    outputs: tuple[Output, ...] = ("ekf", "live", "graph")  # filter and graph as they went, graph in the end
+    outputs: tuple[Output, ...] | None = None  # None: filter and graph as they went, graph in the end; see `compared`
     sequences: tuple[str, ...] = ()  # names of those that it can be run on; empty: all
+    program: str = ""  # FILE.py, FILE.py:CLASS or MODULE:CLASS, see `programs`; empty: the pipeline
+    options: dict[str, Scalar] = field(default_factory=dict)  # of the program: by name to its class
+
+    @property
+    def compared(self) -> tuple[Output, ...]:
+        """The trajectories that are compared."""
+        if self.outputs is not None:
+            return self.outputs
+        return _OF_PROGRAM if self.program else ("ekf", "live", "graph")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,20 +93,35 @@ class Plan:
         return list(dict.fromkeys(axis.name for axis in self.axes))
 
 
-def load_plan(path: Path, variables: Mapping[str, str] | None = None) -> Plan:
-    """Read a plan; sources come back with variables and paths resolved.
+def plan_text(path: Path, programs: Iterable[str] = ()) -> str:
+    """Return the text of a plan with more estimators, which are programs. Raises UsageError when it cannot be read."""
+    try:
+        text = read_text(path)
+    except (OSError, ValueError) as error:
+        raise UsageError(_unreadable(path, error)) from error
+    for program in programs:
+        place, colon, cls = program.partition(":")
+        where = str(Path(place).resolve()) if place.endswith(".py") else place
+        name = f"{Path(place).stem} {cls}".strip()
+        text += f"\n[[estimators]]\nname = {json.dumps(name)}\nprogram = {json.dumps(where + colon + cls)}\n"
+    return text
+
+
+def load_plan(path: Path, variables: Mapping[str, str] | None = None, programs: Iterable[str] = ()) -> Plan:
+    """Read a plan; sources and programs come back with variables and paths resolved.
 
     Args:
         path: TOML file, see docs/experiments.md.
         variables: values of $NAMES in sources; None: the environment.
+        programs: more estimators, see `plan_text`.
 
     Raises:
         UsageError: naming the file, the field, what was asked and what is allowed.
     """
     try:
-        data = tomllib.loads(read_text(path))
-    except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"plan {path} cannot be read: {error}; see docs/experiments.md for an example") from error
+        data = tomllib.loads(plan_text(path, programs))
+    except (ValueError, RecursionError) as error:
+        raise UsageError(_unreadable(path, error)) from error
     return plan_from_data(data, str(path), path.resolve().parent, os.environ if variables is None else variables)
 
 
@@ -102,9 +130,22 @@ def plan_from_data(data: dict[str, Any], where: str, folder: Path, variables: Ma
     _refuse_unknown(data, Plan, where)
     plan = validated(Plan, data, where)
     sequences = tuple(_resolved(sequence, where, folder, variables) for sequence in plan.sequences)
-    plan = dataclasses.replace(plan, sequences=sequences)
+    estimators = tuple(_placed(estimator, folder) for estimator in plan.estimators)
+    plan = dataclasses.replace(plan, sequences=sequences, estimators=estimators)
     _check(plan, where)
     return plan
+
+
+def _unreadable(path: Path, error: Exception) -> str:
+    return f"plan {path} cannot be read: {error}; see docs/experiments.md for an example"
+
+
+def _placed(estimator: Estimator, folder: Path) -> Estimator:
+    """Return an estimator whose program's file has an absolute path."""
+    place, colon, name = estimator.program.partition(":")
+    if not place.endswith(".py"):
+        return estimator
+    return dataclasses.replace(estimator, program=f"{folder / place}{colon}{name}")
 
 
 def _resolved(sequence: Sequence, where: str, folder: Path, variables: Mapping[str, str]) -> Sequence:
@@ -176,8 +217,15 @@ def _check_axes(plan: Plan, where: str) -> None:
 def _check_estimators(plan: Plan, where: str) -> None:
     known = [sequence.name for sequence in plan.sequences]
     for estimator in plan.estimators:
-        if not estimator.outputs or len(set(estimator.outputs)) != len(estimator.outputs):
+        if not estimator.compared or len(set(estimator.compared)) != len(estimator.compared):
             raise UsageError(f"{where}: estimator '{estimator.name}' needs outputs, each one once")
+        allowed = _OF_PROGRAM if estimator.program else _OF_PIPELINE
+        if wrong := [output for output in estimator.compared if output not in allowed]:
+            raise UsageError(
+                f"{where}: estimator '{estimator.name}' has no output '{wrong[0]}'; it has {', '.join(allowed)}"
+            )
+        if estimator.options and not estimator.program:
+            raise UsageError(f"{where}: options of estimator '{estimator.name}' are for a program; use config")
         if unknown := sorted(set(estimator.sequences) - set(known)):
             raise UsageError(f"{where}: estimator '{estimator.name}': no sequence '{unknown[0]}' in {', '.join(known)}")
 

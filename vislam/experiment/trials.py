@@ -11,8 +11,11 @@ from vislam.experiment.jobs import Job
 from vislam.experiment.plan import Plan
 
 _MIN_COMPLETE = 0.5  # of the recording's time; below, a small error only says that little was estimated
-CAUSAL = ("ekf", "live")  # known when the frame came; "graph" and "batch" know the whole recording
-OUTPUT_TITLES = {"ekf": "filter, causal", "live": "graph, causal", "graph": "graph, final", "batch": "batch, final"}
+CAUSAL = ("ekf", "live", "causal")  # known when the frame came; the others know the whole recording
+OUTPUT_TITLES = {
+    "ekf": "filter, causal", "live": "graph, causal", "causal": "causal",
+    "graph": "graph, final", "batch": "batch, final", "final": "final",
+}  # fmt: skip
 
 Kind = Literal["error", "share", "signed", "ratio", "cost", "count"]
 
@@ -88,13 +91,13 @@ def estimate_name(estimator: str, output: str) -> str:
 
 def estimates(plan: Plan) -> list[tuple[str, str]]:
     """Return the (estimator, output) pairs of a plan: causal ones first."""
-    pairs = [(e.name, output) for e in plan.estimators for output in e.outputs]
+    pairs = [(e.name, output) for e in plan.estimators for output in e.compared]
     return sorted(pairs, key=lambda pair: pair[1] not in CAUSAL)
 
 
 def trials(plan: Plan, jobs: Sequence[Job], results: Mapping[str, dict[str, Any]]) -> list[Trial]:
     """Return every trajectory that the plan compares, for the jobs that have a result."""
-    outputs = {estimator.name: estimator.outputs for estimator in plan.estimators}
+    outputs = {estimator.name: estimator.compared for estimator in plan.estimators}
     return [
         _trial(job, output, results[job.key])
         for job in jobs

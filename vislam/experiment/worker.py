@@ -19,6 +19,7 @@ from vislam.core.errors import VislamError
 from vislam.core.files import write_json
 from vislam.experiment.identity import environment
 from vislam.experiment.measures import output_measures, run_measures
+from vislam.experiment.programs import run_program
 from vislam.experiment.recordings import TimedRecording, open_cached
 from vislam.run import execute
 from vislam.run.folder import prepare
@@ -52,13 +53,18 @@ def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -
     recording = TimedRecording(open_cached(spec["source"], config.seed, cache, config.calibration))
     prepare(out, overwrite=False)
     try:
-        execute(recording, config, out, spec["source"], ["vislam", "compare"], recording.frame_done)
+        if spec["program"]:
+            run_program(spec["program"], spec["options"], recording, config, out, recording.frame_done)
+        else:
+            execute(recording, config, out, spec["source"], ["vislam", "compare"], recording.frame_done)
     finally:
         metrics_file = out / "metrics.json"
         if metrics_file.is_file():
             metrics = json.loads(metrics_file.read_text(encoding="utf-8"))
             result["run"] = run_measures(metrics, recording.latencies_s)
             outputs = ["ekf", "live", "graph", *_batch(spec, config, out, result)]
+            if spec["program"]:
+                outputs = ["causal", "final"]
             result["outputs"] = output_measures(out, outputs, metrics, recording.span_ns)
 
 

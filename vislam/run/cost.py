@@ -20,12 +20,15 @@ class CostMeter:
         self._first_pose: dict[str, float | None] = {"first_pose_s": None, "first_pose_cpu_s": None}
 
     def take(self, step: Step) -> None:
-        """Count a frame, and note the first one with a pose published in `odom`."""
-        t_ns = step.front.frame.t_ns
+        """Count the frame of a step."""
+        self.count(step.front.frame.t_ns, step.front.T_odom_body is not None)
+
+    def count(self, t_ns: int, has_pose: bool) -> None:
+        """Count a frame, and note the first one with a pose that is published."""
         if self._frames == 0:
             self._first_t_ns = t_ns
         self._frames += 1
-        if self._first_pose["first_pose_s"] is None and step.front.T_odom_body is not None:
+        if self._first_pose["first_pose_s"] is None and has_pose:
             taken_s = cpu_s() - self._before_s
             self._first_pose = {"first_pose_s": (t_ns - self._first_t_ns) * 1e-9, "first_pose_cpu_s": taken_s}
 

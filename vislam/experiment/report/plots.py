@@ -211,7 +211,7 @@ def _label_plainly(axis: Any) -> None:
 
 
 def _color(output: str) -> str:
-    return CODE[output]
+    return CODE[{"causal": "live", "final": "graph"}.get(output, output)]  # programs show by marker and line
 
 
 def _marker(item: Group) -> str:

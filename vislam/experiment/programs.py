@@ -1,0 +1,264 @@
+"""Estimators that are not vislam's: a class with two doors and an answer, on the pipeline's measurements."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+
+from vislam.config import Config
+from vislam.core.camera import Rig
+from vislam.core.errors import UsageError, VislamError
+from vislam.core.files import write_json
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.recording import Recording
+from vislam.core.trajectory import Trajectory
+from vislam.factors.keys import nearest_rigid
+from vislam.frontend import mode_for
+from vislam.run.cost import CostMeter
+from vislam.run.drive import Progress, imu_noise
+from vislam.run.sources import shaken
+from vislam.trajectory import write_tum
+
+_DOORS = ("inertial", "frame", "answer")
+_RIGID = 1e-3  # largest entry of R^T R - 1; estimators round
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """What an estimator may know before the first measurement."""
+
+    rig: Rig
+    imu_noise: ImuNoise | None  # None: no IMU, or it is off
+    gravity_m_s2: float  # differs by 1e-9 between the members of an ensemble
+    mode: str  # "mono", "stereo", "rgbd" or "planar": how the pipeline would use the rig
+    seed: int  # of every random choice
+
+
+class Program(Protocol):
+    """What the class has; it is made by `Class(setup, **options)`, once for each job, in a process of its own.
+
+    World is any frame: it is aligned as the pipeline's is, by yaw and position with an IMU, else by SE(3), one camera
+    without an IMU by Sim(3). A method `magnetic(sample: MagSample)` is called where there is one and a magnetometer.
+    """
+
+    def inertial(self, sample: ImuSample) -> None:
+        """Take an inertial sample; all come in the order of time, together with the frames."""
+        ...
+
+    def frame(self, frame: Frame) -> Array | None:
+        """Take a frame; return T_world_body [4, 4] at its time as it is known now, None where it is not."""
+        ...
+
+    def answer(self) -> Trajectory:
+        """Return the trajectory as it is known after all measurements."""
+        ...
+
+
+class ProgramError(VislamError):
+    """An estimator that is not vislam's failed, or answered what is no pose."""
+
+
+def load(program: str) -> type[Any]:
+    """Return the class, see `Program`, of `FILE.py`, `FILE.py:CLASS`, `PACKAGE.MODULE` or `PACKAGE.MODULE:CLASS`.
+
+    Without a name it is the only class there with all doors. Raises UsageError where there is none.
+    """
+    place, _, name = program.rpartition(":") if ":" in program else (program, "", "")
+    module = _module(place, program)
+    own = [cls for _, cls in inspect.getmembers(module, inspect.isclass) if cls.__module__ == module.__name__]
+    if name:
+        chosen = getattr(module, name, None)
+        if not inspect.isclass(chosen):
+            raise UsageError(f"estimator {program}: no class '{name}'; there are: {_names(own)}")
+        if missing := [door for door in _DOORS if not callable(getattr(chosen, door, None))]:
+            raise UsageError(
+                f"estimator {program}: '{name}' has no method '{missing[0]}'; it needs {', '.join(_DOORS)}"
+            )
+        return chosen
+    fitting = [cls for cls in own if all(callable(getattr(cls, door, None)) for door in _DOORS)]
+    if len(fitting) != 1:
+        raise UsageError(
+            f"estimator {program}: one class with the methods {', '.join(_DOORS)} is wanted, and {len(fitting)} of "
+            f"{_names(own)} have them; name it as {place}:CLASS"
+        )
+    return fitting[0]
+
+
+def identity(program: str) -> str:
+    """Return what a program is: its class, and the SHA-256 of its file or, in a package, of all that package's."""
+    cls = load(program)
+    file = Path(inspect.getfile(cls))
+    top = sys.modules[cls.__module__.partition(".")[0]]
+    folders = [] if _is_file(program) else [Path(folder) for folder in getattr(top, "__path__", [])]
+    digest = hashlib.sha256()
+    for source in sorted(source for folder in folders for source in folder.rglob("*.py")) or [file]:
+        digest.update(source.name.encode() + source.read_bytes())
+    return f"{cls.__qualname__} {digest.hexdigest()}"
+
+
+def run_program(
+    program: str, options: Mapping[str, Any], recording: Recording, config: Config, out: Path,
+    progress: Progress | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Run an estimator over a recording, write its trajectories and the truth into `out`, and return its metrics.
+
+    Raises:
+        UsageError: there is no such class, or it takes no such options.
+        ProgramError: it raised, or answered what is no pose; what was known before is written.
+        DataError: the recording cannot be used.
+    """
+    run = _Run(program, options, shaken(recording, config.imu.vibration), config)
+    try:
+        run.feed(progress)
+    finally:
+        metrics = run.write(out)
+    return metrics
+
+
+class _Run:
+    """One estimator over one recording."""
+
+    def __init__(self, program: str, options: Mapping[str, Any], recording: Recording, config: Config) -> None:
+        noise = imu_noise(config.imu, recording.imu_noise)
+        self._setup = Setup(
+            recording.rig, noise, config.imu.gravity_m_s2, mode_for(config.frontend, recording.rig), config.seed
+        )
+        self._program, self._recording, self._cost = program, recording, CostMeter()
+        self._t_ns: list[int] = []  # of all frames
+        self._known: list[tuple[int, Array]] = []
+        self._final: Trajectory | None = None
+        cls = load(program)
+        make: Callable[..., Any] = cls
+        try:
+            inspect.signature(cls).bind(self._setup, **options)
+        except TypeError as error:
+            raise UsageError(f"estimator {program}: {cls.__name__}(setup, **options): {error}") from error
+        self._estimator = self._asked(partial(make, self._setup, **options), "at the start")
+
+    def feed(self, progress: Progress | None) -> None:
+        """Give everything to the estimator, and ask for its answer."""
+        magnetic = getattr(self._estimator, "magnetic", None)
+        for value in self._recording.events():
+            if isinstance(value, Frame):
+                self._see(value)
+                if progress is not None:
+                    progress(len(self._t_ns), self._recording.frame_count, "")
+            elif isinstance(value, MagSample):
+                if magnetic is not None:
+                    self._asked(partial(magnetic, value), f"magnetometer sample at {value.t_ns} ns")
+            elif self._setup.imu_noise is not None:
+                self._asked(partial(self._estimator.inertial, value), f"inertial sample at {value.t_ns} ns")
+        answer = self._asked(self._estimator.answer, "in the end")
+        if not isinstance(answer, Trajectory):
+            raise ProgramError(f"{self._program}: answer() gave {type(answer).__name__}; a Trajectory is wanted")
+        self._final = answer
+
+    def write(self, out: Path) -> dict[str, Any]:
+        """Write what is known; return the metrics, those of the pipeline that an estimator by others has, too."""
+        truth = self._recording.truth()
+        if truth is not None:
+            write_tum(truth, out / "trajectory_truth.tum")
+        if self._known:
+            t_ns, T = zip(*self._known, strict=True)
+            write_tum(Trajectory(np.array(t_ns), np.array(T)), out / "trajectory_causal.tum")
+        if self._final is not None:
+            write_tum(self._final, out / "trajectory_final.tum")
+        cost = self._cost.entry({})
+        metrics = {
+            "mode": self._setup.mode,
+            "has_imu": self._setup.imu_noise is not None,
+            "frames": len(self._t_ns),
+            "keyframes": None,
+            "duration_s": (self._t_ns[-1] - self._t_ns[0]) * 1e-9 if self._t_ns else 0.0,
+            "loops": {"accepted": None},
+            "initialisation": {"status": self._program, "t_s": cost["first_pose_s"], "scale_sigma": None},
+            "timing_ms": {},
+            "cost": cost,
+            "nis": {},
+            "doubts": [],
+            "warnings": [],
+        }
+        write_json(out / "metrics.json", metrics)
+        return metrics
+
+    def _see(self, frame: Frame) -> None:
+        where = f"frame {len(self._t_ns)} at {frame.t_ns} ns"
+        answered = self._asked(partial(self._estimator.frame, frame), where)
+        self._t_ns.append(frame.t_ns)
+        if answered is not None:
+            self._known.append((frame.t_ns, self._pose(answered, where)))
+        self._cost.count(frame.t_ns, answered is not None)
+
+    def _asked(self, ask: Callable[[], Any], where: str) -> Any:
+        """Return what an estimator answers; whatever it raises is told with its name and place."""
+        try:
+            return ask()
+        except Exception as error:
+            raise ProgramError(f"{self._program}: {where}: {type(error).__name__}: {error}") from error
+
+    def _pose(self, answered: Any, where: str) -> Array:
+        try:
+            T = np.array(answered, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ProgramError(f"{self._program}: {where}: {error}; a pose [4, 4] is wanted") from error
+        if T.shape != (4, 4):
+            raise ProgramError(f"{self._program}: {where}: a pose is an array [4, 4], not {[*T.shape]}")
+        if not np.isfinite(T).all() or np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() > _RIGID:
+            raise ProgramError(f"{self._program}: {where}: the pose is no rigid motion: {T.round(3).tolist()}")
+        return nearest_rigid(T)
+
+
+def _is_file(program: str) -> bool:
+    return program.partition(":")[0].endswith(".py")
+
+
+def _names(classes: list[type]) -> str:
+    return ", ".join(cls.__name__ for cls in classes) or "none"
+
+
+@contextmanager
+def _beside(folder: Path) -> Iterator[None]:
+    """Inside, what lies in a folder can be imported, as for a script there."""
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+
+
+def _module(place: str, program: str) -> ModuleType:
+    if not _is_file(program):
+        try:
+            return importlib.import_module(place)
+        except Exception as error:
+            raise UsageError(f"estimator {program}: {type(error).__name__}: {error}") from error
+    path = Path(place).resolve()
+    if not path.is_file():
+        raise UsageError(f"estimator {program}: there is no file {path}")
+    name = f"estimator_{hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    found = importlib.util.spec_from_file_location(name, path)
+    assert found is not None and found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    sys.modules[name] = module  # dataclasses look their module up
+    try:
+        with _beside(path.parent):
+            found.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise UsageError(f"estimator {program}: {type(error).__name__}: {error}") from error
+    return module
