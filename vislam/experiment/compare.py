@@ -13,12 +13,12 @@ from typing import Any
 from vislam.core.errors import TrackingLostError, UsageError
 from vislam.core.files import write_json, write_text
 from vislam.core.revision import code_revision
-from vislam.experiment import engines
+from vislam.experiment import engines, winners
 from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, expand, source_identities, unique
 from vislam.experiment.options import CompareOptions
 from vislam.experiment.plan import Plan, load_plan, plan_text
-from vislam.experiment.report.exports import latex, runs_csv, summary_csv, tests_csv
+from vislam.experiment.report.exports import latex, runs_csv, summary_csv, tests_csv, winners_csv
 from vislam.experiment.report.page import comparison_page
 from vislam.experiment.statistics import compare, groups
 from vislam.experiment.store import ResultStore
@@ -104,17 +104,22 @@ def write_results(
         out.mkdir(parents=True, exist_ok=True)
     found = trials(plan, jobs, results)
     grouped = groups(found)
-    tests = [comparison for metric in TESTED for comparison in compare(found, metric)]
+    by_metric = {metric: compare(found, metric) for metric in TESTED}
+    tests = [comparison for comparisons in by_metric.values() for comparison in comparisons]
+    overall = [winner for comparisons in by_metric.values() for winner in winners.of_plan(comparisons)]
+    ranked = overall + winners.of_sequences(grouped, TESTED[0])
     manifest = _manifest(text, jobs, found, command)
     write_json(out / "manifest.json", manifest)
     write_text(out / "runs.csv", runs_csv(plan, found))
     write_text(out / "summary.csv", summary_csv(plan, grouped))
     write_text(out / "tests.csv", tests_csv(tests))
+    write_text(out / "winners.csv", winners_csv(plan, ranked))
     write_text(out / "table.tex", latex(plan, grouped))
-    write_text(out / "report.html", comparison_page(plan, grouped, found, tests, manifest))
+    write_text(out / "report.html", comparison_page(plan, grouped, found, tests, ranked, manifest))
     failed = [job for job in unique(list(jobs)) if results.get(job.key, {}).get("status") == "failed"]
     lines = [f"{len(results)} results, {new} of them new, {len(failed)} failed"]
     lines += [f"failed: {job.label}: {results[job.key]['reason'].splitlines()[0]}" for job in failed[:10]]
+    lines += [winners.told(winner) for winner in overall]
     lines.append(f"report: {out / 'report.html'}")
     return Answer(lines, {"out": str(out), "results": len(results), "new": new, "failed": len(failed)})
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import wilcoxon
+from scipy.stats import rankdata, wilcoxon
 
 from vislam.experiment.plan import Scalar
 from vislam.experiment.trials import BY_NAME, CAUSAL, Trial
@@ -72,6 +72,7 @@ class Comparison:
     first_better: int
     second_better: int
     ratio: float  # median of first / second over the pairs where both are finite; NaN without one
+    effect: float  # matched-pairs rank-biserial correlation (Kerby 2014): -1 first always better, 0 neither, 1 second
     p: float  # Wilcoxon signed-rank, two-sided
     p_holm: float  # the same, corrected for all comparisons of this metric
 
@@ -116,7 +117,7 @@ def compare(trials: Sequence[Trial], metric: str) -> list[Comparison]:
         if causal[first] == causal[second]
     ]
     corrected = holm([comparison.p for comparison in raw])
-    return [_with_holm(comparison, p) for comparison, p in zip(raw, corrected, strict=True)]
+    return [replace(comparison, p_holm=p) for comparison, p in zip(raw, corrected, strict=True)]
 
 
 def holm(p: Sequence[float]) -> list[float]:
@@ -158,11 +159,15 @@ def _test(
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = float(np.median(x[both] / y[both])) if both.any() else math.nan
     better = int((difference < 0.0).sum()), int((difference > 0.0).sum())
-    return Comparison(metric, first, second, len(units), *better, ratio, p, p)
+    return Comparison(metric, first, second, len(units), *better, ratio, _effect(nonzero), p, p)
 
 
-def _with_holm(c: Comparison, p_holm: float) -> Comparison:
-    return Comparison(c.metric, c.first, c.second, c.pairs, c.first_better, c.second_better, c.ratio, c.p, p_holm)
+def _effect(differences: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    """Return by how much the ranks of positive differences outweigh those of negative ones, as a share of all ranks."""
+    if not len(differences):
+        return 0.0
+    ranks = rankdata(np.abs(differences))
+    return float((ranks * np.sign(differences)).sum() / ranks.sum())
 
 
 def _median(ordered: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

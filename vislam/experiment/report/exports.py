@@ -10,6 +10,7 @@ from io import StringIO
 from vislam.experiment.plan import Plan
 from vislam.experiment.statistics import Comparison, Group, Spread, Variant
 from vislam.experiment.trials import BY_NAME, CAUSAL, METRICS, Metric, Trial
+from vislam.experiment.winners import Winner
 
 _LATEX_METRICS = ("ate_m", "scale_error", "rpe_1m_percent", "rpe_5m_percent", "rpe_10m_percent", "completeness")
 _SPECIAL = {
@@ -72,14 +73,38 @@ def summary_csv(plan: Plan, groups: Sequence[Group]) -> str:
 
 def tests_csv(comparisons: Sequence[Comparison]) -> str:
     """Return the paired tests."""
-    head = ["metric", "first", "second", "pairs", "first_better", "second_better", "median_ratio", "p", "p_holm"]
+    head = [
+        "metric",
+        "first",
+        "second",
+        "pairs",
+        "first_better",
+        "second_better",
+        "median_ratio",
+        "effect",
+        "p",
+        "p_holm",
+    ]
     return _csv(
         head,
         [
-            [c.metric, c.first, c.second, c.pairs, c.first_better, c.second_better, c.ratio, c.p, c.p_holm]
+            [c.metric, c.first, c.second, c.pairs, c.first_better, c.second_better, c.ratio, c.effect, c.p, c.p_holm]
             for c in comparisons
         ],
     )
+
+
+def winners_csv(plan: Plan, winners: Sequence[Winner]) -> str:
+    """Return who wins by how much, over the plan (no sequence) and on each sequence; no estimate where nobody does."""
+    head = ["metric", "kind", "sequence", *plan.axis_names, "winner", "margin", "runner_up", "reason"]
+    return _csv(
+        head,
+        [
+            [w.metric, w.kind, w.sequence, *_varied(plan, w.variant), w.estimate,
+             "" if math.isnan(w.margin) else w.margin, w.runner_up, w.reason]
+            for w in winners
+        ],
+    )  # fmt: skip
 
 
 def latex(plan: Plan, groups: Sequence[Group]) -> str:

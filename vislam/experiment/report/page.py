@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from vislam.experiment.report import plots
 from vislam.experiment.report.exports import best, shown, shown_spread, variant_text
 from vislam.experiment.statistics import Comparison, Group
 from vislam.experiment.trials import BY_NAME, Trial
+from vislam.experiment.winners import Winner
 from vislam.report.html import Cell, bullets, card, escape, folded, note, preformatted, section, stylesheet, table, tile
 
 _ACCURACY = (
@@ -48,12 +50,14 @@ def comparison_page(
     groups: Sequence[Group],
     trials: Sequence[Trial],
     comparisons: Sequence[Comparison],
+    winners: Sequence[Winner],
     manifest: dict[str, Any],
 ) -> str:
     """Return the page; everything in it comes from the arguments."""
     body = "".join(
         (
             _head(plan, trials, manifest),
+            section("Who wins?", card(_winners(winners))),
             section("Accuracy", card(_accuracy(groups)), _picture(plots.errors_by_estimate(groups))),
             section("Over the conditions", *(_axis(groups, axis) for axis in plan.axes)),
             section("Relative errors", _picture(plots.over_segments(groups))),
@@ -156,13 +160,35 @@ def _tests(comparisons: Sequence[Comparison]) -> str:
     rows: list[list[str | Cell]] = [
         [
             BY_NAME[c.metric].title, c.first, c.second, str(c.pairs), f"{c.first_better} : {c.second_better}",
-            shown(c.ratio, BY_NAME["anees_position"]), f"{c.p:.4f}",
+            shown(c.ratio, BY_NAME["anees_position"]), f"{c.effect:+.2f}", f"{c.p:.4f}",
             Cell(f"{c.p_holm:.4f}", "accepted" if c.p_holm < 0.05 else ""),
         ]
         for c in comparisons
     ]  # fmt: skip
-    head = ["error", "first", "second", "pairs", "better", "median ratio", "p", "p (Holm)"]
-    return table(head, rows, (0, 1, 2)) + note("A green dot: the two differ at the 5 % level after correction.")
+    head = ["error", "first", "second", "pairs", "better", "median ratio", "effect", "p", "p (Holm)"]
+    return table(head, rows, (0, 1, 2)) + note(
+        "A green dot: the two differ at the 5 % level after correction. Effect: rank-biserial correlation of the "
+        "pairs, -1 where the first is always better, 1 where the second is."
+    )
+
+
+def _winners(winners: Sequence[Winner]) -> str:
+    if not winners:
+        return note("There is only one estimate of each kind: nothing to win.")
+    rows: list[list[str | Cell]] = [
+        [
+            w.sequence or "the whole plan", variant_text(w.variant), BY_NAME[w.metric].title, w.kind,
+            Cell(w.estimate or "none", "accepted" if w.estimate and not w.sequence else ""),
+            "" if math.isnan(w.margin) else f"{w.margin:.0%} less than {w.runner_up}", w.reason,
+        ]
+        for w in winners
+    ]  # fmt: skip
+    return table(
+        ["sequence", "condition", "error", "kind", "winner", "margin", "how sure"], rows, tuple(range(7))
+    ) + note(
+        "Over the whole plan: better than every other one in a paired test at the 5 % level, after correction; the "
+        "margin is the median over the pairs. On a sequence: the worst trial is better than the best of every other."
+    )
 
 
 def _axis(groups: Sequence[Group], axis: Axis) -> str:
