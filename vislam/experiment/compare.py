@@ -20,6 +20,7 @@ from vislam.experiment.options import CompareOptions
 from vislam.experiment.plan import Plan, load_plan, plan_text
 from vislam.experiment.report.exports import latex, runs_csv, summary_csv, tests_csv, winners_csv
 from vislam.experiment.report.page import comparison_page
+from vislam.experiment.slurm import run_on_slurm
 from vislam.experiment.statistics import compare, groups
 from vislam.experiment.store import ResultStore
 from vislam.experiment.trials import Trial, trials
@@ -129,6 +130,8 @@ def _check(options: CompareOptions) -> None:
         raise UsageError("--workers must be at least 1, --sample at least 0")
     if (options.engine == "dask") != (options.scheduler is not None):
         raise UsageError("--engine dask and --scheduler ADDRESS belong together, as tcp://127.0.0.1:8786")
+    if options.sbatch and options.engine != "slurm":
+        raise UsageError("--sbatch is for --engine slurm")
 
 
 def _engine(jobs: Sequence[Job], options: CompareOptions) -> engines.Finished:
@@ -136,7 +139,9 @@ def _engine(jobs: Sequence[Job], options: CompareOptions) -> engines.Finished:
     cache, keep = options.cache.resolve(), None if options.keep_runs is None else options.keep_runs.resolve()
     if not specs:
         return
-    if options.scheduler is not None:
+    if options.engine == "slurm":
+        yield from run_on_slurm(specs, options.sbatch, cache, keep, options.store.resolve().parent / "slurm")
+    elif options.scheduler is not None:
         yield from engines.run_on_dask(specs, options.scheduler, cache, keep)
     else:
         yield from engines.run_locally(specs, options.workers, cache, keep)

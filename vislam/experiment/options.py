@@ -23,10 +23,12 @@ class CompareOptions:
     """Folder for report, tables and manifest; None: results/NAME of the plan"""
     workers: Count = 2
     """Jobs at the same time on this machine; 1 for undisturbed timings"""
-    engine: Literal["local", "dask"] = "local"
-    """Processes of this machine, or the workers of a Dask cluster"""
+    engine: Literal["local", "dask", "slurm"] = "local"
+    """Processes of this machine, the workers of a Dask cluster, or an array of Slurm's"""
     scheduler: str | None = None
     """Address of the Dask scheduler"""
+    sbatch: str = ""
+    """Options for sbatch, as "--partition=cpu --mem=4G"; tasks have the plan's timeout_s and five minutes"""
     store: Path = Path("results/results.db")
     """Keeps every result by the hash of all it depends on; nothing in it runs again"""
     cache: Path = Path("results/recordings")
