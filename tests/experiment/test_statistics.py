@@ -17,7 +17,20 @@ from vislam.experiment.trials import BY_NAME, Trial
 
 def trial(estimator, ate_m, sequence="s", seed=0, member=0, output="ekf", failure="", **values):
     job = Job(
-        f"{sequence}{estimator}{seed}{member}", sequence, (), estimator, 0, seed, member, "src", {}, False, "", {}, 1.0
+        f"{sequence}{estimator}{seed}{member}",
+        sequence,
+        (),
+        estimator,
+        0,
+        seed,
+        member,
+        "src",
+        {},
+        False,
+        "",
+        {},
+        (),
+        1.0,
     )
     known = {} if ate_m is None else {"ate_m": ate_m}
     return Trial(job, output, failure, {**known, **values}, {}, "" if failure else "abc", {})

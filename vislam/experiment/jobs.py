@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from vislam.config import dump, from_data
+from vislam.experiment import commands, programs
 from vislam.experiment.identity import environment, sha256_of, source_identity
 from vislam.experiment.plan import Plan, Scalar, Sequence, nested
-from vislam.experiment.programs import identity
 from vislam.run.folder import fingerprint
 
 JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
@@ -33,6 +33,7 @@ class Job:
     batch: bool  # whether the batch solution is wanted too
     program: str  # that is run in the place of the pipeline, see `programs`; empty: none
     options: dict[str, Scalar]  # of the program
+    command: tuple[str, ...]  # that is run in the place of the pipeline, see `commands`; empty: none
     timeout_s: float
 
     @property
@@ -50,6 +51,7 @@ class Job:
             "batch": self.batch,
             "program": self.program,
             "options": self.options,
+            "command": list(self.command),
             "timeout_s": self.timeout_s,
             "environment": environment(),
         }
@@ -76,12 +78,14 @@ def expand(plan: Plan) -> list[Job]:
                 files = [fingerprint(Path(name)) for name in config["calibration"].values() if name is not None]
                 if (shaking := config["imu"]["vibration"]["recording"]) is not None:
                     files.append(identities.setdefault(shaking, source_identity(shaking)))
-                own = [identity(estimator.program), estimator.options] if estimator.program else []
+                own = [programs.identity(estimator.program), estimator.options] if estimator.program else []
+                own += commands.identity(estimator.command)
                 jobs.append(
                     Job(
                         sha256_of([identities[source], files, config, batch, environment(), *own]),
                         sequence.name, variant, estimator.name, index, seed, member,
-                        source, config, batch, estimator.program, estimator.options, plan.timeout_s,
+                        source, config, batch, estimator.program, estimator.options, estimator.command,
+                        plan.timeout_s,
                     )
                 )  # fmt: skip
     return jobs

@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from vislam.config import validated
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
+from vislam.experiment import commands
 from vislam.run.sources import is_world, split_source
 
 Scalar = bool | int | float | str
@@ -40,21 +41,25 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """One configuration of the pipeline, or a program of somebody else, and which of its trajectories are compared."""
+    """One configuration of the pipeline, or a program of somebody else, and which of its trajectories are compared.
+
+    A program is a class (`program`, see `programs`) or a command line (`command`, see `commands`).
+    """
 
     name: str
     config: Settings = field(default_factory=dict)
     outputs: tuple[Output, ...] | None = None  # None: filter and graph as they went, graph in the end; see `compared`
     sequences: tuple[str, ...] = ()  # names of those that it can be run on; empty: all
-    program: str = ""  # FILE.py, FILE.py:CLASS or MODULE:CLASS, see `programs`; empty: the pipeline
+    program: str = ""  # FILE.py, FILE.py:CLASS or MODULE:CLASS
     options: dict[str, Scalar] = field(default_factory=dict)  # of the program: by name to its class
+    command: tuple[str, ...] = ()  # words, with places such as {recording} and {causal}; $VARIABLES are replaced
 
     @property
     def compared(self) -> tuple[Output, ...]:
         """The trajectories that are compared."""
         if self.outputs is not None:
             return self.outputs
-        return _OF_PROGRAM if self.program else ("ekf", "live", "graph")
+        return _possible(self) if self.program or self.command else ("ekf", "live", "graph")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +135,7 @@ def plan_from_data(data: dict[str, Any], where: str, folder: Path, variables: Ma
     _refuse_unknown(data, Plan, where)
     plan = validated(Plan, data, where)
     sequences = tuple(_resolved(sequence, where, folder, variables) for sequence in plan.sequences)
-    estimators = tuple(_placed(estimator, folder) for estimator in plan.estimators)
+    estimators = tuple(_placed(estimator, where, folder, variables) for estimator in plan.estimators)
     plan = dataclasses.replace(plan, sequences=sequences, estimators=estimators)
     _check(plan, where)
     return plan
@@ -140,27 +145,32 @@ def _unreadable(path: Path, error: Exception) -> str:
     return f"plan {path} cannot be read: {error}; see docs/experiments.md for an example"
 
 
-def _placed(estimator: Estimator, folder: Path) -> Estimator:
-    """Return an estimator whose program's file has an absolute path."""
+def _placed(estimator: Estimator, where: str, folder: Path, variables: Mapping[str, str]) -> Estimator:
+    """Return an estimator whose program's file has an absolute path, and whose command its variables."""
+    command = tuple(_replaced(word, where, variables) for word in estimator.command)
     place, colon, name = estimator.program.partition(":")
-    if not place.endswith(".py"):
-        return estimator
-    return dataclasses.replace(estimator, program=f"{folder / place}{colon}{name}")
+    program = f"{folder / place}{colon}{name}" if place.endswith(".py") else estimator.program
+    return dataclasses.replace(estimator, program=program, command=command)
+
+
+def _replaced(text: str, where: str, variables: Mapping[str, str]) -> str:
+    """Return text with its variables replaced."""
+
+    def value(match: re.Match[str]) -> str:
+        if match[1] not in variables:
+            raise UsageError(f"{where}: {text} needs the environment variable {match[1]}; set it")
+        return variables[match[1]]
+
+    return _VARIABLE.sub(value, text)
 
 
 def _resolved(sequence: Sequence, where: str, folder: Path, variables: Mapping[str, str]) -> Sequence:
     """Return a sequence with its variables replaced, its path absolute and a name."""
-
-    def replaced(text: str) -> str:
-        def value(match: re.Match[str]) -> str:
-            if match[1] not in variables:
-                raise UsageError(f"{where}: {text} needs the environment variable {match[1]}; set it")
-            return variables[match[1]]
-
-        return _VARIABLE.sub(value, text)
-
-    source = replaced(sequence.source)
-    config = {name: replaced(value) if isinstance(value, str) else value for name, value in sequence.config.items()}
+    source = _replaced(sequence.source, where, variables)
+    config = {
+        name: _replaced(value, where, variables) if isinstance(value, str) else value
+        for name, value in sequence.config.items()
+    }
     scheme, name, options = split_source(source)
     if not is_world(scheme, name):
         source = f"{scheme}{folder / name}{options}"
@@ -217,9 +227,11 @@ def _check_axes(plan: Plan, where: str) -> None:
 def _check_estimators(plan: Plan, where: str) -> None:
     known = [sequence.name for sequence in plan.sequences]
     for estimator in plan.estimators:
+        if estimator.command:
+            _check_command(plan, estimator, where)
         if not estimator.compared or len(set(estimator.compared)) != len(estimator.compared):
             raise UsageError(f"{where}: estimator '{estimator.name}' needs outputs, each one once")
-        allowed = _OF_PROGRAM if estimator.program else _OF_PIPELINE
+        allowed = _possible(estimator)
         if wrong := [output for output in estimator.compared if output not in allowed]:
             raise UsageError(
                 f"{where}: estimator '{estimator.name}' has no output '{wrong[0]}'; it has {', '.join(allowed)}"
@@ -228,6 +240,28 @@ def _check_estimators(plan: Plan, where: str) -> None:
             raise UsageError(f"{where}: options of estimator '{estimator.name}' are for a program; use config")
         if unknown := sorted(set(estimator.sequences) - set(known)):
             raise UsageError(f"{where}: estimator '{estimator.name}': no sequence '{unknown[0]}' in {', '.join(known)}")
+
+
+def _possible(estimator: Estimator) -> tuple[Output, ...]:
+    """Return the trajectories that an estimator can give."""
+    if estimator.command:
+        return tuple(output for output in _OF_PROGRAM if output in commands.outputs_of(estimator.command))
+    return _OF_PROGRAM if estimator.program else _OF_PIPELINE
+
+
+def _check_command(plan: Plan, estimator: Estimator, where: str) -> None:
+    try:
+        commands.check(estimator.command)
+    except UsageError as error:
+        raise UsageError(f"{where}: estimator '{estimator.name}': {error}") from error
+    if estimator.program:
+        raise UsageError(f"{where}: estimator '{estimator.name}' is either a program or a command")
+    made_up = [s.name for s in plan.sequences if s.source.startswith(("points:", "eqvio:"))]
+    if unfit := [name for name in made_up if name in (estimator.sequences or made_up)]:
+        raise UsageError(
+            f"{where}: estimator '{estimator.name}' is a command, and '{unfit[0]}' is not on disk, where it could "
+            "be read; name the others in its sequences"
+        )
 
 
 def nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -128,14 +128,37 @@ def run_program(
     return metrics
 
 
+def setup_of(recording: Recording, config: Config) -> Setup:
+    """Return what an estimator may know before the first measurement."""
+    rig, noise = recording.rig, imu_noise(config.imu, recording.imu_noise)
+    return Setup(rig, noise, config.imu.gravity_m_s2, mode_for(config.frontend, rig), config.seed)
+
+
+def write_metrics(out: Path, name: str, setup: Setup, t_ns: Sequence[int], cost: Mapping[str, Any]) -> dict[str, Any]:
+    """Write what of a run's metrics an estimator by others has, too: of frames at `t_ns`, at a cost (`CostMeter`)."""
+    metrics = {
+        "mode": setup.mode,
+        "has_imu": setup.imu_noise is not None,
+        "frames": len(t_ns),
+        "keyframes": None,
+        "duration_s": (t_ns[-1] - t_ns[0]) * 1e-9 if t_ns else 0.0,
+        "loops": {"accepted": None},
+        "initialisation": {"status": name, "t_s": cost["first_pose_s"], "scale_sigma": None},
+        "timing_ms": {},
+        "cost": cost,
+        "nis": {},
+        "doubts": [],
+        "warnings": [],
+    }
+    write_json(out / "metrics.json", metrics)
+    return metrics
+
+
 class _Run:
     """One estimator over one recording."""
 
     def __init__(self, program: str, options: Mapping[str, Any], recording: Recording, config: Config) -> None:
-        noise = imu_noise(config.imu, recording.imu_noise)
-        self._setup = Setup(
-            recording.rig, noise, config.imu.gravity_m_s2, mode_for(config.frontend, recording.rig), config.seed
-        )
+        self._setup = setup_of(recording, config)
         self._program, self._recording, self._cost = program, recording, CostMeter()
         self._t_ns: list[int] = []  # of all frames
         self._known: list[tuple[int, Array]] = []
@@ -176,23 +199,7 @@ class _Run:
             write_tum(Trajectory(np.array(t_ns), np.array(T)), out / "trajectory_causal.tum")
         if self._final is not None:
             write_tum(self._final, out / "trajectory_final.tum")
-        cost = self._cost.entry({})
-        metrics = {
-            "mode": self._setup.mode,
-            "has_imu": self._setup.imu_noise is not None,
-            "frames": len(self._t_ns),
-            "keyframes": None,
-            "duration_s": (self._t_ns[-1] - self._t_ns[0]) * 1e-9 if self._t_ns else 0.0,
-            "loops": {"accepted": None},
-            "initialisation": {"status": self._program, "t_s": cost["first_pose_s"], "scale_sigma": None},
-            "timing_ms": {},
-            "cost": cost,
-            "nis": {},
-            "doubts": [],
-            "warnings": [],
-        }
-        write_json(out / "metrics.json", metrics)
-        return metrics
+        return write_metrics(out, self._program, self._setup, self._t_ns, self._cost.entry({}))
 
     def _see(self, frame: Frame) -> None:
         where = f"frame {len(self._t_ns)} at {frame.t_ns} ns"

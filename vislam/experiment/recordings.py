@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vislam.config import CalibrationConfig
-from vislam.core.errors import StorageError
+from vislam.core.errors import StorageError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.recording import Recording, WrappedRecording
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.experiment.identity import code_sha256, sha256_of
-from vislam.run.sources import open_source
+from vislam.run.sources import open_source, recorded_path
 
 _SIMULATOR = Path(__file__).resolve().parent.parent / "sim"
 
@@ -29,6 +29,25 @@ def open_cached(source: str, seed: int, cache: Path, calibration: CalibrationCon
     """
     if not source.startswith("sim:"):
         return open_source(source, seed, calibration)
+    return open_dataset(f"euroc:{_rendered(source, seed, cache)}")
+
+
+def on_disk(source: str, seed: int, cache: Path) -> Path:
+    """Return the folder of a source, for who reads it by himself; see `open_cached`. Raises UsageError without one."""
+    if source.startswith("sim:"):
+        return _rendered(source, seed, cache)
+    if (path := folder_of(source)) is None:
+        raise UsageError(f"{source} is not on disk, where a command could read it")
+    return path
+
+
+def folder_of(source: str) -> Path | None:
+    """Return where a source on disk is; None where measurements are made as they are asked for."""
+    return None if source.startswith(("sim:", "points:", "eqvio:")) else recorded_path(source)
+
+
+def _rendered(source: str, seed: int, cache: Path) -> Path:
+    """Return the recording of a simulated world (EuRoC), which is rendered unless it is there."""
     key = sha256_of([source, seed, code_sha256(_SIMULATOR)])[:24]
     folder = cache / key
     try:
@@ -42,7 +61,7 @@ def open_cached(source: str, seed: int, cache: Path, calibration: CalibrationCon
                 os.replace(unfinished, folder)
     except OSError as error:
         raise StorageError(f"{cache} cannot hold recordings: {error}; free space or give another --cache") from error
-    return open_dataset(f"euroc:{folder}")
+    return folder
 
 
 class TimedRecording(WrappedRecording):

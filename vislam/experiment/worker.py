@@ -17,10 +17,12 @@ from typing import Any
 from vislam.config import Config, from_data
 from vislam.core.errors import VislamError
 from vislam.core.files import write_json
+from vislam.experiment import commands
+from vislam.experiment.commands import run_command
 from vislam.experiment.identity import environment
 from vislam.experiment.measures import output_measures, run_measures
 from vislam.experiment.programs import run_program
-from vislam.experiment.recordings import TimedRecording, open_cached
+from vislam.experiment.recordings import TimedRecording, on_disk, open_cached
 from vislam.run import execute
 from vislam.run.folder import prepare
 
@@ -55,6 +57,8 @@ def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -
     try:
         if spec["program"]:
             run_program(spec["program"], spec["options"], recording, config, out, recording.frame_done)
+        elif spec["command"]:
+            run_command(spec["command"], on_disk(spec["source"], config.seed, cache), recording, config, out)
         else:
             execute(recording, config, out, spec["source"], ["vislam", "compare"], recording.frame_done)
     finally:
@@ -63,8 +67,8 @@ def _run(spec: dict[str, Any], out: Path, cache: Path, result: dict[str, Any]) -
             metrics = json.loads(metrics_file.read_text(encoding="utf-8"))
             result["run"] = run_measures(metrics, recording.latencies_s)
             outputs = ["ekf", "live", "graph", *_batch(spec, config, out, result)]
-            if spec["program"]:
-                outputs = ["causal", "final"]
+            if spec["program"] or spec["command"]:
+                outputs = [*commands.OUTPUTS]
             result["outputs"] = output_measures(out, outputs, metrics, recording.span_ns)
 
 
