@@ -70,6 +70,9 @@ class Verifier:
         if len(pairs) < config.min_inliers:
             return Verification(f"{len(pairs)} matches, needs {config.min_inliers}", len(pairs), pairs=pairs)
         if not a.has_points and not b.has_points:
+            if len(pairs) < config.min_inliers_direction:
+                reason = f"{len(pairs)} matches, needs {config.min_inliers_direction} without depth"
+                return Verification(reason, len(pairs), has_scale=False, pairs=pairs)
             return self._verify_direction(a, b, pairs)
         found = self._pnp(a, b, pairs)
         if found is None or found[1] < config.min_inliers:
