@@ -232,14 +232,18 @@ def describe(
     keypoints = orb.detect(image, None)
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
-    pixels = np.array([keypoint.pt for keypoint in keypoints])
+    pixels = _places(keypoints)
     strengths = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     rank = _rank_in_cells(pixels, strengths, cell_px, image.shape[1])
     chosen: Sequence[int] = np.lexsort((-strengths, rank))[:count].tolist()
     kept, descriptors = orb.compute(image, [keypoints[i] for i in chosen])
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
-    return np.array([keypoint.pt for keypoint in kept]), np.asarray(descriptors, dtype=np.uint8)
+    return _places(kept), np.asarray(descriptors, dtype=np.uint8)
+
+
+def _places(keypoints: Sequence[cv2.KeyPoint]) -> Array:
+    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
 
 
 def match(
