@@ -45,7 +45,8 @@ class LoopConfig:
     # matches that keep their distances, for views with depth to be alike; chance gives 3, rarely 4
     min_rigid: Whole = 5
     chance_matched_share: Share = 0.015  # of the features that chance matches; views without depth need clearly more
-    tags: Literal["off", "16h5", "25h9", "36h10", "36h11"] = "36h11"  # AprilTag family; 3 ms per keyframe
+    tags: Literal["off", "16h5", "25h9", "36h10", "36h11"] = "36h11"  # AprilTag family
+    tags_every: Count = 4  # so many keyframes, until a tag was seen: 3 to 5 ms each; then, or with a size, all of them
     tag_size_m: NonNegative | None = None  # side of the black square; known, a tag alone gives a relative pose
     max_tags: Whole = 2  # candidates per keyframe that saw the same tag
     retrieved: Count = 10  # keyframes asked of the index and matched, 0.4 ms each

@@ -115,7 +115,7 @@ class LoopDetector:
             self._submaps = self._submaps.begun(view.id)
         self._poses.add(view.id, T_map_body)
         if tags is None:
-            tags = sight_tags(keyframe.frame, self._rig.cameras[0], self._config)
+            tags = self._look_for_tags(keyframe)
         self._tags.add(view.id, tags)
         verified = self._verify(view)
         self._views[view.id] = view
@@ -132,6 +132,12 @@ class LoopDetector:
         """Follow the keyframes that the graph moved, and the submaps that it joined."""
         self._poses.move(update)
         self._submaps = update.submaps
+
+    def _look_for_tags(self, keyframe: Keyframe) -> tuple[TagSighting, ...]:
+        """Return the tags in a keyframe's image; where nobody spoke of tags, few images are searched for the first."""
+        config = self._config
+        is_looked_at = config.tag_size_m is not None or not self._tags.is_empty or keyframe.id % config.tags_every == 0
+        return sight_tags(keyframe.frame, self._rig.cameras[0], config) if is_looked_at else ()
 
     def _candidates(self, view: View) -> list[Candidate]:
         """Return candidates in the order of verification: by tags, then by appearance and odometry in turn.

@@ -75,6 +75,11 @@ class TagBook:
         self._sightings: dict[int, tuple[TagSighting, ...]] = {}  # by keyframe
         self._seen_in: dict[int, list[int]] = {}  # by tag
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no tag was seen so far."""
+        return not self._sightings
+
     def of(self, keyframe_id: int) -> tuple[TagSighting, ...]:
         """Return what a keyframe saw."""
         return self._sightings.get(keyframe_id, ())
