@@ -79,7 +79,7 @@ class FolderLoader:
         """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
         images, color = [], None
         try:
-            for index, (camera, stream) in enumerate(zip(self._rig.cameras, self._cameras, strict=True)):
+            for index, (camera, stream) in enumerate(zip(self._rig.cameras, self._cameras, strict=False)):
                 grey, bgr = read_grey_or_color(stream.path(int(self._frames.camera_rows[i, index])), camera)
                 images.append(grey)
                 color = bgr if index == 0 else color

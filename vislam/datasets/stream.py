@@ -82,11 +82,14 @@ def _unpaired(partners: NDArray[np.int64], others: int) -> int:
     return (len(partners) - paired) + (others - paired)
 
 
-def open_loader(survey: Survey, rig: Rig, frames: FrameTable) -> Loader:
-    """Return what loads the frames of a survey; close it after use. Raises DataError when a video cannot be opened."""
+def open_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | None = None) -> Loader:
+    """Return what loads the frames of a survey, of its first `cameras` only if told; close it after use.
+
+    Raises DataError when a video cannot be opened.
+    """
     if survey.video is not None:
         return VideoLoader(survey.video, survey.cameras[0].files, rig.cameras[0])
-    return FolderLoader(frames, survey.cameras, survey.depth, rig, survey.depth_units_per_m)
+    return FolderLoader(frames, survey.cameras[:cameras], survey.depth, rig, survey.depth_units_per_m)
 
 
 class FileRecording:
@@ -104,6 +107,7 @@ class FileRecording:
         self.name = survey.root.resolve().name
         self.rig: Rig = survey.rig
         self.imu_noise: ImuNoise | None = survey.imu_noise
+        self.cameras_read = len(survey.cameras)  # fewer, where nobody looks at the images of the others
         self._survey = survey
         self._counter = Problems()
         self._counter.update(survey.problems)
@@ -153,7 +157,7 @@ class FileRecording:
 
     def _read_frames(self, from_ns: int | None) -> Generator[Frame, None, None]:
         gaps = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter)
-        with closing(open_loader(self._survey, self.rig, self._frames)) as loader:
+        with closing(open_loader(self._survey, self.rig, self._frames, self.cameras_read)) as loader:
             index = 0 if from_ns is None else int(np.searchsorted(self._frames.t_ns, from_ns))
             with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers)) as decoded:
                 for t_ns, loaded in zip(self._frames.t_ns[index:].tolist(), decoded, strict=False):

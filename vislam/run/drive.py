@@ -36,7 +36,7 @@ from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, verd
 from vislam.run.pipeline import Pipeline
 from vislam.run.session import Session, SessionWriter, recall
 from vislam.run.show import show_map, show_paths, show_step
-from vislam.run.sources import shaken
+from vislam.run.sources import shaken, without_idle_cameras
 from vislam.run.verdict import Evidence, judge
 from vislam.run.viewer import NullViewer, open_viewer
 from vislam.slam import Slam
@@ -75,7 +75,7 @@ class Run:
         Without `slam` the pipeline is made here.
         """
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
-        self.recording = shaken(recording, config.imu.vibration)
+        self.recording = shaken(without_idle_cameras(recording, config), config.imu.vibration)
         self.config = config
         self.out = out
         self.noise = imu_noise(config.imu, recording.imu_noise)

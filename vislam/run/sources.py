@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vislam.config import CalibrationConfig, VibrationConfig, validated
+from vislam.config import CalibrationConfig, Config, VibrationConfig, validated
 from vislam.core.errors import DataError, UsageError
 from vislam.core.recording import Recording
 
@@ -108,6 +108,16 @@ def measured_inertial(uri: str) -> MeasuredInertial:
     name, gyro, accel = found.root.resolve().name, values[:, :3], values[:, 3:]
     fit = fit_truth(t_ns, gyro, accel, truth)
     return MeasuredInertial(name, t_ns, gyro, accel, found.imu_noise, fit.of_imu(truth), found.rig, fit)
+
+
+def without_idle_cameras(recording: Recording, config: Config) -> Recording:
+    """Return a recording that reads cam0 alone where nobody looks at the others: mono, and without a map."""
+    from vislam.datasets.stream import FileRecording
+    from vislam.frontend import mode_for
+
+    if isinstance(recording, FileRecording) and mode_for(config.frontend, recording.rig) == "mono":
+        recording.cameras_read = 1 if not config.map.enabled else len(recording.rig.cameras)
+    return recording
 
 
 def shaken(recording: Recording, vibration: VibrationConfig) -> Recording:
