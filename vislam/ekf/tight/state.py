@@ -83,22 +83,49 @@ def propagated(window: Window, Phi: Array, Q: Array) -> Window:
     Points stand still, but their error is told relative to the body's rotation error, and that changed.
     """
     n, first = len(window.P), window.first_point
-    turned = np.array([skew(f) for f in window.points]).reshape(-1, 3)  # [3 S, 3]
+    turned = _skews(window.points)
     P = window.P.copy()
-    moves = np.eye(15 + n - first, 15)
+    moves, spread = np.empty((15 + n - first, 15)), np.zeros((15 + n - first, 15))
     moves[:15] = Phi
     moves[15:] = turned @ (Phi[:3] - np.eye(3, 15))
-    spread = np.eye(15 + n - first, 15)
-    spread[15:, :3] = turned
-    which = np.concatenate((np.arange(15), np.arange(first, n)))
-    P[which] = moves @ window.P[:15]
-    P[first:] += window.P[first:]
+    spread[:15], spread[15:, :3] = np.eye(15), turned
+    change = moves @ window.P[:15]
+    P[:15] = change[:15]
+    P[first:] += change[15:]
     change = P[:, :15] @ moves.T
-    rest = P[:, first:].copy()
-    P[:, which] = change
-    P[:, first:] += rest
-    P[np.ix_(which, which)] += spread @ Q @ spread.T
+    P[:, :15] = change[:, :15]
+    P[:, first:] += change[:, 15:]
+    noise = spread @ Q @ spread.T
+    P[:15, :15] += noise[:15, :15]
+    P[:15, first:] += noise[:15, 15:]
+    P[first:, :15] += noise[15:, :15]
+    P[first:, first:] += noise[15:, 15:]
     return replace(window, P=0.5 * (P + P.T))
+
+
+def _skews(points: Array) -> Array:
+    """Return `skew` of points [S, 3], one below the other [3 S, 3]."""
+    out = np.zeros((len(points), 3, 3))
+    x, y, z = points.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
+    return out.reshape(-1, 3)
+
+
+def _opened(P: Array, at: int, by: int) -> Array:
+    """Return P with room for so many rows and columns, which hold anything."""
+    out = np.empty((len(P) + by, len(P) + by))
+    out[:at, :at], out[:at, at + by :] = P[:at, :at], P[:at, at:]
+    out[at + by :, :at], out[at + by :, at + by :] = P[at:, :at], P[at:, at:]
+    return out
+
+
+def _closed(P: Array, at: int, by: int) -> Array:
+    """Return P without so many rows and columns."""
+    out = np.empty((len(P) - by, len(P) - by))
+    out[:at, :at], out[:at, at:] = P[:at, :at], P[:at, at + by :]
+    out[at:, :at], out[at:, at:] = P[at + by :, :at], P[at + by :, at + by :]
+    return out
 
 
 def cloned(
@@ -121,13 +148,10 @@ def cloned(
     J[:3, TIME] = turning
     J[3:, TIME] = v + np.cross(p_then, turning)
     at = CLONES + 6 * C
-    P = np.empty((n + 6, n + 6))
-    old = np.concatenate((np.arange(at), np.arange(at + 6, n + 6)))
+    P, here, after = _opened(window.P, at, 6), slice(at, at + 6), slice(at + 6, n + 6)
     JP = J @ window.P
-    P[np.ix_(old, old)] = window.P
-    P[at : at + 6, old] = JP
-    P[old, at : at + 6] = JP.T
-    P[at : at + 6, at : at + 6] = JP @ J.T
+    P[here, :at], P[here, after], P[:at, here], P[after, here] = JP[:, :at], JP[:, at:], JP[:, :at].T, JP[:, at:].T
+    P[here, here] = JP @ J.T
     return replace(
         window,
         P=P,
@@ -141,12 +165,10 @@ def cloned(
 
 def without_clone(window: Window, index: int) -> Window:
     """Return the window without one clone and what was seen there."""
-    at = CLONES + 6 * index
-    keep = np.r_[0:at, at + 6 : len(window.P)]
-    stay = np.r_[0:index, index + 1 : len(window.frames)]
+    stay = np.concatenate((np.arange(index), np.arange(index + 1, len(window.frames))))
     return replace(
         window,
-        P=window.P[np.ix_(keep, keep)],
+        P=_closed(window.P, CLONES + 6 * index, 6),
         frames=window.frames[:index] + window.frames[index + 1 :],
         R=window.R[stay],
         p=window.p[stay],
@@ -236,7 +258,7 @@ def gain_step(P: Array, H: Array, r: Array) -> tuple[Array, Array, float]:
     """Return the change of the state [n] by whitened rows H [m, n], r [m], the covariance after it, and their NIS."""
     HP = H @ P
     S = HP @ H.T
-    S[np.diag_indices(len(r))] += 1.0
+    S.flat[:: len(r) + 1] += 1.0
     L = np.linalg.cholesky(S)
     A = solve_triangular(L, HP, lower=True, check_finite=False)
     b = solve_triangular(L, r, lower=True, check_finite=False)

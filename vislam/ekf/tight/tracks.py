@@ -75,25 +75,31 @@ def ripe_tracks(frames: tuple[FrameTracks, ...], leaving: int | None, least: int
         least: observations of a track to be of use.
         most: tracks.
     """
-    ids = np.concatenate([f.ids[f.unused] for f in frames])
-    at = np.concatenate([np.full(int(f.unused.sum()), i, dtype=np.int64) for i, f in enumerate(frames)])
-    row = np.concatenate([np.flatnonzero(f.unused) for f in frames])
-    order = np.argsort(ids, kind="stable")
-    ids, at, row = ids[order], at[order], row[order]
-    found, starts, counts = np.unique(ids, return_index=True, return_counts=True)
-    if not len(found):
+    rows = [np.flatnonzero(f.unused) for f in frames]
+    ids = np.concatenate([f.ids[r] for f, r in zip(frames, rows, strict=True)])
+    if not len(ids):
         nothing = np.zeros(0, dtype=np.int64)
         return Ripe(nothing, np.zeros(1, dtype=np.int64), nothing, nothing, np.zeros(0, dtype=np.bool_))
+    order = np.argsort(ids, kind="stable")
+    ids, row = ids[order], np.concatenate(rows)[order]
+    at = np.repeat(np.arange(len(frames)), [len(r) for r in rows])[order]
+    starts = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
+    found, counts = ids[starts], np.diff(np.append(starts, len(ids)))
     alive = at[starts + counts - 1] == len(frames) - 1
     ripe = ~alive
     if leaving is not None:
         ripe |= at[starts] == leaving
     chosen = np.flatnonzero(ripe & (counts >= least))
     chosen = chosen[np.argsort(-counts[chosen], kind="stable")][:most]
-    members = [np.arange(starts[k], starts[k] + counts[k]) for k in chosen]
-    flat = np.concatenate(members) if members else np.zeros(0, dtype=np.int64)
     bounds = np.concatenate(([0], np.cumsum(counts[chosen]))).astype(np.int64)
+    flat = np.arange(bounds[-1]) + np.repeat(starts[chosen] - bounds[:-1], counts[chosen])
     return Ripe(found[chosen], bounds, at[flat], row[flat], alive[chosen])
+
+
+def seen_at(frames: tuple[FrameTracks, ...], at: NDArray[np.int64], row: NDArray[np.int64]) -> Array:
+    """Return rows [M, 15] of `features`, each of the frame `at` [M] and the row within it."""
+    begins = np.cumsum([0, *(len(frame.ids) for frame in frames[:-1])])
+    return np.asarray(np.concatenate([frame.seen for frame in frames])[begins[at] + row])
 
 
 def marked(frames: tuple[FrameTracks, ...], at: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[FrameTracks, ...]:

@@ -32,7 +32,7 @@ from vislam.ekf.tight.state import (
     without_clone,
     without_points,
 )
-from vislam.ekf.tight.tracks import FrameTracks, image_motion_px, marked, ripe_tracks
+from vislam.ekf.tight.tracks import FrameTracks, image_motion_px, marked, ripe_tracks, seen_at
 from vislam.imu import ImuNoise
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
@@ -197,8 +197,7 @@ class Updater:
                 np.zeros((0, n)), nothing, nobody, nobody, nobody, nobody, np.zeros((0, 3)), nothing,
                 np.zeros((0, 3, width + 1)), np.zeros((0, 3, 3)),
             )  # fmt: skip
-        seen = np.concatenate([window.frames[i].seen[j][None] for i, j in zip(ripe.at, ripe.row, strict=True)])
-        views = self._views(window, ripe.at, seen)
+        views = self._views(window, ripe.at, seen_at(window.frames, ripe.at, ripe.row))
         prior = features.Prior(np.ascontiguousarray(window.P[visible, visible]), np.ascontiguousarray(change[visible]))
         status, points, tests, fixing, H_points, stack = features.process(
             ripe.starts, views, self._sensor, prior, self._bounds, self._limits
