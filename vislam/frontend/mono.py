@@ -12,6 +12,7 @@ from vislam.core.camera import Rig
 from vislam.core.geometry import invert, transform
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.core.quantiles import median
 from vislam.frontend.agreement import confirmed, failure, weakness
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
@@ -45,6 +46,7 @@ class _Motion:
 
     view: TwoViewEstimate
     pixels: Array  # [N, 2], NaN where not found
+    xy: Array  # [N, 2] the same on z = 1
     parallax_px: float
     failure: str
 
@@ -90,6 +92,7 @@ class MonoFrontEnd:
         self._R_key_gyro: Array = np.eye(3)  # of the last frame, by the gyroscope alone
         self._gyro_sigma_rad = 0.0
         self._T_key_filter: Array | None = np.eye(4)  # of the last frame's camera, by the filter; None: not all known
+        self._key_xy: Array = np.empty((0, 2))  # of the tracks in the keyframe, on z = 1
         self._direction_key: Array = np.zeros(3)  # to the last frame, or where it will probably go; zero: not known
         self._lost = False
 
@@ -118,6 +121,7 @@ class MonoFrontEnd:
         last = np.column_stack([self._camera.normalise(self._last_px), np.ones(len(self._last_px))])
         guess = self._camera.project(last @ R_now_next)
         pixels = self._tracker.follow(frame, guess)
+        self._key_xy = self._camera.normalise(self._tracker.pixels)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
         motion = self._confirmed(self._locate(R_guess, prior, pixels), R_guess, prior, T_last_now)
@@ -162,13 +166,13 @@ class MonoFrontEnd:
             self._T_key_filter = None
             return motion
         self._T_key_filter = self._T_key_filter @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
-        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(motion.pixels)
-        off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, key_xy, xy, 1.0 / self._config.min_depth_m)
+        nearest = 1.0 / self._config.min_depth_m
+        off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, self._key_xy, motion.xy, nearest)
         astray = off_px > self._config.astray_px
         return confirmed(motion, astray, lambda pixels: self._locate(R_guess, prior, pixels), self._config)
 
     def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
-        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(pixels)
+        key_xy, xy = self._key_xy, self._camera.normalise(pixels)
         still = self._turn(R_guess, key_xy, xy) if prior is None else self._turn_by(prior, key_xy, xy)
         parallax_px = self._parallax_px(still.R_key_cam if still.converged else R_guess, key_xy, xy)
         view = still
@@ -182,7 +186,7 @@ class MonoFrontEnd:
                 parallax_px = self._parallax_px(view.R_key_cam, key_xy, xy)
         agree, least = int(view.inliers.sum()), self._min_inliers
         why = failure(len(self._tracker), followed, agree, view.converged, least, self._config)
-        return _Motion(view, pixels, parallax_px, why)
+        return _Motion(view, pixels, xy, parallax_px, why)
 
     def _turn(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
         """Explain the image by rotation alone: all points at infinity."""
@@ -235,14 +239,14 @@ class MonoFrontEnd:
 
     def _learn_noise(self, motion: _Motion, ends: float) -> None:
         """Take note of the distances from epipolar lines; without a direction there are none."""
-        key_xy, xy = self._camera.normalise(self._tracker.pixels), self._camera.normalise(motion.pixels)
         T_key_cam = np.asarray(transform(motion.view.R_key_cam, motion.view.direction_key))
-        self._noise.learn(epipolar_distances(T_key_cam, key_xy, xy), self._camera, xy, ends)
+        distances = epipolar_distances(T_key_cam, self._key_xy, motion.xy)
+        self._noise.learn(distances, self._camera, motion.xy, ends)
 
     def _parallax_px(self, R_key_cam: Array, key_xy: Array, xy: Array) -> float:
         moved = self._moved_xy(R_key_cam, key_xy, xy)
         seen = np.isfinite(moved)
-        return float(np.median(moved[seen]) * self._camera.fx) if seen.any() else 0.0
+        return median(moved[seen]) * self._camera.fx if seen.any() else 0.0
 
     @staticmethod
     def _moved_xy(R_key_cam: Array, key_xy: Array, xy: Array) -> Array:

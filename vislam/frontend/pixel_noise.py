@@ -14,6 +14,7 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.messages import Array, Observations
+from vislam.core.quantiles import median
 
 _MEDIAN_ABS = 0.6745  # of a normal distribution, in standard deviations
 _TRIM = 2.0  # standard deviations
@@ -33,7 +34,7 @@ def _spread_px(lengths: Array) -> float:
     It starts from the median, which outliers of one share in ten raise by an eighth, and goes on with what lies within
     the trim, corrected for the tails that a normal distribution loses there.
     """
-    sigma = float(np.median(lengths)) / _MEDIAN_ABS
+    sigma = median(lengths) / _MEDIAN_ABS
     for _ in range(_STEPS):
         within = lengths[lengths <= _TRIM * sigma]
         if len(within) == 0:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vislam.config import InitConfig
 from vislam.core.messages import Array, Observations
+from vislam.core.quantiles import median
 
 _NS = 1_000_000_000
 _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
@@ -66,8 +67,9 @@ class Stillness:
         frames.append((t_ns, seen.track_ids[order], seen.pixels_px[order]))
         while len(frames) > _MIN_FRAMES and t_ns - frames[0][0] > _WINDOW_NS + _WINDOW_NS // 16:
             _, ids, pixels = frames.popleft()
-            steady = ~np.isin(ids, self._unsteady)
-            self._places.add(ids[steady], pixels[steady], np.unique(np.concatenate([f[1] for f in frames])))
+            if self.resting:
+                steady = ~np.isin(ids, self._unsteady)
+                self._places.add(ids[steady], pixels[steady], np.unique(np.concatenate([f[1] for f in frames])))
         self.moved_px = self.parallax_px = self.noise_px = np.nan
         times_limit = self._times_limit(t_ns)
         self._follow_rest(t_ns, times_limit)
@@ -77,17 +79,23 @@ class Stillness:
         """Return the largest motion over the window in units of its limit; infinite where it cannot be told."""
         if len(self._frames) < _MIN_FRAMES:
             return np.inf
+        if self._is_far():
+            return np.inf
         t_s = np.array([(at_ns - t_ns) / _NS for at_ns, _, _ in self._frames])
         ids, pixels = self._pixels()
-        if len(ids) < _MIN_TRACKS or self._is_far(pixels):
+        if len(ids) < _MIN_TRACKS:
             return np.inf
         return float(max(self._over_window(t_s, ids, pixels), self._in_last_step(pixels)))
 
-    def _is_far(self, pixels: Array) -> bool:
-        """Return whether most tracks [frames, N, 2] are so far from where they were that nothing has to be fitted."""
-        moved = np.hypot(*(pixels[-1] - pixels[0]).T)
-        moved = moved[np.isfinite(moved)]
-        return len(moved) >= _MIN_TRACKS and float(np.median(moved)) > _FAR * self._limit_px
+    def _is_far(self) -> bool:
+        """Return whether most tracks are so far from where they were that nothing has to be fitted."""
+        (_, old_ids, old), (_, ids, new) = self._frames[0], self._frames[-1]
+        if len(old_ids) < _MIN_TRACKS or len(ids) < _MIN_TRACKS:
+            return False
+        at = np.minimum(np.searchsorted(old_ids, ids), len(old_ids) - 1)
+        both = old_ids[at] == ids
+        moved = np.hypot(*(new[both] - old[at[both]]).T)
+        return len(moved) >= _MIN_TRACKS and median(moved) > _FAR * self._limit_px
 
     def _follow_rest(self, t_ns: int, times_limit: float) -> None:
         """Begin a rest, go on with it or end it; one that ends by displacement begins again after a whole window."""
@@ -223,14 +231,14 @@ def _noise(squares: Array, freedom: Array) -> tuple[float, NDArray[np.bool_]]:
 def _common_motion(places: Array, flow: Array) -> tuple[Array, Array]:
     """Return shift, turn and zoom that fit a flow [N, 2] at places [N, 2] robustly, at each place, and the rest."""
     centred = places - np.median(places, axis=0)
-    reach = max(float(np.median(np.linalg.norm(centred, axis=1))), 1.0)
+    reach = max(median(np.linalg.norm(centred, axis=1)), 1.0)
     x, y = centred.T / reach
     one, zero = np.ones(len(x)), np.zeros(len(x))
     A = np.stack([np.column_stack([one, zero, x, -y]), np.column_stack([zero, one, y, x])], axis=1).reshape(-1, 4)
     common = np.broadcast_to(np.median(flow, axis=0), flow.shape)
     for _ in range(_ROBUST_STEPS):
         squares = ((flow - common) ** 2).sum(axis=1)
-        scale = max(float(np.median(squares)) / _MEDIAN_SQUARE, 1e-12) * _CAUCHY**2
+        scale = max(median(squares) / _MEDIAN_SQUARE, 1e-12) * _CAUCHY**2
         weighted = A * np.repeat(1.0 / (1.0 + squares / scale), 2)[:, None]
         found = np.linalg.solve(weighted.T @ A + 1e-9 * np.eye(4), weighted.T @ flow.ravel())
         common = (A @ found).reshape(-1, 2)

@@ -12,6 +12,7 @@ import numpy as np
 
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageU8
+from vislam.core.quantiles import quantile
 
 _NEGLIGIBLE = 1.3  # ratio of brightness; less, and Lucas-Kanade stands it better than a gain known to some percent
 _MIN_PATCHES = 10  # that tell the same; fewer are no evidence
@@ -37,7 +38,8 @@ def matched(source: ImageU8, target: ImageU8, pixels: Array, guess: Array, windo
     if len(patches) < _MIN_PATCHES:
         return source
     mean_source, sigma_source, mean_target, sigma_target = patches.T
-    darker, brighter = np.quantile((mean_target + 1.0) / (mean_source + 1.0), (0.25, 0.75))
+    ratios = np.sort((mean_target + 1.0) / (mean_source + 1.0))
+    darker, brighter = quantile(ratios, 0.25), quantile(ratios, 0.75)
     if darker <= _NEGLIGIBLE and brighter >= 1.0 / _NEGLIGIBLE:  # three in four patches have to agree on a step
         return source
     gain = float(np.median(sigma_target / sigma_source))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vislam.core.geometry import so3_exp, so3_log, tangent_basis
 from vislam.core.jit import njit
 from vislam.core.messages import Array
+from vislam.core.quantiles import median
 from vislam.core.small import back, by, cross, dot, in_a_row
 
 CHI2_GATE = 10.8  # squared deviation with one degree of freedom that one good residual in 1000 exceeds
@@ -164,17 +165,17 @@ def direction_given_rotation(R_key_cam: Array, key_xy: Array, xy: Array) -> Arra
     usable = np.isfinite(xy).all(axis=1)
     if usable.sum() < 2:
         return None
-    a = np.column_stack([key_xy[usable], np.ones(int(usable.sum()))])
-    b = np.column_stack([xy[usable], np.ones(int(usable.sum()))]) @ R_key_cam.T
-    normals = np.cross(a, b)
+    ax, ay = key_xy[usable].T
+    bx, by_, bz = (np.column_stack([xy[usable], np.ones(len(ax))]) @ R_key_cam.T).T
+    normals = np.column_stack([ay * bz - by_, bx - ax * bz, ax * by_ - ay * bx])
     length = np.linalg.norm(normals, axis=1)
-    usual = float(np.median(length))
+    usual = median(length)
     if usual > 0.0:
         normals *= np.minimum(1.0, _LONGEST * usual / np.maximum(length, usual))[:, None]
     direction = np.linalg.eigh(normals.T @ normals)[1][:, 0]
     for _ in range(_REWEIGHTED):
         misfit = np.abs(normals @ direction)
-        weight = 1.0 / np.maximum(misfit, max(float(np.median(misfit)), 1e-12))
+        weight = 1.0 / np.maximum(misfit, max(median(misfit), 1e-12))
         direction = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
     return np.asarray(direction)
 

@@ -15,7 +15,6 @@ from vislam.vision.two_view import epipolar_distances, essential_ransac, refine_
 
 _MIN_MATCHES = 8
 _TRIES = 400  # find 25 inliers among 60 matches with 0.99; more mostly prolong the search in vain
-_LOCAL_TRIES = 1  # more find the same inliers in longer; the direction is refined here afterwards
 _CAUCHY = 2.0  # in sigmas
 _LIMIT_SIGMAS = 3.0  # of an inlier
 _MEDIAN_CHI2_1 = 0.4549  # median of chi-square with one degree of freedom
@@ -35,7 +34,7 @@ class Direction:
 
 def relative_direction(xy_a: Array, xy_b: Array, limit: float, seed: int) -> Direction | None:
     """Return rotation and direction from matches [N, 2] on z = 1 with inlier `limit` there; None when there is none."""
-    start = essential_ransac(None, xy_a, xy_b, limit, _MIN_MATCHES, usac(limit, _TRIES, seed, _LOCAL_TRIES))
+    start = essential_ransac(None, xy_a, xy_b, limit, _MIN_MATCHES, usac(limit, _TRIES, seed))
     if start is None:
         return None
     R, direction, inliers = start
@@ -61,7 +60,7 @@ def relative_direction(xy_a: Array, xy_b: Array, limit: float, seed: int) -> Dir
 def _plane_share(xy_a: Array, xy_b: Array, limit: float, seed: int) -> float:
     """Return the largest share of matches [N, 2] that one homography explains."""
     try:
-        _, mask = cv2.findHomography(xy_a, xy_b, usac(limit, _TRIES, seed, _LOCAL_TRIES))
+        _, mask = cv2.findHomography(xy_a, xy_b, usac(limit, _TRIES, seed))
     except cv2.error:  # degenerate samples only
         return 1.0
     return 1.0 if mask is None else float(np.mean(mask.ravel() > 0))
