@@ -7,13 +7,15 @@ import pytest
 
 from vislam.config import Config, load
 from vislam.core.errors import UsageError
+from vislam.core.messages import Frame
 from vislam.ekf.filtering import Filtering
 from vislam.graph import PoseGraph
 from vislam.pipeline import back, front
 from vislam.pipeline.settings import derived
 from vislam.run import execute
 from vislam.run.folder import prepare
-from vislam.run.sources import open_source
+from vislam.run.sources import open_source, without_idle_cameras
+from worlds.mini_recording import write_asl
 
 FLOOR = {"frontend.mode": "planar", "frontend.planar.height_m": 0.3}
 
@@ -53,6 +55,16 @@ def test_the_stages_get_what_config_json_says(tmp_path, monkeypatch, rig, coupli
     assert set(got) == {"ekf", "graph", "window", "frontend"}
     for section, settings in got.items():
         assert json.loads(json.dumps(asdict(settings))) == written[section], section
+
+
+@pytest.mark.parametrize(("mode", "has_map", "cameras"), [("mono", False, 1), ("mono", True, 2), ("stereo", False, 2)])
+def test_only_images_that_somebody_looks_at_are_read(tmp_path, mode, has_map, cameras):
+    write_asl(tmp_path, frames=4)
+    two = open_source(f"euroc:{tmp_path}")
+    config = load(None, {"frontend.mode": mode, "map.enabled": has_map})
+    frames = [value for value in without_idle_cameras(two, config).events() if isinstance(value, Frame)]
+    assert [len(frame.images) for frame in frames] == [cameras] * 4
+    assert [frame.index for frame in frames] == [0, 1, 2, 3] and not two.problems
 
 
 @pytest.mark.parametrize("settings", [{}, {"ekf.coupling": "loose"}, {"ekf.scale_sigma": 0.02}, FLOOR])

@@ -7,7 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from vislam.config import load
 from vislam.core.geometry import invert, se3_log
+from vislam.core.memory import TagSighting
 from vislam.core.messages import Frame, Keyframe
+from vislam.loop import detector as detector_module
 from vislam.loop.detector import LoopDetector
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.vision.features import find_tags
@@ -115,6 +117,33 @@ def test_a_blank_wall_with_tags_closes_the_loop():
         error = se3_log(invert(edge.T_from_to) @ invert(poses[edge.from_id]) @ poses[edge.to_id])
         assert np.linalg.norm(error[3:]) < 0.05
         assert error @ np.linalg.solve(edge.covariance, error) < 25.0
+
+
+def searched(monkeypatch, settings, tagged=()):
+    """Return which of 14 keyframes are searched for tags, of which some show one."""
+    looked = []
+
+    def sight(frame, camera, config):
+        looked.append(frame.index)
+        return (TagSighting(7, 40.0, None, None),) if frame.index in tagged else ()
+
+    monkeypatch.setattr(detector_module, "sight_tags", sight)
+    detector = LoopDetector(load(None, settings).loop, RIG, SEED)
+    nothing = np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3))
+    for k in range(14):
+        seen = Frame(k * 300_000_000, k, (np.zeros((480, 640), np.uint8),))
+        detector.detect(Keyframe(k, seen.t_ns, seen, *nothing), np.eye(4))
+    return looked
+
+
+def test_where_no_tag_hangs_few_keyframes_are_searched(monkeypatch):
+    assert searched(monkeypatch, {}) == [0, 4, 8, 12]
+    assert searched(monkeypatch, {"loop.tags_every": 1}) == list(range(14))
+
+
+def test_who_tells_the_size_of_tags_or_shows_one_has_all_keyframes_searched(monkeypatch):
+    assert searched(monkeypatch, WITH_SIZE) == list(range(14))
+    assert searched(monkeypatch, {}, tagged=(3, 4)) == [0, *range(4, 14)]
 
 
 def test_who_saw_a_tag_largest_is_asked_first():

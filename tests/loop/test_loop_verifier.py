@@ -10,6 +10,7 @@ from vislam.config import LoopConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.core.messages import Array
+from vislam.loop.verification import verifier as verifier_module
 from vislam.loop.verification.relative_pose import Matched, errors, refine
 from vislam.loop.verification.verifier import Verifier
 from vislam.loop.view import View, make_view
@@ -234,3 +235,14 @@ def test_a_view_copies_only_what_it_needs(world: LandmarkWorld) -> None:
     assert not np.shares_memory(view.descriptors, keyframe.descriptors)
     with pytest.raises(DataError, match="keyframe 3"):
         make_view(replace(keyframe, keypoints_px=keyframe.keypoints_px[:-1]), world.rig)
+
+
+def test_a_pair_without_depth_and_with_too_few_matches_is_not_searched(world: LandmarkWorld, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """It could not pass, however many of its matches agreed."""
+    monkeypatch.setattr(verifier_module, "relative_direction", lambda *_: pytest.fail("searched"))
+    a, b, _ = views(world, np.random.default_rng(4))
+    a, b = (replace(view, points_cam_m=None) for view in (a, b))
+    config = replace(LoopConfig(), min_inliers_direction=10_000)
+    found = Verifier(config, world.rig, 0).verify(a, b)
+    assert found.T_a_b is None and found.matches >= config.min_inliers
+    assert found.reason == f"{found.matches} matches, needs 10000 without depth"

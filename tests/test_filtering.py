@@ -1,0 +1,41 @@
+"""When the filter of a run hears that the noise of the IMU changed."""
+
+import pytest
+
+from vislam.config import load
+from vislam.core.messages import NoiseScale, no_observations
+from vislam.ekf.filtering import Filtering
+from vislam.frontend.result import identity_motion
+from vislam.imu import SeenNoise
+from worlds.flight import MONO
+from worlds.motion import EUROC_NOISE, NS
+from worlds.parts import GRAVITY_M_S2
+
+FRAME_NS = NS // 20
+
+
+class HeardNoise(Filtering):
+    """Takes down since when noise is what it is, as the filter is told."""
+
+    def __init__(self, coupling):
+        config = load(None, {"ekf.coupling": coupling}).ekf
+        super().__init__(config, EUROC_NOISE, GRAVITY_M_S2, MONO)
+        self.since_ns = []
+        follow = self.ekf.follow_noise
+        self.ekf.follow_noise = lambda t_ns, scale: self.since_ns.append(t_ns) or follow(t_ns, scale)
+
+    def frame(self, number, noise):
+        t_ns = number * FRAME_NS
+        self.see(t_ns, identity_motion(t_ns, 0, True, 0), no_observations(), False, None, True, noise)
+
+
+@pytest.mark.parametrize(("coupling", "second"), [("tight", 29), ("loose", 20)])
+def test_news_of_noise_do_not_make_a_tight_filter_go_back_over_its_frames(coupling, second):
+    filtering = HeardNoise(coupling)
+    for number in range(1, 20):
+        filtering.frame(number, SeenNoise(0, NoiseScale(2.0, 3.0)))
+    for number in range(20, 40):
+        louder = number >= 30  # half a second after it became so
+        noise = SeenNoise(20 * FRAME_NS, NoiseScale(4.0, 3.0)) if louder else SeenNoise(0, NoiseScale(2.0, 3.0))
+        filtering.frame(number, noise)
+    assert filtering.since_ns == [0, second * FRAME_NS]  # the first word also says what was before
