@@ -4,6 +4,7 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+import time
 from contextlib import closing
 from dataclasses import fields, is_dataclass
 
@@ -30,7 +31,7 @@ from vislam.core.messages import (
     VoMeasurement,
 )
 from vislam.imu import ImuNoise
-from vislam.run.session import Session, SessionWriter
+from vislam.run.session import Session, SessionWriter, has_begun
 
 SEED = 11
 NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9393e-5, 3.0e-3, 200.0)
@@ -194,6 +195,29 @@ def test_a_killed_writer_leaves_every_committed_keyframe(tmp_path):
         process.send_signal(signal.SIGKILL)
     assert len(list(Session(path).keyframes())) == 3
     assert len(Session(path).factor_log().keyframes) == 3
+
+
+def test_a_session_killed_at_any_moment_of_its_beginning_or_end_can_be_read(tmp_path):
+    """Each of many children makes one and closes it, and is killed somewhere within the time that this takes."""
+    rng = np.random.default_rng(SEED)
+    print("seed", SEED)
+    journals = 0
+    for k in range(100):
+        path = tmp_path / f"{k}.db"
+        child = os.fork()
+        if child == 0:
+            for _ in range(100):
+                path.unlink(missing_ok=True)
+                SessionWriter(path, {"source": "none"}, RIG, None, 9.81).close(finished=True)
+            os._exit(0)
+        time.sleep(rng.uniform(0.0, 0.02))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        journals += path.with_name(f"{k}.db-journal").exists()
+        if has_begun(path):
+            Session(path).close()
+    print(journals, "left a journal")
+    assert journals > 0
 
 
 def test_damage_and_strangers_are_refused(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -18,6 +19,9 @@ def connect(path: Path, read_only: bool = False, **options: Any) -> sqlite3.Conn
     """
     if read_only or path.exists():
         check_file(path)
+    if read_only and Path(f"{path}-journal").exists():
+        with suppress(sqlite3.Error, OSError):  # a place that cannot be written
+            _roll_back(path)
     name = f"file:{quote(str(path))}?mode={'ro' if read_only else 'rwc'}"
     db = sqlite3.connect(name, uri=True, **options)
     try:
@@ -31,6 +35,15 @@ def connect(path: Path, read_only: bool = False, **options: Any) -> sqlite3.Conn
         db.close()
         raise
     return db
+
+
+def _roll_back(path: Path) -> None:
+    """Undo what a process had begun that was killed; its journal stops everybody who may only read."""
+    db = connect(path)
+    try:
+        db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+    finally:
+        db.close()
 
 
 def _allowed(action: int, first: str | None, second: str | None, database: str | None, by: str | None) -> int:

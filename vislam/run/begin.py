@@ -71,7 +71,7 @@ def resume(
             return run.execute(progress)
         session.close()
     with storage(path):
-        for name in ("session.db", "session.db-wal", "session.db-shm"):
+        for name in ("session.db", "session.db-wal", "session.db-shm", "session.db-journal"):
             (out / name).unlink(missing_ok=True)
     return execute(recording, config, out, source, command, progress, base)
 

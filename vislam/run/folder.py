@@ -50,7 +50,7 @@ _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "num
 _RUN_FILES = (
     "log.txt", "manifest.json", "config.json", "sensors.json", "metrics.json", "tracking.csv", "loops.csv",
     "retrieved.csv", "loops_eval.json", "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal",
-    "session.db-shm", "run.rrd",
+    "session.db-shm", "session.db-journal", "run.rrd",
     "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
     "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml",
     "map/drive.yaml", "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
