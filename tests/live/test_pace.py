@@ -3,7 +3,7 @@
 import numpy as np
 
 from vislam.core.messages import Frame, ImuSample
-from vislam.live.pace import Pace
+from vislam.live.pace import MapPace, Pace
 
 PERIOD_NS = 50_000_000  # 20 Hz
 RATE_HZ = 200.0
@@ -25,7 +25,7 @@ class Camera:
             if self.pace.wants(frame):
                 taken.append(self.index)
                 begun_ns, self.now_ns = self.now_ns, self.now_ns + work_ns
-                self.pace.took(frame, begun_ns, self.now_ns)
+                self.pace.took(frame, begun_ns, self.now_ns, work_ns // 4)
         return taken
 
 
@@ -36,6 +36,7 @@ def test_a_machine_that_keeps_up_takes_every_frame() -> None:
     assert set(np.diff(taken)) == {1}
     assert camera.pace.counters["frames_left_out"] == camera.pace.counters["frames_dropped"] == 0
     assert camera.pace.counters["busy_percent"] == 80
+    assert camera.pace.counters["core_percent"] == 20
 
 
 def test_a_machine_that_is_too_slow_takes_every_second_frame_evenly() -> None:
@@ -78,6 +79,43 @@ def test_an_unplugged_camera_is_not_the_machine() -> None:
     assert camera.pace.counters["frames_dropped"] == 0
     assert camera.pace.counters["frames_offered"] == len(taken)
     assert camera.pace.every == 1
+
+
+def test_what_comes_while_vision_works_for_long_is_dropped_and_no_outage() -> None:
+    camera = Camera()
+    camera.runs(1.0, 1_000_000)
+    camera.runs(3.0, 3_000_000_000)
+    camera.runs(1.0, 1_000_000)
+    assert camera.pace.counters["frames_dropped"] == 59
+    assert camera.pace.counters["busy_percent"] <= 100
+
+
+def test_the_map_takes_fewer_keyframes_the_later_it_is() -> None:
+    pace = MapPace(2.0)
+    assert [pace.wants(0.9) for _ in range(4)] == [True] * 4
+    assert [pace.wants(1.5) for _ in range(4)] == [False, True, False, True]
+    assert [pace.wants(2.5) for _ in range(4)] == [False] * 4
+    assert pace.wants(0.1)
+    assert (pace.left_out, pace.latest_s) == (6, 2.5)
+
+
+def test_a_slow_map_is_never_far_behind() -> None:
+    """A keyframe every 0.2 s, and a map that needs 0.5 s for each."""
+    pace, now_s, taken, latest_s = MapPace(2.0), 0.0, 0, 0.0
+    for k in range(500):
+        now_s = max(now_s, 0.2 * k)
+        latest_s = max(latest_s, now_s - 0.2 * k)
+        if pace.wants(now_s - 0.2 * k):
+            now_s, taken = now_s + 0.5, taken + 1
+    assert latest_s < 2.5
+    assert taken > 180  # of the 200 that there is time for
+
+
+def test_a_sensor_slower_than_told_is_not_the_machine() -> None:
+    pace = Pace(RATE_HZ)
+    for k in range(1000):
+        pace.add_sample(ImuSample(10_000_000 * (k + (k > 500)), np.zeros(3), np.zeros(3)))
+    assert pace.counters["samples_missed"] == 1
 
 
 def test_inertial_samples_that_did_not_come_are_counted() -> None:

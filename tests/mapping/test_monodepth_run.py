@@ -16,6 +16,7 @@ from vislam.config import load
 from vislam.core.clock import StageClock
 from vislam.datasets.recorder import record
 from vislam.live.handover import BackEnded, FrontEnded, Seen
+from vislam.live.pace import MapPace
 from vislam.live.processes.child import Flag, Life, Signals
 from vislam.live.processes.front import light
 from vislam.live.processes.map import FollowedPipeline
@@ -154,7 +155,7 @@ def test_the_map_process_of_a_live_run_makes_the_same_depth(recording, finished)
     late.put(BackEnded(None, None, None, {}, {}))
     life, clock = Life("map", Pipe()[1], Signals(Flag(), Flag())), StageClock()
     stage = map_stage(config, source.rig, clock)
-    followed = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes))
+    followed = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes), MapPace(float("inf")))
     steps = [keyframe for step in followed.steps() for keyframe in step.keyframes] + followed.finish().keyframes
     scans = {i: scan for step in steps for i, scan in step.scans.items() if scan.depth_png}
     out, metrics = finished

@@ -126,18 +126,40 @@ SLOW = {"frames_offered": 593, "frames_dropped": 424, "frames_left_out": 100, "s
 
 
 def test_that_the_machine_is_too_slow_is_said_before_everything_else():
-    found = verdict(**SLOW, late_s=0.8, busy=0.97, coverage=0.1, frames_lost=60, frames_missing=500)
+    found = verdict(
+        **SLOW, late_s=0.8, busy=0.97, core=0.9, graph_late_s=3.1, map_late_s=2.2, coverage=0.1, frames_lost=60,
+        frames_missing=500,
+    )  # fmt: skip
     assert found.state is Trust.LOST
     assert found.reasons[0].startswith("the machine is too slow for its sensors: 524 of 593 frames")
     assert "17829 of 26829 inertial samples" in found.reasons[0]
-    assert "--map.no-enabled" in found.reasons[0]
+    waited = "waited longest: frames for vision 0.8 s, for the map 2.2 s, keyframes for the graph 3.1 s; vision"
+    assert waited in found.reasons[0]
+    assert "97% of the time, with 90% of a core: give it less to do (--profile pi, " in found.reasons[0]
+    assert "--map.no-enabled" in found.reasons[0] and found.reasons[0].endswith("--live.realtime-priority 50")
     assert not any("never arrived" in reason for reason in found.reasons)
+
+
+def test_a_machine_that_others_use_is_to_be_freed_first():
+    (reason,) = verdict(**SLOW, busy=0.95, core=0.3).reasons
+    assert "other work had its core, so end that first; then give it less to do" in reason
+
+
+def test_a_map_that_left_keyframes_out_is_told():
+    assert verdict(keyframes=80, map_left_out=5).state is Trust.TRUSTED
+    (reason,) = verdict(keyframes=80, map_left_out=30).reasons
+    assert "30 of 80 keyframes left out of the map" in reason and "realtime" not in reason
 
 
 @pytest.mark.parametrize("changes", [{"samples_missed": 0}, {"frames_dropped": 0, "frames_left_out": 0}])
 def test_frames_or_samples_alone_make_a_machine_too_slow(changes):
     found = verdict(**{**SLOW, **changes})
     assert found.state is Trust.DOUBTFUL and "too slow" in found.reasons[0]
+
+
+def test_what_a_slow_machine_explains_is_not_told_of_the_sensors():
+    reasons = verdict(**SLOW, rate_hz=120.0, rate_told_hz=200.0, frames_missing=500).reasons
+    assert len(reasons) == 1 and "waited" not in reasons[0]
 
 
 def test_a_machine_that_misses_little_is_not_too_slow():

@@ -28,6 +28,7 @@ class LiveConfig:
     rest_speed_m_s: NonNegative = 0.1
     keyframe_queue: Count = 8  # keyframes that may wait for the back end; when half of that wait, fewer are made
     crowded_spacing: Positive = 2.0  # factor on the distances between keyframes then
+    map_age_s: Positive = 2.0  # older frames make the map take fewer keyframes: it would fall behind without end
     # 1 to 99: SCHED_FIFO for the fast process, where the system permits; 0: as others
     realtime_priority: Annotated[int, Range(0, 99)] = 0
 

@@ -28,6 +28,8 @@ def status_line(run: LiveRun) -> str:
     late = f"{latency['p50']:.2f}/{latency['p99']:.2f} ms" if "p50" in latency else "-"
     every = run.notes.get("front", {}).get("every", 1)
     slow = f"too slow, one frame in {every} is taken  " if every > 1 else ""
+    left_out = run.notes.get("map", {}).get("map_left_out", 0)
+    slow += f"map too slow, {left_out} keyframes left out  " if left_out else ""
     return (
         f"{slow}x {x:7.2f} y {y:7.2f} z {z:5.2f} m +-{status['sigma_m']:.2f}  {status['speed_m_s']:.2f} m/s  "
         f"map {status['map_revision']}  sample to pose {late} (p50/p99)  {names}"

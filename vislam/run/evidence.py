@@ -48,6 +48,8 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         samples_missed=live.get("samples_missed", 0),
         late_s=1e-3 * live.get("late_ms", 0),
         busy=0.01 * live.get("busy_percent", 0),
+        core=0.01 * live.get("core_percent", 0),
+        graph_late_s=1e-3 * live.get("back_late_ms", 0),
         has_imu=has_imu,
         is_started=not has_imu or report.start is not None,
         start_reason=report.refusal,

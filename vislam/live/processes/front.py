@@ -109,7 +109,7 @@ class FrontProcess:
         self._frames_taken = 0
         self._feeds_depth = makes_depth(config, rig)
         self._poses: PoseReader | None = None
-        self._counters = {"crowded_frames": 0, "waits_for_back": 0}
+        self._counters = {"crowded_frames": 0, "waits_for_back": 0, "back_late_ms": 0}
         self._pace, self._told_every = Pace(noise.rate_hz), 1
 
     def loop(self, camera: FrameSource, samples: SampleReceiver) -> None:
@@ -155,20 +155,24 @@ class FrontProcess:
         return replace(report, counters={**report.counters, "live": {**self._counters, **self._pace.counters}})
 
     def _process(self, frame: Frame) -> None:
-        begun_ns = time.monotonic_ns()
+        begun_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
         self._see(frame)
-        self._pace.took(frame, begun_ns, time.monotonic_ns())
+        self._pace.took(frame, begun_ns, time.monotonic_ns(), time.thread_time_ns() - cpu_ns)
 
     def _see(self, frame: Frame) -> None:
-        is_crowded = self._pace.every > 1 or len(self._to_back) >= self._config.live.keyframe_queue // 2
-        self.front.frontend.keyframe_spacing = self._config.live.crowded_spacing if is_crowded else 1.0
+        live, waiting = self._config.live, len(self._to_back)
+        is_crowded = self._pace.every > 1 or 2 * waiting >= live.keyframe_queue
+        is_full = 4 * waiting >= 3 * live.keyframe_queue
+        self.front.frontend.keyframe_spacing = live.crowded_spacing ** (is_crowded + is_full)
         self._counters["crowded_frames"] += is_crowded
+        self._counters["back_late_ms"] = max(self._counters["back_late_ms"], round(1e3 * self._to_back.age_s))
         step = self.front.process(frame)
         self._correct(step)
         self._judge(frame.t_ns)
         for odometry in step.keyframes:
             self._put_keyframe(KeyframeOut(odometry, *self._first()))
         shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
+        shows = shows and self._to_map.age_s < live.map_age_s
         self._frames_taken += 1
         seen = Seen(light(step, shows, self._feeds_depth), self._T_map_odom(), self.front.start, self.front.news)
         if not self._to_map.put(seen):

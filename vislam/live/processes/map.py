@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,6 +20,7 @@ from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.core.recording import Recording
 from vislam.live.beginning import Beginning
 from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
+from vislam.live.pace import MapPace
 from vislam.live.processes.child import Life
 from vislam.live.wire.mail import Inbox
 from vislam.mapping.depth.mono import SeenFrame
@@ -31,7 +33,10 @@ from vislam.pipeline.steps import Finish, KeyframeStep, Step
 from vislam.run import Progress, Run, begun
 from vislam.run.folder import MapChoice
 from vislam.run.session import Session, SessionWriter
+from vislam.run.verdict import Evidence
+from vislam.trajectory import Trajectory
 
+_LOG = logging.getLogger(__name__)
 _WAIT_S = 0.05
 
 
@@ -56,7 +61,8 @@ def run(
     """
     clock = StageClock()
     stage = map_stage(config, recording.rig, clock)
-    pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes))
+    pace = MapPace(config.live.map_age_s)
+    pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes), pace)
     if beginning is not None:
         pipeline.wait_for_back()
     make = partial(_LiveRun, recording, config, out, pipeline, has_camera)
@@ -100,6 +106,12 @@ class _LiveRun(Run):
             if self.joined_t_ns is not None and not was_found:
                 self._followed.life.note(found_in_map=True)
 
+    def _evidence(self, report: FrontReport, final: Trajectory) -> Evidence:
+        """Return what the pipeline has to say, and how the map kept up."""
+        pace = self._followed.pace
+        evidence = super()._evidence(report, final)
+        return replace(evidence, map_left_out=pace.left_out, map_late_s=pace.latest_s)
+
 
 class _Front:
     """What is known here of the front half."""
@@ -119,8 +131,9 @@ class _Front:
 class _Back:
     """What is known here of the back end, and the map."""
 
-    def __init__(self, stage: MapStage | None) -> None:
+    def __init__(self, stage: MapStage | None, pace: MapPace) -> None:
         self.stage = stage
+        self._pace = pace
         self.graph = EndedGraph(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), [], [])
         self._counters: dict[str, dict[str, int]] = {}
 
@@ -132,7 +145,11 @@ class _Back:
     @property
     def counters(self) -> dict[str, dict[str, int]]:
         """Counters of its rooms, and of the map here."""
-        return self._counters | ({} if self.stage is None else self.stage.counters)
+        if self.stage is None:
+            return self._counters
+        counters = self.stage.counters
+        late = {"keyframes_left_out": self._pace.left_out, "late_ms": round(1e3 * self._pace.latest_s)}
+        return {**self._counters, **counters, "map": {**counters["map"], **late}}
 
     def end(self, ended: BackEnded) -> None:
         """Take its last word."""
@@ -147,13 +164,16 @@ class FollowedPipeline:
     Keyframes come when the graph has them, later than their frames; the frame that is at hand then carries them.
     """
 
-    def __init__(self, life: Life, clock: StageClock, stage: MapStage | None, frames: Inbox, keyframes: Inbox) -> None:
-        """Follow two queues, and feed a map."""
+    def __init__(
+        self, life: Life, clock: StageClock, stage: MapStage | None, frames: Inbox, keyframes: Inbox, pace: MapPace
+    ) -> None:
+        """Follow two queues, and feed a map as fast as it can."""
         self.clock = clock
         self.counters = {"frames_lost": 0, "relocalised": 0}
         self.front = _Front()
         self.life = life
-        self._map = _Back(stage)
+        self.pace = pace
+        self._map = _Back(stage, pace)
         self._frames, self._keyframes = frames, keyframes
         self._late: deque[KeyframeStep] = deque()  # whose frame has not come yet
         self._back_ended: BackEnded | None = None
@@ -239,6 +259,15 @@ class FollowedPipeline:
         T_map_body = None if front.T_odom_body is None else seen.T_map_odom @ front.T_odom_body
         return Step(front, T_map_body, localisation, len(self._submaps.groups) - 1, keyframes)
 
+    def _wants_mapped(self) -> bool:
+        """Return whether the map takes the next keyframe; say when it leaves one out."""
+        is_wanted = self.pace.wants(self._frames.age_s)
+        if not is_wanted:
+            if self.pace.left_out == 1:
+                _LOG.warning("the map does not keep up with vision: it takes fewer keyframes until it does")
+            self.life.note(map_left_out=self.pace.left_out)
+        return is_wanted
+
     def _take_keyframes(self, wait_s: float = 0.0) -> None:
         while self._back_ended is None and (message := self._keyframes.get(wait_s)) is not None:
             if isinstance(message, BackEnded):
@@ -265,7 +294,7 @@ class FollowedPipeline:
             while self._seen and self._seen[0].keyframe_id < keyframe_id:
                 seen.append(self._seen.popleft())
             T_map_body = poses.get(keyframe_id, update.T_map_odom @ odometry.T_odom_body)
-            scans.append(stage.add(odometry, T_map_body, seen))
+            scans.append(stage.add(odometry, T_map_body, seen) if self._wants_mapped() else {})
         return [replace(step, scans=scan) for step, scan in zip(ripe, scans, strict=True)]
 
 

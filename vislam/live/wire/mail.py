@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -20,6 +21,7 @@ class Outbox:
         self._connection = connection
         self._waiting: queue.Queue[Any] = queue.Queue(capacity)
         self.is_broken = False  # the other side is gone; what is put in is lost
+        self._sends_ns: int | None = None  # when what is being sent now was put in; None: nothing is
         self._thread = threading.Thread(target=self._send, name="outbox", daemon=True)
         self._thread.start()
 
@@ -28,7 +30,7 @@ class Outbox:
         if self.is_broken:
             return True
         try:
-            self._waiting.put(value, block=timeout_s > 0.0, timeout=timeout_s or None)
+            self._waiting.put((time.monotonic_ns(), value), block=timeout_s > 0.0, timeout=timeout_s or None)
         except queue.Full:
             return False
         return True
@@ -36,6 +38,12 @@ class Outbox:
     def __len__(self) -> int:
         """Return how much waits."""
         return self._waiting.qsize()
+
+    @property
+    def age_s(self) -> float:
+        """How long the oldest of what waits has waited to be taken."""
+        since_ns = self._sends_ns
+        return 0.0 if since_ns is None else (time.monotonic_ns() - since_ns) * 1e-9
 
     def close(self) -> None:
         """Send all that waits, then end the stream."""
@@ -45,13 +53,15 @@ class Outbox:
         self._connection.close()
 
     def _send(self) -> None:
-        while not isinstance(value := self._waiting.get(), _End):
+        while not isinstance((stamped := self._waiting.get())[1], _End):
             if self.is_broken:
                 continue
+            self._sends_ns = stamped[0]
             try:
-                self._connection.send(value)
+                self._connection.send(stamped)
             except OSError:
                 self.is_broken = True
+            self._sends_ns = None
 
 
 class _End:
@@ -65,13 +75,18 @@ class Inbox:
         """Take the connection, to be used in this process only."""
         self._connection = connection
         self.is_over = False  # the other side closed it, or was killed
+        self.age_s = 0.0  # that the newest value had waited when it was taken
 
     def get(self, timeout_s: float = 0.0) -> Any | None:
         """Return the next value, waiting at most so long; None if none came."""
         if self.is_over:
             return None
         try:
-            return self._connection.recv() if self._connection.poll(timeout_s) else None
+            if not self._connection.poll(timeout_s):
+                return None
+            put_ns, value = self._connection.recv()
         except (EOFError, OSError):
             self.is_over = True
             return None
+        self.age_s = (time.monotonic_ns() - put_ns) * 1e-9
+        return value

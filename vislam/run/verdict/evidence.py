@@ -61,6 +61,10 @@ class Evidence:
     samples_missed: int = 0  # inertial ones, that their rate would have brought
     late_s: float = 0.0  # most that a frame waited
     busy: float = 0.0  # share of the time in which vision worked
+    core: float = 0.0  # of a core that it had
+    graph_late_s: float = 0.0  # most that a keyframe waited for the graph
+    map_late_s: float = 0.0  # most that a frame waited for the map
+    map_left_out: int = 0  # keyframes that the map left out for want of time
     # the start
     has_imu: bool = False
     is_started: bool = True  # gravity was found, or there is no IMU

@@ -14,6 +14,9 @@ from vislam.run.verdict.evidence import Evidence, Moved
 
 _MIN_FRAMES = 30  # before shares of them mean anything
 _MIN_LOOPS = 8
+_MIN_KEYFRAMES = 10
+_SOON_S = 0.05  # that things may wait, and nobody has to know
+_OWN_SHARE = 0.7  # of the time in which vision works that it has a core; below, other work has it
 _CALIBRATE = "run `vislam calibrate camera-imu`"
 
 
@@ -57,19 +60,30 @@ def _slow(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     if not _is_slow(e, c):
         return
     unseen = e.frames_dropped + e.frames_left_out
+    mapped = f", {e.map_left_out} of {e.keyframes} keyframes left out of the map" if e.map_left_out else ""
+    waited = {"frames for vision": e.late_s, "for the map": e.map_late_s, "keyframes for the graph": e.graph_late_s}
+    longest = ", ".join(f"{what} {late_s:.1f} s" for what, late_s in waited.items() if late_s >= _SOON_S)
+    waits = f"; what waited longest: {longest}" if longest else ""
+    others = "other work had its core, so end that first; then " if e.core < _OWN_SHARE * e.busy else ""
+    samples = "; for samples, --live.realtime-priority 50" if _misses_samples(e, c) else ""
     yield (
         f"the machine is too slow for its sensors: {unseen} of {e.frames_offered} frames were not looked at "
         f"({e.frames_dropped} dropped, {e.frames_left_out} left out in time), {e.samples_missed} of "
-        f"{e.samples + e.samples_missed} inertial samples missed, frames waited up to {e.late_s:.1f} s and vision "
-        f"worked {e.busy:.0%} of the time: give it less to do (--map.no-enabled, --view.no-enabled, "
-        "--frontend.max-tracks 200, a lower rate of the camera), and first end what else runs"
+        f"{e.samples + e.samples_missed} inertial samples missed{mapped}{waits}; vision worked {e.busy:.0%} of the "
+        f"time, with {e.core:.0%} of a core: {others}give it less to do (--profile pi, a lower rate of the camera, "
+        f"--map.no-enabled, --view.no-enabled){samples}"
     )
 
 
 def _is_slow(e: Evidence, c: VerdictConfig) -> bool:
     unseen = e.frames_dropped + e.frames_left_out
-    missed = e.samples_missed > c.missing_share * (e.samples + e.samples_missed)
-    return missed or (e.frames_offered >= _MIN_FRAMES and unseen > c.missing_share * e.frames_offered)
+    is_blind = e.frames_offered >= _MIN_FRAMES and unseen > c.missing_share * e.frames_offered
+    is_thin = e.keyframes >= _MIN_KEYFRAMES and e.map_left_out > c.missing_share * e.keyframes
+    return is_blind or is_thin or _misses_samples(e, c)
+
+
+def _misses_samples(e: Evidence, c: VerdictConfig) -> bool:
+    return e.samples_missed > c.missing_share * (e.samples + e.samples_missed)
 
 
 def _lost(e: Evidence, c: VerdictConfig) -> Iterator[str]:
@@ -179,7 +193,8 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         yield f"gyroscope noise is {turn_deg:.1f} deg after a second, even at its quietest: mount it on something soft"
     if (speed := e.accel_noise or 0.0) > c.accel_noise_m_s:
         yield f"accelerometer noise is {speed:.2f} m/s after a second, even at its quietest: mount it on something soft"
-    if e.rate_hz is not None and e.rate_told_hz and abs(e.rate_hz / e.rate_told_hz - 1.0) > c.rate_error:
+    off = 0.0 if e.rate_hz is None or not e.rate_told_hz else abs(e.rate_hz / e.rate_told_hz - 1.0)
+    if off > c.rate_error and not _misses_samples(e, c):
         yield f"inertial samples come at {e.rate_hz:.0f} Hz, told were {e.rate_told_hz:.0f}: look for what loses them"
     if e.longest_gap_s > e.max_gap_s:
         yield f"no inertial sample for {e.longest_gap_s:.2f} s: look at the cable, the bus and the load of the machine"
