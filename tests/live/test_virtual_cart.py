@@ -229,6 +229,8 @@ def test_a_whole_run_of_the_virtual_cart(tmp_path: Path) -> None:
     metrics = LiveRun(source, config, out, asked, ["vislam", "live"]).execute(duration_s=14.0)
     assert metrics["mode"] == "planar"
     assert metrics["frames"] > 5
+    late = {role: cost["late_kernels"] for role, cost in metrics["cost"]["processes"].items()}
+    assert late == dict.fromkeys(("fast", "front", "back", "map"), 0), "rehearse what calls them, too"
     assert metrics["counters"]["imu"]["gaps"] >= 1
     assert metrics["live"]["counters"]["samples"] > 200
     assert (out / "trajectory_truth.tum").is_file()

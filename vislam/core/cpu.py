@@ -36,8 +36,22 @@ class _Compiling(event.Listener):  # type: ignore[misc] # numba has no types
                 self.cpu_s += took_s
 
 
-_compiling = _Compiling()
+class _Taking(event.Listener):  # type: ignore[misc]
+    """Counts how often numba was asked for a kernel that is not there yet: it is compiled, or loaded from a cache."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def on_start(self, event: object) -> None:
+        self.count += 1
+
+    def on_end(self, event: object) -> None:
+        pass
+
+
+_compiling, _taking = _Compiling(), _Taking()
 event.register("numba:compile", _compiling)
+event.register("numba:compiler_lock", _taking)
 _ahead_s: dict[str, float] = {}
 _ahead_lock = threading.Lock()
 
@@ -55,6 +69,11 @@ def thread_cpu_s() -> float:
 def compile_cpu_s() -> float:
     """Return the CPU time in which this process compiled kernels, since this module was imported."""
     return _compiling.cpu_s
+
+
+def kernels_taken() -> int:
+    """Return how often a kernel was called for the first time: each compiles, or waits for the disk."""
+    return _taking.count
 
 
 @contextmanager

@@ -86,6 +86,8 @@ class Life:
     def __init__(self, role: str, report: Connection, signals: Signals) -> None:
         """Keep the parent's id: with another parent, the old one is dead."""
         self.role = role
+        self.when_ready: Callable[[], None] = _do_nothing
+        self.when_over: Callable[[], None] = _do_nothing  # no more measurements come
         self._report = report
         self._sending = threading.Lock()  # threads that read sensors may warn
         self._signals = signals
@@ -108,6 +110,7 @@ class Life:
 
     def ready(self) -> bool:
         """Say that everything is loaded, wait for the others; False when the run ends before."""
+        self.when_ready()
         self.tell(Ready(self.role))
         _die_with_parent(False)  # from now on it looks after that itself, and ends in order
         while not self._signals.go.wait(0.1):
@@ -152,6 +155,10 @@ def _die_with_parent(is_on: bool) -> None:
     parent = parent_process()
     if is_on and parent is not None and not parent.is_alive():
         os._exit(1)
+
+
+def _do_nothing() -> None:
+    """Do nothing."""
 
 
 def _portable(error: Exception) -> Exception | None:

@@ -20,6 +20,7 @@ from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.core.recording import Recording
 from vislam.live.beginning import Beginning
 from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
+from vislam.live.map_rehearsal import rehearse_map
 from vislam.live.pace import MapPace
 from vislam.live.processes.child import Life
 from vislam.live.wire.mail import Inbox
@@ -59,6 +60,7 @@ def run(
         base: the map among them, if it is that of another run.
         has_camera: False where no frame can come, and none is asked for.
     """
+    rehearse_map(config, recording.rig)
     clock = StageClock()
     stage = map_stage(config, recording.rig, clock)
     pace = MapPace(config.live.map_age_s)
@@ -105,6 +107,7 @@ class _LiveRun(Run):
             self._take(step)
             if self.joined_t_ns is not None and not was_found:
                 self._followed.life.note(found_in_map=True)
+        self._followed.life.when_over()
 
     def _evidence(self, report: FrontReport, final: Trajectory) -> Evidence:
         """Return what the pipeline has to say, and how the map kept up."""

@@ -32,8 +32,17 @@ def run_camera(life: Life, name: str, cart: str, epoch: Epoch, options: PlaceOpt
     imager = Imager(camera.width, camera.height, noisy=True)
     rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(5,)))
     slot = SlotWriter(name, _HEAD.size + camera.width * camera.height * (5 if rig.has_depth else 1))
+
+    def picture(t_s: float) -> bytes:
+        """Return what the slot holds of an image after its head."""
+        T = follower.at(t_s).T_world_body(BODY_HEIGHT_M) @ rig.T_body_cams[0]
+        light, exact = renderer.render(scene, T)
+        grey = cv2.cvtColor(imager.sense(light, 1.0, rng), cv2.COLOR_BGR2GRAY)
+        return grey.tobytes() + (sense_depth(exact, DepthNoise(), rng).tobytes() if rig.has_depth else b"")
+
     try:
         follower = Follower.waiting(cart)
+        picture(0.0)  # paints and compiles
         if not life.ready():
             return
         begin_ns, index = epoch.begin_ns(), 0
@@ -44,12 +53,9 @@ def run_camera(life: Life, name: str, cart: str, epoch: Epoch, options: PlaceOpt
             time.sleep(max(t_s - since_s, 0.0))
             if any(begin <= t_s < end for begin, end in options.camera_out):
                 continue
-            T = follower.at(t_s).T_world_body(BODY_HEIGHT_M) @ rig.T_body_cams[0]
-            light, exact = renderer.render(scene, T)
-            grey = cv2.cvtColor(imager.sense(light, 1.0, rng), cv2.COLOR_BGR2GRAY)
-            depth = sense_depth(exact, DepthNoise(), rng).tobytes() if rig.has_depth else b""
-            head = _HEAD.pack(begin_ns + round((t_s + options.camera_delay_s) * _NS), index, *grey.shape)
-            slot.write(head + grey.tobytes() + depth)
+            body = picture(t_s)
+            stamp_ns = begin_ns + round((t_s + options.camera_delay_s) * _NS)
+            slot.write(_HEAD.pack(stamp_ns, index, camera.height, camera.width) + body)
     finally:
         slot.close()
 
@@ -75,7 +81,7 @@ class VirtualCamera:
         read = self._slot.read()
         if read is None:
             return None
-        self._sequence, data = read
+        self._sequence, data = read[0], bytearray(read[1])  # images that may be written to, as all cameras give
         t_ns, index, height, width = _HEAD.unpack_from(data)
         self._newest_ns = time.monotonic_ns()
         self._counts["captured"] += 1
