@@ -7,8 +7,8 @@ import importlib.util
 import json
 import os
 import signal
-import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import psutil
@@ -21,6 +21,7 @@ from vislam.core.log import log_to
 from vislam.hw.chips import BusError
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
+from vislam.live import run_live
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
 from vislam.run.folder import prepare
@@ -114,22 +115,42 @@ def test_unplugged_sensors_degrade_and_come_back(tmp_path: Path) -> None:
     assert left_behind("unplugged") == []
 
 
-def test_an_interrupt_ends_it_cleanly(tmp_path: Path) -> None:
-    live, out = start(tmp_path, "interrupted")
-    begun = time.monotonic()
-    sent = []
+def interrupter(sent: list[int]) -> Callable[[LiveRun], None]:
+    """Return what sends Ctrl-C once, when there are some seconds of samples."""
 
     def interrupt(run: LiveRun) -> None:
-        status = run.notes.get("fast", {}).get("status", {})
-        if not sent and status.get("samples", 0) > 800:
-            sent.append(time.monotonic() - begun)
+        samples = run.notes.get("fast", {}).get("status", {}).get("samples", 0)
+        if not sent and samples > 800:
+            sent.append(samples)
             os.kill(os.getpid(), signal.SIGINT)
 
-    metrics = live.execute(interrupt)
-    assert sent
+    return interrupt
+
+
+def test_an_interrupt_ends_it_cleanly_without_what_takes_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_live, "_BRIEF_S", 60.0)  # a machine may be slow
+    live, out = start(tmp_path, "interrupted")
+    sent: list[int] = []
+    metrics = live.execute(interrupter(sent))
+    assert sent and live.is_brief
     assert metrics["frames"] > 0
     assert {path.name for path in out.iterdir()} >= _FILES
+    assert not (out / "map").exists()
     assert left_behind("interrupted") == []
+
+
+def test_an_interrupt_does_not_wait_for_a_slow_end_and_the_session_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_live, "_BRIEF_S", 0.0)
+    live, out = start(tmp_path, "hurried")
+    sent: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        live.execute(interrupter(sent))
+    assert sent and not (out / "metrics.json").exists()
+    assert left_behind("hurried") == []
+    with closing(Session(out / "session.db")) as session:
+        assert len(session.factor_log().keyframes) > 0
 
 
 def bridged(role: str) -> dict[str, object]:

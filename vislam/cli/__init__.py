@@ -23,8 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a verb and leave the process with its exit code, soon after a signal that asks for it."""
     with interrupts.bounded():
         code = run_verb(list(sys.argv[1:] if arguments is None else arguments))
-        if code == interrupts.EXIT_CODE:
-            interrupts.leave()
+        if interrupts.has_come():
+            interrupts.leave(code)
         sys.exit(code)
 
 

@@ -66,7 +66,13 @@ class _Clock:
 
 
 _clocks: list[_Clock] = []  # of the process: one, once it is asked for
-_raised: list[int] = []  # signals that became a KeyboardInterrupt
+_came: list[int] = []  # signals
+_raised: list[int] = []  # that became a KeyboardInterrupt
+
+
+def has_come() -> bool:
+    """Return whether a signal asked for the end."""
+    return bool(_came)
 
 
 def has_raised() -> bool:
@@ -104,6 +110,7 @@ def counted() -> Iterator[Asked]:
 def _handled(asked: Asked, raises: bool) -> Iterator[None]:
     def take(number: int, frame: object) -> None:
         asked.count += 1
+        _came.append(number)
         if number == signal.SIGHUP:
             leave_terminal()
         if raises and asked.count == 1:  # another one would disturb the end that the first began
@@ -127,13 +134,13 @@ def _handled(asked: Asked, raises: bool) -> Iterator[None]:
             clock.asked = was
 
 
-def leave() -> NoReturn:
-    """End the process with exit code 130 without taking it apart, which may take seconds of its own."""
+def leave(code: int = EXIT_CODE) -> NoReturn:
+    """End the process without taking it apart, which may take seconds of its own."""
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):
             stream.flush()
-    os._exit(EXIT_CODE)
+    os._exit(code)
 
 
 def ignore() -> None:

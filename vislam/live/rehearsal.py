@@ -33,7 +33,7 @@ _DEPTH_M = 2.0
 def rehearse_front(config: Config, rig: Rig, noise: ImuNoise) -> None:
     """Run the front half once, and its filter through a longer rest."""
     warm_up(config, noise, rig.T_body_cams[0])
-    front = Front(config, rig, noise, StageClock())
+    front = Front(_patient(config), rig, noise, StageClock())
     for value in made_up(config, rig):
         if isinstance(value, Frame):
             front.process(value)
@@ -51,12 +51,18 @@ def rehearse(config: Config, rig: Rig, noise: ImuNoise) -> None:
         first_training=2, min_training_lag=1,
     )  # fmt: skip
     window = replace(config.window, keyframes=min(config.window.keyframes, _WINDOW))
-    slam = Slam(replace(config, loop=loop, window=window, map=replace(config.map, enabled=False)), rig, noise)
+    config = replace(_patient(config), loop=loop, window=window, map=replace(config.map, enabled=False))
+    slam = Slam(config, rig, noise)
     slam.front.frontend.keyframe_spacing = _SPACING
     for value in made_up(config, rig):
         slam.feed(value)
     slam.finish()
     _see_direction()
+
+
+def _patient(config: Config) -> Config:
+    """Return settings by which what is made up is never given up for want of a start."""
+    return replace(config, init=replace(config.init, give_up_s=_FRAMES * _FRAME_NS * 1e-9 + 1.0))
 
 
 def _see_direction() -> None:

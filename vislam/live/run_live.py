@@ -38,7 +38,9 @@ from vislam.run import imu_noise
 from vislam.run.folder import MapChoice
 
 _LOG = logging.getLogger(__name__)
-_WATCH_S = 0.2
+_WATCH_S = 0.1
+_WRITERS = ("fast", "front", "back", "map")
+_BRIEF_S = 1.3  # after a signal, that writing down what there is may take
 _AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
 
 
@@ -189,8 +191,13 @@ class LiveRun:
         """Roles of the processes that are not ready yet."""
         return [role for role, child in self._children.items() if not child.is_ready]
 
+    @property
+    def is_brief(self) -> bool:
+        """Whether a signal ended it: then there is neither map nor report yet."""
+        return self._signals.brief.is_set()
+
     def stop(self) -> None:
-        """Ask for the end, as Ctrl-C does."""
+        """Ask for the end, as `duration_s` does."""
         self._signals.stop.set()
 
     def processes(self) -> dict[str, SpawnProcess]:
@@ -206,7 +213,8 @@ class LiveRun:
 
         Raises:
             VislamError: what a process raised, or that one was killed; what was computed is in the run folder.
-            KeyboardInterrupt: a signal before the sensors were read, or a second one while the first was being obeyed.
+            KeyboardInterrupt: a signal before the sensors were read, while the end was being written down, or one after
+                which that took too long.
         """
         try:
             with interrupts.counted() as asked:
@@ -219,6 +227,8 @@ class LiveRun:
             self._end()
         if self._failure is not None:
             raise self._failure
+        if self.metrics is None and self.is_brief:
+            raise KeyboardInterrupt  # the session has all but what came since its last keyframe
         if self.metrics is None:
             raise HardwareError("the run ended before its folder was written; see what is said above")
         told = {name: value for name, value in self.notes.get("fast", {}).items() if name != "status"}
@@ -238,16 +248,20 @@ class LiveRun:
             if self.is_going:
                 asked.take_time()
                 deadline = min(deadline, time.monotonic() + (float("inf") if duration_s is None else duration_s))
+            if asked.count:
+                self._signals.brief.set()
             if asked.count or time.monotonic() > deadline or self._failure is not None:
                 self._signals.stop.set()
 
     def _watch_ending(self, asked: interrupts.Asked, show: Show | None) -> None:
         """Watch over the processes while they write down what there is; those that had not begun are not waited for."""
-        patience = float("inf")
+        patience = time.monotonic() + _BRIEF_S if self.is_brief else float("inf")
         while self.is_going and any(child.process.is_alive() for child in self._children.values()):
             self._watch(show)
-            if asked.count > 1:
+            if asked.count > self.is_brief:
                 raise KeyboardInterrupt
+            if self.is_brief and all("cost" in self.notes.get(role, {}) for role in _WRITERS):
+                break  # they have told all, and to take a process apart takes time
             if self._failure is not None:
                 patience = min(patience, time.monotonic() + _AFTER_FAILURE_S)
             if time.monotonic() > patience:

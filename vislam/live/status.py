@@ -11,6 +11,8 @@ def status_line(run: LiveRun) -> str:
     if not run.is_going:
         waiting = ", ".join(run.waits_for) or "nothing"
         return f"getting ready: waiting for {waiting}"
+    if run.is_brief:
+        return "ending at once: the map's files and the report are left for later"
     if run.is_ending:
         return "ending: the run is written down; Ctrl-C again does not wait for that"
     told = run.notes.get("fast", {})

@@ -129,8 +129,10 @@ def _execute(
     from vislam.core.files import write_json
     from vislam.live.status import status_line
 
-    with written_up(out, command), rewritten_line() as show:
+    with written_up(out, command, lambda: live.is_brief), rewritten_line() as show:
         write_json(out / "sensors.json", asdict(sensors))
         metrics = live.execute(lambda run: show(status_line(run)), seconds)
     print_metrics(metrics, out, as_json)
+    if live.is_brief and not as_json:
+        print(f"left out, for Ctrl-C does not wait: vislam map {out}; vislam report {out}", flush=True)
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,11 @@ from vislam.core.log import log_to
 
 
 @contextmanager
-def written_up(out: Path, command: Sequence[str]) -> Iterator[None]:
-    """Keep the log of a run and write its report afterwards, whatever happened on the way but an interrupt."""
+def written_up(out: Path, command: Sequence[str], is_hurried: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Keep the log of a run and write its report afterwards, whatever happened on the way but an interrupt.
+
+    An interrupt that was answered with an end in order is told by `is_hurried`.
+    """
     from vislam import report  # what draws is loaded by the first use, when the run has given its memory back
 
     with log_to(out, command):
@@ -30,7 +33,8 @@ def written_up(out: Path, command: Sequence[str]) -> Iterator[None]:
                 if (out / "metrics.json").is_file():
                     report.write_report(out)
             raise
-        report.write_report(out)
+        if not is_hurried():
+            report.write_report(out)
 
 
 def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:

@@ -52,6 +52,8 @@ def run(
         del memory
     life.ready()
     while (keyframe := _next(life, inbox)) is not None:
+        if life.is_brief:
+            continue  # those that had to wait are left out
         if back is None:
             back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, keyframe.odometry.T_odom_body)
         if begins_recording:

@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawValue
@@ -78,6 +78,7 @@ class Signals:
 
     go: Flag  # every process is ready
     stop: Flag
+    brief: Flag = field(default_factory=Flag)  # nobody waits for the end: what takes time is left for later
 
 
 class Life:
@@ -99,6 +100,11 @@ class Life:
     def stopped(self) -> bool:
         """Whether the run is to end, because somebody said so or the parent is gone."""
         return self._signals.stop.is_set() or self.is_orphan
+
+    @property
+    def is_brief(self) -> bool:
+        """Whether the run is to end at once, with what it has."""
+        return self._signals.brief.is_set()
 
     @property
     def is_orphan(self) -> bool:

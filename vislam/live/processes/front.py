@@ -126,8 +126,8 @@ class FrontProcess:
                 self._process(self._frames.popleft())
 
     def end(self) -> None:
-        """Process what still waits."""
-        while self._frames:
+        """Process what still waits, as far as somebody does for that."""
+        while self._frames and not self._life.is_brief:
             self._process(self._frames.popleft())
         for odometry in self.front.give_up_waiting():
             self._put_keyframe(KeyframeOut(odometry, *self._first()))

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -100,6 +101,10 @@ class _LiveRun(Run):
         finally:
             stored.close()
         self.base = {"path": str(beginning.session), "keyframes": beginning.first_id, "localize_only": False}
+
+    def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
+        """Write all files; without map and pictures where nobody waits for them."""
+        return super()._finish(start, is_brief or self._followed.life.is_brief)
 
     def _feed(self, progress: Progress | None) -> None:
         for step in self._followed.steps():
@@ -243,7 +248,7 @@ class FollowedPipeline:
             self.clock.add(timings)
             return Finish([], keyframes, None, None)
         self.clock.add(timings | ended.timings)
-        if ended.update is not None and self._map.stage is not None:
+        if ended.update is not None and self._map.stage is not None and not self.life.is_brief:
             self._map.stage.move(ended.update)
             self._map.stage.finish()
         return Finish([], keyframes, ended.update, ended.news)
@@ -264,6 +269,8 @@ class FollowedPipeline:
 
     def _wants_mapped(self) -> bool:
         """Return whether the map takes the next keyframe; say when it leaves one out."""
+        if self.life.is_brief:
+            return False
         is_wanted = self.pace.wants(self._frames.age_s)
         if not is_wanted:
             if self.pace.left_out == 1:
