@@ -76,14 +76,15 @@ class Filtering:
     ) -> None:  # fmt: skip
         """Take what was seen in a frame and what the IMU's noise is, and tell the filter what it is to know by now.
 
-        That noise changed is known half a second later. A tight filter does not go back over the frames since: it takes
-        as long for each again, and noise that it took for a little too long to be what it was changes little.
+        That noise changed is known half a second later. Over the frames since, a tight filter goes back only where it
+        grew: it takes as long for each again, and to have believed in too much of it for so long does no harm.
         """
         on_wheels = self._config.nonholonomic and not at_rest
         news = None
         if noise.scale != self._noise_told:
-            is_first = self._noise_told == AS_MODELLED  # it also says what was before
-            since_ns = self._newest_ns if self.coupling == "tight" and not is_first else 0
+            told = self._noise_told
+            is_calmer = noise.scale.gyro <= told.gyro and noise.scale.accel <= told.accel
+            since_ns = self._newest_ns if self.coupling == "tight" and is_calmer else 0
             self._noise_told = noise.scale
             news = replace(noise, t_ns=max(noise.t_ns, self._start_ns, since_ns))
         self._newest_ns = t_ns
