@@ -5,7 +5,8 @@
     .venv/bin/python benchmarks/drawn_camera.py --record
 
 Frames spread over a world are rendered, sensed and written as PNG as `vislam simulate` does; each stage's CPU time is
-the least of some rounds, compilation and painting not counted. Brute force renders `--moments` sharp images per frame
+the least of some rounds, compilation and painting not counted. At the end ten seconds are recorded by `--workers` threads:
+frames a second, of which a loaded machine shows fewer (cores tells). Brute force renders `--moments` sharp images per frame
 and adds up their light; both take turns. The difference is the mean over all pixels, in grey levels, without noise.
 """
 
@@ -31,12 +32,13 @@ import numpy as np  # noqa: E402
 
 import results  # noqa: E402
 from vislam.core.messages import Array, Frame, ImageF32  # noqa: E402
-from vislam.datasets.recorder import Recorder  # noqa: E402
+from vislam.datasets.recorder import Recorder, record  # noqa: E402
 from vislam.sim import Simulation, open_world  # noqa: E402
 from vislam.sim.scene import Renderer  # noqa: E402
 from vislam.sim.sensing import Imager  # noqa: E402
 
 cv2.setNumThreads(1)
+_RECORDED_S = 10.0
 MARGIN = 0.05  # of the frames are left out at both ends, where the motion rests
 
 
@@ -107,6 +109,20 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
         results.record("drawn_camera", {f"{setting}: {stage}": ms for stage, ms in mean_ms.items()})
 
 
+def keep_up(args: argparse.Namespace, folder: Path) -> None:
+    """Print how many frames a second are recorded by several threads, once the world is painted."""
+    options = {"image_width_px": args.width, "exposure_s": args.exposure_s, "workers": args.workers}
+    world = open_world(args.world, duration_s=_RECORDED_S, **options)
+    world.render(0)
+    begin_s, begin_cpu_s = time.perf_counter(), time.process_time()
+    frames = record(world, folder / "whole").counts["frames"]
+    wall_s, cpu_s = time.perf_counter() - begin_s, time.process_time() - begin_cpu_s
+    print(
+        f"recorded: {frames} frames in {wall_s:.1f} s by {args.workers} threads, {frames / wall_s:.1f} a second; "
+        f"{1e3 * cpu_s / frames:.0f} ms of CPU each, {cpu_s / wall_s:.2f} cores"
+    )
+
+
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -116,9 +132,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--moments", type=int, default=16)
+    parser.add_argument("--workers", type=int, default=2, help="threads that render what is recorded")
     parser.add_argument("--record", action="store_true", help="keep the times in benchmarks/results")
     with tempfile.TemporaryDirectory() as folder:
-        measure(parser.parse_args(), Path(folder))
+        asked = parser.parse_args()
+        measure(asked, Path(folder))
+        keep_up(asked, Path(folder))
 
 
 if __name__ == "__main__":

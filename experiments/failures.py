@@ -38,6 +38,8 @@ _DROPPED_CAPABILITIES = (1, 2)  # linux/capability.h: DAC_OVERRIDE, DAC_READ_SEA
 _PR_CAPBSET_DROP = 24  # linux/prctl.h
 _WORLD = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=100"
 _MEND_KB = 400_000
+# CPython 3.11 keeps a byte code file of which it could write a part only, and never starts again
+_ENVIRONMENT = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
 _CAMERA = """\
 cam0:
   camera_model: pinhole
@@ -89,6 +91,7 @@ def _writers(run_out: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     yield "simulate", "simulate corridor-loop --duration-s 1 --out {place}/world", ()
     yield "simulate graph", "simulate --graph grid3d --out {place}/world.g2o", ()
     yield "optimize", "optimize {place}/run", ("run",)
+    yield "join", "optimize {data}/run {data}/other --out {place}/both", ()
     yield "posegraph", "posegraph {data}/graph.g2o --out {place}/graph", ()
     yield "map", "map {place}/run", ("run",)
     yield "report", "report {place}/run", ("run",)
@@ -100,7 +103,13 @@ def _writers(run_out: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
 
 
 def _full_disk() -> Iterator[Case]:
-    free = {"run": (0, 30, 200, 600, 1500, 3000), "record": (0, 40), "live": (0, 30, 200), "report": (0, 200)}
+    free = {
+        "run": (0, 30, 200, 600, 1500, 3000),
+        "record": (0, 40),
+        "live": (0, 30, 200),
+        "report": (0, 200),
+        "join": (0, 200),
+    }
     short = {"simulate", "simulate graph", "posegraph", "report", "board", "record"}
     for name, command, copies in _writers("run"):
         for free_kb in free.get(name, (0, 30)):
@@ -149,6 +158,8 @@ def _bad_files() -> Iterator[Case]:
     yield Case("a seed among the options of a world: run", f"run {_WORLD},seed=1 {here}", (2,), is_short=True)
     for what in ("nothing", "folder", "noise.bin", "secret"):
         path = f"{{data}}/{what}"
+        yield Case(f"one of two sessions is {what}: join", f"optimize {{data}}/run {path} {here}", (2, 3),
+                   is_short=True)  # fmt: skip
         yield Case(f"calibration is {what}: run", f"run {{data}}/world --calibration.camera {path} {here}", (2, 3),
                    is_short=True)  # fmt: skip
         yield Case(f"calibration is {what}: live",
@@ -169,6 +180,7 @@ def make_data(data: Path) -> None:
     data.mkdir(parents=True, exist_ok=True)
     for command in (
         f"run {_WORLD} --out {data}/run --view.no-enabled",
+        f"run {_WORLD} --out {data}/other --view.no-enabled",
         f"simulate corridor-loop --duration-s 1 --out {data}/world",
         f"simulate --graph grid3d --out {data}/graph.g2o",
     ):
@@ -282,7 +294,7 @@ def _run(case: Case, data: Path, place: Path, is_mended: bool = False) -> tuple[
     with _board(data, case.fault == "unplugged"), open(into or os.devnull, "w") as out:
         begun = time.monotonic()
         process = subprocess.Popen(
-            words, stdout=out, stderr=subprocess.PIPE, text=True, cwd=data, start_new_session=True,
+            words, stdout=out, stderr=subprocess.PIPE, text=True, cwd=data, start_new_session=True, env=_ENVIRONMENT,
             preexec_fn=lambda: _without_rights(case, is_mended),  # noqa: PLW1509 it calls the system only
         )  # fmt: skip
         try:

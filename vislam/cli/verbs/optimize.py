@@ -96,8 +96,11 @@ def _optimize_run(options: OptimizeOptions) -> int:
 
 def _join_sessions(options: JoinOptions) -> int:
     from vislam.report.graph_page import write_graph_report
+    from vislam.run.folder import storage
     from vislam.run.offline.join_sessions import join_sessions, write_joined
 
+    with storage(options.out):  # before the work, which may take minutes
+        options.out.mkdir(parents=True, exist_ok=True)
     with progress_bar("loops between sessions", "keyframes") as bar:
         joined = join_sessions(options.sessions, progress=bar)
     write_joined(joined, options.out)
