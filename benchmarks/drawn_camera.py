@@ -5,9 +5,9 @@
     .venv/bin/python benchmarks/drawn_camera.py --record
 
 Frames spread over a world are rendered, sensed and written as PNG as `vislam simulate` does; each stage's CPU time is
-the least of some rounds, compilation and painting not counted. At the end ten seconds are recorded by `--workers` threads:
-frames a second, of which a loaded machine shows fewer (cores tells). Brute force renders `--moments` sharp images per frame
-and adds up their light; both take turns. The difference is the mean over all pixels, in grey levels, without noise.
+the least of some rounds, compilation and painting not counted. Brute force renders `--moments` sharp images per frame
+and adds up their light; both take turns. The difference is the mean over all pixels, in grey levels, without noise. At
+the end ten seconds are recorded by `--workers` threads: frames a second, fewer on a loaded machine (cores tells).
 """
 
 from __future__ import annotations

@@ -55,7 +55,8 @@ def main(arguments: list[str]) -> int:
     command = ["vislam", "optimize", *arguments]
     folders = [a for a in takewhile(lambda a: not a.startswith("-"), arguments) if Path(a).is_dir()]
     sessions = [a for a in arguments if (Path(a) / "session.db").is_file() or Path(a).name == "session.db"]
-    if len(folders) > 1 or len(sessions) > 1 or (sessions and any(a.partition("=")[0] == "--out" for a in arguments)):
+    has_out = any(a.partition("=")[0] == "--out" for a in arguments)
+    if len(folders) > 1 or len(sessions) > 1 or ((folders or sessions) and has_out):
         join = parse(JoinOptions, arguments, "optimize")
         with log_to(join.out, command):
             return _join_sessions(join)
@@ -96,11 +97,10 @@ def _optimize_run(options: OptimizeOptions) -> int:
 
 def _join_sessions(options: JoinOptions) -> int:
     from vislam.report.graph_page import write_graph_report
-    from vislam.run.folder import storage
+    from vislam.run.folder import check_writable
     from vislam.run.offline.join_sessions import join_sessions, write_joined
 
-    with storage(options.out):  # before the work, which may take minutes
-        options.out.mkdir(parents=True, exist_ok=True)
+    check_writable(options.out)  # before the work, which may take minutes
     with progress_bar("loops between sessions", "keyframes") as bar:
         joined = join_sessions(options.sessions, progress=bar)
     write_joined(joined, options.out)
