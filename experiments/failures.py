@@ -40,6 +40,7 @@ _WORLD = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=100"
 _MEND_KB = 400_000
 # CPython 3.11 keeps a byte code file of which it could write a part only, and never starts again
 _ENVIRONMENT = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+_ENVIRONMENT.pop("PYTHONUNBUFFERED", None)  # users have it not, and what stdout still holds at the end fails late
 _CAMERA = """\
 cam0:
   camera_model: pinhole

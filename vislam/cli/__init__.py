@@ -25,6 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = run_verb(list(sys.argv[1:] if arguments is None else arguments))
         if interrupts.has_come():
             interrupts.leave(code)
+        _let_go_of_output()
         sys.exit(code)
 
 
@@ -69,6 +70,15 @@ def _answered(arguments: list[str]) -> int:
         set_level(kept_level)
     code: int = import_module(f"vislam.cli.verbs.{name}").main(rest)
     return code
+
+
+def _let_go_of_output() -> None:
+    """Give up what stdout did not take: Python would try again at its end, and change the exit code to 120."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted() -> int:
