@@ -122,7 +122,9 @@ def _full_disk() -> Iterator[Case]:
                 is_refused_again=goes_on,
             )  # fmt: skip
     for verb in ("completion bash", "doctor {data}/world", "eval {data}/run", "loops {data}/run", "--help"):
-        yield Case(f"full disk: {verb} to a file", f"{verb} > /dev/full", (3,), is_short=verb == "completion bash")
+        yield Case(
+            f"full disk: {verb} to a file", f"{verb} > /dev/full", (3,), is_short=verb in ("completion bash", "--help")
+        )
 
 
 def _read_only() -> Iterator[Case]:
