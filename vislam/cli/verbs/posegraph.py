@@ -48,8 +48,10 @@ def main(arguments: list[str]) -> int:
 def _optimize(options: PoseGraphOptions, out: Path) -> int:
     with while_importing():  # it takes longer than solving most files
         from vislam.report.graph_page import write_graph_report
+        from vislam.run.folder import check_writable
         from vislam.run.offline.optimize_graph import optimize_graph_file
 
+    check_writable(out)  # before the work, which may take minutes
     limit = options.settings.iterations
     with progress_bar(options.file.stem, "iterations") as bar:
         result = optimize_graph_file(
