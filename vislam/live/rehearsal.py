@@ -33,6 +33,7 @@ _DEPTH_M = 2.0
 def rehearse_front(config: Config, rig: Rig, noise: ImuNoise) -> None:
     """Run the front half once, and its filter through a longer rest."""
     warm_up(config, noise, rig.T_body_cams[0])
+    _see_direction()
     front = Front(_patient(config), rig, noise, StageClock())
     for value in made_up(config, rig):
         if isinstance(value, Frame):
