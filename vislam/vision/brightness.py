@@ -34,7 +34,8 @@ def matched(source: ImageU8, target: ImageU8, pixels: Array, guess: Array, windo
         window_px: side of a patch.
     """
     stride = max(len(pixels) // _MAX_PATCHES, 1)
-    patches = _compare(source, target, pixels[::stride], guess[::stride], max(window_px // _SAMPLES, 1))
+    some, guessed = np.ascontiguousarray(pixels[::stride]), np.ascontiguousarray(guess[::stride])  # one layout
+    patches = _compare(source, target, some, guessed, max(window_px // _SAMPLES, 1))
     if len(patches) < _MIN_PATCHES:
         return source
     mean_source, sigma_source, mean_target, sigma_target = patches.T
