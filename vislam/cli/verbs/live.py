@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -131,7 +132,12 @@ def _execute(
 
     with written_up(out, command, lambda: live.is_brief), rewritten_line() as show:
         write_json(out / "sensors.json", asdict(sensors))
-        metrics = live.execute(lambda run: show(status_line(run)), seconds)
+        try:
+            metrics = live.execute(lambda run: show(status_line(run)), seconds)
+        except KeyboardInterrupt:
+            if live.is_brief:  # there was no time for more than the session
+                print(f"vislam: to go on from there: vislam optimize {out}, or live --resume {out}", file=sys.stderr)
+            raise
     print_metrics(metrics, out, as_json)
     if live.is_brief and not as_json:
         print(f"left out, for Ctrl-C does not wait: vislam map {out}; vislam report {out}", flush=True)
