@@ -20,8 +20,9 @@ OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z0-9_-]*(?:\.[a-z0-9_-]+)*)(?:[ =]([A
 def advice() -> tuple[tuple[str, str, str], ...]:
     """Return file and line, option and the word after it, of every string in the package."""
     found = []
-    colours = {PACKAGE / "report" / name for name in ("style.py", "drawing.py")}  # of a page, no options
-    for path in sorted({*PACKAGE.rglob("*.py")} - colours):
+    # colours of a page, and options of another program
+    others = {PACKAGE / "report/style.py", PACKAGE / "report/drawing.py", PACKAGE / "experiment/slurm.py"}
+    for path in sorted({*PACKAGE.rglob("*.py")} - others):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         docstrings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
