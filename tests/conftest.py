@@ -1,6 +1,7 @@
 """Fixtures every test may use."""
 
 import os
+import signal
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
@@ -19,6 +20,10 @@ settings.register_profile("vislam", deadline=None, derandomize=True)
 settings.load_profile("vislam")
 
 cv2.setNumThreads(1)  # as in deterministic replay
+
+for interrupt in (signal.SIGINT, signal.SIGHUP):  # in the background of a script they are ignored, and tests send them
+    if signal.getsignal(interrupt) is signal.SIG_IGN:
+        signal.signal(interrupt, signal.default_int_handler if interrupt == signal.SIGINT else signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")
