@@ -39,7 +39,6 @@ class Filtering:
         self._told: list[Correction] = []  # since somebody asked
         self._start_ns = 0
         self._noise_told = AS_MODELLED
-        self._newest_ns = 0  # frame that was seen
 
     @property
     def state(self) -> NavState | None:
@@ -74,20 +73,11 @@ class Filtering:
         self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,
         shows_scale: bool, noise: SeenNoise,
     ) -> None:  # fmt: skip
-        """Take what was seen in a frame and what the IMU's noise is, and tell the filter what it is to know by now.
-
-        That noise changed is known half a second later. Over the frames since, a tight filter goes back only where it
-        grew: it takes as long for each again, and to have believed in too much of it for so long does no harm.
-        """
+        """Take what was seen in a frame and what the IMU's noise is, and tell the filter what it is to know by now."""
         on_wheels = self._config.nonholonomic and not at_rest
         news = None
         if noise.scale != self._noise_told:
-            told = self._noise_told
-            is_calmer = noise.scale.gyro <= told.gyro and noise.scale.accel <= told.accel
-            since_ns = self._newest_ns if self.coupling == "tight" and is_calmer else 0
-            self._noise_told = noise.scale
-            news = replace(noise, t_ns=max(noise.t_ns, self._start_ns, since_ns))
-        self._newest_ns = t_ns
+            self._noise_told, news = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))
         self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale, news))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
         while self._seen and self._seen[0].t_ns <= newest_ns:
