@@ -11,7 +11,7 @@ from typing import Any
 from vislam.config import dump, from_data
 from vislam.experiment import commands, programs
 from vislam.experiment.identity import environment, sha256_of, source_identity
-from vislam.experiment.plan import Plan, Scalar, Sequence, nested
+from vislam.experiment.plan import Estimator, Plan, Scalar, Sequence, nested
 from vislam.run.folder import fingerprint
 
 JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
@@ -60,6 +60,7 @@ class Job:
 def expand(plan: Plan) -> list[Job]:
     """Return every job of a plan, in its order. Raises UsageError for a configuration or program that is none."""
     identities: dict[str, str] = {}
+    others = [_identity(estimator) for estimator in plan.estimators]
     jobs = []
     for sequence, variant in ((s, v) for s in plan.sequences for v in variants(plan, s.name)):
         source, settings = _conditions(plan, sequence, variant)
@@ -78,17 +79,21 @@ def expand(plan: Plan) -> list[Job]:
                 files = [fingerprint(Path(name)) for name in config["calibration"].values() if name is not None]
                 if (shaking := config["imu"]["vibration"]["recording"]) is not None:
                     files.append(identities.setdefault(shaking, source_identity(shaking)))
-                own = [programs.identity(estimator.program), estimator.options] if estimator.program else []
-                own += commands.identity(estimator.command)
                 jobs.append(
                     Job(
-                        sha256_of([identities[source], files, config, batch, environment(), *own]),
+                        sha256_of([identities[source], files, config, batch, environment(), *others[index]]),
                         sequence.name, variant, estimator.name, index, seed, member,
                         source, config, batch, estimator.program, estimator.options, estimator.command,
                         plan.timeout_s,
                     )
                 )  # fmt: skip
     return jobs
+
+
+def _identity(estimator: Estimator) -> list[Any]:
+    """Return what an estimator is that is not the pipeline; nothing for one that is."""
+    own = [programs.identity(estimator.program), estimator.options] if estimator.program else []
+    return own + commands.identity(estimator.command)
 
 
 def variants(plan: Plan, sequence: str) -> list[tuple[tuple[str, Scalar], ...]]:

@@ -16,6 +16,7 @@ from vislam.config import validated
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.experiment import commands
+from vislam.experiment.recordings import is_on_disk
 from vislam.run.sources import is_world, split_source
 
 Scalar = bool | int | float | str
@@ -256,7 +257,7 @@ def _check_command(plan: Plan, estimator: Estimator, where: str) -> None:
         raise UsageError(f"{where}: estimator '{estimator.name}': {error}") from error
     if estimator.program:
         raise UsageError(f"{where}: estimator '{estimator.name}' is either a program or a command")
-    made_up = [s.name for s in plan.sequences if s.source.startswith(("points:", "eqvio:"))]
+    made_up = [s.name for s in plan.sequences if not is_on_disk(s.source)]
     if unfit := [name for name in made_up if name in (estimator.sequences or made_up)]:
         raise UsageError(
             f"{where}: estimator '{estimator.name}' is a command, and '{unfit[0]}' is not on disk, where it could "

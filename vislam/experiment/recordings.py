@@ -36,14 +36,15 @@ def on_disk(source: str, seed: int, cache: Path) -> Path:
     """Return the folder of a source, for who reads it by himself; see `open_cached`. Raises UsageError without one."""
     if source.startswith("sim:"):
         return _rendered(source, seed, cache)
-    if (path := folder_of(source)) is None:
+    path = recorded_path(source) if is_on_disk(source) else None
+    if path is None:
         raise UsageError(f"{source} is not on disk, where a command could read it")
     return path
 
 
-def folder_of(source: str) -> Path | None:
-    """Return where a source on disk is; None where measurements are made as they are asked for."""
-    return None if source.startswith(("sim:", "points:", "eqvio:")) else recorded_path(source)
+def is_on_disk(source: str) -> bool:
+    """Whether a source is a folder, or becomes one as a rendered world does; others are made as they are asked for."""
+    return not source.startswith(("points:", "eqvio:"))
 
 
 def _rendered(source: str, seed: int, cache: Path) -> Path:

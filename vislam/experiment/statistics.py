@@ -66,6 +66,7 @@ class Comparison:
     """A paired test between two estimates: does one have the smaller error, over sequences, conditions and seeds?"""
 
     metric: str
+    is_causal: bool  # both are, or neither is
     first: str
     second: str
     pairs: int
@@ -112,7 +113,7 @@ def compare(trials: Sequence[Trial], metric: str) -> list[Comparison]:
             values.setdefault(unit[0], {})[unit[1:]] = _median(np.sort(np.array(measured)))
             causal[unit[0]] = members[0].output in CAUSAL
     raw = [
-        _test(metric, first, second, values[first], values[second])
+        _test(metric, causal[first], first, second, values[first], values[second])
         for first, second in itertools.combinations(values, 2)
         if causal[first] == causal[second]
     ]
@@ -141,6 +142,7 @@ def _by_unit(trials: Sequence[Trial]) -> dict[tuple[str, str, Variant, int], lis
 
 def _test(
     metric: str,
+    is_causal: bool,
     first: str,
     second: str,
     a: dict[tuple[str, Variant, int], float],
@@ -159,7 +161,7 @@ def _test(
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = float(np.median(x[both] / y[both])) if both.any() else math.nan
     better = int((difference < 0.0).sum()), int((difference > 0.0).sum())
-    return Comparison(metric, first, second, len(units), *better, ratio, _effect(nonzero), p, p)
+    return Comparison(metric, is_causal, first, second, len(units), *better, ratio, _effect(nonzero), p, p)
 
 
 def _effect(differences: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

@@ -10,6 +10,7 @@ from vislam.experiment.statistics import Comparison, Group, Variant
 from vislam.experiment.trials import BY_NAME, CAUSAL
 
 LEVEL = 0.05  # of the tests, after correction
+_KINDS = ("causal", "final")
 _FEWEST_PAIRS = 6  # of a signed-rank test that can say anything at this level
 
 
@@ -34,10 +35,12 @@ def of_plan(comparisons: Sequence[Comparison]) -> list[Winner]:
     margin is the median ratio to the other that comes nearest.
     """
     found = []
-    for names in _classes(comparisons):
-        tests = [c for c in comparisons if c.first in names]
-        kind = "causal" if _is_causal(names[0]) else "final"
-        metric = comparisons[0].metric
+    for kind in _KINDS:
+        tests = [c for c in comparisons if c.is_causal == (kind == "causal")]
+        if not tests:
+            continue
+        names = list(dict.fromkeys(name for c in tests for name in (c.first, c.second)))
+        metric = tests[0].metric
         beaten = {name: [c for c in tests if _better(c) == name] for name in names}
         won = [name for name in names if len(beaten[name]) == len(names) - 1]
         if won:
@@ -59,7 +62,7 @@ def of_sequences(groups: Sequence[Group], metric: str) -> list[Winner]:
     found = []
     for sequence, variant in dict.fromkeys((group.sequence, group.variant) for group in groups):
         here = [group for group in groups if (group.sequence, group.variant) == (sequence, variant)]
-        for kind in ("causal", "final"):
+        for kind in _KINDS:
             rivals = [g for g in here if (g.output in CAUSAL) == (kind == "causal") and g.spread(metric) is not None]
             if len(rivals) > 1:
                 found.append(_on(sequence, variant, kind, metric, rivals))
@@ -83,21 +86,6 @@ def _on(sequence: str, variant: Variant, kind: str, metric: str, rivals: Sequenc
         return Winner(metric, kind, sequence, variant, "", math.nan, "", reason)
     margin = 1.0 - best.median / spreads[second].median
     return Winner(metric, kind, sequence, variant, first, margin, second, f"{best.count} trials, none overlaps")
-
-
-def _classes(comparisons: Sequence[Comparison]) -> list[list[str]]:
-    """Return the estimates that are compared with one another."""
-    found: list[list[str]] = []
-    for c in comparisons:
-        names = next((names for names in found if c.first in names or c.second in names), None)
-        if names is None:
-            found.append(names := [])
-        names += [name for name in (c.first, c.second) if name not in names]
-    return found
-
-
-def _is_causal(estimate: str) -> bool:
-    return estimate.endswith("causal")
 
 
 def _better(c: Comparison) -> str:
