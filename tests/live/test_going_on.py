@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -126,6 +127,25 @@ def test_a_run_ended_by_ctrl_c_a_kill_and_an_outage_is_resumed_each_time(first, 
         assert len(stored.frames()) == last["frames"]
     finally:
         stored.close()
+
+
+def test_frames_whose_keyframes_waited_at_the_end_are_not_lost(tmp_path: Path) -> None:
+    out, stopped_s = tmp_path / "behind", []
+
+    def watch(run: LiveRun) -> None:
+        back = run.processes()["back"].pid
+        if not stopped_s and run.notes.get("fast", {}).get("status", {}).get("map_revision", 0) >= 2:
+            stopped_s.append(time.monotonic())
+            os.kill(back, signal.SIGSTOP)
+        if stopped_s and time.monotonic() > stopped_s[0] + 8.0 and not run.is_brief:
+            interrupt(run)
+        if run.is_brief:
+            os.kill(back, signal.SIGCONT)
+
+    metrics = begin(out).execute(watch, PATIENCE_S)
+    assert len(read_tum(out / "trajectory_graph.tum").t_ns) < 0.5 * metrics["frames"]
+    assert metrics["coverage_frames"] > 0.9
+    assert metrics["verdict"]["state"] != "lost"
 
 
 @pytest.mark.parametrize("localize_only", [False, True])

@@ -355,7 +355,7 @@ class Run:
             "problems": dict(self.recording.problems),
             "loops": loops,
             "graph_revisions": self.log.revisions,
-            "coverage_frames": len(final) / max(len(self.log), 1),
+            "coverage_frames": evidence.coverage,
             "doubts": list(verdict.reasons),
             "warnings": self.warnings,
         }
@@ -365,12 +365,18 @@ class Run:
         front = front_evidence(report, self.config.imu)
         graph = None if self.slam.back is None else self.slam.back.graph
         if graph is None:
-            return whole_evidence(front, self.log, final, [], {}, 0, {})
+            return whole_evidence(front, self.log, final, self._frames_due, [], {}, 0, {})
         ids, states = graph.ids.tolist(), graph.states()
         by_keyframe = dict(zip(ids, states, strict=True)) if states else {}
         apart = len({*self._submaps.groups}) - 1
         keyframes = self.witness.evidence(ids, graph.poses(), states)
-        return whole_evidence(front, self.log, final, graph.edge_reports(), by_keyframe, apart, keyframes)
+        reports = graph.edge_reports()
+        return whole_evidence(front, self.log, final, self._frames_due, reports, by_keyframe, apart, keyframes)
+
+    @property
+    def _frames_due(self) -> int:
+        """How many frames the final trajectory ought to have poses of."""
+        return len(self.log)
 
     def _found_in_map(self) -> dict[str, Any] | None:
         """Return in which map the run began, and when it was found there."""

@@ -147,8 +147,8 @@ def _window_turn(calibration: Any, prior_deg: float) -> Moved | None:
 
 
 def whole_evidence(
-    front: Evidence, log: RunLog, final: Trajectory, reports: Sequence[EdgeReport], states: dict[int, NavState],
-    submaps_apart: int, keyframes: dict[str, Any],
+    front: Evidence, log: RunLog, final: Trajectory, frames_due: int, reports: Sequence[EdgeReport],
+    states: dict[int, NavState], submaps_apart: int, keyframes: dict[str, Any],
 ) -> Evidence:  # fmt: skip
     """Return the evidence of a whole run.
 
@@ -156,6 +156,7 @@ def whole_evidence(
         front: that of the front half.
         log: of the run.
         final: the final trajectory.
+        frames_due: how many frames it ought to have poses of.
         reports: what became of the loops that were offered to the graph.
         states: of the graph, by keyframe.
         submaps_apart: submaps that are joined with nothing.
@@ -163,7 +164,7 @@ def whole_evidence(
     """
     return replace(
         front,
-        coverage=len(final) / max(len(log), 1),
+        coverage=len(final) / max(frames_due, 1),
         submaps_apart=submaps_apart,
         sigma_m=log.worst_position_sigma_m,
         apart=_apart(log, final, states) if front.has_imu and front.is_started else None,

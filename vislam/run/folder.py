@@ -257,6 +257,10 @@ class RunLog:
     def __len__(self) -> int:
         return len(self._frames)
 
+    def frames_up_to(self, keyframe_id: int) -> int:
+        """Return how many frames hang on this keyframe or an earlier one."""
+        return sum(frame.keyframe_id <= keyframe_id for frame in self._frames)
+
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
         """Times [N] of the frames so far."""

@@ -114,6 +114,14 @@ class _LiveRun(Run):
                 self._followed.life.note(found_in_map=True)
         self._followed.life.when_over()
 
+    @property
+    def _frames_due(self) -> int:
+        """All frames; where nobody waits for the end, those whose keyframes the graph had got by then."""
+        back = self._followed.back
+        if not self._followed.life.is_brief or back is None:
+            return super()._frames_due
+        return self.log.frames_up_to(max(back.graph.ids.tolist(), default=-1))
+
     def _evidence(self, report: FrontReport, final: Trajectory) -> Evidence:
         """Return what the pipeline has to say, and how the map kept up."""
         pace = self._followed.pace
