@@ -1,0 +1,81 @@
+"""What a sensor has to say of itself: the one definition that every estimator uses."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from vislam.core.messages import Array
+from vislam.core.readings import Reading
+from vislam.sensors.body import BodyState
+
+
+class Variable(NamedTuple):
+    """One number that is estimated beside the body: a lever arm, a scale, an offset, a coordinate of a frame."""
+
+    name: str  # with its unit
+    sigma: float  # of what is known before the first reading
+    start: float = 0.0
+    walk: float = 0.0  # per square root of a second; 0: it does not change
+
+
+class Begun(NamedTuple):
+    """First values of the own variables, good enough to linearise at."""
+
+    values: Array  # [V]
+    sigmas: Array  # [V]
+
+
+class Sensor(ABC):
+    """One kind of measurement. A subclass holds settings only: the same reading gives the same answer, always.
+
+    Attributes:
+        columns: what the values of a reading are, with units; also the columns of its file.
+        touches: the parts of the body's state that show in it: "rotation", "position", "velocity", "gyro_bias",
+            "accel_bias". Numerical derivatives are taken by these only.
+        variables: own ones, estimated with the body's state by every estimator; each has its own values.
+        gate_probability: that a good reading passes the test of its innovation.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = ()
+    touches: ClassVar[tuple[str, ...]] = ("rotation", "position", "velocity")
+    variables: tuple[Variable, ...] = ()
+    gate_probability: float = 0.999
+
+    @abstractmethod
+    def residual(self, values: Array, body: BodyState, own: Array) -> Array:
+        """Return measured minus predicted [m].
+
+        Args:
+            values: [C] of the reading.
+            body: at its time.
+            own: [V] the own variables, in the order of `variables`.
+        """
+
+    @abstractmethod
+    def noise(self, values: Array) -> Array:
+        """Return the covariance [m, m] of the residual of a reading, where the device tells none."""
+
+    def jacobians(self, values: Array, body: BodyState, own: Array) -> tuple[Array, Array] | None:
+        """Return what the residual hangs on: H [m, 15] and H_own [m, V] with `residual ~ H @ error + H_own @ error`.
+
+        That is minus the derivative of the residual by the estimate. None: derived numerically.
+        """
+        return None
+
+    def begin(self, readings: Sequence[Reading], bodies: Sequence[BodyState]) -> Begun | None:
+        """Return first values of the own variables from all readings so far, and the body at each; None: too early.
+
+        Override it where the variables' start is too far from the truth for one linear step, as the heading of a frame.
+        """
+        return Begun(
+            np.array([variable.start for variable in self.variables], dtype=np.float64),
+            np.array([variable.sigma for variable in self.variables], dtype=np.float64),
+        )
+
+    def check(self, values: Array) -> str:
+        """Return why values [C] that are finite cannot be a reading; empty: they can."""
+        return ""
