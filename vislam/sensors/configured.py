@@ -1,0 +1,39 @@
+"""Sensors that a configuration file can name: made from settings, and able to draw readings of themselves."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vislam.core.errors import UsageError
+from vislam.core.messages import Array
+from vislam.sensors.body import BodyState
+from vislam.sensors.sensor import Sensor
+
+
+class Configured(Sensor):
+    """A sensor with a dataclass of settings, whose fields are the keys of its table in a configuration file.
+
+    Attributes:
+        Settings: that dataclass; ranges of its numbers stand in their types (`vislam.config.ranges`).
+        sigma_columns: of a file, one name for each number of the residual; a name may come several times. Where a file
+            has them all, its rows bring their own covariance. Empty: a file cannot.
+        slips: the columns that a simulated slip makes larger.
+    """
+
+    Settings: ClassVar[type[Any]]
+    sigma_columns: ClassVar[tuple[str, ...]] = ()
+    slips: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, settings: Any = None) -> None:
+        """Take settings; the defaults without any."""
+
+    def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
+        """Return the values [C] of a reading of a true body at true own variables [V], with the noise of `noise`."""
+        raise UsageError(f"{type(self).__name__} cannot draw readings; give it a method `draw(body, own, rng)`")
+
+
+def noisy(exact: Array, covariance: Array, rng: np.random.Generator) -> Array:
+    """Return numbers [m] with noise of a covariance [m, m] added."""
+    return exact + np.linalg.cholesky(covariance) @ rng.normal(size=len(exact))

@@ -1,0 +1,93 @@
+"""Speed and steering angle of a car."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.config.ranges import Finite, NonNegative, Positive
+from vislam.config.sensors import Vector3
+from vislam.core.messages import Array
+from vislam.sensors.body import BodyState
+from vislam.sensors.configured import noisy
+from vislam.sensors.kinds.driven import NO_TURN, Driven, Told, floor_covariance
+from vislam.sensors.mounting import Mount
+from vislam.sensors.sensor import Variable
+
+_MOST_STEERING_RAD = 1.4  # beyond it no wheel rolls
+
+
+@dataclass(frozen=True, slots=True)
+class AckermannSettings:
+    """Settings of `ackermann`."""
+
+    wheelbase_m: Positive = 2.5
+    scale_sigma: Positive = 0.03
+    steering_offset_rad: Finite = 0.0
+    steering_offset_sigma_rad: Positive = 0.02
+    axle_m: Vector3 = (0.0, 0.0, 0.0)  # middle of the axle that does not steer, in the body
+    mount_rpy_rad: Vector3 = NO_TURN  # roll, pitch, yaw of the base in the body
+    mount_sigma_rad: NonNegative = 0.0  # above 0 its yaw and pitch are estimated
+    sigma_m_s: Positive = 0.05
+    slip: NonNegative = 0.02  # share of the speed
+    sigma_steering_rad: Positive = 0.01  # of the angle of a wheel in the middle; tyres slip sideways by as much
+    sideways_m_s: Positive = 0.1
+    upward_m_s: Positive = 0.1
+    gyro_rad_s: NonNegative = 0.01
+
+
+class Ackermann(Driven):
+    """Speed of the rear axle and angle of the front wheels: `turn = speed * tan(steering + offset) / wheelbase`."""
+
+    Settings = AckermannSettings
+    columns = ("speed_m_s", "steering_rad")
+    slips = ("speed_m_s",)
+
+    def __init__(self, settings: AckermannSettings | None = None) -> None:
+        """Take settings; the defaults without any."""
+        self.settings = s = settings or AckermannSettings()
+        super().__init__(
+            Mount(s.axle_m, s.mount_rpy_rad, s.mount_sigma_rad),
+            (
+                Variable("scale", s.scale_sigma, 1.0),
+                Variable("steering_offset_rad", s.steering_offset_sigma_rad, s.steering_offset_rad),
+            ),
+        )
+
+    def told(self, values: Array, own: Array) -> Told:
+        """Return the motion of such a car."""
+        speed, tangent = own[0] * values[0], math.tan(values[1] + own[1])
+        curvature = tangent / self.settings.wheelbase_m
+        by_own = np.zeros((4, 2))
+        by_own[0, 0] = values[0]
+        by_own[3] = [values[0] * curvature, speed * (1.0 + tangent**2) / self.settings.wheelbase_m]
+        return Told(np.array([speed, 0.0, 0.0, speed * curvature]), by_own)
+
+    def noise(self, values: Array) -> Array:
+        """Return the covariance [4, 4]: that of speed and angle, carried into the motion."""
+        s = self.settings
+        tangent = math.tan(values[1] + s.steering_offset_rad)
+        J = np.zeros((4, 2))
+        J[0, 0] = 1.0
+        J[3] = [tangent / s.wheelbase_m, values[0] * (1.0 + tangent**2) / s.wheelbase_m]
+        return J @ self._told_noise(values) @ J.T + floor_covariance(s.sideways_m_s, s.upward_m_s, s.gyro_rad_s)
+
+    def check(self, values: Array) -> str:
+        """Return why an angle is none."""
+        if abs(values[1]) <= _MOST_STEERING_RAD:
+            return ""
+        return f"wheels steered by {values[1]:g} rad; {_MOST_STEERING_RAD:g} at most; degrees?"
+
+    def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
+        """Return speed and angle of a true body; of one that stands, the wheels are straight."""
+        motion = self.base_motion(body, own)
+        moves = abs(motion[0]) > 1e-6
+        steering = math.atan(motion[3] * self.settings.wheelbase_m / motion[0]) if moves else 0.0
+        exact = np.array([motion[0] / own[0], steering - own[1]])
+        return noisy(exact, self._told_noise(exact), rng)
+
+    def _told_noise(self, values: Array) -> Array:
+        s = self.settings
+        return np.diag([s.sigma_m_s**2 + (s.slip * values[0]) ** 2, s.sigma_steering_rad**2])

@@ -1,0 +1,87 @@
+"""Velocities that another odometry tells in the base's axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from vislam.config.ranges import NonNegative, Positive
+from vislam.config.sensors import Vector3
+from vislam.core.messages import Array
+from vislam.sensors.body import BodyState
+from vislam.sensors.configured import noisy
+from vislam.sensors.kinds.driven import NO_TURN, Driven, Told, floor_covariance
+from vislam.sensors.mounting import Mount
+from vislam.sensors.sensor import Variable
+
+
+@dataclass(frozen=True, slots=True)
+class TwistSettings:
+    """Settings of `twist` and `omni`."""
+
+    scale_sigma: Positive = 0.03  # of the speed
+    turn_scale_sigma: Positive = 0.03  # of the rate
+    base_m: Vector3 = (0.0, 0.0, 0.0)  # in the body, the point whose velocity is told
+    mount_rpy_rad: Vector3 = NO_TURN  # roll, pitch, yaw of the base in the body
+    mount_sigma_rad: NonNegative = 0.0  # above 0 its yaw and pitch are estimated
+    sigma_m_s: Positive = 0.03
+    slip: NonNegative = 0.02  # share of the speed
+    sigma_rad_s: Positive = 0.02
+    turn_slip: NonNegative = 0.05  # share of the rate
+    sideways_m_s: Positive = 0.05  # of a base that cannot go sideways
+    upward_m_s: Positive = 0.1
+    gyro_rad_s: NonNegative = 0.01
+
+
+class Omni(Driven):
+    """Forward and left velocity and rate of a base that goes any way: `true = scale * told`."""
+
+    Settings = TwistSettings
+    columns: ClassVar[tuple[str, ...]] = ("vx_m_s", "vy_m_s", "wz_rad_s")
+    slips = ("vx_m_s",)
+
+    def __init__(self, settings: TwistSettings | None = None) -> None:
+        """Take settings; the defaults without any."""
+        self.settings = s = settings or TwistSettings()
+        super().__init__(
+            Mount(s.base_m, s.mount_rpy_rad, s.mount_sigma_rad),
+            (Variable("scale", s.scale_sigma, 1.0), Variable("turn_scale", s.turn_scale_sigma, 1.0)),
+        )
+
+    def told(self, values: Array, own: Array) -> Told:
+        """Return the motion that is told."""
+        vx, vy, wz = self._all(values)
+        by_own = np.array([[vx, 0.0], [vy, 0.0], [0.0, 0.0], [0.0, wz]])
+        return Told(np.array([own[0] * vx, own[0] * vy, 0.0, own[1] * wz]), by_own)
+
+    def noise(self, values: Array) -> Array:
+        """Return the covariance [4, 4]."""
+        s = self.settings
+        told = self._told_noise(values)
+        sideways = told[1, 1] if len(self.columns) == 3 else s.sideways_m_s**2
+        noise = floor_covariance(0.0, s.upward_m_s, s.gyro_rad_s)
+        return noise + np.diag([told[0, 0], sideways, 0.0, told[2, 2]])
+
+    def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
+        """Return the velocities of a true body."""
+        vx, vy, _, wz = self.base_motion(body, own) / own[[0, 0, 0, 1]]
+        told = noisy(np.array([vx, vy, wz]), self._told_noise(np.array([vx, vy, wz])), rng)
+        return told if len(self.columns) == 3 else told[[0, 2]]
+
+    def _all(self, values: Array) -> tuple[float, float, float]:
+        return float(values[0]), float(values[1]) if len(values) == 3 else 0.0, float(values[-1])
+
+    def _told_noise(self, values: Array) -> Array:
+        """Return the covariance [3, 3] of forward, left and rate."""
+        s = self.settings
+        vx, vy, wz = self._all(values)
+        along = s.sigma_m_s**2 + s.slip**2 * (vx**2 + vy**2)
+        return np.diag([along, along, s.sigma_rad_s**2 + (s.turn_slip * wz) ** 2])
+
+
+class Twist(Omni):
+    """Forward velocity and rate of a base that cannot go sideways."""
+
+    columns = ("vx_m_s", "wz_rad_s")

@@ -1,0 +1,87 @@
+"""Readings drawn from a known path with a sensor's own noise, and what goes wrong with real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vislam.core.geometry import so3_exp
+from vislam.core.messages import Array
+from vislam.core.readings import Reading
+from vislam.sensors.body import BodyState
+from vislam.sensors.configured import Configured
+
+Spans = tuple[tuple[float, float], ...]  # from and to, in seconds after the first body
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What goes wrong, with a probability per reading or for a time."""
+
+    outages: Spans = ()  # nothing is said
+    stuck: Spans = ()  # the last values again and again
+    slips: Spans = ()  # wheels turn faster than they roll
+    slip_share: float = 0.5  # by so much
+    outliers: float = 0.0  # probability of a reading of a body that is elsewhere and moves otherwise
+    outlier_m: float = 10.0  # sigma per axis of how far off; 0.1 of it in m/s, and 0.1 of it in rad about each axis
+    backward: float = 0.0  # probability of a stamp before that of the last reading
+    backward_s: float = 0.5  # by so much at most
+
+
+NO_FAULTS = Faults()
+
+
+def drawn_readings(
+    name: str, sensor: Configured, bodies: Sequence[BodyState], own: Array, seed: int, faults: Faults = NO_FAULTS
+) -> list[Reading]:
+    """Return the readings of a sensor along a true path.
+
+    Args:
+        name: of the sensor.
+        sensor: that draws.
+        bodies: the truth at each reading, in time order.
+        own: true own variables: [V] for all the time, or [N, V] one row for each body.
+        seed: of noise and faults; the same one gives the same readings.
+        faults: what goes wrong. Values that `check` refuses are drawn like others.
+    """
+    return list(_drawn(name, sensor, bodies, own, np.random.default_rng(seed), faults))
+
+
+def _drawn(
+    name: str, sensor: Configured, bodies: Sequence[BodyState], own: Array, rng: np.random.Generator, faults: Faults
+) -> Iterator[Reading]:
+    owns = np.broadcast_to(own, (len(bodies), len(sensor.variables)))
+    last: Array | None = None
+    for body, true_own in zip(bodies, owns, strict=True):
+        since_s = (body.t_ns - bodies[0].t_ns) * 1e-9
+        seen = _elsewhere(body, faults.outlier_m, rng) if rng.random() < faults.outliers else body
+        values = sensor.draw(seen, np.array(true_own), rng)
+        if _within(since_s, faults.slips):
+            slipping = np.array([column in sensor.slips for column in sensor.columns])
+            values = np.where(slipping, (1.0 + faults.slip_share) * values, values)
+        t_ns = body.t_ns
+        if rng.random() < faults.backward:
+            t_ns -= int(rng.uniform(0.0, faults.backward_s) * 1e9)
+        if _within(since_s, faults.outages):
+            continue
+        if last is not None and _within(since_s, faults.stuck):
+            values = last
+        last = values
+        yield Reading(name, t_ns, values)
+
+
+def _within(since_s: float, spans: Spans) -> bool:
+    return any(begin <= since_s < end for begin, end in spans)
+
+
+def _elsewhere(body: BodyState, sigma_m: float, rng: np.random.Generator) -> BodyState:
+    """Return a body that has nothing to do with this one, as a wild reading tells of."""
+    return replace(
+        body,
+        R_world_body=body.R_world_body @ so3_exp(0.1 * sigma_m * rng.normal(size=3)),
+        position_m=body.position_m + sigma_m * rng.normal(size=3),
+        velocity_m_s=body.velocity_m_s + 0.1 * sigma_m * rng.normal(size=3),
+        rate_rad_s=body.rate_rad_s + 0.1 * sigma_m * rng.normal(size=3),
+    )
