@@ -11,14 +11,16 @@ from vislam.core.messages import Array
 from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD, about_up, wrapped
 from vislam.sensors.sensor import Begun
 
-_HEADINGS = 12  # to start from; a start within 60 deg of the truth ends there
-_FEWEST = 12  # ranges: four numbers are asked, five with a bias, and wild ones have to show
-_STEPS = 30
+_HEADINGS = 8  # to start from; a start within 45 deg of the truth ends there
+_FEWEST = 20  # ranges: four numbers are asked, five with a bias, and wild ones have to show
+_STEPS = 60
 _SAME_SIGMAS = 1.0
 _DOUBT = 16.0  # a second solution that fits worse by less (4 sigmas) is as good as the first
 _HUBER = 2.0
 _MOST_SCALE = 3.0
 _CLEAR = 3.0  # sigmas of a range by which the path is spread
+_FAR = 6.0  # sigmas from a solution at which its cost is looked at
+_RISE = 0.5  # of what it would rise by if it were quadratic
 _NEAR = 0.1  # sigma of the place, as a share of the ranges, from which on a linear step is good
 
 
@@ -48,9 +50,9 @@ class _Solution(NamedTuple):
 def ranged_frame(seen: Ranges, prior: Prior) -> Begun | None:
     """Return T_frame_world as yaw, x, y, z and the bias, with sigmas; None: too early, or not to be told apart.
 
-    Gauss-Newton with Huber's weights from twelve headings, and above and below the anchors. Refused are solutions that
+    Gauss-Newton with Huber's weights from eight headings, and above and below the anchors. Refused are solutions that
     another one, such as a mirrored one, fits nearly as well; that are not sure of heading (5 deg) or place (a tenth
-    of the ranges); and that fit worse than the ranges' noise allows.
+    of the ranges); that lie in a valley too bent for a covariance; and that fit worse than the ranges' noise allows.
     """
     centred = seen.world_m - seen.world_m.mean(axis=0)
     spread_m = math.sqrt(float((centred[:, :2] ** 2).sum(axis=1).mean())) if len(centred) else 0.0
@@ -69,7 +71,7 @@ def ranged_frame(seen: Ranges, prior: Prior) -> Begun | None:
         return None
     if any(s.cost < best.cost + _DOUBT * best.scale**2 and _differs(s, best, sigmas) for s in solutions):
         return None
-    return Begun(best.values, sigmas)
+    return Begun(best.values, sigmas) if _is_round(best, covariance, seen, prior) else None
 
 
 def _starts(seen: Ranges, prior: Prior) -> list[Array]:
@@ -84,7 +86,7 @@ def _starts(seen: Ranges, prior: Prior) -> list[Array]:
         level = float(np.mean(seen.anchors_m[:, 2] - turned[:, 2]))
         off = float(np.sqrt(np.maximum(seen.ranges_m**2 - ((away + t)[:, :2] ** 2).sum(axis=1), 0.0)).mean())
         known_up = prior.sigmas[3] < 0.5 * float(np.median(seen.ranges_m))
-        for up in [prior.starts[3]] if known_up else [t[2], level + off + 0.1, level - off - 0.1]:
+        for up in [prior.starts[3]] if known_up else [level + off + 0.1, level - off - 0.1]:
             starts.append(np.array([yaw, t[0], t[1], up, prior.starts[4]]))
     return starts
 
@@ -136,6 +138,18 @@ def _differs(one: _Solution, best: _Solution, sigmas: Array) -> bool:
     away = np.abs(one.values - best.values)
     away[0] = abs(wrapped(float(away[0])))
     return bool((away > _SAME_SIGMAS * sigmas + 1e-3).any())
+
+
+def _is_round(best: _Solution, covariance: Array, seen: Ranges, prior: Prior) -> bool:
+    """Return whether the cost rises around a solution as its covariance says; in a valley that bends it does not."""
+    lengths, directions = np.linalg.eigh(covariance)
+    for step in (_FAR * np.sqrt(np.maximum(lengths, 0.0)) * directions).T:
+        if not step.any():
+            continue  # a number that is known
+        costs = [_system(best.values + sign * step, seen, prior)[2] for sign in (1.0, -1.0)]
+        if min(costs) - best.cost < _RISE * (_FAR * best.scale) ** 2:
+            return False
+    return True
 
 
 def _is_near(values: Array, covariance: Array, seen: Ranges) -> bool:
