@@ -22,6 +22,7 @@ from vislam.core.messages import (
     RetrievedKeyframe,
     Tracking,
 )
+from vislam.core.readings import OwnStart
 
 
 def at_pose(state: NavState, T_world_body: Array) -> NavState:
@@ -132,6 +133,7 @@ class GraphNews:
     loops: tuple[LoopState, ...] = ()  # those that changed
     ties: tuple[Tied, ...] = ()  # new ones
     vo_scale: float = 1.0
+    own: tuple[OwnStart, ...] = ()  # the own variables of sensors as they are now
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +158,7 @@ class GraphMemory:
     ties: list[Tied]
     vo_scale: float
     revision: int
+    own: tuple[OwnStart, ...] = ()  # the last estimate of the own variables of sensors
 
 
 @dataclass(frozen=True, slots=True, eq=False)

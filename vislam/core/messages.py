@@ -13,10 +13,13 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from vislam.core.readings import OwnStart, PlacedReading
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -152,6 +155,8 @@ class KeyframePacket:
     at_rest: bool = False  # zero velocity held over the span, decided by IMU and image together
     time_offset_s: float = 0.0  # what has been added to the camera's own stamp to get the IMU's time
     begins_submap: bool = False  # nothing measured the motion since the previous keyframe: a new submap
+    readings: tuple[PlacedReading, ...] = ()  # of other sensors since the previous keyframe
+    own_starts: tuple[OwnStart, ...] = ()  # of sensors that have begun since then
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,6 +41,7 @@ class Step:
     variance_m2: float
     note: str
     named: dict[Label, gtsam.NonlinearFactor] = field(default_factory=dict)  # those that may be replaced later
+    own: dict[int, float] = field(default_factory=dict)  # guesses of sensors' own variables that are new, by key
 
 
 class Builder:

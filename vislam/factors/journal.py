@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.memory import WindowRecord
 from vislam.core.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
+from vislam.core.readings import OwnStart, PlacedReading
 from vislam.factors.keys import nearest_rigid
 from vislam.factors.noise_models import checked_covariance, checked_covariances
+from vislam.factors.placed import checked_readings, checked_starts
 
 _RIGID = 1e-4  # how far R^T R may be from identity
 _USELESS_RAD = 0.5  # odometry that knows rotation or translation no better than this is as good as lost
@@ -46,6 +48,8 @@ class KeyframeRecord:
     imu: ImuSpan | None
     rest_from: int | None  # the keyframe since which the body has not moved; None: it may have
     begins_submap: bool = False  # nothing was measured; then the motion above is a guess, with sigmas that say so
+    readings: tuple[PlacedReading, ...] = ()  # of other sensors; none where a submap begins
+    own_starts: tuple[OwnStart, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,10 +119,11 @@ def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> Keyfram
     what = f"keyframe {keyframe.id} at {keyframe.t_ns} ns"
     if keyframe.id != expected:
         raise DataError(f"{what}: ids must be dense, expected {expected}")
+    starts = checked_starts(packet.own_starts, what)
     if previous is None:
-        return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, None)
+        return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, None, own_starts=starts)
     if packet.begins_submap:  # of another recording perhaps, whose clock began anew
-        return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, None, True)
+        return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, None, True, (), starts)
     if keyframe.t_ns <= previous.t_ns:
         raise DataError(f"{what}: time must increase, the previous keyframe is at {previous.t_ns} ns")
     T: Array | None = None
@@ -132,7 +137,10 @@ def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> Keyfram
     rest_from = None
     if packet.at_rest:
         rest_from = previous.id if previous.rest_from is None else previous.rest_from
-    return KeyframeRecord(keyframe.id, keyframe.t_ns, T, covariance, vo.has_scale, degraded, imu, rest_from)
+    return KeyframeRecord(
+        keyframe.id, keyframe.t_ns, T, covariance, vo.has_scale, degraded, imu, rest_from,
+        readings=checked_readings(packet.readings, what), own_starts=starts,
+    )  # fmt: skip
 
 
 def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:

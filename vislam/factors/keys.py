@@ -8,7 +8,8 @@ import numpy as np
 from vislam.core.messages import Array
 
 _INDEX_BITS = 56
-_POSE, _VELOCITY, _BIAS = (ord(c) << _INDEX_BITS for c in "xvb")
+_POSE, _VELOCITY, _BIAS, _OWN, _WALKING = (ord(c) << _INDEX_BITS for c in "xvbow")
+_VARIABLE_BITS = 40  # above the id of a keyframe
 
 
 def X(i: int) -> int:
@@ -24,6 +25,16 @@ def V(i: int) -> int:
 def B(i: int) -> int:
     """Return the key of keyframe i's IMU biases."""
     return _BIAS | i
+
+
+def own_key(n: int) -> int:
+    """Return the key of variable n of all that sensors have of their own, one that does not change."""
+    return _OWN | n
+
+
+def walking_key(n: int, i: int) -> int:
+    """Return the key of variable n of all that sensors have of their own, one that walks, at keyframe i."""
+    return _WALKING | n << _VARIABLE_BITS | i
 
 
 def bias_of(gyro_rad_s: Array, accel_m_s2: Array) -> gtsam.imuBias.ConstantBias:

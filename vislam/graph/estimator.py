@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from vislam.config import GraphConfig
 from vislam.core.geometry import invert, se3_adjoint
 from vislam.core.messages import Array
+from vislam.core.readings import OwnStart
 from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
 from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
+from vislam.factors.readings import Own, Readings
 from vislam.factors.solvers import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
 from vislam.graph.segments import Link, Segment, Stand, summarised
 
@@ -50,10 +52,11 @@ class Estimator(Generic[L]):
     estimate read all.
     """
 
-    def __init__(self, config: GraphConfig, odometry: Odometry) -> None:
-        """Start empty."""
+    def __init__(self, config: GraphConfig, odometry: Odometry, readings: Readings | None = None) -> None:
+        """Start empty; `readings` are those of other sensors, a record for each keyframe of the odometry."""
         self._config = config
         self._odometry = odometry
+        self._readings = readings
         self._factorization: Factorization = "CHOLESKY"
         self._solver: Solver = IncrementalSolver(config, self._factorization)
         self._slots: dict[Label, int] = {}
@@ -110,6 +113,33 @@ class Estimator(Generic[L]):
         """Return the estimated state of keyframe k."""
         return read_guess(self._values, k, self.has_imu)
 
+    def own(self, name: str) -> tuple[Array, Array] | None:
+        """Return a sensor's own variables [V] and their sigmas [V], NaN where gtsam cannot give them.
+
+        None while the sensor has none in the graph.
+        """
+        places = None if self._readings is None else self._readings.own(name)
+        if places is None:
+            return None
+        joint = self.joint_covariance([place.key for place in places])
+        units = np.array([place.unit for place in places])
+        sigmas = np.full(len(places), np.nan) if joint is None else np.sqrt(np.diag(joint))
+        return self._own_values(places), sigmas * units
+
+    def own_starts(self) -> tuple[OwnStart, ...]:
+        """Return the own variables of sensors as they are now, each with the unit of its key for a sigma."""
+        if self._readings is None:
+            return ()
+        found = ((name, self._readings.own(name)) for name in self._readings.names)
+        return tuple(
+            OwnStart(name, self._own_values(places), np.array([place.unit for place in places]))
+            for name, places in found
+            if places is not None
+        )
+
+    def _own_values(self, places: list[Own]) -> Array:
+        return np.array([self._values.atDouble(place.key) * place.unit for place in places])
+
     def take_read(self) -> NDArray[np.int64]:
         """Return the ids of the poses that were read back since the last call, ascending."""
         ids = np.unique(np.concatenate(self._read)) if self._read else np.zeros(0, np.int64)
@@ -150,7 +180,7 @@ class Estimator(Generic[L]):
         """Take the first keyframe; return what went wrong, normally nothing."""
         factors, guess = self._odometry.start()
         self._reach_m[0] = np.inf
-        return self._extend(factors, {}, guess)
+        return self._extend(factors, {}, guess, {})
 
     def restore(self, guesses: list[Guess], loops: list[L], spare: list[L], vo_scale: float) -> tuple[list[Step], str]:
         """Start with all keyframes of the odometry at their last estimates, and with loops that were accepted.
@@ -165,6 +195,8 @@ class Estimator(Generic[L]):
         values = gtsam.Values()
         for k, guess in enumerate(guesses):
             insert_guess(values, k, guess, self.has_imu)
+        if self._readings is not None:
+            self._readings.complete(values)
         steps = [self._step(k, values) for k in range(1, len(guesses))]
         try:
             self._restart(values, [], self._new_solver(), from_batch=False, steps=steps)
@@ -181,7 +213,7 @@ class Estimator(Generic[L]):
             self._reach_m = np.concatenate([self._reach_m, np.zeros_like(self._reach_m)])
         self._reach_m[k] = self._odometry.reach_m(k)
         named = self._odometry.news(self.vo_scale) | step.named
-        return step, self._extend(step.factors, named, step.guess)
+        return step, self._extend(step.factors, named, step.guess, step.own)
 
     def distrust_odometry(self, factor: float) -> None:
         """Multiply the sigma of visual odometry; past factors follow with the next `close` in batch."""
@@ -247,8 +279,13 @@ class Estimator(Generic[L]):
         return ""
 
     def can_freeze(self, segment: Segment) -> bool:
-        """Return whether loops and odometry alone tie these keyframes, which are of one submap and free to move."""
+        """Return whether loops and odometry alone tie these keyframes, which are of one submap and free to move.
+
+        A segment with readings of other sensors is never summed up: what they say hangs on more than relative poses.
+        """
         inside = segment.keyframes
+        if self._readings is not None and any(map(self._readings.has, range(segment.first, segment.end + 1))):
+            return False
         if self._solver.reads_all or any(k in self._held for k in inside):
             return False
         return bool(np.all(np.isfinite(self._reach_m[segment.first : segment.end])))
@@ -359,14 +396,21 @@ class Estimator(Generic[L]):
     def _step(self, k: int, values: gtsam.Values) -> Step:
         before = read_guess(values, k - 1, self.has_imu)
         earlier = values.atPose3(X(k - 2)).matrix() if k > 1 else None
-        return self._odometry.step(k, before, earlier, self.vo_scale)
+        step = self._odometry.step(k, before, earlier, self.vo_scale)
+        return step if self._readings is None else self._readings.joined(step, k, before.T_map_body, values)
 
     def _extend(
-        self, factors: list[gtsam.NonlinearFactor], named: dict[Label, gtsam.NonlinearFactor], guess: Guess
+        self,
+        factors: list[gtsam.NonlinearFactor],
+        named: dict[Label, gtsam.NonlinearFactor],
+        guess: Guess,
+        own: dict[int, float],
     ) -> str:
-        """Add a keyframe with its factors; those whose name is known replace the older ones."""
+        """Add a keyframe with its factors and new own variables; factors whose name is known replace the older ones."""
         new = gtsam.Values()
         insert_guess(new, self._count, guess, self.has_imu)
+        for key, value in own.items():
+            new.insert(key, value)
         self._count += 1
         replaced = [self._slots[label] for label in named if label in self._slots]
         try:
@@ -400,6 +444,8 @@ class Estimator(Generic[L]):
         keys = [X(k) for k in solved]
         if self.has_imu:
             keys += [key for k in solved for key in (V(k), B(k))]
+        if self._readings is not None:
+            keys += self._readings.keys_of(solved)
         self._adopt(self._solver.estimate(keys), ids, self._stands)
 
     def _adopt(self, values: gtsam.Values, ids: NDArray[np.int64], stands: Mapping[int, Stand]) -> None:
@@ -428,11 +474,13 @@ class Estimator(Generic[L]):
         self._read.append(ids)
 
     def _completed(self, values: gtsam.Values) -> gtsam.Values:
-        """Return values with the poses of the keyframes, too, that left the solver."""
+        """Return values with the poses of the keyframes, too, that left the solver, and own variables that it lacks."""
         out = gtsam.Values(values)
         for k in self._stands:
             if not out.exists(X(k)):
                 out.insert(X(k), gtsam.Pose3(self._buffer[k]))
+        if self._readings is not None:
+            self._readings.complete(out)
         return out
 
     def _begin_anew(self, solver: Solver, labels: list[Label | None], slots: list[int]) -> None:

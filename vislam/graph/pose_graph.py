@@ -24,6 +24,7 @@ from vislam.factors.journal import (
     start_record,
 )
 from vislam.factors.loop import LoopModel
+from vislam.factors.readings import Readings
 from vislam.graph.belief import LoopSet
 from vislam.graph.estimator import Estimator
 from vislam.graph.joining import Placement, Waiting, relinked, weak_link
@@ -31,6 +32,7 @@ from vislam.graph.restore import restored_journal, sort_loops
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.graph.travel import Travel
 from vislam.imu import ImuNoise
+from vislam.sensors import Suite
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new submap: no loop may be tested against it
@@ -47,9 +49,18 @@ class PoseGraph:
     """
 
     def __init__(
-        self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, rig: Rig, window: WindowConfig
+        self,
+        config: GraphConfig,
+        noise: ImuNoise | None,
+        gravity_m_s2: float,
+        rig: Rig,
+        window: WindowConfig,
+        suite: Suite | None = None,
     ) -> None:
-        """Set up for a rig; without `noise` there is no IMU and only poses are estimated."""
+        """Set up for a rig; without `noise` there is no IMU and only poses are estimated.
+
+        `suite` has the sensors whose readings become factors; of any other, they are left out and counted.
+        """
         self._config = config
         self._noise = noise
         self._lever_m = np.array(rig.T_body_cams[0][:3, 3], dtype=np.float64)
@@ -60,7 +71,10 @@ class PoseGraph:
             self._source = WindowSource(config, SlidingWindow(window, rig, noise, gravity_m_s2))
         else:
             self._source = MotionSource(config, noise, gravity_m_s2, self._lever_m)
-        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry)
+        self._readings = Readings(suite or Suite())
+        self._dropped = 0  # readings of keyframes before which no keyframe tells the way
+        sensed = self._readings if suite is not None and len(suite) else None
+        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, sensed)
         self._start: StartRecord | None = None
         self._start_t_ns: int | None = None
         self._journal: list[Record] = []
@@ -128,6 +142,9 @@ class PoseGraph:
         has_gravity = self._noise is not None
         self._keyframes, self._journal = restored_journal(memory, self._config, has_gravity, self._start)
         guesses = self._source.restore(self._keyframes, memory)
+        self._readings.recall(memory.own)
+        for packet, record in zip(memory.packets, self._keyframes, strict=True):
+            self._take_readings(packet, record)
         for k in [record.id for record in self._keyframes if record.begins_submap]:
             self._submaps = self._submaps.begun(k)
             self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
@@ -162,7 +179,9 @@ class PoseGraph:
         """Return what `restore` will need of the last keyframe, beside what was measured and the poses."""
         loops = self._loops.take_states(self._waiting.edges)
         states = self._source.take_states(self._newest)
-        return GraphNews(self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale)
+        return GraphNews(
+            self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, self._estimator.own_starts()
+        )
 
     def add(
         self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None
@@ -186,6 +205,7 @@ class PoseGraph:
         said = self._source.add(packet, record, T_odom_body)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
+        self._take_readings(packet, record)
         self._said = said[-1] if said else None
         self._journal += [self._start, record, *said] if previous is None else [record, *said]
         if previous is None:
@@ -229,6 +249,18 @@ class PoseGraph:
         """
         return [self._stretched(self._state(k)) for k in range(len(self._keyframes))]
 
+    def own(self, name: str) -> tuple[Array, Array] | None:
+        """Return a sensor's own variables [V], in their order, and their sigmas [V], NaN where gtsam gives none.
+
+        Those that walk are as with the newest reading. None while none of them has a factor.
+        """
+        return self._estimator.own(name)
+
+    @property
+    def reading_counts(self) -> dict[str, int]:
+        """Return what became of readings, as `Readings.counts`, and how many were dropped where a submap begins."""
+        return {**self._readings.counts, "dropped": self._dropped}
+
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
         return self._loops.relative_covariance(i, j)
@@ -243,6 +275,10 @@ class PoseGraph:
                 f"keyframe 0 at {record.t_ns} ns: the initial state is of {self._start_t_ns} ns; "
                 "give the state at the time of keyframe 0"
             )
+
+    def _take_readings(self, packet: KeyframePacket, record: KeyframeRecord) -> None:
+        self._dropped += len(packet.readings) - len(record.readings)
+        self._readings.append(record)
 
     def _motion(self, k: int) -> Array:
         """Return the motion [4, 4] to keyframe k from the one before."""

@@ -32,6 +32,7 @@ from vislam.mapping.stage import MapStage
 from vislam.pipeline.front import Front
 from vislam.pipeline.settings import without_gravity
 from vislam.pipeline.steps import FrontStep, KeyframeStep
+from vislam.sensors import Suite
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
 MAX_SEEN = 120  # frames kept between two keyframes: 2 s at 60 Hz, 40 MB
@@ -48,14 +49,17 @@ class Back:
         clock: StageClock,
         first_state: NavState | None,
         T_map_body: Array,
+        suite: Suite | None = None,
     ) -> None:
         """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity.
 
-        `config` is as `settings.derived` gives it.
+        `config` is as `settings.derived` gives it; `suite` has the sensors whose readings the graph takes.
         """
         self._has_gravity = has_gravity = first_state is not None
         graph = config.graph if has_gravity else without_gravity(config.graph, rig)
-        self.graph = PoseGraph(graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, config.window)
+        self.graph = PoseGraph(
+            graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, config.window, suite
+        )
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self._false = None
@@ -155,10 +159,10 @@ class Back:
 class KeyframeIntake:
     """Hands keyframes to the stages of a run, which begin with the first one or with an earlier run."""
 
-    def __init__(self, rig: Rig, front: Front, clock: StageClock) -> None:
-        """Wait for the first keyframe of `front`."""
+    def __init__(self, rig: Rig, front: Front, clock: StageClock, suite: Suite | None = None) -> None:
+        """Wait for the first keyframe of `front`; `suite` has the sensors whose readings come with keyframes."""
         self._front = front
-        self._make = partial(Back, front.config, rig)
+        self._make = partial(Back, front.config, rig, suite=suite)
         self._clock = clock
         self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # since the newest keyframe
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed

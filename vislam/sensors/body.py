@@ -105,6 +105,15 @@ def by_keyframes(T_earlier: Array, T_later: Array, station: Station) -> tuple[Ar
     return earlier, later
 
 
+def rate_by_keyframes(T_earlier: Array, T_later: Array, station: Station) -> tuple[Array, Array]:
+    """Return how the rate [3] of `between_keyframes` hangs on both poses: [3, 6] each, as `by_keyframes`."""
+    missed, T_s = _missed(T_earlier, T_later, station), station.length_s
+    earlier, later = np.zeros((3, 6)), np.zeros((3, 6))
+    earlier[:, :3] = -so3_left_jacobian_inverse(missed) @ station.dR_all.T / T_s
+    later[:, :3] = so3_right_jacobian_inverse(missed) / T_s
+    return earlier, later
+
+
 def path_variances(station: Station) -> tuple[float, float]:
     """Return the variances per axis of position (m^2) and velocity (m^2/s^2) that an error of the force leaves."""
     s, T_s, sigma = station.since_s, station.length_s, station.accel_sigma_m_s2

@@ -12,7 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from vislam.core.errors import DataError
-from vislam.run.session.schema import APPLICATION_ID, SCHEMA, SCHEMA_VERSION, readable
+from vislam.run.session.schema import (
+    APPLICATION_ID,
+    OLDEST_VERSION,
+    READINGS_SCHEMA,
+    SCHEMA,
+    SCHEMA_VERSION,
+    readable,
+)
 
 # tables: which columns each of the checksums at the end of a row covers; what is changed alone has its own
 _COVERED: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -31,6 +38,10 @@ _COVERED: dict[str, tuple[tuple[int, ...], ...]] = {
     "vocabulary": (tuple(range(4)),),
     "newest": ((0, 1),),
 }
+_COVERED_READINGS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "readings": (tuple(range(7)),),
+    "own_starts": (tuple(range(5)),),
+}
 _EXACT = 2**53  # whole numbers below are the same to SQLite, whether they were given as int or as float
 
 
@@ -44,14 +55,14 @@ def checksum(values: Iterable[Any]) -> int:
 
 def checksums(table: str, row: tuple[Any, ...]) -> tuple[int, ...]:
     """Return the checksums that end a row [columns, without checksums] of a table."""
-    return tuple(checksum(row[i] for i in columns) for columns in _COVERED[table])
+    return tuple(checksum(row[i] for i in columns) for columns in (_COVERED | _COVERED_READINGS)[table])
 
 
 def check_sound(db: sqlite3.Connection, path: Path) -> None:
     """Raise DataError unless a file is a session of the format read here, with our tables alone, whole in itself."""
-    check_version(db, path)
+    version = check_version(db, path)
     with readable(path):
-        if _objects(db) != _known_objects():
+        if _objects(db) != _known_objects(version):
             raise DataError(
                 f"session {path} holds other tables, triggers or views than a run makes; run the recording again"
             )
@@ -63,7 +74,8 @@ def check_sound(db: sqlite3.Connection, path: Path) -> None:
 def check_records(db: sqlite3.Connection, path: Path) -> None:
     """Raise DataError unless every record is what was written."""
     with readable(path):
-        for table, covered in _COVERED.items():
+        tables = _COVERED | (_COVERED_READINGS if has_readings(db) else {})
+        for table, covered in tables.items():
             for number, row in enumerate(db.execute(f"SELECT * FROM {table}")):
                 count = len(row) - len(covered)
                 if checksums(table, row[:count]) != row[count:]:
@@ -73,16 +85,24 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
                     )
 
 
-def check_version(db: sqlite3.Connection, path: Path) -> None:
-    """Raise DataError unless the file is a session of the format that is read here."""
+def has_readings(db: sqlite3.Connection) -> bool:
+    """Return whether a session has the tables of readings of other sensors: not one of an older format."""
+    return bool(db.execute("PRAGMA user_version").fetchone()[0] > OLDEST_VERSION)
+
+
+def check_version(db: sqlite3.Connection, path: Path) -> int:
+    """Return the format of a session; raises DataError unless it is one that is read here."""
     with readable(path):
         application = db.execute("PRAGMA application_id").fetchone()[0]
         version = db.execute("PRAGMA user_version").fetchone()[0]
     if application != APPLICATION_ID:
         raise DataError(f"{path} is not a vislam session")
-    if version != SCHEMA_VERSION:
+    if not OLDEST_VERSION <= version <= SCHEMA_VERSION:
         step = "update vislam" if version > SCHEMA_VERSION else "run the recording again"
-        raise DataError(f"{path} has session format {version}, this vislam reads {SCHEMA_VERSION}; {step}")
+        raise DataError(
+            f"{path} has session format {version}, this vislam reads {OLDEST_VERSION} and {SCHEMA_VERSION}; {step}"
+        )
+    return int(version)
 
 
 def _bytes(value: Any) -> bytes:
@@ -103,10 +123,11 @@ def _objects(db: sqlite3.Connection) -> set[tuple[Any, ...]]:
 
 
 @cache
-def _known_objects() -> set[tuple[Any, ...]]:
+def _known_objects(version: int) -> set[tuple[Any, ...]]:
     db = sqlite3.connect(":memory:")
     try:
-        for statement in SCHEMA.split(";"):
+        whole = SCHEMA if version == OLDEST_VERSION else SCHEMA + READINGS_SCHEMA
+        for statement in whole.split(";"):
             db.execute(statement)
         return _objects(db)
     finally:

@@ -6,7 +6,7 @@ import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,9 @@ from vislam.core.messages import (
 )
 from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
 from vislam.imu import ImuNoise
-from vislam.run.session.checks import check_records, check_sound
+from vislam.run.session.checks import check_records, check_sound, has_readings
 from vislam.run.session.packets import LIGHT_COLUMNS, packet_of
+from vislam.run.session.readings import readings_of, starts_of
 from vislam.run.session.schema import (
     DESCRIPTOR_BYTES,
     from_bytes,
@@ -253,7 +254,18 @@ class Session:
                 out.append(packet_of(t_ns, tuple(row)))
             if len(out) != count:
                 raise ValueError(f"{count} keyframes but {len(out)} packets")
-        return out
+            return self._with_readings(out)
+
+    def _with_readings(self, packets: list[KeyframePacket]) -> list[KeyframePacket]:
+        """Return the packets with what other sensors said; a session of an older format knows nothing of it."""
+        if not has_readings(self._db):
+            return packets
+        readings, starts = readings_of(self._db), starts_of(self._db)
+        for k in readings.keys() | starts.keys():
+            if k not in range(len(packets)):
+                raise ValueError(f"readings with keyframe {k}, which is not there")
+            packets[k] = replace(packets[k], readings=readings.get(k, ()), own_starts=starts.get(k, ()))
+        return packets
 
     def factor_log(self) -> FactorLog:
         """Return all that was measured up to the last committed keyframe."""

@@ -16,7 +16,8 @@ from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": tells our files from other SQLite files
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
+OLDEST_VERSION = 8  # read as well; it knows no readings of other sensors
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -85,6 +86,16 @@ CREATE TABLE vocabulary (
     trainings INTEGER NOT NULL, crc INTEGER NOT NULL
 );
 CREATE TABLE newest (one INTEGER PRIMARY KEY CHECK (one = 1), value TEXT NOT NULL, crc INTEGER NOT NULL);
+"""
+READINGS_SCHEMA = """
+CREATE TABLE readings (
+    id INTEGER NOT NULL, number INTEGER NOT NULL, sensor TEXT NOT NULL, t_ns INTEGER NOT NULL,
+    numbers BLOB NOT NULL, covariance BLOB, station BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (id, number)
+);
+CREATE TABLE own_starts (
+    id INTEGER NOT NULL, number INTEGER NOT NULL, sensor TEXT NOT NULL, numbers BLOB NOT NULL, sigmas BLOB NOT NULL,
+    crc INTEGER NOT NULL, PRIMARY KEY (id, number)
+);
 """
 
 

@@ -27,11 +27,13 @@ from vislam.core.memory import (
 from vislam.core.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
 from vislam.factors.factor_log import rig_data, state_data
 from vislam.imu import ImuNoise
-from vislam.run.session.checks import check_records, check_sound, checksum, checksums
+from vislam.run.session.checks import check_records, check_sound, checksum, checksums, has_readings
 from vislam.run.session.packets import packet_row
 from vislam.run.session.reader import Session
+from vislam.run.session.readings import own_data, reading_rows, start_rows
 from vislam.run.session.schema import (
     APPLICATION_ID,
+    READINGS_SCHEMA,
     SCHEMA,
     SCHEMA_VERSION,
     maybe_bytes,
@@ -55,7 +57,7 @@ class SessionWriter:
         sensors = {"rig": rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
         with storage(path), self._transaction():  # half of the tables would be a file that nobody can open again
             self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
-            for statement in SCHEMA.split(";"):
+            for statement in (SCHEMA + READINGS_SCHEMA).split(";"):
                 self._db.execute(statement)
             self._tell({**info, **sensors, "gravity_m_s2": gravity_m_s2, "finished": False})
             self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
@@ -79,6 +81,7 @@ class SessionWriter:
         writer._open(path)
         with storage(path), writer._transaction():
             db = writer._db
+            writer._bring_up()
             newest_id, newest_t_ns = db.execute("SELECT id, t_ns FROM keyframes ORDER BY id DESC").fetchone() or (-1, 0)
             db.execute("DELETE FROM frames WHERE t_ns > ? OR keyframe_id > ?", (newest_t_ns, newest_id))
             base = writer.base()
@@ -132,10 +135,17 @@ class SessionWriter:
                 newest = json.loads(writer._db.execute("SELECT value FROM newest").fetchone()[0])
             with storage(path), writer._transaction():
                 writer._move(update, news)
-                changed = {**newest, "revision": update.revision, "vo_scale": news.vo_scale}
+                changed = {**newest, "revision": update.revision, "vo_scale": news.vo_scale, **_own_news(news)}
                 writer._replace("newest", [(1, json.dumps(changed))])
         finally:
             writer._db.close()
+
+    def _bring_up(self) -> None:
+        """Give a session of an older format the tables that it lacks."""
+        if not has_readings(self._db):
+            for statement in READINGS_SCHEMA.split(";"):
+                self._db.execute(statement)
+            self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
     def _open(self, path: Path) -> None:
         self.path = path
@@ -179,6 +189,8 @@ class SessionWriter:
                 self._tell({"start": _start_data(entry.start)})
             self._insert("keyframes", [row])
             self._insert("packets", [packet_row(packet, update.newest)])
+            self._insert("readings", reading_rows(packet))
+            self._insert("own_starts", start_rows(packet))
             if entry.filter_state is not None:
                 self._put_states("filter", [(keyframe.id, entry.filter_state)])
             scans = entry.scans.items()
@@ -195,7 +207,7 @@ class SessionWriter:
             moved = [(*shift, checksum((edge_id, *shift)), edge_id) for edge_id, shift in entry.shifts.items()]
             self._db.executemany("UPDATE edges SET moved_rms_m = ?, moved_max_m = ?, crc_moved = ? WHERE id = ?", moved)
             newest = {"revision": update.revision, "vo_scale": news.vo_scale, "front": _front_data(entry.front)}
-            self._replace("newest", [(1, json.dumps(newest))])
+            self._replace("newest", [(1, json.dumps({**newest, **_own_news(news)}))])
 
     def move(self, update: GraphUpdate, news: GraphNews) -> None:
         """Commit what an update without a new keyframe changed."""
@@ -285,6 +297,11 @@ def _front_data(front: FrontNews | None) -> dict[str, Any]:
     front = front or FrontNews()
     arrays = {"filter_camera": front.filter_camera, "tilt": front.tilt}
     return {**asdict(front), **{name: None if array is None else array.tolist() for name, array in arrays.items()}}
+
+
+def _own_news(news: GraphNews) -> dict[str, Any]:
+    """Return the own variables of sensors as an entry of `newest`; nothing where there are none."""
+    return {"own": own_data(news.own)} if news.own else {}
 
 
 def _state_row(state: LoopState) -> tuple[Any, ...]:
