@@ -10,6 +10,7 @@ from vislam.ekf.loose.filter import Ekf
 from vislam.ekf.tight import CameraCalibration, MsckfEkf
 from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise
+from vislam.sensors import Suite
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
@@ -17,8 +18,13 @@ if TYPE_CHECKING:  # the fast path must not load OpenCV
 __all__ = ["CameraCalibration", "Correction", "Ekf", "Hint", "MsckfEkf", "UpdateResult", "make_ekf"]
 
 
-def make_ekf(config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> Ekf | MsckfEkf:
-    """Return the filter that `config.coupling` asks for: loose takes motions of visual odometry, tight takes tracks."""
+def make_ekf(
+    config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None = None
+) -> Ekf | MsckfEkf:
+    """Return the filter that `config.coupling` asks for: loose takes motions of visual odometry, tight takes tracks.
+
+    Both take readings of the sensors of `suite`, if there are any.
+    """
     if config.coupling == "tight":
-        return MsckfEkf(config, noise, gravity_m_s2, rig)
-    return Ekf(config, noise, gravity_m_s2, rig.T_body_cams[0])
+        return MsckfEkf(config, noise, gravity_m_s2, rig, suite)
+    return Ekf(config, noise, gravity_m_s2, rig.T_body_cams[0], suite)

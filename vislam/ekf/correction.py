@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vislam.core.messages import Observations, Tracking, VoMeasurement, no_observations
+from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.loose.filter import Ekf
 from vislam.imu import SeenNoise
 
@@ -83,3 +84,16 @@ class Hint:
     def apply(self, ekf: Ekf) -> UpdateResult:
         """Give it to a filter."""
         return ekf.update_zero_velocity(self.t_ns) if self.at_rest else ekf.update_nonholonomic(self.t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ToldReading:
+    """What a sensor other than IMU and camera told, or first values of its own variables, and when that was."""
+
+    t_ns: int
+    what: Reading | OwnStart
+
+    def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
+        """Give it to a filter."""
+        what = self.what
+        return ekf.update_sensor(what) if isinstance(what, Reading) else ekf.begin_sensor(self.t_ns, what)

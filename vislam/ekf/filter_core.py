@@ -10,6 +10,7 @@ from vislam.config import EkfConfig
 from vislam.core.geometry import quaternion_wxyz
 from vislam.core.messages import Array, NavState, NoiseScale
 from vislam.ekf.history import Event, M, Outcome
+from vislam.ekf.sensor_rows import OwnVariables, Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.imu import ImuNoise
 
@@ -29,6 +30,11 @@ class CoreState(Protocol):
         """When vision last corrected it; the start, before."""
         ...
 
+    @property
+    def own(self) -> OwnVariables:
+        """What it knows of the sensors' own variables; views."""
+        ...
+
     def copy(self) -> Self:
         """Return a copy that further steps leave alone."""
         ...
@@ -44,6 +50,11 @@ class Core(Protocol[State_contra, M]):
     @property
     def counters(self) -> tuple[str, ...]:
         """Every counter that a measurement can end in."""
+        ...
+
+    @property
+    def sensing(self) -> Sensing:
+        """What it does with readings of sensors other than IMU and camera."""
         ...
 
     def time_of(self, event: Event[M], state: State_contra) -> int:

@@ -11,10 +11,13 @@ import numpy as np
 from vislam.config import EkfConfig
 from vislam.core.geometry import invert
 from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, NavState, Observations, VoMeasurement
+from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import Ekf, make_ekf
-from vislam.ekf.correction import Correction
+from vislam.ekf.correction import Correction, ToldReading
 from vislam.ekf.tight import CameraCalibration, MsckfEkf
+from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise, SeenNoise
+from vislam.sensors import Suite
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
@@ -30,13 +33,16 @@ class Filtering:
         coupling: "loose" takes motions of visual odometry, "tight" takes tracks.
     """
 
-    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
-        """Make the filter that `config.coupling` asks for."""
+    def __init__(
+        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None = None
+    ) -> None:
+        """Make the filter that `config.coupling` asks for; `suite`: sensors other than IMU and camera."""
         self.coupling = config.coupling
         self._config = config
-        self.ekf: Ekf | MsckfEkf = make_ekf(config, gravity_m_s2=gravity_m_s2, rig=rig, noise=noise)
+        self.ekf: Ekf | MsckfEkf = make_ekf(config, gravity_m_s2=gravity_m_s2, rig=rig, noise=noise, suite=suite)
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._told: list[Correction] = []  # since somebody asked
+        self._told_readings: list[ToldReading] = []  # since somebody asked
         self._start_ns = 0
         self._noise_told = AS_MODELLED
 
@@ -88,6 +94,21 @@ class Filtering:
     def take_told(self) -> list[Correction]:
         """Return what the filter was told since this was asked last."""
         told, self._told = self._told, []
+        return told
+
+    def add_reading(self, reading: Reading) -> UpdateResult:
+        """Tell the filter at once what a sensor says; stamps are by the IMU's clock, and may be late."""
+        self._told_readings.append(ToldReading(reading.t_ns, reading))
+        return self._told_readings[-1].apply(self.ekf)
+
+    def begin_sensor(self, t_ns: int, start: OwnStart) -> UpdateResult:
+        """Tell the filter first values of a sensor's own variables, which hold from `t_ns` on."""
+        self._told_readings.append(ToldReading(t_ns, start))
+        return self._told_readings[-1].apply(self.ekf)
+
+    def take_told_readings(self) -> list[ToldReading]:
+        """Return what the filter was told of other sensors since this was asked last, in that order."""
+        told, self._told_readings = self._told_readings, []
         return told
 
     def motion(self, from_t_ns: int, to_t_ns: int) -> Array | None:

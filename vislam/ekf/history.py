@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
 from vislam.core.messages import Array, NoiseScale
+from vislam.core.readings import OwnStart, Reading
 
 S = TypeVar("S")
 M = TypeVar("M")
@@ -54,7 +55,8 @@ class Event(Generic[M]):
     """A measurement, and what became of it the last time it was applied."""
 
     t_ns: int  # by the clock of the sensor: the core says when that was by the IMU's
-    measurement: M | AtRest | KnownBias | NoiseScale  # noise: from here on, over what the filter was made with
+    # noise: from here on, over what the filter was made with
+    measurement: M | AtRest | KnownBias | NoiseScale | Reading | OwnStart
     outcome: Outcome | None = None  # None while it waits for the IMU
 
 
@@ -96,12 +98,14 @@ class History(Generic[S, M]):
 
     def holds(self, t_ns: int, kind: type[object]) -> bool:
         """Whether a measurement of this kind and stamp is here already."""
+        return any(isinstance(event.measurement, kind) for event in self.of(t_ns))
+
+    def of(self, t_ns: int) -> Iterator[Event[M]]:
+        """Yield the events of a stamp, newest first."""
         place = bisect_right(self._events, t_ns, key=_stamp)
         while place > 0 and self._events[place - 1].t_ns == t_ns:
             place -= 1
-            if isinstance(self._events[place].measurement, kind):
-                return True
-        return False
+            yield self._events[place]
 
     def checkpoint_at(self, t_ns: int) -> Checkpoint[S] | None:
         """Return the newest checkpoint at or before a time, None if it is older than all."""

@@ -151,12 +151,8 @@ class Timeline(Generic[S, M]):
 
     def state_at(self, t_ns: int) -> NavState | None:
         """Return the filtered state at a time within the history, None outside of it."""
-        checkpoint = self._checkpoint_at(t_ns)
-        if checkpoint is None:
-            return None
-        state = checkpoint.state.copy()
-        self._integrate(state, checkpoint.t_ns, t_ns)
-        return self._nav_state(t_ns, state)
+        state = self._state_then(t_ns)
+        return None if state is None else self._nav_state(t_ns, state)
 
     def pose_at(self, t_ns: int) -> Array | None:
         """Return T_odom_body [4, 4] at a time within the history, interpolated; None outside of it."""
@@ -247,11 +243,14 @@ class Timeline(Generic[S, M]):
             keep_track(self._series, piece, track)
 
     def _apply(self, event: Event[M], t_ns: int) -> None:
-        rate = self._series.at(t_ns)[:3] if len(self._series) else np.zeros(3)
         if event.outcome is not None:  # a rerun: what it was counted as before no longer holds
             self._account(event.outcome, -1)
-        event.outcome = self._core.apply(self._state, event, rate, (self._t_ns - t_ns) * 1e-9)
+        event.outcome = self._core.apply(self._state, event, self._rate_at(t_ns), (self._t_ns - t_ns) * 1e-9)
         self._account(event.outcome, 1)
+
+    def _rate_at(self, t_ns: int) -> Array:
+        """Return what the gyro showed [3]."""
+        return self._series.at(t_ns)[:3] if len(self._series) else np.zeros(3)
 
     def _account(self, outcome: Outcome, sign: int) -> None:
         for name, number in outcome.counts.items():
@@ -259,6 +258,14 @@ class Timeline(Generic[S, M]):
 
     def _checkpoint_at(self, t_ns: int) -> Checkpoint[S] | None:
         return self._history.checkpoint_at(t_ns) if self._history is not None and t_ns <= self._t_ns else None
+
+    def _state_then(self, t_ns: int) -> S | None:
+        checkpoint = self._checkpoint_at(t_ns)
+        if checkpoint is None:
+            return None
+        state = checkpoint.state.copy()
+        self._integrate(state, checkpoint.t_ns, t_ns)
+        return state
 
     def _snapshot(self, after_event: bool) -> Checkpoint[S]:
         return Checkpoint(self._t_ns, self._applied, self._state.copy(), after_event)
@@ -275,12 +282,5 @@ class Timeline(Generic[S, M]):
         self._t_ns, self._applied, self._state = checkpoint.t_ns, checkpoint.applied, checkpoint.state.copy()
 
     def _nav_state(self, t_ns: int, state: S) -> NavState:
-        x = state.x
-        return NavState(
-            t_ns=t_ns,
-            T_world_body=pose(x, 0, 6),
-            velocity_world_m_s=x[3:6].copy(),
-            gyro_bias_rad_s=x[13:16].copy(),
-            accel_bias_m_s2=x[10:13].copy(),
-            covariance=self._core.covariance(state),
-        )
+        x, covariance = state.x, self._core.covariance(state)
+        return NavState(t_ns, pose(x, 0, 6), x[3:6].copy(), x[13:16].copy(), x[10:13].copy(), covariance)

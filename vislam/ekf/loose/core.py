@@ -11,6 +11,7 @@ from vislam.config import EkfConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, quaternion_wxyz, skew
 from vislam.core.messages import Array, NavState, NoiseScale, VoMeasurement
+from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.filter_core import REST_PAUSE_NS, imu_sigmas, nominal, reset_sigmas, scaled
 from vislam.ekf.history import AtRest, Event, Outcome
 from vislam.ekf.loose import kernels, visual_motion
@@ -24,9 +25,12 @@ from vislam.ekf.loose.measurements import (
     where_rest_began,
     zero_velocity,
 )
+from vislam.ekf.loose.own_variables import begin, correct_by_reading
 from vislam.ekf.loose.state import Ledger, LooseState
+from vislam.ekf.sensor_rows import Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.imu import ImuNoise
+from vislam.sensors import Suite
 
 LooseMeasurement = VoMeasurement | NewKeyframe | OnWheels
 LooseEvent = Event[LooseMeasurement]
@@ -60,9 +64,12 @@ _COUNTERS = (
 class LooseCore:
     """Moves and corrects a `LooseState`, as `ekf.core.Core` has it."""
 
-    counters = _COUNTERS
-
-    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None) -> None:
+    def __init__(
+        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None, suite: Suite | None
+    ) -> None:
+        self.sensing = Sensing(suite, _COUNTERS)
+        self.counters = (*_COUNTERS, *self.sensing.counters)
+        own = self.sensing.suite.size
         self._config = config
         self._gravity = gravity_m_s2
         self._told_sigmas = imu_sigmas(config, noise)
@@ -75,16 +82,17 @@ class LooseCore:
         self._fraction = float(config.vo_shared_fraction)
         self._nothing = np.zeros((6, 6))
         self._reset_sigmas = reset_sigmas(config)
-        self._all = np.eye(kernels.ERRORS)
-        self._only_biases = np.diag(np.repeat([0.0, 1.0, 0.0], [9, 6, 6]))
-        self._not_the_past = np.eye(kernels.ERRORS)  # the body moves as much as its place against the clone
+        self._all = np.eye(kernels.ERRORS + own)
+        self._only_biases = np.diag(np.repeat([0.0, 1.0, 0.0], [9, 6, 6 + own]))
+        self._not_the_past = np.eye(kernels.ERRORS + own)  # the body moves as much as its place against the clone
         self._not_the_past[3:6, 18:21] = -np.eye(3)
         self._not_the_past[18:21] = 0.0
 
     def blank(self) -> LooseState:
         """Return a state of nothing, before there is one."""
-        x, P = np.zeros(kernels.NOMINAL), np.zeros((kernels.ERRORS, kernels.ERRORS))
-        return LooseState(x, P, Ledger(), self._told_sigmas)
+        n = len(self._all)
+        x = np.concatenate((np.zeros(kernels.NOMINAL), self.sensing.suite.starts))
+        return LooseState(x, np.zeros((n, n)), Ledger(), self._told_sigmas)
 
     def begin(self, start: NavState, vo: VoMeasurement | None, noise: NoiseScale) -> LooseState:
         """Return the filter at a state; `vo` places the keyframe it refers to. Raises ValueError, see `Ekf`."""
@@ -96,7 +104,7 @@ class LooseCore:
         state.P[:15, :15] = covariance
         kernels.clone(state.x, state.P)
         if self._config.vision == "accumulated":
-            state.P[15:] = state.P[:, 15:] = 0.0  # no clone: the 16 numbers of the paper
+            state.P[15:] = state.P[:, 15:] = 0.0  # no clone, and no sensor has begun: the 16 numbers of the paper
         state.ledger = Ledger(last_vo_t_ns=start.t_ns, floor_z_m=float(state.x[2]), noise=noise)
         state.sigmas = scaled(self._told_sigmas, noise)
         if vo is not None:
@@ -155,6 +163,10 @@ class LooseCore:
             floor_z_m = state.ledger.floor_z_m
             known = on_wheels(state.x, gyro_rad_s, self._axle, sigma_m_s, floor_z_m, self._floor_sigma)
             self._correct(state, known, self._all, "nonholonomic", out)
+        elif isinstance(what, Reading):
+            correct_by_reading(self.sensing, state, what, gyro_rad_s, out)
+        elif isinstance(what, OwnStart):
+            begin(self.sensing, state, what, event.t_ns, out)
         else:
             known = biases(state.x, what.values[:3], what.values[3:6], what.values[6:])
             self._correct(state, known, self._only_biases, "bias", out)
@@ -192,9 +204,9 @@ class LooseCore:
         state.x[16:19] = T_keyframe[:3, 3]
         state.x[19:23] = quaternion_wxyz(T_keyframe[:3, :3].copy())
         P = state.P
-        P[15:, :15] = J @ P[0:6, :15]
-        P[:15, 15:] = P[15:, :15].T
-        P[15:, 15:] = J @ P[0:6, 0:6] @ J.T + noise
+        P[15:21, :15] = J @ P[0:6, :15]
+        P[:15, 15:21] = P[15:21, :15].T
+        P[15:21, 15:21] = J @ P[0:6, 0:6] @ J.T + noise
         kernels.symmetrise(P)
 
     def _apply_rest(self, state: LooseState, t_ns: int, gyro_rad_s: Array, out: Outcome) -> Ledger:
@@ -262,7 +274,7 @@ class LooseCore:
         return replace(ledger, rejects=rejects, rejects_since_ns=since)
 
     def _moves(self, vo: VoMeasurement) -> Array:
-        """Return [21, 21] what becomes of the optimal gain: not all that it would move may move (Schmidt-Kalman).
+        """Return [n, n] what becomes of the optimal gain: not all that it would move may move (Schmidt-Kalman).
 
         A continuous odom: tilt that is learned metres away from the origin would swing the body about it. With the gain
         of the clone's position at zero the past stays where it is, and P keeps the uncertainty of it.
@@ -272,7 +284,7 @@ class LooseCore:
     def _correct(
         self, state: LooseState, measurement: LinearMeasurement, moves: Array, name: str, out: Outcome
     ) -> None:
-        """Gate and apply a measurement; `moves` [21, 21]: what becomes of the optimal gain."""
+        """Gate and apply a measurement; `moves` [n, n]: what becomes of the optimal gain."""
         residual, H, noise = measurement
         out.nis = kernels.update(state.x, state.P, H, noise, residual, self._limits[len(residual)], moves)
         self._judge(len(residual), name, out)

@@ -22,11 +22,13 @@ from vislam.ekf.loose.core import LooseCore, LooseMeasurement
 from vislam.ekf.loose.measurements import NewKeyframe, OnWheels
 from vislam.ekf.loose.state import LooseState
 from vislam.ekf.loose.visual_motion import why_unusable
-from vislam.ekf.timeline import Timeline, UpdateResult
+from vislam.ekf.sensed_timeline import SensedTimeline
+from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise
+from vislam.sensors import Suite
 
 
-class Ekf(Timeline[LooseState, LooseMeasurement]):
+class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
     """The timeline with the loose core, and the doors of its measurements.
 
     Attributes:
@@ -34,8 +36,9 @@ class Ekf(Timeline[LooseState, LooseMeasurement]):
     """
 
     def __init__(
-        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None = None
-    ) -> None:
+        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None = None,
+        suite: Suite | None = None,
+    ) -> None:  # fmt: skip
         """Set up an uninitialised filter.
 
         Args:
@@ -44,8 +47,9 @@ class Ekf(Timeline[LooseState, LooseMeasurement]):
             gravity_m_s2: magnitude, down in `odom`.
             T_body_camera: [4, 4]; its lever arm turns a direction seen by one camera into motion of the body.
                 None: camera and IMU coincide. Not used for metric visual odometry.
+            suite: sensors other than IMU and camera; None: there are none.
         """
-        self._loose = LooseCore(config, noise, float(gravity_m_s2), T_body_camera)
+        self._loose = LooseCore(config, noise, float(gravity_m_s2), T_body_camera, suite)
         super().__init__(self._loose, self._loose.blank(), config, config.history_s)
 
     @property

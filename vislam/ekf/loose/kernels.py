@@ -5,6 +5,7 @@ Karpov et al. 2026), then the cloned keyframe: position 16:19, quaternion 19:23.
 Error state [21]: rotation 0:3 (body side), position 3:6, velocity 6:9, gyro bias 9:12, accel bias 12:15 (the order of
 `NavState`), then the clone: rotation 15:18, position 18:21. Sola, "Quaternion kinematics for the error-state Kalman
 filter", 2017; the clone after Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002.
+The K own variables of sensors (`vislam.sensors`) end both: x [23 + K] and errors [21 + K] that are simply added.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def predict(
     sigmas: Array,
     gravity: float,
 ) -> None:
-    """Move x [23] and P [21, 21] by one step, in place.
+    """Move x [23 + K] and P [21 + K, 21 + K] by one step, in place.
 
     Mid-point: both samples [6] (gyro, accel) are averaged, and the force acts along the attitude half way. The same
     arithmetic as `vislam.imu.preintegrate`.
@@ -90,12 +91,12 @@ def predict(
             done unseen inside a hole (rad/s and m/s^2).
         gravity: m/s^2.
     """
-    _step(x, P, Step(rate0, rate1, dt, gap_s), sigmas, gravity, np.zeros((2, _MOVING, ERRORS)))
+    _step(x, P, Step(rate0, rate1, dt, gap_s), sigmas, gravity, np.zeros((2, _MOVING, len(P))))
 
 
 @njit(cache=True, nogil=True)
 def _step(x: Array, P: Array, step: Step, sigmas: Array, gravity: float, work: Array) -> None:
-    """Do what `predict` says. `work` [2, 9, 21]: scratch, all zero at first, for many steps."""
+    """Do what `predict` says. `work` [2, 9, 21 + K]: scratch, all zero at first, for many steps."""
     rate0, rate1, dt, gap_s = step
     wx = (0.5 * (rate0[0] + rate1[0]) - x[13]) * dt
     wy = (0.5 * (rate0[1] + rate1[1]) - x[14]) * dt
@@ -204,7 +205,7 @@ def predict_run(
     `gaps_s` [N] is, for the step that ends at each sample, the length of the hole it lies in, else 0.
     """
     before, after = np.empty(6), np.empty(6)
-    work = np.zeros((2, _MOVING, ERRORS))
+    work = np.zeros((2, _MOVING, len(P)))
     store(x, track[0])
     for k in range(1, len(t_ns)):
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
@@ -221,14 +222,14 @@ def predict_run(
 
 @njit(cache=True, nogil=True)
 def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Array) -> None:
-    """Apply a gain K [21, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain.
+    """Apply a gain K [n, m] in place: x by K @ residual, P by Joseph's form, which is valid for any gain.
 
     The correction is that of the right-invariant error (Barrau and Bonnabel, "The invariant extended Kalman filter as a
     stable observer", IEEE TAC 2017): rotation, position and velocity move along the group SE_2(3), and P, though kept
     in the error of `NavState`, is carried to the new state so that the invariant error keeps its covariance. What
     vision and gravity cannot tell, heading and position, then stays untold however often the state is corrected.
     """
-    G = np.eye(ERRORS)  # from the error about the old state to that about the new
+    G = np.eye(len(P))  # from the error about the old state to that about the new
     _move_all(x, K @ residual, G)
     GK = G @ K
     A = GK @ H
@@ -252,6 +253,8 @@ def _move_all(x: Array, d: Array, G: Array) -> None:
     for i in range(3):
         x[10 + i] += d[12 + i]
         x[13 + i] += d[9 + i]
+    for i in range(len(x) - NOMINAL):
+        x[NOMINAL + i] += d[ERRORS + i]
 
 
 @njit(cache=True, nogil=True)
@@ -290,7 +293,7 @@ def _move(x: Array, d: Array, G: Array, at: int, error: int, row: int, R: Array,
 
 @njit(cache=True, nogil=True)
 def innovation(P: Array, H: Array, noise: Array, residual: Array) -> tuple[float, Array]:
-    """Return the normalised innovation squared and the optimal gain [21, m]."""
+    """Return the normalised innovation squared and the optimal gain [n, m]."""
     m = len(residual)
     HP = H @ P
     S = HP @ np.ascontiguousarray(H.T) + noise
@@ -316,17 +319,21 @@ def update(x: Array, P: Array, H: Array, noise: Array, residual: Array, limit: f
     """Correct x and P in place, unless the normalised innovation squared is above the limit; return that.
 
     Args:
-        x: nominal state [23].
-        P: covariance [21, 21].
-        H: Jacobian [m, 21].
+        x: nominal state [23 + K].
+        P: covariance [n, n], n = 21 + K.
+        H: Jacobian [m, n], or [m, 21] of what does not depend on own variables.
         noise: [m, m].
         residual: [m].
         limit: of the gate; negative: change nothing.
-        moves: [21, 21] what becomes of the optimal gain; the identity leaves it as it is.
+        moves: [n, n] what becomes of the optimal gain; the identity leaves it as it is.
     """
-    nis, K = innovation(P, H, noise, residual)
+    wide = H
+    if H.shape[1] < len(P):
+        wide = np.zeros((len(H), len(P)))
+        wide[:, : H.shape[1]] = H
+    nis, K = innovation(P, wide, noise, residual)
     if nis <= limit:
-        correct(x, P, moves @ K, H, noise, residual)
+        correct(x, P, moves @ K, wide, noise, residual)
     return nis
 
 
@@ -334,6 +341,9 @@ def clone(x: Array, P: Array) -> None:
     """Make the clone a copy of the present pose, fully correlated with it, in place."""
     x[16:19] = x[0:3]
     x[19:23] = x[6:10]
-    P[15:, :15] = P[0:6, :15]
-    P[:15, 15:] = P[:15, 0:6]
-    P[15:, 15:] = P[0:6, 0:6]
+    P[15:21, :15] = P[0:6, :15]
+    P[:15, 15:21] = P[:15, 0:6]
+    P[15:21, 15:21] = P[0:6, 0:6]
+    if len(P) > ERRORS:
+        P[15:21, 21:] = P[0:6, 21:]
+        P[21:, 15:21] = P[21:, 0:6]

@@ -24,7 +24,7 @@ class OnWheels(NamedTuple):
 
 
 class LinearMeasurement(NamedTuple):
-    """A measurement at the present state: `residual ~ H @ error + noise`."""
+    """A measurement at the present state, without own variables: `residual ~ H @ error + noise`."""
 
     residual: Array  # [m]
     H: Array  # [m, 21]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from vislam.core.messages import AS_MODELLED, Array, NoiseScale
+from vislam.ekf.loose.kernels import ERRORS, NOMINAL
+from vislam.ekf.sensor_rows import OwnVariables
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,14 +29,15 @@ class Ledger:
     vo_t_ns: int = 0
     noise: NoiseScale = AS_MODELLED  # white noise of the IMU over that of the model
     floor_z_m: float = 0.0  # height of the body in `odom` at the start, where a floor keeps it
+    own_since_ns: Mapping[str, int] = field(default_factory=dict)  # see `OwnVariables`
 
 
 @dataclass(slots=True, eq=False)
 class LooseState:
     """The filter at one instant; x and P are changed in place."""
 
-    x: Array  # [23] see `kernels`
-    P: Array  # [21, 21]
+    x: Array  # [23 + K] see `kernels`
+    P: Array  # [21 + K, 21 + K]
     ledger: Ledger
     sigmas: Array  # [6] of the IMU, with the noise that goes on now, see `Ekf.follow_noise`
 
@@ -41,6 +45,11 @@ class LooseState:
     def last_vision_t_ns(self) -> int:
         """When visual odometry last corrected it; the start, before."""
         return self.ledger.last_vo_t_ns
+
+    @property
+    def own(self) -> OwnVariables:
+        """The sensors' own variables; views."""
+        return OwnVariables(self.x[NOMINAL:], self.P[ERRORS:, ERRORS:], self.ledger.own_since_ns)
 
     def copy(self) -> LooseState:
         """Return a copy that further steps leave alone."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.jit import njit
 from vislam.core.messages import Array, VoMeasurement
-from vislam.ekf.loose.kernels import ERRORS, pose, update
+from vislam.ekf.loose.kernels import pose, update
 from vislam.ekf.loose.measurements import LinearMeasurement, spread
 from vislam.vision.relative_motion import direction_noise, direction_residual, metric_residual
 
@@ -96,8 +96,8 @@ def relative_motion(
     """Return motion against the clone: 6 rows, 5 without scale, 3 (rotation) without parallax.
 
     Args:
-        x: nominal state [23].
-        P: covariance [21, 21]; how far the camera moved is only as well known as this says.
+        x: nominal state [23 + K].
+        P: covariance [21 + K, 21 + K]; how far the camera moved is only as well known as this says.
         T: [4, 4] from the keyframe that is cloned to the body; without scale its translation is a unit direction, or 0.
         covariance: [6, 6] of T, on its body side, inflated.
         has_scale: whether the translation is in metres.
@@ -128,7 +128,7 @@ def relative_motion(
 @njit(cache=True, nogil=True)
 def _displacement_variance(P: Array, T_clone: Array, direction: Array) -> float:
     """Return how well the motion since the clone is known along a direction [3] of the clone's axes, in m^2."""
-    row = np.zeros(ERRORS)
+    row = np.zeros(len(P))
     row[3:6] = np.ascontiguousarray(T_clone[:3, :3]) @ direction
     row[18:21] = -row[3:6]
     return max(np.sum(row * (P @ row)), 0.0)
@@ -161,12 +161,12 @@ def correct(
     """Correct x and P in place by a motion since the clone, unless it fails its gate.
 
     Args:
-        x: nominal state [23].
-        P: covariance [21, 21].
+        x: nominal state [23 + K].
+        P: covariance [21 + K, 21 + K].
         motion: since the clone.
         shared: with earlier motions from this keyframe.
         limits: [13] of the gate, by degrees of freedom.
-        moves: [21, 21] what becomes of the optimal gain.
+        moves: [21 + K, 21 + K] what becomes of the optimal gain.
 
     Returns:
         The normalised innovation squared, its degrees of freedom, by how many metres the motion is impossible, and what
@@ -178,8 +178,8 @@ def correct(
     more = np.zeros((6, 6))
     widened = P.copy()
     if fraction > 0.0:
-        more = shared_error(seen.H[:, 15:].copy(), fraction * seen.noise, already)
-        widened[15:, 15:] += more
+        more = shared_error(seen.H[:, 15:21].copy(), fraction * seen.noise, already)
+        widened[15:21, 15:21] += more
     limit = limits[degrees] if opposed_m == 0.0 else -1.0
     nis = update(x, widened, seen.H, (1.0 - fraction) * seen.noise, seen.residual, limit, moves)
     if nis <= limit:

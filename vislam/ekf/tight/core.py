@@ -10,16 +10,20 @@ import numpy as np
 from vislam.config import EkfConfig
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, NavState, NoiseScale
+from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.filter_core import imu_sigmas, nominal, scaled
 from vislam.ekf.history import AtRest, Event, KnownBias, Outcome
 from vislam.ekf.loose.kernels import Step
+from vislam.ekf.sensor_rows import OwnVariables, Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.ekf.tight import kernels
 from vislam.ekf.tight.kernels import INERTIAL, Inertial
-from vislam.ekf.tight.state import MOUNT, TIME, Window, propagated
+from vislam.ekf.tight.own_variables import begun, corrected_by_reading
+from vislam.ekf.tight.state import CLONES, MOUNT, TIME, Window, propagated
 from vislam.ekf.tight.tracks import FrameTracks
 from vislam.ekf.tight.update import Updater
 from vislam.imu import ImuNoise
+from vislam.sensors import Suite
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
@@ -87,6 +91,12 @@ class TightState:
         """When tracks last corrected it; the start, before."""
         return self.window.last_vision_t_ns
 
+    @property
+    def own(self) -> OwnVariables:
+        """The sensors' own variables; views."""
+        window, first = self.window, self.window.first_own
+        return OwnVariables(window.own, window.P[first:, first:], window.own_since_ns)
+
     def copy(self) -> TightState:
         """Return a copy that further steps leave alone."""
         return TightState(Inertial(*(part.copy() for part in self.inertial)), self.window, self.sigmas)
@@ -95,9 +105,9 @@ class TightState:
 class TightCore:
     """Moves and corrects a `TightState`, as `ekf.core.Core` has it."""
 
-    counters = _COUNTERS
-
-    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None) -> None:
+        self.sensing = Sensing(suite, _COUNTERS)
+        self.counters = (*_COUNTERS, *self.sensing.counters)
         self._config = config
         self._gravity = gravity_m_s2
         self._told_sigmas = imu_sigmas(config, noise)
@@ -106,13 +116,15 @@ class TightCore:
 
     def blank(self) -> TightState:
         """Return a state of nothing, before there is one."""
-        return self._at(np.zeros(16), Window(np.zeros((19, 19)), 0.0, self.R_configured))
+        n, own = CLONES + self.sensing.suite.size, self.sensing.suite.starts
+        return self._at(np.zeros(16), Window(np.zeros((n, n)), 0.0, self.R_configured, own=own))
 
     def begin(self, start: NavState, camera: CameraCalibration | None, noise: NoiseScale) -> TightState:
         """Return the filter at a state. Raises ValueError where that is not finite."""
         config = self._config
         x = nominal(start)
-        P = np.zeros((19, 19))
+        n, own = CLONES + self.sensing.suite.size, self.sensing.suite.starts
+        P = np.zeros((n, n))
         M = kernels.from_nav_error(x)
         P[:15, :15] = M @ (0.5 * (start.covariance + start.covariance.T)) @ M.T
         if config.tight_time_offset:
@@ -124,14 +136,14 @@ class TightCore:
             P[TIME, TIME] = camera.time_offset_sigma_s**2
             P[MOUNT, MOUNT] = np.diag(camera.rotation_sigma_rad**2)
             time_offset_s, R_body_cam = camera.time_offset_s, R_body_cam @ so3_exp(camera.rotation_rad)
-        return self._at(x, Window(P, time_offset_s, R_body_cam, last_vision_t_ns=start.t_ns, noise=noise))
+        return self._at(x, Window(P, time_offset_s, R_body_cam, last_vision_t_ns=start.t_ns, noise=noise, own=own))
 
     def _at(self, x: Array, window: Window) -> TightState:
         return TightState(_since_now(x), window, scaled(self._told_sigmas, window.noise))
 
     def time_of(self, event: TightEvent, state: TightState) -> int:
         """Return when an event happened: the stamps of frames and of rest are by the camera's clock."""
-        if isinstance(event.measurement, KnownBias | NoiseScale):
+        if isinstance(event.measurement, KnownBias | NoiseScale | Reading | OwnStart):
             return event.t_ns
         return event.t_ns + round(state.window.time_offset_s * 1e9)
 
@@ -165,6 +177,10 @@ class TightCore:
         elif isinstance(what, NoiseScale):
             window, outcome = replace(window, noise=what), Outcome(True, counts={"noise_changes": 1})
             state.sigmas = scaled(self._told_sigmas, what)
+        elif isinstance(what, Reading):
+            window, outcome = corrected_by_reading(self.sensing, window, state.x, what, gyro_rad_s, ago_s)
+        elif isinstance(what, OwnStart):
+            window, outcome = begun(self.sensing, window, what, event.t_ns)
         else:
             window, outcome = self._updater.known_bias(window, state.x, what.values)
         offset_s = min(max(window.time_offset_s, -_MAX_OFFSET_S), _MAX_OFFSET_S)

@@ -18,20 +18,24 @@ from vislam.config import EkfConfig
 from vislam.core.geometry import so3_log
 from vislam.core.messages import NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf.history import AtRest, Event
+from vislam.ekf.sensed_timeline import SensedTimeline
 from vislam.ekf.tight.core import CameraCalibration, TightCore, TightState
 from vislam.ekf.tight.state import MOUNT, TIME
 from vislam.ekf.tight.tracks import FrameTracks, prepare
-from vislam.ekf.timeline import Timeline, UpdateResult
+from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise
+from vislam.sensors import Suite
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
 
 
-class MsckfEkf(Timeline[TightState, FrameTracks]):
+class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
     """The timeline with the tight core. Times of states are by the IMU's clock, those of frames by the camera's."""
 
-    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+    def __init__(
+        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None = None
+    ) -> None:
         """Set up an uninitialised filter.
 
         Args:
@@ -39,10 +43,11 @@ class MsckfEkf(Timeline[TightState, FrameTracks]):
             noise: of the IMU, until `follow_noise` tells what the samples show.
             gravity_m_s2: magnitude, down in `odom`.
             rig: cameras; observations may also hold right pixels (two cameras) or depth.
+            suite: sensors other than IMU and camera; None: there are none.
         """
         self._rig = rig
         self._readout_s = config.tight_readout_s or 0.0
-        self._tight = TightCore(config, noise, float(gravity_m_s2), rig)
+        self._tight = TightCore(config, noise, float(gravity_m_s2), rig, suite)
         super().__init__(self._tight, self._tight.blank(), config, config.tight_history_s)
 
     @property

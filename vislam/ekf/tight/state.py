@@ -1,13 +1,14 @@
 """What the tight filter estimates beside its inertial state, and the moves on it: clone, forget, correct.
 
-Error state [19 + 6 C + 3 S]: the 15 inertial ones (`kernels`), time offset 15, extrinsic rotation 16:19 (camera
-side), clones (rotation, position), points kept in the state. Clones and points are right-invariant too: a point is
-`Exp(e) f^ + e_f` with the rotation error e of the body now. Everything here is replaced, never changed in place, so
-that a checkpoint is a reference.
+Error state [19 + 6 C + 3 S + K]: the 15 inertial ones (`kernels`), time offset 15, extrinsic rotation 16:19 (camera
+side), clones (rotation, position), points kept in the state, own variables of sensors. Clones and points are
+right-invariant too: a point is `Exp(e) f^ + e_f` with the rotation error e of the body now. Everything here is
+replaced, never changed in place, so that a checkpoint is a reference.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -46,7 +47,7 @@ class Rest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Covariance of everything, calibration, clones with the tracks seen there, and points in the state."""
+    """Covariance of everything, calibration, clones with the tracks seen there, points in the state, own variables."""
 
     P: Array  # [n, n]
     time_offset_s: float  # to add to a frame's stamp to get the IMU's time
@@ -65,6 +66,8 @@ class Window:
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0
     noise: NoiseScale = AS_MODELLED  # white noise of the IMU from here on
+    own: Array = field(default_factory=lambda: _none(0))  # [K] of sensors, as `Suite` orders them
+    own_since_ns: Mapping[str, int] = field(default_factory=dict)  # see `OwnVariables`
 
     @property
     def to_first(self) -> Array:
@@ -76,30 +79,36 @@ class Window:
         """Where the points begin in the error state."""
         return CLONES + 6 * len(self.frames)
 
+    @property
+    def first_own(self) -> int:
+        """Where the points end in the error state, and the sensors' own variables begin."""
+        return len(self.P) - len(self.own)
+
 
 def propagated(window: Window, Phi: Array, Q: Array) -> Window:
     """Return the window after the inertial part went through the transition Phi with noise Q [15, 15].
 
-    Points stand still, but their error is told relative to the body's rotation error, and that changed.
+    Points stand still, but their error is told relative to the body's rotation error, and that changed. Own variables
+    of sensors stand still.
     """
-    n, first = len(window.P), window.first_point
+    first, end = window.first_point, window.first_own
     turned = _skews(window.points)
     P = window.P.copy()
-    moves, spread = np.empty((15 + n - first, 15)), np.zeros((15 + n - first, 15))
+    moves, spread = np.empty((15 + end - first, 15)), np.zeros((15 + end - first, 15))
     moves[:15] = Phi
     moves[15:] = turned @ (Phi[:3] - np.eye(3, 15))
     spread[:15], spread[15:, :3] = np.eye(15), turned
     change = moves @ window.P[:15]
     P[:15] = change[:15]
-    P[first:] += change[15:]
+    P[first:end] += change[15:]
     change = P[:, :15] @ moves.T
     P[:, :15] = change[:, :15]
-    P[:, first:] += change[:, 15:]
+    P[:, first:end] += change[:, 15:]
     noise = spread @ Q @ spread.T
     P[:15, :15] += noise[:15, :15]
-    P[:15, first:] += noise[:15, 15:]
-    P[first:, :15] += noise[15:, :15]
-    P[first:, first:] += noise[15:, 15:]
+    P[:15, first:end] += noise[:15, 15:]
+    P[first:end, :15] += noise[15:, :15]
+    P[first:end, first:end] += noise[15:, 15:]
     return replace(window, P=0.5 * (P + P.T))
 
 
@@ -183,7 +192,7 @@ def without_points(window: Window, drop: NDArray[np.bool_]) -> Window:
         return window
     stay = np.flatnonzero(~drop)
     rows = window.first_point + (3 * stay[:, None] + np.arange(3)).ravel()
-    keep = np.concatenate((np.arange(window.first_point), rows))
+    keep = np.concatenate((np.arange(window.first_point), rows, np.arange(window.first_own, len(window.P))))
     return replace(
         window,
         P=window.P[np.ix_(keep, keep)],
@@ -214,8 +223,10 @@ def with_points(window: Window, ids: NDArray[np.int64], points: Array, fixing: A
         G[rows, :3] = skew(points[k])
         noise[rows, rows] = inverse @ inverse.T
         moved[k] += inverse @ fixing[k, :, -1]
-    GP = G @ window.P
-    P = np.block([[window.P, GP.T], [GP, GP @ G.T + noise]])
+    GP, at = G @ window.P, window.first_own
+    P, here, after = _opened(window.P, at, len(G)), slice(at, at + len(G)), slice(at + len(G), n + len(G))
+    P[here, :at], P[here, after], P[:at, here], P[after, here] = GP[:, :at], GP[:, at:], GP[:, :at].T, GP[:, at:].T
+    P[here, here] = GP @ G.T + noise
     return replace(
         window,
         P=0.5 * (P + P.T),
@@ -284,6 +295,7 @@ def moved(window: Window, x: Array, change: Array) -> Window:
         p=p,
         velocity=velocity,
         points=points,
+        own=window.own + change[window.first_own :],
     )
 
 

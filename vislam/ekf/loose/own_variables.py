@@ -1,0 +1,47 @@
+"""What readings of sensors other than IMU and camera do to the loose filter, and where their own variables begin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vislam.core.messages import Array
+from vislam.core.readings import OwnStart, Reading
+from vislam.ekf.history import Outcome
+from vislam.ekf.loose import kernels
+from vislam.ekf.loose.state import LooseState
+from vislam.ekf.sensor_rows import Sensing, body_of
+
+
+def begin(sensing: Sensing, state: LooseState, start: OwnStart, t_ns: int, out: Outcome) -> None:
+    """Set a sensor's own variables in a state, in place."""
+    out.accept(f"{start.sensor}_begun")
+    sensing.begin(start, state.x[kernels.NOMINAL :], state.P)
+    _note(state, start.sensor, t_ns)
+
+
+def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gyro_rad_s: Array, out: Outcome) -> None:
+    """Correct a state in place by a reading, unless its gate refuses it.
+
+    The past moves as well, also where `odom` is continuous: a reading may tell where in `odom` the body is, and that is
+    no business of the clone.
+    """
+    name = reading.sensor
+    rows = sensing.rows(reading, body_of(reading.t_ns, state.x, gyro_rad_s), state.own, out)
+    if rows is None:
+        return
+    P, m = state.P.copy(), len(rows.residual)  # a copy: a reading that the gate refuses leaves no walk behind
+    sensing.grow(name, reading.t_ns, state.ledger.own_since_ns, P)
+    H = np.zeros((m, len(P)))
+    H[:, :15], H[:, kernels.ERRORS :][:, sensing.suite.own(name)] = rows.H, rows.H_own
+    everything = np.eye(len(P))
+    nis = kernels.update(state.x, P, H, np.eye(m), rows.residual, sensing.limit(name, m), everything)
+    if sensing.judge(name, nis, m, out):
+        state.P = P
+        _note(state, name, reading.t_ns)
+
+
+def _note(state: LooseState, name: str, t_ns: int) -> None:
+    since_ns = {**state.ledger.own_since_ns, name: t_ns}
+    state.ledger = replace(state.ledger, own_since_ns=since_ns)

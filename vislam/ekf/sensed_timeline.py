@@ -1,0 +1,76 @@
+"""The doors of a filter for sensors other than IMU and camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.core.messages import Array
+from vislam.core.readings import OwnStart, Reading
+from vislam.ekf.filter_core import S
+from vislam.ekf.history import Event, M
+from vislam.ekf.sensor_rows import body_of
+from vislam.ekf.timeline import Timeline, UpdateResult
+from vislam.sensors import BodyState
+
+
+class SensedTimeline(Timeline[S, M]):
+    """The timeline with readings of a `Suite` of sensors. Stamps are by the IMU's clock.
+
+    As every measurement they may come late and in any order; of those with one stamp the order of arrival counts.
+    """
+
+    def begin_sensor(self, t_ns: int, start: OwnStart) -> UpdateResult:
+        """Set a sensor's own variables at a time; its readings from then on are used.
+
+        What was known of them before is forgotten, and what the rest of the state has learned from them stays. Sensors
+        without variables need no start, and get none. `initialise` forgets all starts.
+        """
+        name = start.sensor
+        if name not in self._core.sensing.suite.names:
+            return self._refuse_unknown(name)
+        reason = self._core.sensing.why_no_start(start)
+        if not reason and self._is_here(t_ns, OwnStart, name):
+            reason = f"sensor {name!r} has a start of {t_ns} ns already"
+        return self._refuse(f"{name}_refused", reason) if reason else self._insert(Event(t_ns, start))
+
+    def update_sensor(self, reading: Reading) -> UpdateResult:
+        """Correct the state at the time of a reading.
+
+        One that cannot be used, comes twice, is of a sensor that has not begun or that fails, or does not pass the gate
+        is counted and changes nothing. The gate may say no for ever: nothing is inflated for a sensor's sake.
+        """
+        name = reading.sensor
+        if name not in self._core.sensing.suite.names:
+            return self._refuse_unknown(name)
+        reason = self._core.sensing.why_unusable(reading)
+        if not reason and self._is_here(reading.t_ns, Reading, name):
+            reason = f"sensor {name!r} has a reading of {reading.t_ns} ns already"
+        return self._refuse(f"{name}_refused", reason) if reason else self._insert(Event(reading.t_ns, reading))
+
+    def own(self, name: str) -> tuple[Array, Array]:
+        """Return values [V] and sigmas [V] of a sensor's own variables now; before it begins, what it says of them.
+
+        Raises KeyError for a sensor that is not there.
+        """
+        values, covariance = self._core.sensing.own(name, self._state.own, self._t_ns)
+        return values, np.sqrt(np.diag(covariance))
+
+    def own_covariance(self, name: str) -> Array:
+        """Return the covariance [V, V] of a sensor's own variables, as `own` has them."""
+        return self._core.sensing.own(name, self._state.own, self._t_ns)[1]
+
+    def body_at(self, t_ns: int) -> BodyState | None:
+        """Return the body at a time within the history, as a sensor sees it; None outside of it."""
+        state = self._state_then(t_ns)
+        return None if state is None else body_of(t_ns, state.x, self._rate_at(t_ns))
+
+    def _refuse_unknown(self, name: str) -> UpdateResult:
+        names = ", ".join(self._core.sensing.suite.names)
+        self._counts.setdefault("sensor_unknown", 0)  # a filter without sensors counts what it always did
+        return self._refuse("sensor_unknown", f"no sensor is called {name!r}; there is {names or 'none'}")
+
+    def _is_here(self, t_ns: int, kind: type[Reading] | type[OwnStart], name: str) -> bool:
+        if self._history is None:
+            return False
+        known = (event.measurement for event in self._history.of(t_ns))
+        return any(isinstance(measurement, kind) and measurement.sensor == name for measurement in known)
