@@ -182,8 +182,8 @@ def check_size(path: Path, limit_bytes: int) -> None:
         raise DataError(f"{path} has {size} bytes, more than the {limit_bytes} allowed; split the recording")
 
 
-def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str) -> Iterator[Row[T]]:
-    """Yield rows with strictly rising stamps; drop and count the others.
+def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str, keep_equal: bool = False) -> Iterator[Row[T]]:
+    """Yield rows with strictly rising stamps, or with `keep_equal` stamps that do not fall; drop and count the others.
 
     A stamp that goes back is dropped, unless the stamp before it had leapt ahead: then that one is the wrong one, and
     dropping it saves everything behind it.
@@ -192,7 +192,7 @@ def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str) -> Iter
     held: Row[T] | None = None
     for row in rows:
         t_ns = row[0]
-        if held is None or t_ns > held[0]:
+        if held is None or t_ns > held[0] or (keep_equal and t_ns == held[0]):
             if held is not None:
                 yield held
                 last_ns = held[0]

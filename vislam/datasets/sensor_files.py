@@ -1,0 +1,176 @@
+"""Files of sensors other than IMU and camera: tables, and what satellite receivers write."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from vislam.core.errors import DataError
+from vislam.core.messages import Array
+from vislam.core.reading import open_file
+from vislam.core.readings import Reading
+from vislam.datasets.tables import (
+    MAX_LINE_BYTES,
+    Problems,
+    Row,
+    in_time_order,
+    parse_ns,
+    parse_seconds,
+    read_rows,
+)
+from vislam.sensors.configured import Configured
+from vislam.sensors.geodetic import LocalFrame
+from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
+from vislam.sensors.ticks import TickSpeeds
+from vislam.sensors.toml import SensorFile
+
+_HEADER_LINES = 20  # a header stands among the first ones
+_STAMPS: dict[str, Callable[[str], int]] = {"t_ns": parse_ns, "t_s": parse_seconds}
+_CHUNK_BYTES = 2**16
+_TICKS = ("left_ticks", "right_ticks")
+
+
+def sensor_readings(name: str, sensor: Configured, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    """Yield a sensor's readings in time order, by the IMU's clock, in bounded memory.
+
+    What cannot be used is left out and counted. Several readings may have the same stamp, as ranges to several anchors.
+
+    Raises:
+        DataError: the file cannot be read, lacks a column, or most of its rows are unusable.
+    """
+    if file.format == "csv":
+        readings = _counts(name, file, problems) if file.ticks else _table(name, sensor, file, problems)
+    else:
+        readings = {"nmea": _nmea, "ubx": _ubx}[file.format](FixReadings(name, file.gnss), file, problems)
+    rows = ((reading.t_ns, reading) for reading in readings)
+    shift_ns = round(file.offset_s * 1e9)
+    for t_ns, reading in in_time_order(rows, problems, f"{file.path.parent.name}/{file.path.name}", keep_equal=True):
+        yield replace(reading, t_ns=t_ns + shift_ns)
+
+
+def local_frame(file: SensorFile) -> LocalFrame:
+    """Return the frame of a receiver's file, to turn east, north, up back into latitude, longitude, height.
+
+    Its datum is the one that was told, or the first fix that is good enough. Raises DataError where there is none.
+    """
+    made, readers = FixReadings("", file.gnss), {"nmea": _nmea, "ubx": _ubx}
+    if made.frame is None and file.format in readers:
+        next(readers[file.format](made, file, Problems()), None)
+    if made.frame is None:
+        raise DataError(f"{file.path}: no datum is told and no fix is good enough to be one")
+    return made.frame
+
+
+def _table(name: str, sensor: Configured, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    sigmas = tuple(dict.fromkeys(sensor.sigma_columns))
+    header = _header(file.path)
+    has_sigmas = bool(sigmas) and set(sigmas) <= set(header)
+    asked = sensor.columns + (sigmas if has_sigmas else ())
+    for t_ns, numbers in read_rows(file.path, _row(asked, header, file.path), problems, ",", needs_line_end=True):
+        values = np.array(numbers[: len(sensor.columns)])
+        if not has_sigmas:
+            yield Reading(name, t_ns, values)
+        elif min(told := numbers[len(sensor.columns) :]) > 0.0:
+            by_name = dict(zip(sigmas, told, strict=True))
+            yield Reading(name, t_ns, values, _diagonal([by_name[column] for column in sensor.sigma_columns]))
+        else:
+            problems.count(f"{file.path.parent.name}/{file.path.name}: rows with a sigma that is not positive")
+
+
+def _counts(name: str, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    assert file.ticks is not None
+    speeds = TickSpeeds(file.ticks)
+    place = f"{file.path.parent.name}/{file.path.name}"
+    parse = _row(_TICKS, _header(file.path), file.path)
+    for t_ns, numbers in read_rows(file.path, parse, problems, ",", needs_line_end=True):
+        if not all(number.is_integer() for number in numbers):
+            problems.count(f"{place}: counts that are not whole")
+            continue
+        try:
+            found = speeds.speeds(t_ns, *map(int, numbers))
+        except ValueError as error:
+            problems.count(f"{place}: counts that give no speed", str(error))
+            continue
+        if found is not None:
+            yield Reading(name, found[0], np.array(found[1]))
+
+
+def _row(asked: tuple[str, ...], header: tuple[str, ...], path: Path) -> Callable[[list[str]], Row[list[float]]]:
+    """Return what makes stamp and asked numbers of a row's fields; without a header they stand in their order."""
+    at, stamp_at, parse_stamp = list(range(1, 1 + len(asked))), 0, _STAMPS["t_ns"]
+    if header:
+        if missing := [column for column in asked if column not in header]:
+            raise DataError(f"{path}: no column {missing[0]}; there are {', '.join(header)}; docs/more-sensors.md")
+        stamp = next(column for column in header if column in _STAMPS)
+        at, stamp_at, parse_stamp = [header.index(column) for column in asked], header.index(stamp), _STAMPS[stamp]
+
+    def parse(fields: list[str]) -> Row[list[float]]:
+        if len(fields) <= max(stamp_at, *at):
+            raise ValueError
+        numbers = [float(fields[k]) for k in at]
+        if not all(map(math.isfinite, numbers)):
+            raise ArithmeticError
+        return parse_stamp(fields[stamp_at]), numbers
+
+    return parse
+
+
+def _header(path: Path) -> tuple[str, ...]:
+    """Return the names of a table's columns, in a comment or not; empty: it does not say."""
+    try:
+        with open_file(path) as file:
+            for _ in range(_HEADER_LINES):
+                line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace")
+                names = tuple(field.strip(' #\t\r\n"') for field in line.split(","))
+                if set(names) & set(_STAMPS):
+                    return names
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    return ()
+
+
+def _nmea(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    fixes = NmeaFixes()
+
+    def parse(fields: list[str]) -> Row[Fix | None]:
+        return 0, fixes.feed(fields[0])
+
+    for _t_ns, fix in read_rows(file.path, parse, problems, "\n", needs_line_end=True):
+        yield from _made(fix, made, file, problems)
+    yield from _made(fixes.end(), made, file, problems)
+    problems.count(f"{file.path.parent.name}/{file.path.name}: fixes before any date", times=fixes.undated)
+
+
+def _ubx(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    fixes, count = UbxFixes(), 0
+    try:
+        with open_file(file.path) as stream:
+            while data := stream.read(_CHUNK_BYTES):
+                for fix in fixes.feed(data):
+                    count += 1
+                    yield from _made(fix, made, file, problems)
+    except OSError as error:
+        raise DataError(f"{file.path} cannot be read: {error.strerror}") from error
+    if not count and not fixes.undated:
+        raise DataError(f"{file.path}: no message NAV-PVT with a fix; set the receiver to send UBX-NAV-PVT")
+    place = f"{file.path.parent.name}/{file.path.name}"
+    problems.count(f"{place}: damaged messages", times=fixes.damaged)
+    problems.count(f"{place}: fixes before any date", times=fixes.undated)
+
+
+def _made(fix: Fix | None, made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    try:
+        reading = None if fix is None else made.reading(fix)
+    except ValueError as error:
+        problems.count(f"{file.path.parent.name}/{file.path.name}: fixes refused", str(error))
+        return
+    if reading is not None:
+        yield reading
+
+
+def _diagonal(sigmas: list[float]) -> Array:
+    return np.diag(np.square(sigmas))

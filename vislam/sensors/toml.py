@@ -1,0 +1,127 @@
+"""The sensors of one machine from a TOML file: `[sensors.NAME]` with kind, file and settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from vislam.config import validated
+from vislam.config.ranges import Finite, Probability
+from vislam.core.errors import UsageError
+from vislam.core.reading import read_text
+from vislam.sensors.configured import Configured
+from vislam.sensors.gnss.fixes import GnssSettings
+from vislam.sensors.registry import kind_class
+from vislam.sensors.suite import Suite
+from vislam.sensors.ticks import TicksSettings
+
+MOST_SENSORS = 64
+_MOST_BYTES = 2**20
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
+FileFormat = Literal["csv", "nmea", "ubx"]
+_FORMATS: dict[str, FileFormat] = {".nmea": "nmea", ".ubx": "ubx"}  # all else is a table
+
+
+@dataclass(frozen=True, slots=True)
+class _Common:
+    """The keys that every sensor's table may have beside its settings."""
+
+    kind: str
+    file: str = ""  # beside the TOML file; empty: readings come from elsewhere
+    format: FileFormat | None = None  # None: by the file's ending
+    offset_s: Finite = 0.0  # is added to the file's stamps, to have them by the IMU's clock
+    gate_probability: Probability = 0.999
+    ticks: TicksSettings | None = None
+    gnss: GnssSettings | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFile:
+    """Where a sensor's readings are, and how they are read."""
+
+    path: Path
+    format: FileFormat
+    offset_s: float
+    ticks: TicksSettings | None  # None: the file has speeds
+    gnss: GnssSettings
+
+
+@dataclass(frozen=True, slots=True)
+class SensorSetup:
+    """The sensors of a machine, and the files of those that have one."""
+
+    suite: Suite
+    sensors: Mapping[str, Configured]
+    files: Mapping[str, SensorFile]
+
+
+def load_sensor_setup(path: Path) -> SensorSetup:
+    """Return the sensors that a TOML file describes.
+
+    Raises UsageError in one line: file, table, key, what was asked and what was found.
+    """
+    try:
+        data = tomllib.loads(read_text(path, _MOST_BYTES))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"sensors {path} cannot be read: {error}; see docs/more-sensors.md for an example") from error
+    return sensor_setup(data, str(path), path.parent)
+
+
+def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSetup:
+    """Return the sensors that plain data describe; `source` stands in errors, files are beside `folder`."""
+    if other := sorted(set(data) - {"sensors"}):
+        raise UsageError(f"{source}: no table [{other[0]}]; tables [sensors.NAME] are asked")
+    tables = data.get("sensors", {})
+    if not isinstance(tables, dict) or not 1 <= len(tables) <= MOST_SENSORS:
+        raise UsageError(f"{source}: 1 to {MOST_SENSORS} tables [sensors.NAME] are asked")
+    sensors: dict[str, Configured] = {}
+    files: dict[str, SensorFile] = {}
+    for name, table in tables.items():
+        where = f"{source}: [sensors.{name}]"
+        if not _NAME.fullmatch(name):
+            raise UsageError(f"{where}: a name of letters, digits, - and _ is asked, a letter first, 32 at most")
+        if not isinstance(table, dict):
+            raise UsageError(f"{where}: a table is asked, got {table!r}")
+        sensors[name], file = _sensor(table, where, folder)
+        if file is not None:
+            files[name] = file
+    return SensorSetup(Suite(sensors), sensors, files)
+
+
+def _sensor(table: dict[str, Any], where: str, folder: Path) -> tuple[Configured, SensorFile | None]:
+    if not isinstance(table.get("kind"), str):
+        raise UsageError(f'{where}: option kind: a name is asked, as kind = "position", got {table.get("kind")!r}')
+    shared = {key.name for key in dataclasses.fields(_Common)}
+    common = validated(_Common, {key: value for key, value in table.items() if key in shared}, where)
+    own = {key: value for key, value in table.items() if key not in shared}
+    try:
+        cls = kind_class(common.kind)
+    except UsageError as error:
+        raise UsageError(f"{where}: option kind: {error}") from error
+    known = [setting.name for setting in dataclasses.fields(cls.Settings)]
+    if unknown := [key for key in own if key not in known]:
+        raise UsageError(f"{where}: no option {unknown[0]!r}; there are: {', '.join([*sorted(shared), *known])}")
+    settings = validated(cls.Settings, own, where)
+    try:
+        sensor = cls(settings)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from error
+    sensor.gate_probability = common.gate_probability
+    return sensor, _file(common, sensor, where, folder)
+
+
+def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> SensorFile | None:
+    if not common.file or "\0" in common.file:
+        return None
+    path = folder / common.file
+    format_ = common.format or _FORMATS.get(path.suffix.lower(), "csv")
+    if format_ != "csv" and sensor.columns != ("east_m", "north_m", "up_m"):
+        raise UsageError(f"{where}: option format: {format_} holds fixes, for a kind that has east, north, up")
+    if common.ticks and sensor.columns != ("left_m_s", "right_m_s"):
+        raise UsageError(f"{where}: option ticks: counts are those of kind wheels, this is {common.kind}")
+    return SensorFile(path, format_, common.offset_s, common.ticks, common.gnss or GnssSettings())
