@@ -12,10 +12,11 @@ from vislam.config.sensors import Vector3
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import noisy
-from vislam.sensors.kinds.driven import NO_TURN, Driven, Told, floor_covariance
+from vislam.sensors.kinds.driven import NO_TURN, Compared, Driven
 from vislam.sensors.mounting import Mount
 from vislam.sensors.sensor import Variable
 
+_LEAST_TURN = 1e-3  # rad/s; at rest no angle tells a turn, and a variance has to be positive
 _MOST_STEERING_RAD = 1.4  # beyond it no wheel rolls
 
 
@@ -56,23 +57,28 @@ class Ackermann(Driven):
             ),
         )
 
-    def told(self, values: Array, own: Array) -> Told:
-        """Return the motion of such a car."""
-        speed, tangent = own[0] * values[0], math.tan(values[1] + own[1])
-        curvature = tangent / self.settings.wheelbase_m
+    def compared(self, values: Array, motion: Array, own: Array) -> Compared:
+        """Return speed, sideways and upward velocity and turn against a motion.
+
+        The turn is that which the angle gives at the body's own speed; the angle that a turn gives is none at rest.
+        """
+        base_m, tangent = self.settings.wheelbase_m, math.tan(values[1] + own[1])
+        expected = motion[0] / own[0]
+        by_motion = np.diag([1.0 / own[0], 1.0, 1.0, 1.0])
+        by_motion[3, 0] = -tangent / base_m
         by_own = np.zeros((4, 2))
-        by_own[0, 0] = values[0]
-        by_own[3] = [values[0] * curvature, speed * (1.0 + tangent**2) / self.settings.wheelbase_m]
-        return Told(np.array([speed, 0.0, 0.0, speed * curvature]), by_own)
+        by_own[0, 0] = -expected / own[0]
+        by_own[3, 1] = -motion[0] * (1.0 + tangent**2) / base_m
+        turn = motion[0] * tangent / base_m
+        return Compared(np.array([values[0] - expected, -motion[1], -motion[2], turn - motion[3]]), by_motion, by_own)
 
     def noise(self, values: Array) -> Array:
-        """Return the covariance [4, 4]: that of speed and angle, carried into the motion."""
+        """Return the covariance [4, 4]; that of the angle counts by the speed that is told."""
         s = self.settings
-        tangent = math.tan(values[1] + s.steering_offset_rad)
-        J = np.zeros((4, 2))
-        J[0, 0] = 1.0
-        J[3] = [tangent / s.wheelbase_m, values[0] * (1.0 + tangent**2) / s.wheelbase_m]
-        return J @ self._told_noise(values) @ J.T + floor_covariance(s.sideways_m_s, s.upward_m_s, s.gyro_rad_s)
+        speed, steering = np.diag(self._told_noise(values))
+        by_angle = values[0] * (1.0 + math.tan(values[1] + s.steering_offset_rad) ** 2) / s.wheelbase_m
+        turn = by_angle**2 * steering + s.gyro_rad_s**2 + _LEAST_TURN**2
+        return np.diag([speed, s.sideways_m_s**2, s.upward_m_s**2, turn])
 
     def check(self, values: Array) -> str:
         """Return why an angle is none."""

@@ -15,18 +15,20 @@ from vislam.sensors.mounting import Mount
 from vislam.sensors.sensor import Variable
 
 
-class Told(NamedTuple):
-    """What a reading says of the base: forward, left, up velocity and rate about up, and how it hangs on own ones."""
+class Compared(NamedTuple):
+    """A reading against the motion of the base: forward, left, up velocity and rate about up."""
 
-    motion: Array  # [4]
-    by_own: Array  # [4, V without the mounting]
+    residual: Array  # [4]
+    by_motion: Array  # [4, 4] minus its derivative by the motion
+    by_own: Array  # [4, V without the mounting] the same by own variables
 
 
 class Driven(Configured):
-    """Residual [4]: forward, left and up velocity of the axle in m/s, rate about the base's up in rad/s.
+    """Residual [4] of a base that goes where it looks: what the device says, and no motion sideways or up.
 
-    The body's rate is the gyroscope's, so wheels that turn otherwise than the gyroscope fail the gate as a whole; what
-    slips by less is in the noise, which grows with speed and turn.
+    What the device says is compared with what the body's motion lets expect, and never scaled itself: its noise would
+    else make scales and widths too small. The body's rate is the gyroscope's, so wheels that turn otherwise fail the
+    gate as a whole; what slips by less is in the noise, which grows with speed and turn.
     """
 
     touches = ("rotation", "velocity", "gyro_bias")
@@ -34,31 +36,27 @@ class Driven(Configured):
     def __init__(self, mount: Mount, variables: tuple[Variable, ...]) -> None:
         """Take the mounting and the own variables besides."""
         self._mount = mount
-        self._told = len(variables)
+        self._others = len(variables)
         self.variables = variables + mount.variables
 
     @abstractmethod
-    def told(self, values: Array, own: Array) -> Told:
-        """Return what a reading says at own variables [V without the mounting]."""
+    def compared(self, values: Array, motion: Array, own: Array) -> Compared:
+        """Return a reading against a motion [4] at own variables [V without the mounting]."""
 
     def residual(self, values: Array, body: BodyState, own: Array) -> Array:
-        """Return measured minus predicted motion [4] of the base."""
-        return self.told(values, own[: self._told]).motion - self._mount.motion(body, own[self._told :])
+        """Return measured minus predicted [4]."""
+        return self.compared(values, self.base_motion(body, own), own[: self._others]).residual
 
     def jacobians(self, values: Array, body: BodyState, own: Array) -> tuple[Array, Array]:
         """Return H [4, 15] and H_own [4, V]."""
-        told = self.told(values, own[: self._told])
-        driven = self._mount.driven(body, own[self._told :])
-        return driven.H, np.hstack([-told.by_own, driven.by_mount])
+        driven = self._mount.driven(body, own[self._others :])
+        compared = self.compared(values, driven.motion, own[: self._others])
+        by_mount = compared.by_motion @ driven.by_mount
+        return compared.by_motion @ driven.H, np.hstack([compared.by_own, by_mount])
 
     def base_motion(self, body: BodyState, own: Array) -> Array:
         """Return forward, left, up velocity and rate about up [4] of a body."""
-        return self._mount.motion(body, own[self._told :])
-
-
-def floor_covariance(left_m_s: float, up_m_s: float, gyro_rad_s: float) -> Array:
-    """Return the covariance [4, 4] of what no wheel tells: sideways and upward motion, and the gyroscope's noise."""
-    return np.diag([0.0, left_m_s**2, up_m_s**2, gyro_rad_s**2])
+        return self._mount.motion(body, own[self._others :])
 
 
 NO_TURN: Vector3 = (0.0, 0.0, 0.0)

@@ -12,7 +12,7 @@ from vislam.config.sensors import Vector3
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import noisy
-from vislam.sensors.kinds.driven import NO_TURN, Driven, Told, floor_covariance
+from vislam.sensors.kinds.driven import NO_TURN, Compared, Driven
 from vislam.sensors.mounting import Mount
 from vislam.sensors.sensor import Variable
 
@@ -50,19 +50,23 @@ class Omni(Driven):
             (Variable("scale", s.scale_sigma, 1.0), Variable("turn_scale", s.turn_scale_sigma, 1.0)),
         )
 
-    def told(self, values: Array, own: Array) -> Told:
-        """Return the motion that is told."""
+    def compared(self, values: Array, motion: Array, own: Array) -> Compared:
+        """Return forward, left and upward velocity and rate against a motion."""
         vx, vy, wz = self._all(values)
-        by_own = np.array([[vx, 0.0], [vy, 0.0], [0.0, 0.0], [0.0, wz]])
-        return Told(np.array([own[0] * vx, own[0] * vy, 0.0, own[1] * wz]), by_own)
+        scales = np.array([own[0], own[0] if len(values) == 3 else 1.0, 1.0, own[1]])
+        expected = motion / scales
+        by_own = np.zeros((4, 2))
+        by_own[0, 0], by_own[3, 1] = -expected[0] / own[0], -expected[3] / own[1]
+        if len(values) == 3:
+            by_own[1, 0] = -expected[1] / own[0]
+        return Compared(np.array([vx, vy, 0.0, wz]) - expected, np.diag(1.0 / scales), by_own)
 
     def noise(self, values: Array) -> Array:
         """Return the covariance [4, 4]."""
         s = self.settings
-        told = self._told_noise(values)
-        sideways = told[1, 1] if len(self.columns) == 3 else s.sideways_m_s**2
-        noise = floor_covariance(0.0, s.upward_m_s, s.gyro_rad_s)
-        return noise + np.diag([told[0, 0], sideways, 0.0, told[2, 2]])
+        along, left, turn = np.diag(self._told_noise(values))
+        sideways = left if len(values) == 3 else s.sideways_m_s**2
+        return np.diag([along, sideways, s.upward_m_s**2, turn + s.gyro_rad_s**2])
 
     def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
         """Return the velocities of a true body."""

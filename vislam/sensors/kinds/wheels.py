@@ -11,7 +11,7 @@ from vislam.config.sensors import Vector3
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import noisy
-from vislam.sensors.kinds.driven import NO_TURN, Driven, Told, floor_covariance
+from vislam.sensors.kinds.driven import NO_TURN, Compared, Driven
 from vislam.sensors.mounting import Mount
 from vislam.sensors.sensor import Variable
 
@@ -55,20 +55,24 @@ class Wheels(Driven):
             ),
         )
 
-    def told(self, values: Array, own: Array) -> Told:
-        """Return the motion of a base with such wheels."""
-        left, right, width = own[0] * values[0], own[1] * values[1], own[2]
-        turn = (right - left) / width
-        by_own = np.zeros((4, 3))
-        by_own[0, :2] = 0.5 * values
-        by_own[3] = [-values[0] / width, values[1] / width, -turn / width]
-        return Told(np.array([0.5 * (left + right), 0.0, 0.0, turn]), by_own)
+    def compared(self, values: Array, motion: Array, own: Array) -> Compared:
+        """Return left and right speed, sideways and upward velocity against a motion."""
+        scales, half = own[:2], 0.5 * own[2] * np.array([-1.0, 1.0])  # how far left a wheel is, to the right
+        expected = (motion[0] + half * motion[3]) / scales
+        by_motion, by_own = np.zeros((4, 4)), np.zeros((4, 3))
+        by_motion[:2, 0], by_motion[:2, 3] = 1.0 / scales, half / scales
+        by_motion[2, 1] = by_motion[3, 2] = 1.0
+        by_own[[0, 1], [0, 1]] = -expected / scales
+        by_own[:2, 2] = half / own[2] * motion[3] / scales
+        return Compared(np.append(values - expected, -motion[1:3]), by_motion, by_own)
 
     def noise(self, values: Array) -> Array:
-        """Return the covariance [4, 4]: each wheel's own, carried into the motion."""
+        """Return the covariance [4, 4]."""
         s = self.settings
-        J = np.array([[0.5, 0.5], [0.0, 0.0], [0.0, 0.0], [-1.0 / s.track_width_m, 1.0 / s.track_width_m]])
-        return J @ self._wheel_noise(values) @ J.T + floor_covariance(s.sideways_m_s, s.upward_m_s, s.gyro_rad_s)
+        noise = np.diag([0.0, 0.0, s.sideways_m_s**2, s.upward_m_s**2])
+        turned = 0.5 * s.track_width_m * s.gyro_rad_s * np.array([-1.0, 1.0])
+        noise[:2, :2] = self._wheel_noise(values) + np.outer(turned, turned)
+        return noise
 
     def check(self, values: Array) -> str:
         """Return why a speed is none."""
