@@ -18,7 +18,7 @@ Factorization = Literal["CHOLESKY", "QR"]
 FAILURES = (RuntimeError, ValueError, IndexError, KeyError)  # what gtsam's bindings are known to raise
 
 _BATCH_ITERATIONS = 20
-_RELINEARIZE_OWN = 0.02
+RELINEARIZE_OWN = 0.02  # of a sensor's own variables, in units of how well they were known at first
 
 
 class Solver(Protocol):
@@ -67,8 +67,8 @@ class IncrementalSolver:
         thresholds.insert(("x", pose))
         thresholds.insert(("v", np.full(3, config.relinearize_velocity_m_s)))
         thresholds.insert(("b", np.full(6, config.relinearize_bias)))
-        for letter in "ow":  # own variables of sensors, in units of how well they were known at first
-            thresholds.insert((letter, np.full(1, _RELINEARIZE_OWN)))
+        for letter in "ow":
+            thresholds.insert((letter, np.full(1, RELINEARIZE_OWN)))
         params.setRelinearizeThreshold(thresholds)
         self._isam = gtsam.ISAM2(params)
 

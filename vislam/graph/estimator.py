@@ -23,11 +23,13 @@ from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
 from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
-from vislam.factors.readings import Own, Readings
+from vislam.factors.sensed import Readings
 from vislam.factors.solvers import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
 from vislam.graph.segments import Link, Segment, Stand, summarised
+from vislam.sensors import Suite
 
 _BATCH_ITERATIONS = 50
+_READING_ROUNDS, _READING_GAIN = 3, 1e-4  # in which a batch solution linearises readings anew; relative gain to go on
 _CONVERGED_M = 1e-5  # largest change of a step that finish takes for convergence; rad and m alike
 
 
@@ -56,7 +58,7 @@ class Estimator(Generic[L]):
         """Start empty; `readings` are those of other sensors, a record for each keyframe of the odometry."""
         self._config = config
         self._odometry = odometry
-        self._readings = readings
+        self._readings = Readings(Suite(), config) if readings is None else readings
         self._factorization: Factorization = "CHOLESKY"
         self._solver: Solver = IncrementalSolver(config, self._factorization)
         self._slots: dict[Label, int] = {}
@@ -114,31 +116,12 @@ class Estimator(Generic[L]):
         return read_guess(self._values, k, self.has_imu)
 
     def own(self, name: str) -> tuple[Array, Array] | None:
-        """Return a sensor's own variables [V] and their sigmas [V], NaN where gtsam cannot give them.
+        """See `Readings.own`."""
+        return self._readings.own(name, self._values, self.joint_covariance)
 
-        None while the sensor has none in the graph.
-        """
-        places = None if self._readings is None else self._readings.own(name)
-        if places is None:
-            return None
-        joint = self.joint_covariance([place.key for place in places])
-        units = np.array([place.unit for place in places])
-        sigmas = np.full(len(places), np.nan) if joint is None else np.sqrt(np.diag(joint))
-        return self._own_values(places), sigmas * units
-
-    def own_starts(self) -> tuple[OwnStart, ...]:
-        """Return the own variables of sensors as they are now, each with the unit of its key for a sigma."""
-        if self._readings is None:
-            return ()
-        found = ((name, self._readings.own(name)) for name in self._readings.names)
-        return tuple(
-            OwnStart(name, self._own_values(places), np.array([place.unit for place in places]))
-            for name, places in found
-            if places is not None
-        )
-
-    def _own_values(self, places: list[Own]) -> Array:
-        return np.array([self._values.atDouble(place.key) * place.unit for place in places])
+    def all_own(self) -> tuple[OwnStart, ...]:
+        """See `Readings.all_own`."""
+        return self._readings.all_own(self._values)
 
     def take_read(self) -> NDArray[np.int64]:
         """Return the ids of the poses that were read back since the last call, ascending."""
@@ -195,8 +178,7 @@ class Estimator(Generic[L]):
         values = gtsam.Values()
         for k, guess in enumerate(guesses):
             insert_guess(values, k, guess, self.has_imu)
-        if self._readings is not None:
-            self._readings.complete(values)
+        self._readings.complete(values)
         steps = [self._step(k, values) for k in range(1, len(guesses))]
         try:
             self._restart(values, [], self._new_solver(), from_batch=False, steps=steps)
@@ -207,12 +189,13 @@ class Estimator(Generic[L]):
     def extend(self) -> tuple[Step, str]:
         """Take the next keyframe of the odometry; return its step and what went wrong, normally nothing."""
         k = self._count
+        refreshed = self._readings.refreshed(self._values)
         step = self._step(k, self._values)
         if k == len(self._buffer):
             self._buffer = np.concatenate([self._buffer, np.zeros_like(self._buffer)])
             self._reach_m = np.concatenate([self._reach_m, np.zeros_like(self._reach_m)])
         self._reach_m[k] = self._odometry.reach_m(k)
-        named = self._odometry.news(self.vo_scale) | step.named
+        named = self._odometry.news(self.vo_scale) | step.named | refreshed
         return step, self._extend(step.factors, named, step.guess, step.own)
 
     def distrust_odometry(self, factor: float) -> None:
@@ -284,7 +267,7 @@ class Estimator(Generic[L]):
         A segment with readings of other sensors is never summed up: what they say hangs on more than relative poses.
         """
         inside = segment.keyframes
-        if self._readings is not None and any(map(self._readings.has, range(segment.first, segment.end + 1))):
+        if any(map(self._readings.has, range(segment.first, segment.end + 1))):
             return False
         if self._solver.reads_all or any(k in self._held for k in inside):
             return False
@@ -377,11 +360,10 @@ class Estimator(Generic[L]):
             if float(np.max(np.abs(self.poses - before))) < _CONVERGED_M:
                 break
         now = self._completed(self._values)
-        graph, _ = self._whole(now, self.loops | self.spare, as_measured=True)
-        cost = float(graph.error(now))
+        graph, labels = self._whole(now, self.loops | self.spare, as_measured=True)
+        cost = self._cost(graph, labels, now)
         try:
-            values = optimize(graph, now, _BATCH_ITERATIONS)
-            batch_cost = float(graph.error(values))
+            values, batch_cost = self._batch(graph, labels, now)
             if not batch_cost < cost:
                 return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch reached {batch_cost:.6g}"
         except FAILURES as error:
@@ -393,11 +375,34 @@ class Estimator(Generic[L]):
             note += self._recover(self._values, [], error) + "; "
         return f"{note}batch at cost {batch_cost:.6g}, {self.solver_name} had {cost:.6g}"
 
+    def _batch(
+        self, graph: gtsam.NonlinearFactorGraph, labels: list[Label | None], values: gtsam.Values
+    ) -> tuple[gtsam.Values, float]:
+        """Return the batch solution of a whole graph and its cost; with readings, linearised anew a few times."""
+        best = optimize(graph, values, _BATCH_ITERATIONS)
+        cost = self._cost(graph, labels, best)
+        for _ in range(_READING_ROUNDS if len(self._readings) else 0):
+            graph, labels = self._whole(best, self.loops | self.spare, as_measured=True)
+            tried = optimize(graph, best, _BATCH_ITERATIONS)
+            before, tried_cost = cost, self._cost(graph, labels, tried)
+            if not tried_cost < before:
+                break
+            best, cost = tried, tried_cost
+            if before - cost < _READING_GAIN * before:
+                break
+        return best, cost
+
+    def _cost(self, graph: gtsam.NonlinearFactorGraph, labels: list[Label | None], values: gtsam.Values) -> float:
+        """Return the cost of values in a whole graph, that of readings as they are and not as linearised."""
+        numbers = [n for n, label in enumerate(labels) if label is not None and label[0] == "reading"]
+        linear = sum(float(graph.at(n).error(values)) for n in numbers)
+        return float(graph.error(values)) - linear + self._readings.loss(values)
+
     def _step(self, k: int, values: gtsam.Values) -> Step:
         before = read_guess(values, k - 1, self.has_imu)
         earlier = values.atPose3(X(k - 2)).matrix() if k > 1 else None
         step = self._odometry.step(k, before, earlier, self.vo_scale)
-        return step if self._readings is None else self._readings.joined(step, k, before.T_map_body, values)
+        return self._readings.joined(step, k, before.T_map_body, values)
 
     def _extend(
         self,
@@ -444,8 +449,7 @@ class Estimator(Generic[L]):
         keys = [X(k) for k in solved]
         if self.has_imu:
             keys += [key for k in solved for key in (V(k), B(k))]
-        if self._readings is not None:
-            keys += self._readings.keys_of(solved)
+        keys += self._readings.keys_of(solved)
         self._adopt(self._solver.estimate(keys), ids, self._stands)
 
     def _adopt(self, values: gtsam.Values, ids: NDArray[np.int64], stands: Mapping[int, Stand]) -> None:
@@ -479,8 +483,7 @@ class Estimator(Generic[L]):
         for k in self._stands:
             if not out.exists(X(k)):
                 out.insert(X(k), gtsam.Pose3(self._buffer[k]))
-        if self._readings is not None:
-            self._readings.complete(out)
+        self._readings.complete(out)
         return out
 
     def _begin_anew(self, solver: Solver, labels: list[Label | None], slots: list[int]) -> None:

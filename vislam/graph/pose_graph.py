@@ -24,7 +24,7 @@ from vislam.factors.journal import (
     start_record,
 )
 from vislam.factors.loop import LoopModel
-from vislam.factors.readings import Readings
+from vislam.factors.sensed import Readings
 from vislam.graph.belief import LoopSet
 from vislam.graph.estimator import Estimator
 from vislam.graph.joining import Placement, Waiting, relinked, weak_link
@@ -71,10 +71,8 @@ class PoseGraph:
             self._source = WindowSource(config, SlidingWindow(window, rig, noise, gravity_m_s2))
         else:
             self._source = MotionSource(config, noise, gravity_m_s2, self._lever_m)
-        self._readings = Readings(suite or Suite())
-        self._dropped = 0  # readings of keyframes before which no keyframe tells the way
-        sensed = self._readings if suite is not None and len(suite) else None
-        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, sensed)
+        self._readings = Readings(suite or Suite(), config)
+        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, self._readings)
         self._start: StartRecord | None = None
         self._start_t_ns: int | None = None
         self._journal: list[Record] = []
@@ -144,7 +142,7 @@ class PoseGraph:
         guesses = self._source.restore(self._keyframes, memory)
         self._readings.recall(memory.own)
         for packet, record in zip(memory.packets, self._keyframes, strict=True):
-            self._take_readings(packet, record)
+            self._readings.append(record, len(packet.readings))
         for k in [record.id for record in self._keyframes if record.begins_submap]:
             self._submaps = self._submaps.begun(k)
             self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
@@ -180,7 +178,7 @@ class PoseGraph:
         loops = self._loops.take_states(self._waiting.edges)
         states = self._source.take_states(self._newest)
         return GraphNews(
-            self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, self._estimator.own_starts()
+            self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, self._estimator.all_own()
         )
 
     def add(
@@ -205,7 +203,7 @@ class PoseGraph:
         said = self._source.add(packet, record, T_odom_body)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
-        self._take_readings(packet, record)
+        self._readings.append(record, len(packet.readings))
         self._said = said[-1] if said else None
         self._journal += [self._start, record, *said] if previous is None else [record, *said]
         if previous is None:
@@ -258,8 +256,8 @@ class PoseGraph:
 
     @property
     def reading_counts(self) -> dict[str, int]:
-        """Return what became of readings, as `Readings.counts`, and how many were dropped where a submap begins."""
-        return {**self._readings.counts, "dropped": self._dropped}
+        """Return what became of readings, as `Readings.counts`."""
+        return self._readings.counts
 
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
@@ -275,10 +273,6 @@ class PoseGraph:
                 f"keyframe 0 at {record.t_ns} ns: the initial state is of {self._start_t_ns} ns; "
                 "give the state at the time of keyframe 0"
             )
-
-    def _take_readings(self, packet: KeyframePacket, record: KeyframeRecord) -> None:
-        self._dropped += len(packet.readings) - len(record.readings)
-        self._readings.append(record)
 
     def _motion(self, k: int) -> Array:
         """Return the motion [4, 4] to keyframe k from the one before."""

@@ -97,10 +97,11 @@ def check_version(db: sqlite3.Connection, path: Path) -> int:
         version = db.execute("PRAGMA user_version").fetchone()[0]
     if application != APPLICATION_ID:
         raise DataError(f"{path} is not a vislam session")
-    if not OLDEST_VERSION <= version <= SCHEMA_VERSION:
-        step = "update vislam" if version > SCHEMA_VERSION else "run the recording again"
+    if version > SCHEMA_VERSION:
+        raise DataError(f"{path} has session format {version}, this vislam reads {SCHEMA_VERSION}; update vislam")
+    if version < OLDEST_VERSION:
         raise DataError(
-            f"{path} has session format {version}, this vislam reads {OLDEST_VERSION} and {SCHEMA_VERSION}; {step}"
+            f"{path} has session format {version}, this vislam reads {OLDEST_VERSION}; run the recording again"
         )
     return int(version)
 

@@ -32,7 +32,7 @@ from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig
 from vislam.imu import ImuNoise
 from vislam.run.session.checks import check_records, check_sound, has_readings
 from vislam.run.session.packets import LIGHT_COLUMNS, packet_of
-from vislam.run.session.readings import readings_of, starts_of
+from vislam.run.session.reading_rows import readings_of, starts_of
 from vislam.run.session.schema import (
     DESCRIPTOR_BYTES,
     from_bytes,

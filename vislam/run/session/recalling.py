@@ -25,7 +25,7 @@ from vislam.core.messages import Array, Frame, Keyframe, NavState
 from vislam.factors.factor_log import state_from
 from vislam.imu import ImuNoise
 from vislam.run.session.reader import Session
-from vislam.run.session.readings import own_of
+from vislam.run.session.reading_rows import own_of
 from vislam.run.session.schema import maybe_numbers, numbers, readable, window_of
 
 _RIGID = 1e-4  # how far R R^T may be from identity

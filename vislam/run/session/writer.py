@@ -30,7 +30,7 @@ from vislam.imu import ImuNoise
 from vislam.run.session.checks import check_records, check_sound, checksum, checksums, has_readings
 from vislam.run.session.packets import packet_row
 from vislam.run.session.reader import Session
-from vislam.run.session.readings import own_data, reading_rows, start_rows
+from vislam.run.session.reading_rows import own_data, reading_rows, start_rows
 from vislam.run.session.schema import (
     APPLICATION_ID,
     READINGS_SCHEMA,

@@ -8,22 +8,28 @@ keyframe with readings, tied to the one before, and begins anew with each submap
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
+from vislam.config import GraphConfig
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, PlacedReading
-from vislam.factors.builder import Step
+from vislam.factors.builder import Label, Step
 from vislam.factors.journal import KeyframeRecord
-from vislam.factors.keys import X, own_key, walking_key
-from vislam.factors.reading import ReadingFactor
+from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
+from vislam.factors.reading_factor import ReadingFactor
+from vislam.factors.solvers import RELINEARIZE_OWN
 from vislam.sensors import Suite, Variable
 
+Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
+
 MOST = 10  # readings of one sensor between two keyframes that get factors; of more, as many evenly spaced
+_REFRESHED = 10  # entries, of one sensor and keyframe each, that are linearised anew with a keyframe at most
+_NEWEST, _BLOCK = 20, 40  # entries that are looked at with each keyframe: the newest, and older ones in turn
 _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided by
 
 
@@ -37,35 +43,59 @@ class _Begun:
     newest: dict[int, int] = field(default_factory=dict)  # of walking ones, by number: keyframe of the newest key
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class _Place(NamedTuple):
+    """Where an entry is linearised."""
+
+    T_earlier: Array  # [4, 4]
+    T_later: Array  # [4, 4]
+    own: Array  # [V] in units of the keys
+
+    def is_left(self, now: _Place, config: GraphConfig) -> bool:
+        """Return whether the estimate has moved on by more than the solver itself takes for little."""
+        for before, after in ((self.T_earlier, now.T_earlier), (self.T_later, now.T_later)):
+            change = np.abs(after - before)
+            if change[:3, 3].max() > config.relinearize_translation_m:
+                return True
+            if change[:3, :3].max() > config.relinearize_rotation_rad:
+                return True
+        return bool(np.any(np.abs(now.own - self.own) > RELINEARIZE_OWN))
+
+
+@dataclass(slots=True, eq=False)
 class _Entry:
-    """What one sensor said with one keyframe, and how its own variables enter there."""
+    """What one sensor said with one keyframe, how its own variables enter there, and where it was linearised."""
 
+    number: int  # of all entries
     sensor: str
+    k: int  # the keyframe
     placed: list[PlacedReading]
-    keys: list[int]  # of its own variables
-    earlier: list[int | None]  # of each: the key from which it walked; None: it did not, or begins here
-    new: list[bool]  # of each: its first factors come with this keyframe
-    dt_s: list[float]  # of each: since that
-
-
-class Own(NamedTuple):
-    """Where one own variable is in the graph."""
-
-    key: int
-    unit: float
+    keys: list[int] = field(default_factory=list)  # of its own variables
+    earlier: list[int | None] = field(default_factory=list)  # of each: the key from which it walked; None: from none
+    new: list[bool] = field(default_factory=list)  # of each: its first factors come with this keyframe
+    dt_s: list[float] = field(default_factory=list)  # of each: since that
+    factor: ReadingFactor | None = None
+    place: _Place | None = None
 
 
 class Readings:
-    """Owns the readings of a run as records; factors are built from them at any estimate, as often as asked."""
+    """Owns the readings of a run as records; factors are built from them at any estimate, as often as asked.
 
-    def __init__(self, suite: Suite) -> None:
+    Factors are linear: gtsam copies all its values into each call of a function in Python, and would call it for all
+    readings whenever a variable that they share moves. Those whose estimate has moved since are linearised anew, a few
+    with each keyframe, and all with each new start of the solver.
+    """
+
+    def __init__(self, suite: Suite, config: GraphConfig) -> None:
         """Start empty."""
         self._suite = suite
+        self._config = config
         self._begun: dict[str, _Begun] = {}
-        self._entries: list[list[_Entry]] = []  # by keyframe
+        self._entries: list[_Entry] = []
+        self._by_keyframe: dict[int, list[_Entry]] = {}
+        self._newest: dict[str, _Entry] = {}  # of each sensor
+        self._next_old = 0  # where the next block of older entries begins that is looked at
         self._t_ns: list[int] = []
-        self._failed: set[tuple[int, str, int]] = set()
+        self._failed: set[tuple[int, int]] = set()  # entries and the readings in them
         self._counts: Counter[str] = Counter()
         self._recalled: dict[str, Array] = {}
 
@@ -74,8 +104,8 @@ class Readings:
         """Return how many readings have factors, and how many do not for which reason.
 
         `used`: in factors; `unknown`: of a sensor that the suite does not have; `unusable`: the sensor refuses them;
-        `early`: own variables had no start yet; `thinned`: too many between two keyframes; `failed`: of those used,
-        the sensor's own code failed at some estimate, and they say nothing there.
+        `early`: own variables had no start yet; `thinned`: too many between two keyframes; `dropped`: where a submap
+        begins; `failed`: of those used, the sensor's own code failed at some estimate, and they say nothing there.
         """
         return {**self._counts, "failed": len(self._failed)}
 
@@ -83,9 +113,10 @@ class Readings:
         """Take the last estimate of an earlier run as first guess of the keyframes that are appended next."""
         self._recalled = {one.sensor: np.asarray(one.values, dtype=np.float64) for one in own}
 
-    def append(self, record: KeyframeRecord) -> None:
-        """Take the next keyframe."""
+    def append(self, record: KeyframeRecord, offered: int) -> None:
+        """Take the next keyframe, with which so many readings were `offered`."""
         self._t_ns.append(record.t_ns)
+        self._counts["dropped"] += offered - len(record.readings)
         if record.begins_submap:
             for begun in self._begun.values():
                 begun.newest.clear()
@@ -95,63 +126,89 @@ class Readings:
         for one in record.readings:
             if self._is_usable(one):
                 by_sensor.setdefault(one.reading.sensor, []).append(one)
-        entries = []
         for name, placed in by_sensor.items():
             if self._suite[name].variables and name not in self._begun:
                 self._counts["early"] += len(placed)
                 continue
-            entries.append(self._entry(name, placed, record))
-        self._entries.append(entries)
+            entry = self._newest[name] = self._entry(name, placed, record)
+            self._entries.append(entry)
+            self._by_keyframe.setdefault(record.id, []).append(entry)
+
+    def __len__(self) -> int:
+        """Return how many factors there are."""
+        return len(self._entries)
 
     def has(self, k: int) -> bool:
         """Return whether keyframe k came with factors."""
-        return bool(self._entries[k])
+        return k in self._by_keyframe
 
     def keys_of(self, keyframes: Iterable[int]) -> list[int]:
         """Return the keys of own variables that any of some keyframes touch, and of those that do not change."""
         constant = {own_key(n) for begun in self._begun.values() for n in begun.constant}
-        touched = (key for k in keyframes for entry in self._entries[k] for key in entry.keys)
+        touched = (key for k in keyframes for entry in self._by_keyframe.get(k, ()) for key in entry.keys)
         return sorted(constant.union(touched))
 
     def complete(self, values: gtsam.Values) -> None:
         """Add own variables that values lack, each as near as known."""
-        for entry in (entry for entries in self._entries for entry in entries):
+        for entry in self._entries:
             for key, guess in zip(entry.keys, self._guesses(entry, values), strict=True):
                 if not values.exists(key):
                     values.insert(key, guess)
 
     def joined(self, step: Step, k: int, T_earlier: Array, values: gtsam.Values) -> Step:
         """Return what ties keyframe k to the one before, at T_earlier [4, 4], with the factors of its readings."""
-        if not self._entries[k]:
+        if k not in self._by_keyframe:
             return step
         T_later = values.atPose3(X(k)).matrix() if values.exists(X(k)) else step.guess.T_map_body
-        factors, guesses = list(step.factors), dict[int, float]()
-        for entry in self._entries[k]:
-            sensor, own = self._suite[entry.sensor], self._guesses(entry, values)
+        factors, named, guesses = list(step.factors), dict(step.named), dict[int, float]()
+        for entry in self._by_keyframe[k]:
+            own = self._guesses(entry, values)
             guesses |= {key: guess for key, guess, new in zip(entry.keys, own, entry.new, strict=True) if new}
             factors += self._ties(entry)
-            units = self._units(entry.sensor)
+            entry.factor = None  # its noise hangs on the place, too
+            named[_label(entry)] = self._linearised(entry, _Place(T_earlier, T_later, np.array(own)))
+        return replace(step, factors=factors, named=named, own=guesses)
 
-            def failed(number: int, name: str = entry.sensor) -> None:
-                self._failed.add((k, name, number))
+    def refreshed(self, values: gtsam.Values) -> dict[Label, gtsam.NonlinearFactor]:
+        """Return new factors for a few of those whose estimate has moved on; the newest are looked at each time."""
+        newest = max(len(self._entries) - _NEWEST, 0)
+        begin = self._next_old if self._next_old < newest else 0
+        self._next_old = min(begin + _BLOCK, newest)
+        out: dict[Label, gtsam.NonlinearFactor] = {}
+        for entry in (*reversed(self._entries[newest:]), *self._entries[begin : self._next_old]):
+            if entry.place is None or len(out) == _REFRESHED:
+                continue
+            place = self._place(entry, values)
+            if entry.place.is_left(place, self._config):
+                out[_label(entry)] = self._linearised(entry, place)
+        return out
 
-            variables = np.array(own) * units
-            factor = ReadingFactor(sensor, entry.placed, (T_earlier, T_later), variables, units, failed)
-            if factor.size:
-                factors.append(factor.factor(X(k - 1), X(k), entry.keys))
-        return replace(step, factors=factors, own=guesses)
+    def loss(self, values: gtsam.Values) -> float:
+        """Return what the factors cost at an estimate, not linearised."""
+        total = 0.0
+        for entry in self._entries:
+            if entry.factor is not None:
+                T_earlier, T_later, own = self._place(entry, values)
+                residual = entry.factor.losses(T_earlier, T_later, own * self._units(entry.sensor))
+                total += 0.5 * float(residual @ residual)
+        return total
 
-    def own(self, name: str) -> list[Own] | None:
-        """Return where each own variable of a sensor is now; None before its first factors."""
-        newest = next((e for entries in reversed(self._entries) for e in entries if e.sensor == name), None)
+    def own(self, name: str, values: gtsam.Values, covariance: Covariance) -> tuple[Array, Array] | None:
+        """Return a sensor's own variables [V] and their sigmas [V], NaN where there is no covariance.
+
+        `covariance` gives the joint one of keys. None while the sensor has no variables in the graph.
+        """
+        newest = self._newest.get(name)
         if newest is None or not newest.keys:
             return None
-        return [Own(key, unit) for key, unit in zip(newest.keys, self._units(name).tolist(), strict=True)]
+        joint, units = covariance(newest.keys), self._units(name)
+        sigmas = np.full(len(units), np.nan) if joint is None else np.sqrt(np.diag(joint))
+        return np.array(self._guesses(newest, values)) * units, sigmas * units
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the sensors with own variables that have begun."""
-        return tuple(self._begun)
+    def all_own(self, values: gtsam.Values) -> tuple[OwnStart, ...]:
+        """Return the own variables of all sensors as they are now, each with the unit of its key for a sigma."""
+        found = [(name, entry, self._units(name)) for name, entry in self._newest.items() if entry.keys]
+        return tuple(OwnStart(name, np.array(self._guesses(entry, values)) * u, u) for name, entry, u in found)
 
     def _begin(self, start: OwnStart) -> None:
         """Take first values of a sensor's own variables; what is in the graph already knows better than later ones."""
@@ -169,16 +226,14 @@ class Readings:
         self._begun[start.sensor] = _Begun(values, np.maximum(units, _SIGMA_MIN))
 
     def _is_usable(self, placed: PlacedReading) -> bool:
-        name = placed.reading.sensor
-        if name not in self._suite.names:
+        if placed.reading.sensor not in self._suite.names:
             self._counts["unknown"] += 1
             return False
         try:
             why = self._suite.why_unusable(placed.reading)
         except Exception as error:  # its check is somebody else's code
             why = str(error) or type(error).__name__
-        if why:
-            self._counts["unusable"] += 1
+        self._counts["unusable"] += bool(why)
         return not why
 
     def _entry(self, name: str, placed: list[PlacedReading], record: KeyframeRecord) -> _Entry:
@@ -188,7 +243,7 @@ class Readings:
             chosen = np.linspace(0.0, len(placed) - 1.0, MOST).round().astype(int).tolist()
             placed = [placed[n] for n in chosen]
         self._counts["used"] += len(placed)
-        entry = _Entry(name, placed, [], [], [], [])
+        entry = _Entry(len(self._entries), name, record.id, placed)
         if not self._suite[name].variables:
             return entry
         begun, first = self._begun[name], self._suite.own(name).start
@@ -204,6 +259,29 @@ class Readings:
             else:
                 begun.constant.add(n)
         return entry
+
+    def _linearised(self, entry: _Entry, place: _Place) -> gtsam.NonlinearFactor:
+        """Return the factor of an entry at a place."""
+        units = self._units(entry.sensor)
+        if entry.factor is None:
+
+            def failed(n: int) -> None:
+                self._failed.add((entry.number, n))
+
+            sensor, poses = self._suite[entry.sensor], (place.T_earlier, place.T_later)
+            entry.factor = ReadingFactor(sensor, entry.placed, poses, place.own * units, units, failed)
+        entry.place = place
+        around = gtsam.Values()  # few, for they are copied
+        around.insert(X(entry.k - 1), gtsam.Pose3(nearest_rigid(place.T_earlier)))
+        around.insert(X(entry.k), gtsam.Pose3(nearest_rigid(place.T_later)))
+        for key, value in zip(entry.keys, place.own.tolist(), strict=True):
+            around.insert(key, value)
+        nonlinear = entry.factor.factor(X(entry.k - 1), X(entry.k), entry.keys)
+        return gtsam.LinearContainerFactor(nonlinear.linearize(around), around)
+
+    def _place(self, entry: _Entry, values: gtsam.Values) -> _Place:
+        T_earlier, T_later = (values.atPose3(X(k)).matrix() for k in (entry.k - 1, entry.k))
+        return _Place(T_earlier, T_later, np.array(self._guesses(entry, values)))
 
     def _units(self, name: str) -> Array:
         return self._begun[name].units if self._suite[name].variables else np.zeros(0)
@@ -235,6 +313,10 @@ class Readings:
             elif entry.new[n]:
                 out.append(_prior(entry.keys[n], variable, unit))
         return out
+
+
+def _label(entry: _Entry) -> Label:
+    return "reading", entry.number
 
 
 def _prior(key: int, variable: Variable, unit: float) -> gtsam.PriorFactorDouble:

@@ -1,8 +1,7 @@
 """The factor of what one sensor said between two keyframes, by the definition that every estimator uses.
 
-The residuals of all its readings stand in one factor: gtsam copies all its values into each call of a CustomFactor, so
-that fewer of them are cheaper. Each reading has a Cauchy kernel of its own in it, as gtsam would apply one: the
-linearised rows carry the root of the weight, and the error is the loss.
+The residuals of all its readings stand in one factor, and each has a Cauchy kernel of its own in it, as gtsam would
+apply one: the linearised rows carry the root of the weight, and the error is the loss.
 """
 
 from __future__ import annotations
