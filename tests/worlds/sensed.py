@@ -109,9 +109,7 @@ def station_at(world: World, k: int, share: float, imu: bool = True) -> Station:
         R, p, v = R @ so3_exp(0.5 * dt * (gyro[i] + gyro[i + 1])), p + dt * v + 0.5 * dt * dt * force, v + dt * force
         path.append((R, v, p))
     (R_all, _, p_all), (R_s, v_s, p_s) = path[-1], path[here]
-    return Station(
-        here * dt, length_s, R_s, v_s, p_s, R_all, p_all, GRAVITY_M_S2, gyro[here], *bias, _IMU_SIGMA_M_S2
-    )
+    return Station(here * dt, length_s, R_s, v_s, p_s, R_all, p_all, GRAVITY_M_S2, gyro[here], *bias, _IMU_SIGMA_M_S2)
 
 
 def reading_at(

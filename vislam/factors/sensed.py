@@ -28,7 +28,7 @@ from vislam.sensors import Suite, Variable
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
 
 MOST = 10  # readings of one sensor between two keyframes that get factors; of more, as many evenly spaced
-_REFRESHED = 10  # entries, of one sensor and keyframe each, that are linearised anew with a keyframe at most
+_REFRESHED = 5  # entries, of one sensor and keyframe each, that are linearised anew with a keyframe at most
 _NEWEST, _BLOCK = 20, 40  # entries that are looked at with each keyframe: the newest, and older ones in turn
 _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided by
 

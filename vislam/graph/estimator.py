@@ -16,20 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import GraphConfig
-from vislam.core.geometry import invert, se3_adjoint
 from vislam.core.messages import Array
-from vislam.core.readings import OwnStart
 from vislam.factors.builder import Guess, Label, Step, insert_guess, read_guess
 from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
 from vislam.factors.sensed import Readings
 from vislam.factors.solvers import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
-from vislam.graph.segments import Link, Segment, Stand, summarised
+from vislam.graph.segments import Link, Segment, Stand, joint_beside, summarised
+from vislam.graph.settling import BATCH_ITERATIONS, settled, short
 from vislam.sensors import Suite
 
-_BATCH_ITERATIONS = 50
-_READING_ROUNDS, _READING_GAIN = 3, 1e-4  # in which a batch solution linearises readings anew; relative gain to go on
 _CONVERGED_M = 1e-5  # largest change of a step that finish takes for convergence; rad and m alike
 
 
@@ -83,6 +80,11 @@ class Estimator(Generic[L]):
         return self._buffer[: self._count]
 
     @property
+    def values(self) -> gtsam.Values:
+        """Return the estimate of all variables, each as it was last read back."""
+        return self._values
+
+    @property
     def has_imu(self) -> bool:
         """Return whether velocities and biases are estimated."""
         return self._odometry.has_imu
@@ -115,14 +117,6 @@ class Estimator(Generic[L]):
         """Return the estimated state of keyframe k."""
         return read_guess(self._values, k, self.has_imu)
 
-    def own(self, name: str) -> tuple[Array, Array] | None:
-        """See `Readings.own`."""
-        return self._readings.own(name, self._values, self.joint_covariance)
-
-    def all_own(self) -> tuple[OwnStart, ...]:
-        """See `Readings.all_own`."""
-        return self._readings.all_own(self._values)
-
     def take_read(self) -> NDArray[np.int64]:
         """Return the ids of the poses that were read back since the last call, ascending."""
         ids = np.unique(np.concatenate(self._read)) if self._read else np.zeros(0, np.int64)
@@ -135,7 +129,7 @@ class Estimator(Generic[L]):
         That of poses alone has in it what their odometry is wrong by in common.
         """
         try:
-            joint = self._joint(keys)
+            joint = joint_beside(self._stands, keys, self._solver.joint_covariance)
         except FAILURES:
             return None
         ids = [key - X(0) for key in keys]
@@ -143,21 +137,6 @@ class Estimator(Generic[L]):
             shared = self._odometry.shared_error(ids, self.poses)
             joint = joint if shared is None else joint + shared @ shared.T
         return joint if np.all(np.isfinite(joint)) else None
-
-    def _joint(self, keys: list[int]) -> Array:
-        """Return the joint marginal of variables; how one stands beside another errs independently of all else."""
-        stands = [self._stands.get(key - X(0)) for key in keys]
-        if not any(stands):
-            return self._solver.joint_covariance(keys)
-        hosts = [key if stand is None else X(stand.host) for key, stand in zip(keys, stands, strict=True)]
-        unique = sorted(set(hosts))
-        solved = self._solver.joint_covariance(unique)
-        carry, own = np.zeros((6 * len(keys), 6 * len(unique))), np.zeros((6 * len(keys), 6 * len(keys)))
-        for n, (host, stand) in enumerate(zip(hosts, stands, strict=True)):
-            rows, columns = slice(6 * n, 6 * n + 6), slice(6 * unique.index(host), 6 * unique.index(host) + 6)
-            carry[rows, columns] = np.eye(6) if stand is None else se3_adjoint(invert(stand.T_host_self))
-            own[rows, rows] = 0.0 if stand is None else stand.covariance
-        return np.asarray(carry @ solved @ carry.T + own)
 
     def begin(self) -> str:
         """Take the first keyframe; return what went wrong, normally nothing."""
@@ -360,43 +339,17 @@ class Estimator(Generic[L]):
             if float(np.max(np.abs(self.poses - before))) < _CONVERGED_M:
                 break
         now = self._completed(self._values)
-        graph, labels = self._whole(now, self.loops | self.spare, as_measured=True)
-        cost = self._cost(graph, labels, now)
+        loops = self.loops | self.spare
+        found = settled(lambda values: self._whole(values, loops, as_measured=True), now, self._readings, optimize)
+        if found.failure or not found.cost < found.cost_before:
+            why = f"failed: {found.failure}" if found.failure else f"reached {found.cost:.6g}"
+            return f"{note}kept {self.solver_name} at cost {found.cost_before:.6g}, batch {why}"
         try:
-            values, batch_cost = self._batch(graph, labels, now)
-            if not batch_cost < cost:
-                return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch reached {batch_cost:.6g}"
-        except FAILURES as error:
-            return f"{note}kept {self.solver_name} at cost {cost:.6g}, batch failed: {_short(error)}"
-        try:
-            self._restart(values, [], self._new_solver(), from_batch=False)
-            self._adopt(values, np.arange(self._count), self._stands)
+            self._restart(found.values, [], self._new_solver(), from_batch=False)
+            self._adopt(found.values, np.arange(self._count), self._stands)
         except FAILURES as error:
             note += self._recover(self._values, [], error) + "; "
-        return f"{note}batch at cost {batch_cost:.6g}, {self.solver_name} had {cost:.6g}"
-
-    def _batch(
-        self, graph: gtsam.NonlinearFactorGraph, labels: list[Label | None], values: gtsam.Values
-    ) -> tuple[gtsam.Values, float]:
-        """Return the batch solution of a whole graph and its cost; with readings, linearised anew a few times."""
-        best = optimize(graph, values, _BATCH_ITERATIONS)
-        cost = self._cost(graph, labels, best)
-        for _ in range(_READING_ROUNDS if len(self._readings) else 0):
-            graph, labels = self._whole(best, self.loops | self.spare, as_measured=True)
-            tried = optimize(graph, best, _BATCH_ITERATIONS)
-            before, tried_cost = cost, self._cost(graph, labels, tried)
-            if not tried_cost < before:
-                break
-            best, cost = tried, tried_cost
-            if before - cost < _READING_GAIN * before:
-                break
-        return best, cost
-
-    def _cost(self, graph: gtsam.NonlinearFactorGraph, labels: list[Label | None], values: gtsam.Values) -> float:
-        """Return the cost of values in a whole graph, that of readings as they are and not as linearised."""
-        numbers = [n for n, label in enumerate(labels) if label is not None and label[0] == "reading"]
-        linear = sum(float(graph.at(n).error(values)) for n in numbers)
-        return float(graph.error(values)) - linear + self._readings.loss(values)
+        return f"{note}batch at cost {found.cost:.6g}, {self.solver_name} had {found.cost_before:.6g}"
 
     def _step(self, k: int, values: gtsam.Values) -> Step:
         before = read_guess(values, k - 1, self.has_imu)
@@ -493,7 +446,7 @@ class Estimator(Generic[L]):
 
     def _recover(self, values: gtsam.Values, fresh: list[L], error: Exception) -> str:
         """Go down the ladder until a solver takes the records; always ends with a usable one."""
-        cause = f"gtsam failed ({_short(error)}); "
+        cause = f"gtsam failed ({short(error)}); "
         self._factorization = "QR"
         values = self._completed(values)
         rungs = [(fresh, False), ([], False), ([], True)] if fresh else [([], False), ([], True)]
@@ -519,12 +472,7 @@ class Estimator(Generic[L]):
         return IncrementalSolver(self._config, self._factorization)
 
     def _restart(
-        self,
-        values: gtsam.Values,
-        fresh: list[L],
-        solver: Solver,
-        from_batch: bool,
-        steps: list[Step] | None = None,
+        self, values: gtsam.Values, fresh: list[L], solver: Solver, from_batch: bool, steps: list[Step] | None = None
     ) -> None:
         """Fill a new solver from the records, starting at `values`; nothing changes when it fails.
 
@@ -534,7 +482,7 @@ class Estimator(Generic[L]):
         values = self._completed(values)
         if from_batch:
             plain = {edge.id for edge in fresh}
-            values = optimize(self._whole(values, loops, plain)[0], values, _BATCH_ITERATIONS)
+            values = optimize(self._whole(values, loops, plain)[0], values, BATCH_ITERATIONS)
         graph, labels = self._whole(values, loops, steps=steps)
         slots = solver.update(graph, values, [])
         solver.iterate(self._config.loop_iterations)
@@ -576,8 +524,3 @@ def _graph(factors: list[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
     for factor in factors:
         graph.add(factor)
     return graph
-
-
-def _short(error: Exception) -> str:
-    lines = [line for line in str(error).strip().splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0][:80] if lines else ''}"

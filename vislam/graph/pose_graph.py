@@ -49,17 +49,12 @@ class PoseGraph:
     """
 
     def __init__(
-        self,
-        config: GraphConfig,
-        noise: ImuNoise | None,
-        gravity_m_s2: float,
-        rig: Rig,
-        window: WindowConfig,
+        self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, rig: Rig, window: WindowConfig,
         suite: Suite | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Set up for a rig; without `noise` there is no IMU and only poses are estimated.
 
-        `suite` has the sensors whose readings become factors; of any other, they are left out and counted.
+        `suite` has the sensors whose readings become factors; `readings.counts` tells what became of them.
         """
         self._config = config
         self._noise = noise
@@ -71,8 +66,8 @@ class PoseGraph:
             self._source = WindowSource(config, SlidingWindow(window, rig, noise, gravity_m_s2))
         else:
             self._source = MotionSource(config, noise, gravity_m_s2, self._lever_m)
-        self._readings = Readings(suite or Suite(), config)
-        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, self._readings)
+        self.readings = Readings(suite or Suite(), config)
+        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, self.readings)
         self._start: StartRecord | None = None
         self._start_t_ns: int | None = None
         self._journal: list[Record] = []
@@ -140,17 +135,16 @@ class PoseGraph:
         has_gravity = self._noise is not None
         self._keyframes, self._journal = restored_journal(memory, self._config, has_gravity, self._start)
         guesses = self._source.restore(self._keyframes, memory)
-        self._readings.recall(memory.own)
+        self.readings.recall(memory.own)
         for packet, record in zip(memory.packets, self._keyframes, strict=True):
-            self._readings.append(record, len(packet.readings))
+            self.readings.append(record, len(packet.readings))
         for k in [record.id for record in self._keyframes if record.begins_submap]:
             self._submaps = self._submaps.begun(k)
             self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
         models = [LoopModel(r, self._config, self._lever_m) for r in self._journal if isinstance(r, LoopRecord)]
         by_place = sort_loops(memory.loops, {m.id: m for m in models})
-        steps, note = self._estimator.restore(
-            guesses, by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE], memory.vo_scale
-        )
+        held, spare = by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE]
+        steps, note = self._estimator.restore(guesses, held, spare, memory.vo_scale)
         poses = self._estimator.poses
         for record, step in zip(self._keyframes[1:], steps, strict=True):
             T_map_before = memory.T_map_body[record.id - 1]
@@ -177,9 +171,8 @@ class PoseGraph:
         """Return what `restore` will need of the last keyframe, beside what was measured and the poses."""
         loops = self._loops.take_states(self._waiting.edges)
         states = self._source.take_states(self._newest)
-        return GraphNews(
-            self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, self._estimator.all_own()
-        )
+        own = self.readings.all_own(self._estimator.values)
+        return GraphNews(self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, own)
 
     def add(
         self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None
@@ -203,7 +196,7 @@ class PoseGraph:
         said = self._source.add(packet, record, T_odom_body)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
-        self._readings.append(record, len(packet.readings))
+        self.readings.append(record, len(packet.readings))
         self._said = said[-1] if said else None
         self._journal += [self._start, record, *said] if previous is None else [record, *said]
         if previous is None:
@@ -252,12 +245,7 @@ class PoseGraph:
 
         Those that walk are as with the newest reading. None while none of them has a factor.
         """
-        return self._estimator.own(name)
-
-    @property
-    def reading_counts(self) -> dict[str, int]:
-        """Return what became of readings, as `Readings.counts`."""
-        return self._readings.counts
+        return self.readings.own(name, self._estimator.values, self._estimator.joint_covariance)
 
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
@@ -383,24 +371,12 @@ class PoseGraph:
         self._published = known
         self._revision += 1
         newest = self._newest = self._state(len(poses) - 1) if self._noise is not None else None
-        details = {
-            "solver": self._estimator.solver_name,
-            "pending": self._loops.pending,
-            "vo_scale": self._estimator.vo_scale,
-            **self._source.details,
-        }
+        solver, vo_scale = self._estimator.solver_name, self._estimator.vo_scale
+        details = {"solver": solver, "pending": self._loops.pending, "vo_scale": vo_scale, **self._source.details}
         return GraphUpdate(
-            self._revision,
-            moved,
-            poses[moved],
-            self._T_map_odom,
-            newest,
-            tuple(accepted),
-            tuple(refused),
-            note,
-            details,
-            self._submaps,
-        )
+            self._revision, moved, poses[moved], self._T_map_odom, newest, tuple(accepted), tuple(refused), note,
+            details, self._submaps,
+        )  # fmt: skip
 
 
 def _variances(record: KeyframeRecord, step: Step) -> tuple[float, float]:

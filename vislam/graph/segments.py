@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
-from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array
 from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
@@ -129,6 +129,25 @@ def summarised(
     joint = np.block([[spread + cross @ carry.T, cross], [cross.T, known]])
     told, shift = H[own:, own:] + H[own:, :own] @ carry, eta[own:] + carry.T @ eta[:own]
     return Summary(_tree(told, shift, around, poses), _stands(joint, segment, around, poses))
+
+
+def joint_beside(stands: Mapping[int, Stand], keys: list[int], solved: Callable[[list[int]], Array]) -> Array:
+    """Return the joint marginal of variables, of which `solved` gives those that the solver has.
+
+    How one stands beside another errs independently of all else.
+    """
+    beside = [stands.get(key - X(0)) for key in keys]
+    if not any(beside):
+        return solved(keys)
+    hosts = [key if stand is None else X(stand.host) for key, stand in zip(keys, beside, strict=True)]
+    unique = sorted(set(hosts))
+    known = solved(unique)
+    carry, own = np.zeros((6 * len(keys), 6 * len(unique))), np.zeros((6 * len(keys), 6 * len(keys)))
+    for n, (host, stand) in enumerate(zip(hosts, beside, strict=True)):
+        rows, columns = slice(6 * n, 6 * n + 6), slice(6 * unique.index(host), 6 * unique.index(host) + 6)
+        carry[rows, columns] = np.eye(6) if stand is None else se3_adjoint(invert(stand.T_host_self))
+        own[rows, rows] = 0.0 if stand is None else stand.covariance
+    return np.asarray(carry @ known @ carry.T + own)
 
 
 def _tree(told: Array, shift: Array, ids: list[int], poses: Mapping[int, Array]) -> dict[tuple[int, int], Link]:

@@ -1,0 +1,66 @@
+"""The batch solution of a whole graph, and whether it is better than where it began."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import gtsam
+
+from vislam.factors.builder import Label
+from vislam.factors.sensed import Readings
+from vislam.factors.solvers import FAILURES
+
+BATCH_ITERATIONS = 50
+_ROUNDS, _GAIN = 3, 1e-4  # in which readings are linearised anew, at most; a smaller relative gain ends them
+
+Optimizer = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values, int], gtsam.Values]
+Whole = tuple[gtsam.NonlinearFactorGraph, list[Label | None]]  # all factors, with their names
+
+
+class Settled(NamedTuple):
+    """A batch solution."""
+
+    values: gtsam.Values
+    cost_before: float
+    cost: float
+    failure: str  # empty: gtsam found one
+
+
+def settled(
+    whole: Callable[[gtsam.Values], Whole], values: gtsam.Values, readings: Readings, optimize: Optimizer
+) -> Settled:
+    """Return the batch solution from `values`, at which `whole` builds all factors; it may cost more.
+
+    Readings count as they are, not as linearised.
+    """
+    graph = whole(values)
+    before = _cost(graph, values, readings)
+    try:
+        best = optimize(graph[0], values, BATCH_ITERATIONS)
+        cost = _cost(graph, best, readings)
+        for _ in range(_ROUNDS if len(readings) else 0):
+            graph = whole(best)
+            tried = optimize(graph[0], best, BATCH_ITERATIONS)
+            last, tried_cost = cost, _cost(graph, tried, readings)
+            if not tried_cost < last:
+                break
+            best, cost = tried, tried_cost
+            if last - cost < _GAIN * last:
+                break
+    except FAILURES as error:
+        return Settled(values, before, before, short(error))
+    return Settled(best, before, cost, "")
+
+
+def short(error: Exception) -> str:
+    """Return the first line of what gtsam said."""
+    lines = [line for line in str(error).strip().splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0][:80] if lines else ''}"
+
+
+def _cost(whole: Whole, values: gtsam.Values, readings: Readings) -> float:
+    graph, labels = whole
+    numbers = [n for n, label in enumerate(labels) if label is not None and label[0] == "reading"]
+    linear = sum(float(graph.at(n).error(values)) for n in numbers)
+    return float(graph.error(values)) - linear + readings.loss(values)
