@@ -71,7 +71,11 @@ class Checkpoint(Generic[S]):
 
 
 class History(Generic[S, M]):
-    """Events in order of their stamps (ties in order of arrival) and checkpoints, both bounded by `forget_before`."""
+    """Events in order of their stamps and checkpoints, both bounded by `forget_before`.
+
+    Of one stamp, readings of other sensors come last, by name, and what begins a sensor before them: several of them
+    often have one stamp. The rest stands in order of arrival.
+    """
 
     def __init__(self, first: Checkpoint[S], time_of: Callable[[Event[M], S], int]) -> None:
         """Begin at a checkpoint; `time_of` tells when an event happened by the IMU's clock, as far as a state knows."""
@@ -87,7 +91,7 @@ class History(Generic[S, M]):
 
     def insert(self, event: Event[M]) -> int:
         """Sort an event in and return its number since the start."""
-        place = bisect_right(self._events, event.t_ns, key=_stamp)
+        place = bisect_right(self._events, _turn(event), key=_turn)
         self._events.insert(place, event)
         return place + self._forgotten
 
@@ -142,6 +146,13 @@ class History(Generic[S, M]):
         forgotten, self._events = self._events[:drop], self._events[drop:]
         self._forgotten += drop
         return forgotten
+
+
+def _turn(event: Event[M]) -> tuple[int, int, str]:
+    what = event.measurement
+    if isinstance(what, Reading):
+        return event.t_ns, 2, what.sensor
+    return (event.t_ns, 1, what.sensor) if isinstance(what, OwnStart) else (event.t_ns, 0, "")
 
 
 def _stamp(item: Event[M] | Checkpoint[S]) -> int:

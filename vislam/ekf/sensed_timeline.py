@@ -16,7 +16,7 @@ from vislam.sensors import BodyState
 class SensedTimeline(Timeline[S, M]):
     """The timeline with readings of a `Suite` of sensors. Stamps are by the IMU's clock.
 
-    As every measurement they may come late and in any order; of those with one stamp the order of arrival counts.
+    As every measurement they may come late and in any order, those with one stamp included.
     """
 
     def begin_sensor(self, t_ns: int, start: OwnStart) -> UpdateResult:
