@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from vislam.config import load
-from vislam.core.geometry import skew
+from vislam.core.geometry import skew, so3_exp, so3_log
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import CameraCalibration, Ekf, MsckfEkf
 from vislam.ekf.filtering import Filtering
+from vislam.ekf.tight.own_variables import by_now
 from vislam.ekf.tight.state import CLONES
 from vislam.sensors import BodyState, Sensor, Suite, Variable
 from worlds import monte_carlo as mc
@@ -113,6 +114,31 @@ def test_a_marked_place_stays_the_keyframe_that_was_taken_there() -> None:
         assert most < 0.03
         assert compared == ekf.counters["vo_accepted"] + 1 + ekf.counters["vo_gated"]
         assert ekf.counters["vo_accepted"] > 50
+
+
+def test_a_new_keyframe_shares_all_errors_of_the_body() -> None:
+    """Those with own variables, too: whatever tells a scale tells where the keyframe is."""
+    sensors = {"speed": Speed(), "fix": Fix()}
+    run = SensedRun.make(30, 2.0, sensors, {"speed": 20, "fix": 30})
+    _, ekf = list(run.replay(made("loose", Suite(sensors))))[-1]
+    assert ekf.add_keyframe(7, ekf.state().t_ns).accepted
+    P = ekf._state.P
+    assert np.abs(P[21:, 3:6]).min() > 1e-7
+    np.testing.assert_allclose(P[15:21], P[0:6], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(P[:, 15:21], P[:, 0:6], rtol=1e-9, atol=1e-15)
+
+
+def test_the_error_of_the_body_a_moment_ago_hangs_on_that_of_now_as_it_says() -> None:
+    rng, ago_s, h = np.random.default_rng(8), 0.05, 1e-6
+    bias = rng.normal(size=(2, 3))
+    body = BodyState(0, so3_exp(rng.normal(size=3)), *rng.normal(size=(2, 3)), *bias, rng.normal(size=3))
+    there, M = body.later(-ago_s), by_now(body, ago_s)
+    for k, e in enumerate(np.eye(15) * h):
+        moved = body.moved(e).later(-ago_s)
+        turned = so3_log(np.ascontiguousarray(there.R_world_body.T @ moved.R_world_body))
+        parts = ("position_m", "velocity_m_s", "gyro_bias_rad_s", "accel_bias_m_s2")
+        change = np.concatenate([turned, *(getattr(moved, part) - getattr(there, part) for part in parts)])
+        np.testing.assert_allclose(change / h, M[:, k], atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vislam.core.geometry import so3_exp
+from vislam.core.geometry import so3_exp, so3_right_jacobian
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.history import Outcome
@@ -41,7 +41,7 @@ def corrected_by_reading(
     sensing.grow(name, reading.t_ns, window.own_since_ns, P)
     grown = replace(window, P=P)
     H = np.zeros((len(rows.residual), len(P)))
-    H[:, :INERTIAL] = rows.H @ _then(body, ago_s) @ to_nav_error(x)
+    H[:, :INERTIAL] = rows.H @ by_now(body, ago_s) @ to_nav_error(x)
     H[:, window.first_own :][:, at] = rows.H_own
     S = H @ P @ H.T + np.eye(len(H))
     nis = float(rows.residual @ np.linalg.solve(S, rows.residual))
@@ -51,10 +51,10 @@ def corrected_by_reading(
     return replace(corrected(grown, x, H, rows.residual), own_since_ns=since_ns), out
 
 
-def _then(body: BodyState, ago_s: float) -> Array:
+def by_now(body: BodyState, ago_s: float) -> Array:
     """Return how the error [15] of the body a moment ago, `body.later(-ago_s)`, hangs on that of now."""
     M = np.eye(INERTIAL)
     M[0:3, 0:3] = so3_exp(body.rate_rad_s * ago_s)
-    M[0:3, 9:12] = ago_s * np.eye(3)
+    M[0:3, 9:12] = ago_s * so3_right_jacobian(-body.rate_rad_s * ago_s)
     M[3:6, 6:9] = -ago_s * np.eye(3)
     return M
