@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from vislam.report.drawing import Axis, Lines, drawing
+from vislam.run.report.drawing import Axis, Lines, drawing
 
 SQUARE = np.array([[[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]]])
 

@@ -11,9 +11,9 @@ import pytest
 
 from run_folder import DEGRADED, LOST, make_run
 from vislam.core.errors import DataError, StorageError
-from vislam.report import write_report
-from vislam.report.run_files import read_run
-from vislam.report.scene import build_scene, loop_segments
+from vislam.run.report import write_report
+from vislam.run.report.run_files import read_run
+from vislam.run.report.scene import build_scene, loop_segments
 
 
 class Page(HTMLParser):

@@ -15,9 +15,9 @@ from vislam.cli import run_verb
 from vislam.config import load
 from vislam.core.messages import Frame, ImuSample
 from vislam.datasets.recorder import record
-from vislam.report.run_files import read_run
 from vislam.run import execute
 from vislam.run.folder import prepare
+from vislam.run.report.run_files import read_run
 from vislam.sim import open_world
 from vislam.trajectory import read_tum
 

@@ -1,6 +1,7 @@
 """The reference pipeline, on one thread: measurements go in by `Slam.feed`, one `Step` per frame comes out.
 
 inertial sample -> EKF                                  -> pose in odom, at IMU rate
+reading         -> EKF, and with the next keyframe -> graph
 frame           -> front end -> EKF                     -> keyframe?
 keyframe        -> loop detector -> graph -> mapper     -> poses in map, T_map_odom, map
 """
@@ -15,20 +16,22 @@ from vislam.core.clock import StageClock
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Frame, GraphUpdate, ImuSample, MagSample
+from vislam.core.readings import Reading
 from vislam.pipeline.back import Back, KeyframeIntake
 from vislam.pipeline.front import Front
 from vislam.pipeline.in_map import InMap
 from vislam.pipeline.steps import Finish, Step
+from vislam.sensors import Suite
 
 
 class Slam:
-    """Camera and IMU in, poses and map out; deterministic, one thread, two doors: an inertial sample and a frame."""
+    """Camera and IMU in, poses and map out; deterministic, one thread."""
 
-    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None = None) -> None:
-        """Build the pipeline for a rig; without `noise` there is no IMU."""
+    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None = None, suite: Suite | None = None) -> None:
+        """Build the pipeline for a rig; without `noise` there is no IMU. `suite` are further sensors, if any."""
         self.clock = StageClock()
-        self.front = Front(config, rig, noise, self.clock)
-        self._intake = KeyframeIntake(rig, self.front, self.clock)
+        self.front = Front(config, rig, noise, self.clock, suite)
+        self._intake = KeyframeIntake(rig, self.front, self.clock, suite)
         self._in_map = InMap(config.publish)
         self._frames: deque[Frame] = deque()
 
@@ -65,7 +68,7 @@ class Slam:
         self._in_map.begin(update.submaps.begun(first_id))
         return update
 
-    def feed(self, value: ImuSample | MagSample | Frame) -> list[Step]:
+    def feed(self, value: ImuSample | MagSample | Reading | Frame) -> list[Step]:
         """Take one measurement; return a step for every frame that could be processed with it.
 
         A frame waits until one inertial sample newer than it has come, so that its span ends exactly at its time.

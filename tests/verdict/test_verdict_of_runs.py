@@ -8,9 +8,9 @@ from vislam.cli.verbs.results import print_metrics
 from vislam.config import load
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.messages import Frame, ImuSample
-from vislam.report import write_report
 from vislam.run import execute
 from vislam.run.folder import prepare
+from vislam.run.report import write_report
 from vislam.run.sources import open_source
 from vislam.sim.faults.faults import FAULTS, FaultyRecording
 

@@ -23,6 +23,7 @@ from vislam.config.ranges import Whole, check_ranges
 from vislam.config.sensors import (
     Axes,
     BridgeClockConfig,
+    FurtherSensorsConfig,
     Gy85Config,
     Matrix3,
     RecordConfig,
@@ -46,6 +47,7 @@ __all__ = [
     "DriveConfig",
     "EkfConfig",
     "FrontEndConfig",
+    "FurtherSensorsConfig",
     "GraphConfig",
     "GraphWorldConfig",
     "Gy85Config",
@@ -89,6 +91,7 @@ class Config:
     seed: Whole = 0  # of every random choice in the pipeline
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
+    sensors: FurtherSensorsConfig = field(default_factory=FurtherSensorsConfig)
     frontend: FrontEndConfig = field(default_factory=FrontEndConfig)
     init: InitConfig = field(default_factory=InitConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
@@ -129,6 +132,7 @@ def load(path: Path | None = None, overrides: dict[str, Any] | None = None, prof
 def load_sensors(path: Path | None = None) -> SensorsConfig:
     """Return the sensors of a cart as a TOML file describes them; raises UsageError as `load` does."""
     data = {} if path is None else _read_toml(path)
+    data.pop("sensors", None)  # further ones, of which `vislam.sensors.toml` makes something
     _refuse_unknown(data, SensorsConfig, str(path))
     return validated(SensorsConfig, data, str(path))
 

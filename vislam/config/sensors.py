@@ -138,3 +138,10 @@ class RecordConfig:
     image_format: Literal["jpg", "png"] = "jpg"  # MJPG cameras give no more; png takes five times the space
     image_queue: Count = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
     imu_queue: Count = 8000  # samples that may wait: 18 s at 450 Hz
+
+
+@dataclass(frozen=True, slots=True)
+class FurtherSensorsConfig:
+    """Sensors other than IMU and camera; docs/sensors.md."""
+
+    file: str | None = None  # TOML with a table `[sensors.NAME]` for each, beside which their readings lie

@@ -16,13 +16,14 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.geometry import invert, transform
 from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking
-from vislam.ekf.correction import Correction, Hint
+from vislam.ekf.correction import Correction, Hint, ToldReading
 from vislam.ekf.loose.filter import Ekf
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
 from vislam.live.inertial_only import InertialOnly
 from vislam.live.notices import CameraHealth, Doubted, MapMoved, Rebase, Start, ToFast
 from vislam.live.wire.published_pose import PublishedPose, of_base
+from vislam.sensors import Suite
 from vislam.trajectory.continuity import Continuity, in_odom
 
 _NS = 1_000_000_000
@@ -38,7 +39,7 @@ class FastPath:
 
     def __init__(
         self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None],
-        memory: BiasMemory | None = None, is_mag_calibrated: bool = False,
+        memory: BiasMemory | None = None, is_mag_calibrated: bool = False, suite: Suite | None = None,
     ) -> None:  # fmt: skip
         """Prepare an uninitialised filter.
 
@@ -49,13 +50,14 @@ class FastPath:
             publish: takes each pose.
             memory: gyro biases that earlier power-ups found; None: none.
             is_mag_calibrated: without, its samples say nothing: iron on the cart turns the field as it turns the cart.
+            suite: further sensors, of which vision's side hands over the readings; None: none.
         """
         self.counters = {"samples": 0, "rests_without_vision": 0, "wheels_without_vision": 0, "rebases": 0}
         self._config = config
         self._noise = noise
         self._T_body_camera = T_body_camera
         self._publish = publish
-        self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, T_body_camera)
+        self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, T_body_camera, suite=suite)
         self._buffer = ImuBuffer(config.imu)
         self._is_mag_calibrated = is_mag_calibrated
         self._alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
@@ -137,7 +139,7 @@ class FastPath:
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
-        corrects = self._started and isinstance(message, (Correction, Rebase))
+        corrects = self._started and isinstance(message, (Correction, ToldReading, Rebase))
         before = self._ekf.state() if corrects else None
         self._take(message)
         if before is not None:
@@ -149,6 +151,8 @@ class FastPath:
             is_seen = message.vo.tracking is not Tracking.LOST
             self._follow_vision(is_seen, answer.accepted, is_seen and not np.isnan(answer.nis) and not answer.accepted)
             self._at_rest = message.at_rest
+        elif isinstance(message, ToldReading):
+            message.apply(self._ekf)
         elif isinstance(message, Rebase):
             self.counters["rebases"] += 1
             self._ekf.initialise(message.state)

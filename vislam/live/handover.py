@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,11 @@ class EndedGraph:
     T_map_body: Array  # [M, 4, 4]
     nav_states: list[NavState]
     reports: list[EdgeReport]
+    own_variables: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # of further sensors, with sigmas
+
+    def own(self, name: str) -> tuple[Array, Array] | None:
+        """Return own variables of a further sensor and their sigmas; None where it has none in the graph."""
+        return self.own_variables.get(name)
 
     def poses(self) -> Array:
         """Return T_map_body [M, 4, 4]."""

@@ -27,6 +27,8 @@ def status_line(run: LiveRun) -> str:
     reasons = run.notes.get("front", {}).get("verdict", {}).get("reasons")
     names += f"  because {reasons[0]}" if reasons else ""
     names += f"  no zero yet: {refused}" if refused else ""
+    silent = {name: word for name, word in run.notes.get("front", {}).get("sensors", {}).items() if word != "well"}
+    names += "".join(f"  {name} {word}" for name, word in silent.items())
     late = f"{latency['p50']:.2f}/{latency['p99']:.2f} ms" if "p50" in latency else "-"
     every = run.notes.get("front", {}).get("every", 1)
     slow = f"too slow, one frame in {every} is taken  " if every > 1 else ""

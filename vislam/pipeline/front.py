@@ -27,7 +27,9 @@ from vislam.core.messages import (
     Tracking,
     VoMeasurement,
 )
+from vislam.core.readings import Reading
 from vislam.ekf import Ekf, Hint
+from vislam.ekf.correction import ToldReading
 from vislam.ekf.filtering import Filtering
 from vislam.ekf.tight import EarlyFrames
 from vislam.frontend import TrackResult, make_frontend
@@ -51,8 +53,10 @@ from vislam.imu import (
 )
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.gravity import GravityWait, Released
+from vislam.pipeline.readings import ReadingIntake
 from vislam.pipeline.settings import derived
 from vislam.pipeline.steps import Estimate, FrontStep
+from vislam.sensors import Suite
 from vislam.trajectory.continuity import in_odom
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
@@ -71,8 +75,13 @@ class Front:
     left before that was known keeps the camera's own time.
     """
 
-    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock) -> None:
-        """Build the stages for a rig; without `noise` there is no IMU and odometry is visual only."""
+    def __init__(
+        self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock, suite: Suite | None = None
+    ) -> None:
+        """Build the stages for a rig; without `noise` there is no IMU and odometry is visual only.
+
+        `suite` are the sensors other than IMU and camera, if there are any.
+        """
         self.config = config = derived(config, rig, noise)
         self.frontend = make_frontend(config.frontend, rig, config.seed)
         if noise is None and self.frontend.mode == "mono":
@@ -101,10 +110,14 @@ class Front:
             self.condition = ConditionWatch()
             self._rest = RestDetector(config.init, noise)
             self._stillness = Stillness(config.init)
-            self._filter = Filtering(config.ekf, noise, config.imu.gravity_m_s2, rig)
+            self._filter = Filtering(config.ekf, noise, config.imu.gravity_m_s2, rig, suite)
             early = EarlyFrames(config.ekf, rig, config.imu.gravity_m_s2) if self.frontend.mode == "mono" else None
             self._gravity = GravityWait(config, rig, noise, self._filter, self._buffer, early)
             self.ekf_coupling = self._filter.coupling
+        self._readings: ReadingIntake | None = None
+        if suite is not None and len(suite):
+            buffer = None if noise is None else self._buffer
+            self._readings = ReadingIntake(suite, self._filter, buffer, config.imu.gravity_m_s2)
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
         self._graph_state: NavState | None = None  # at the newest keyframe that the graph has told of
@@ -175,14 +188,23 @@ class Front:
         camera = None if self._filter is None else self._filter.camera
         return replace(self.frontend.news, time_offset_sigma_s=self.camera_clock.sigma_s, filter_camera=camera)
 
-    def add(self, value: ImuSample | MagSample) -> None:
-        """Take a sample of an inertial sensor; the filter predicts at once."""
+    def add(self, value: ImuSample | MagSample | Reading) -> None:
+        """Take a sample of an inertial sensor, or a reading of another; the filter predicts at once."""
         if isinstance(value, MagSample):
             self._mag = value
+        elif isinstance(value, Reading):
+            if self._readings is not None:
+                self._readings.add(value)
         elif self._has_imu and self._filter is not None and self._buffer.add(value):
             with self._clock.measure("ekf predict"):
                 self._filter.ekf.predict(value)
             self.condition.add(value)
+            if self._readings is not None and self._gravity.initialisation is not None:
+                self._readings.hand_on(value.t_ns)
+
+    def take_told_readings(self) -> list[ToldReading]:
+        """Return what the filter was told by further sensors since this was asked last."""
+        return [] if self._filter is None else self._filter.take_told_readings()
 
     def add_hint(self, hint: Hint) -> None:
         """Tell the filter what holds a body while the camera sees nothing."""
@@ -224,6 +246,8 @@ class Front:
             ready = self._seek_gravity(span, track, still_image)
             estimate, state = self._correct(frame, track, at_rest, span)
         T_odom_body = None if estimate is None else estimate.T_odom_body
+        if self._readings is not None:
+            self._readings.see(frame.t_ns, T_odom_body)
         T_keyframe_body = self._since_keyframe(T_vo_keyframe_body, T_odom_body)
         if track.keyframe is not None:
             ready += self._take_keyframe(track, T_odom_body, state)
@@ -262,6 +286,7 @@ class Front:
             self.condition.condition() if self.noise is not None else None,
             self.noise,
             self._track_noise.summary(self._told_px),
+            {} if self._readings is None else self._readings.report(),
         )  # fmt: skip
 
     @property
@@ -316,6 +341,8 @@ class Front:
             counters["camera clock"] = {"changes": self.camera_clock.changes}
         if self._filter is not None:
             counters["ekf"] = dict(self._filter.ekf.counters)
+        if self._readings is not None:
+            counters |= {f"sensor {name}": dict(counts) for name, counts in self._readings.counters.items()}
         return counters
 
     @property
@@ -496,6 +523,8 @@ class Front:
         packet = KeyframePacket(
             keyframe, track.vo, track.observations, imu, self._mag, at_rest, self.camera_clock.applied_s, begins_submap
         )
+        if self._readings is not None and not (self._has_imu and self._gravity.holds_keyframes):
+            packet = self._readings.pack(packet, self._keyframe_t_ns, state)
         self.camera_clock.took_keyframe()
         self._keyframe_variance_m2 = variance_m2
         self._keyframe_id, self._keyframe_t_ns = keyframe.id, keyframe.t_ns
@@ -527,6 +556,8 @@ class Front:
             return self._take_released(self._gravity.give_up_scale(now_t_ns))
         self.counters["imu_given_up"] = 1
         self._filter, self._has_imu = None, False
+        if self._readings is not None:
+            self._readings.give_up_filter()
         released = self._take_released(self._gravity.give_up(self._T_upright))
         self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
         return released

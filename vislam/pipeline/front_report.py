@@ -30,6 +30,7 @@ class FrontReport:
     condition: InertialCondition | None = None  # of the IMU; None without one
     told_noise: ImuNoise | None = None  # of the IMU
     track_noise: dict[str, Any] = field(default_factory=dict)  # of pixels: what tracks showed, and what was used for it
+    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # further ones, see `ReadingIntake.report`
 
     @property
     def alignment(self) -> Alignment:

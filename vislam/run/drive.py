@@ -21,6 +21,7 @@ from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
 from vislam.core.messages import Frame, ImuSample, Localisation, LoopDecision, MagSample, Submaps, Tracking
+from vislam.core.readings import Reading
 from vislam.core.recording import Recording
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
@@ -31,8 +32,9 @@ from vislam.pipeline.steps import KeyframeStep, Step
 from vislam.run.cost import CostMeter
 from vislam.run.evidence import KeyframeWitness, front_evidence, whole_evidence
 from vislam.run.folder import RunLog
+from vislam.run.further_sensors import further_readings
 from vislam.run.loop_gallery import LoopGallery
-from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, verdict_entry
+from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, sensors_entry, verdict_entry
 from vislam.run.pipeline import Pipeline
 from vislam.run.session import Session, SessionWriter, recall
 from vislam.run.show import show_map, show_paths, show_step
@@ -76,10 +78,12 @@ class Run:
         """
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
         self.recording = shaken(without_idle_cameras(recording, config), config.imu.vibration)
+        self._further = None if slam else further_readings(recording, config.sensors, config.seed)
+        suite = None if self._further is None else self._further.suite
         self.config = config
         self.out = out
         self.noise = imu_noise(config.imu, recording.imu_noise)
-        self.slam: Pipeline = Slam(config, recording.rig, self.noise) if slam is None else slam
+        self.slam: Pipeline = Slam(config, recording.rig, self.noise, suite) if slam is None else slam
         self.log = RunLog()
         self.cost = CostMeter()
         self.gallery = LoopGallery()
@@ -195,15 +199,15 @@ class Run:
                         progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
         raise KeyboardInterrupt  # between two values, where the pipeline is whole
 
-    def _values(self) -> Iterator[ImuSample | MagSample | Frame]:
-        """Yield the recording, or what is left of it."""
+    def _values(self) -> Iterator[ImuSample | MagSample | Frame | Reading]:
+        """Yield the recording with the readings of further sensors, or what is left of it."""
         if self._from is None:
-            yield from self.recording.events()
+            yield from self._events()
             return
         begin_ns = self._from.camera_t_ns
         samples_ns = min(begin_ns, self._from.t_ns) - _INERTIAL_BEFORE_NS
         begun = False
-        for value in self.recording.events(begin_ns):
+        for value in self._events(begin_ns):
             if value.t_ns < (begin_ns if isinstance(value, Frame) else samples_ns):
                 continue
             if isinstance(value, Frame) and not begun:
@@ -214,6 +218,10 @@ class Run:
                     )
                 begun = True
             yield value
+
+    def _events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
+        events = self.recording.events(from_ns)
+        return events if self._further is None else self._further.among(events)
 
     def _take(self, step: Step) -> None:
         if self._from is not None and step.front.frame.t_ns <= self._from.t_ns:
@@ -352,7 +360,8 @@ class Run:
             "cost": self.cost.entry(timing_ms),
             "counters": counters,
             "nis": front.nis,
-            "problems": dict(self.recording.problems),
+            "sensors": sensors_entry(front.sensors, None if back is None else back.graph),
+            "problems": {**self.recording.problems, **({} if self._further is None else self._further.problems)},
             "loops": loops,
             "graph_revisions": self.log.revisions,
             "coverage_frames": evidence.coverage,

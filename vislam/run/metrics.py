@@ -9,6 +9,7 @@ from typing import Any
 from vislam.core.errors import DataError, TrackingLostError, VislamError
 from vislam.pipeline.front_report import FrontReport
 from vislam.run.folder import RunLog
+from vislam.run.pipeline import FinalGraph
 from vislam.run.verdict import Evidence, Verdict
 from vislam.trajectory import Alignment, Trajectory, evaluate
 
@@ -75,6 +76,16 @@ def verdict_entry(evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
         "moved": list(verdict.moved),
         "evidence": asdict(evidence),
     }
+
+
+def sensors_entry(told: dict[str, dict[str, Any]], graph: FinalGraph | None) -> dict[str, dict[str, Any]]:
+    """Return what is known of further sensors, `told` by the front half, with their own variables in the graph."""
+    out = {}
+    for name, entry in told.items():
+        found = None if graph is None or not entry["variables"] else graph.own(name)
+        by_graph = {} if found is None else {"graph": {"values": found[0].tolist(), "sigmas": found[1].tolist()}}
+        out[name] = entry | by_graph
+    return out
 
 
 def refuse(metrics: dict[str, Any], out: Path) -> None:

@@ -104,6 +104,10 @@ class FinalGraph(Protocol):
         """Return the states of the keyframes; empty without an IMU."""
         ...
 
+    def own(self, name: str) -> tuple[Array, Array] | None:
+        """Return own variables [V] of a further sensor and their sigmas [V]; None where it has none in the graph."""
+        ...
+
     def edge_reports(self) -> list[EdgeReport]:
         """Return what became of every offered loop."""
         ...

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vislam.config import validated
-from vislam.config.ranges import Finite, Probability
+from vislam.config.ranges import Finite, NonNegative, Probability
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.sensors.configured import Configured
@@ -34,6 +34,7 @@ class _Common:
     kind: str
     file: str = ""  # beside the TOML file; empty: readings come from elsewhere
     format: FileFormat | None = None  # None: by the file's ending
+    simulated_hz: NonNegative = 0.0  # above 0, and without a file, readings are drawn on the truth of a recording
     offset_s: Finite = 0.0  # is added to the file's stamps, to have them by the IMU's clock
     gate_probability: Probability = 0.999
     ticks: TicksSettings | None = None
@@ -58,6 +59,7 @@ class SensorSetup:
     suite: Suite
     sensors: Mapping[str, Configured]
     files: Mapping[str, SensorFile]
+    simulated_hz: Mapping[str, float]  # of those whose readings are drawn
 
 
 def load_sensor_setup(path: Path) -> SensorSetup:
@@ -81,19 +83,22 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
         raise UsageError(f"{source}: 1 to {MOST_SENSORS} tables [sensors.NAME] are asked")
     sensors: dict[str, Configured] = {}
     files: dict[str, SensorFile] = {}
+    simulated: dict[str, float] = {}
     for name, table in tables.items():
         where = f"{source}: [sensors.{name}]"
         if not _NAME.fullmatch(name):
             raise UsageError(f"{where}: a name of letters, digits, - and _ is asked, a letter first, 32 at most")
         if not isinstance(table, dict):
             raise UsageError(f"{where}: a table is asked, got {table!r}")
-        sensors[name], file = _sensor(table, where, folder)
+        sensors[name], file, rate_hz = _sensor(table, where, folder)
         if file is not None:
             files[name] = file
-    return SensorSetup(Suite(sensors), sensors, files)
+        elif rate_hz > 0.0:
+            simulated[name] = rate_hz
+    return SensorSetup(Suite(sensors), sensors, files, simulated)
 
 
-def _sensor(table: dict[str, Any], where: str, folder: Path) -> tuple[Configured, SensorFile | None]:
+def _sensor(table: dict[str, Any], where: str, folder: Path) -> tuple[Configured, SensorFile | None, float]:
     if not isinstance(table.get("kind"), str):
         raise UsageError(f'{where}: option kind: a name is asked, as kind = "position", got {table.get("kind")!r}')
     shared = {key.name for key in dataclasses.fields(_Common)}
@@ -112,7 +117,7 @@ def _sensor(table: dict[str, Any], where: str, folder: Path) -> tuple[Configured
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
     sensor.gate_probability = common.gate_probability
-    return sensor, _file(common, sensor, where, folder)
+    return sensor, _file(common, sensor, where, folder), common.simulated_hz
 
 
 def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> SensorFile | None:

@@ -62,8 +62,8 @@ def _print_edges(loops: list[dict[str, Any]]) -> None:
 
 
 def _change(options: LoopsOptions) -> int:
-    from vislam.report import write_report
     from vislam.run.offline.loop_undo import change_loops
+    from vislam.run.report import write_report
 
     answer = change_loops(options.run, options.undo, options.redo)
     write_report(options.run)

@@ -75,8 +75,8 @@ def _describe(options: MapOptions) -> int:
 
 
 def _rebuild(options: MapOptions) -> int:
-    from vislam.report import write_report
     from vislam.run.offline.rebuild import rebuild
+    from vislam.run.report import write_report
 
     with progress_bar(options.source.name, "steps") as progress:
         answer = rebuild(options.source, options.settings, options.out, options.poses, progress)

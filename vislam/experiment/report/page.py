@@ -13,7 +13,19 @@ from vislam.experiment.report.exports import best, shown, shown_spread, variant_
 from vislam.experiment.statistics import Comparison, Group
 from vislam.experiment.trials import BY_NAME, Trial
 from vislam.experiment.winners import Winner
-from vislam.report.html import Cell, bullets, card, escape, folded, note, preformatted, section, stylesheet, table, tile
+from vislam.run.report.html import (
+    Cell,
+    bullets,
+    card,
+    escape,
+    folded,
+    note,
+    preformatted,
+    section,
+    stylesheet,
+    table,
+    tile,
+)
 
 _ACCURACY = (
     "ate_m", "scale_error", "start_scale_sigma", "end_scale_sigma", "rpe_1m_percent", "rpe_5m_percent",

@@ -18,13 +18,14 @@ from vislam.live.processes.child import Life
 from vislam.live.rehearsal import rehearse
 from vislam.live.wire.mail import Inbox, Outbox
 from vislam.pipeline.back import Back
+from vislam.sensors import Suite
 
 _WAIT_S = 0.1
 
 
 def run(
     life: Life, config: Config, rig: Rig, noise: ImuNoise, keyframes: Connection, to_fast: Connection,
-    to_map: Connection, beginning: Beginning | None,
+    to_map: Connection, beginning: Beginning | None, suite: Suite,
 ) -> None:  # fmt: skip
     """Take keyframes until the front process ends them; then finish the graph and hand it over.
 
@@ -37,6 +38,7 @@ def run(
         to_fast: `MapMoved`, one per revision.
         to_map: `BackBegun` if there is a `beginning`, `KeyframeStep`, then `BackEnded`.
         beginning: the session that the run goes on from.
+        suite: further sensors, whose readings come with keyframes.
     """
     cv2.setNumThreads(1)
     config = replace(config, map=replace(config.map, enabled=False))
@@ -47,7 +49,7 @@ def run(
     begins_recording = beginning is not None
     if beginning is not None:
         memory = recalled(beginning)
-        back = Back(config, rig, noise, clock, memory.first_state, memory.T_start)
+        back = Back(config, rig, noise, clock, memory.first_state, memory.T_start, suite)
         _put(life, outbox, BackBegun(back.restore(memory)))
         del memory
     life.ready()
@@ -55,7 +57,8 @@ def run(
         if life.is_brief:
             continue  # those that had to wait are left out
         if back is None:
-            back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, keyframe.odometry.T_odom_body)
+            T_odom_body = keyframe.odometry.T_odom_body
+            back = Back(config, rig, keyframe.noise, clock, keyframe.first_state, T_odom_body, suite)
         if begins_recording:
             begins_recording = not back.begin_recording(keyframe.first_state, keyframe.odometry.T_odom_body)
             if begins_recording:
@@ -67,7 +70,8 @@ def run(
         ended = BackEnded(None, None, None, {}, clock.summary_ms())
     else:
         update = back.finish()
-        graph = EndedGraph(back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports())
+        own = {name: found for name in suite.names if (found := back.graph.own(name)) is not None}
+        graph = EndedGraph(back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports(), own)
         ended = BackEnded(graph, update, back.graph.take_news(), back.counters, clock.summary_ms())
     _put(life, outbox, ended)
     outbox.close()

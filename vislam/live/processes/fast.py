@@ -26,6 +26,7 @@ from vislam.live.processes.child import Life
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import PosePublisher
 from vislam.live.wire.stream import SampleSender
+from vislam.sensors import Suite
 
 _NS = 1_000_000_000
 _READ_S = 0.005  # most that reading waits: messages of vision are looked for in between
@@ -42,6 +43,7 @@ def run(
     inbox: list[Connection],
     memory: BiasMemory,
     is_mag_calibrated: bool,
+    suite: Suite,
 ) -> None:
     """Read, predict, publish, until the run ends; then end the stream of samples.
 
@@ -55,6 +57,7 @@ def run(
         inbox: from the front and the back process.
         memory: gyro biases that earlier power-ups found.
         is_mag_calibrated: whether what the magnetometer says may be used.
+        suite: further sensors, which another process reads.
     """
     warm_up(config, noise, T_body_camera)
     take_priority(config.live, life)
@@ -64,7 +67,7 @@ def run(
     try:
         source = open_source()
         try:
-            fast = FastPath(config, noise, T_body_camera, publisher.publish, memory, is_mag_calibrated)
+            fast = FastPath(config, noise, T_body_camera, publisher.publish, memory, is_mag_calibrated, suite)
             if life.ready():
                 _loop(life, fast, source, sender, Messages(inbox), latency)
             counters = {

@@ -7,6 +7,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
@@ -29,6 +30,7 @@ from vislam.live.handover import FrontEnded, KeyframeOut, Seen
 from vislam.live.notices import CameraHealth, Doubted, Rebase, Start, ToFast
 from vislam.live.pace import Pace
 from vislam.live.processes.child import Life
+from vislam.live.readings import ReadingSource
 from vislam.live.rehearsal import rehearse_front
 from vislam.live.wire.mail import Outbox
 from vislam.live.wire.publisher import PoseReader
@@ -39,10 +41,12 @@ from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.steps import FrontStep
 from vislam.run.evidence import front_evidence
 from vislam.run.verdict import Trust, Verdict, judge
+from vislam.sensors import Suite
 
 _LOG = logging.getLogger(__name__)
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
 _PUT_S = 0.1
+_SENSORS_S = 1.0  # between two words on how further sensors are
 _JUDGE_NS = 1_000_000_000  # of frames between verdicts: one costs a millisecond
 _STEPS = 4096  # frames that may wait for the map process: minutes; then it is stuck
 
@@ -53,6 +57,8 @@ def run(
     rig: Rig,
     noise: ImuNoise,
     open_camera: Callable[[], FrameSource],
+    open_readings: Callable[[], ReadingSource],
+    suite: Suite,
     samples: socket.socket,
     to_fast: Connection,
     to_back: Connection,
@@ -67,6 +73,8 @@ def run(
         rig: the cameras.
         noise: of the IMU.
         open_camera: opens them, in this process.
+        open_readings: opens the further sensors, in this process.
+        suite: what those are.
         samples: from the fast process.
         to_fast: corrections.
         to_back: `KeyframeOut`.
@@ -75,29 +83,28 @@ def run(
     """
     cv2.setNumThreads(1)
     rehearse_front(config, rig, noise)
-    camera = open_camera()
-    try:
+    with ExitStack() as devices:
+        camera = devices.enter_context(closing(open_camera()))
+        readings = devices.enter_context(closing(open_readings()))
         back, follower = Outbox(to_back, config.live.keyframe_queue), Outbox(to_map, _STEPS)
-        process = FrontProcess(life, config, rig, noise, to_fast, back, follower)
+        process = FrontProcess(life, config, rig, noise, suite, to_fast, back, follower)
         if beginning is not None:
             process.front.begin_in_map(beginning.first_id, beginning.next_track_id)
         if life.ready():
-            process.loop(camera, SampleReceiver(samples))
+            process.loop(camera, SampleReceiver(samples), readings)
             process.end()
         process.closing(camera.counters())
-    finally:
-        camera.close()
 
 
 class FrontProcess:
     """Owns the front half of this run and the ends of its wires."""
 
     def __init__(
-        self, life: Life, config: Config, rig: Rig, noise: ImuNoise, to_fast: Connection, to_back: Outbox,
-        to_map: Outbox,
+        self, life: Life, config: Config, rig: Rig, noise: ImuNoise, suite: Suite, to_fast: Connection,
+        to_back: Outbox, to_map: Outbox,
     ) -> None:  # fmt: skip
         self.clock = StageClock()
-        self.front = Front(config, rig, noise, self.clock)
+        self.front = Front(config, rig, noise, self.clock, suite)
         self._life, self._config = life, config
         self._to_fast, self._to_back, self._to_map = to_fast, to_back, to_map
         self._frames: deque[Frame] = deque()
@@ -106,16 +113,21 @@ class FrontProcess:
         self._camera_health = Health(0)
         self._verdict = Verdict(Trust.TRUSTED)
         self._judged_t_ns = 0
+        self._sensors_noted_s = 0.0
         self._frames_taken = 0
         self._feeds_depth = makes_depth(config, rig)
         self._poses: PoseReader | None = None
         self._counters = {"crowded_frames": 0, "waits_for_back": 0, "back_late_ms": 0}
         self._pace, self._told_every = Pace(noise.rate_hz), 1
 
-    def loop(self, camera: FrameSource, samples: SampleReceiver) -> None:
-        """Take frames and samples until the samples end."""
+    def loop(self, camera: FrameSource, samples: SampleReceiver, readings: ReadingSource) -> None:
+        """Take frames, samples and readings until the samples end."""
         while not samples.ended and not self._life.is_orphan:
+            for reading in readings.read():
+                self.front.add(reading)
             samples.receive(self._take)
+            self._tell_readings()
+            self._follow_sensors(readings)
             frame = camera.read(_READ_S)
             if frame is not None and self._pace.wants(frame):
                 self._frames.append(frame)
@@ -194,6 +206,19 @@ class FrontProcess:
             return
         for correction in step.corrections:
             self._send(replace(correction, observations=no_observations()))
+
+    def _tell_readings(self) -> None:
+        """Tell the fast process's filter what this one was told by further sensors; `Rebase` has it in its state."""
+        for told in self.front.take_told_readings():
+            if self.front.ekf_coupling != "tight":
+                self._send(told)
+
+    def _follow_sensors(self, readings: ReadingSource) -> None:
+        """Note once a second how the further sensors are."""
+        now_s = time.monotonic()
+        if now_s - self._sensors_noted_s >= _SENSORS_S and (status := readings.status()):
+            self._sensors_noted_s = now_s
+            self._life.note(sensors=status)
 
     def _judge(self, t_ns: int) -> None:
         """Tell the pose whether the run so far is to be doubted, and people why; nothing while it begins."""

@@ -21,6 +21,7 @@ from vislam.factors.factor_log import rig_from
 from vislam.graph import PoseGraph
 from vislam.loop.table import read_loops
 from vislam.run.folder import RunLog, read_metrics, recorded_alignment
+from vislam.run.further_sensors import suite_of
 from vislam.run.session import Session, SessionWriter, recall
 from vislam.trajectory import evaluate, read_tum, write_states_csv, write_tum
 
@@ -138,7 +139,8 @@ def _optimise(config: Config, info: dict[str, Any], memory: SlamMemory) -> _Redo
     """Build the graph of the run from what the session stored, and optimise it to convergence."""
     start = memory.front.start
     noise, first = (None, None) if start is None else (start.noise, start.first_state)
-    graph = PoseGraph(config.graph, noise, float(info["gravity_m_s2"]), rig_from(info["rig"]), config.window)
+    suite = suite_of(config.sensors)
+    graph = PoseGraph(config.graph, noise, float(info["gravity_m_s2"]), rig_from(info["rig"]), config.window, suite)
     graph.initialise(first, memory.T_start)
     graph.restore(memory.graph)
     return _Redone(graph, graph.finish(), graph.take_news(), config)

@@ -45,6 +45,7 @@ class AnchorRangeSettings:
     bias_m: Finite = 0.0  # by which all ranges are too long
     bias_sigma_m: NonNegative = 0.0  # above 0 it is estimated
     bias_walk_m_per_sqrt_s: NonNegative = 0.0
+    scale_sigma: NonNegative = 0.0  # above 0 it is estimated how many times the distance a range is
 
 
 class AnchorRange(Configured):
@@ -67,10 +68,12 @@ class AnchorRange(Configured):
             anchors += vector_variables(f"anchor_{number}", (place[0], place[1], place[2]), s.anchor_sigma_m)
         lever = vector_variables("lever", s.lever_m, s.lever_sigma_m)
         bias = (Variable("bias_m", s.bias_sigma_m, s.bias_m, s.bias_walk_m_per_sqrt_s),) if s.bias_sigma_m else ()
-        self.variables = frame + anchors + lever + bias
+        scale = (Variable("scale", s.scale_sigma, 1.0),) if s.scale_sigma else ()
+        self.variables = frame + anchors + lever + bias + scale
         self._frame, self._moving = len(frame), bool(anchors)
         self._lever = slice(len(frame + anchors), len(frame + anchors + lever))
-        self._bias = slice(self._lever.stop, len(self.variables))
+        self._bias = slice(self._lever.stop, self._lever.stop + len(bias))
+        self._scale = slice(self._bias.stop, len(self.variables))
         self._lever_m: Array = np.array(s.lever_m, dtype=np.float64)
 
     def residual(self, values: Array, body: BodyState, own: Array) -> Array:
@@ -82,7 +85,8 @@ class AnchorRange(Configured):
         number = int(values[0])
         antenna = placed(body, own[: self._frame], self._lever_of(own))
         away = antenna.point_m - self._anchor(number, own)
-        ray = away / max(float(np.linalg.norm(away)), _TOUCHING_M)
+        distance_m = float(np.linalg.norm(away))
+        ray = self._scale_of(own) * away / max(distance_m, _TOUCHING_M)
         H_own = np.zeros((1, len(own)))
         H_own[0, : self._frame] = ray @ antenna.by_frame
         if self._moving:
@@ -90,6 +94,7 @@ class AnchorRange(Configured):
         if self._lever.stop > self._lever.start:
             H_own[0, self._lever] = ray @ antenna.by_lever
         H_own[0, self._bias] = 1.0
+        H_own[0, self._scale] = distance_m
         return (ray @ antenna.H)[None], H_own
 
     def noise(self, values: Array) -> Array:
@@ -110,11 +115,13 @@ class AnchorRange(Configured):
         readings, bodies = thinned_pairs(readings, bodies)
         world = [body.position_m + body.R_world_body @ self._lever_m for body in bodies]
         variances = [r.covariance[0, 0] if r.covariance is not None else self.settings.sigma_m**2 for r in readings]
-        unsure = self.settings.anchor_sigma_m**2 + self.settings.lever_sigma_m**2
+        far = np.array([r.values[1] for r in readings])
+        settled = self.settings.anchor_sigma_m**2 + self.settings.lever_sigma_m**2
+        unsure = settled + (self.settings.scale_sigma * far) ** 2
         seen = Ranges(
             np.array(world).reshape(-1, 3),
             np.array([self._anchors[int(r.values[0])] for r in readings]).reshape(-1, 3),
-            np.array([r.values[1] for r in readings]),
+            far,
             np.sqrt(np.array(variances) + unsure),
         )
         rows = [*range(4), self._bias.start] if self._bias.stop > self._bias.start else list(range(4))
@@ -136,10 +143,13 @@ class AnchorRange(Configured):
     def _predicted(self, number: int, body: BodyState, own: Array) -> Array:
         antenna = placed(body, own[: self._frame], self._lever_of(own)).point_m
         bias = own[self._bias] if self._bias.stop > self._bias.start else np.array([self.settings.bias_m])
-        return np.linalg.norm(antenna - self._anchor(number, own)) + bias
+        return self._scale_of(own) * np.linalg.norm(antenna - self._anchor(number, own)) + bias
 
     def _anchor(self, number: int, own: Array) -> Array:
         return own[self._at[number] : self._at[number] + 3] if self._moving else self._anchors[number]
+
+    def _scale_of(self, own: Array) -> float:
+        return float(own[self._scale.start]) if self._scale.stop > self._scale.start else 1.0
 
     def _lever_of(self, own: Array) -> Array:
         return own[self._lever] if self._lever.stop > self._lever.start else self._lever_m

@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from vislam.report.html import stylesheet
+from vislam.run.report.html import stylesheet
 
 # matplotlib cannot write CSS variables: these colours stand for them and are replaced in the SVG
 _VARIABLES = {

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from vislam.core.errors import VislamError
 from vislam.core.geometry import invert, sim3_parts, transform
 from vislam.core.messages import Array
-from vislam.report.run_files import RunFiles, as_dict
 from vislam.run.folder import recorded_alignment
+from vislam.run.report.run_files import RunFiles, as_dict
 from vislam.trajectory import Trajectory, align, associate, nees
 
 _LABELS = {"truth": "truth", "ekf": "EKF alone", "live": "live (causal)", "graph": "graph, final", "batch": "batch"}

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from vislam.core.files import write_text
-from vislam.report import plots
-from vislam.report.html import (
+from vislam.run.report import plots
+from vislam.run.report.html import (
     Cell,
     bullets,
     card,
@@ -29,9 +29,9 @@ from vislam.report.html import (
     table,
     tile,
 )
-from vislam.report.loop_section import loops_section
-from vislam.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_run
-from vislam.report.scene import Scene, build_scene
+from vislam.run.report.loop_section import loops_section
+from vislam.run.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_run
+from vislam.run.report.scene import Scene, build_scene
 from vislam.run.verdict import verdict_sentence
 
 

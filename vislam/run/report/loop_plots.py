@@ -10,7 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from vislam.report.style import CODE, RC, light, svg
+from vislam.run.report.style import CODE, RC, light, svg
 
 STAGES = {"appearance": "muted", "temporal": "warn", "geometry": "live", "checks": "ekf", "graph": "graph"}
 _TITLES = {

@@ -6,10 +6,10 @@ import re
 from collections import Counter
 
 from vislam.loop.table import LoopRow, caption
-from vislam.report import loop_plots
-from vislam.report.html import Cell, card, escape, folded, grid, note, number, picture, section, table
-from vislam.report.run_files import RunFiles, as_dict
-from vislam.report.scene import Scene
+from vislam.run.report import loop_plots
+from vislam.run.report.html import Cell, card, escape, folded, grid, note, number, picture, section, table
+from vislam.run.report.run_files import RunFiles, as_dict
+from vislam.run.report.scene import Scene
 
 _SHOWN_LOOPS = 10  # rows that are always seen
 _MAX_LOOPS = 300  # rows that can be unfolded; the rest is in loops.csv

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 from vislam.core.late import late
 
 if TYPE_CHECKING:
-    from vislam.report.loop_plots import write_loop_plot
-    from vislam.report.page import write_report
+    from vislam.run.report.loop_plots import write_loop_plot
+    from vislam.run.report.page import write_report
 
 __all__ = ["write_loop_plot", "write_report"]
 
 __getattr__ = late(
     __name__,
     {
-        "write_loop_plot": "vislam.report.loop_plots",
-        "write_report": "vislam.report.page",
+        "write_loop_plot": "vislam.run.report.loop_plots",
+        "write_report": "vislam.run.report.page",
     },
 )

@@ -13,8 +13,8 @@ from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
 from vislam.core.errors import DataError
 from vislam.core.files import write_text
 from vislam.core.messages import Array
-from vislam.report.drawing import Axis, Lines, drawing
-from vislam.report.html import bullets, card, escape, folded, grid, note, number, section, stylesheet, table, tile
+from vislam.run.report.drawing import Axis, Lines, drawing
+from vislam.run.report.html import bullets, card, escape, folded, grid, note, number, section, stylesheet, table, tile
 
 _MAX_LINES = 3000  # edges drawn of a picture: more cannot be seen and only makes the file heavy
 _REGIONS = 40  # poses whose uncertainty is drawn

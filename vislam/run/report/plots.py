@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from vislam.core.messages import Array, NavState
-from vislam.report.run_files import RunFiles
-from vislam.report.scene import Scene, loop_segments
-from vislam.report.style import CODE, RC, svg
+from vislam.run.report.run_files import RunFiles
+from vislam.run.report.scene import Scene, loop_segments
+from vislam.run.report.style import CODE, RC, svg
 
 _WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
 _STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad"}

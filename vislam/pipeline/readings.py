@@ -1,0 +1,187 @@
+"""Readings of further sensors on their way: first to find where their frames are, then to the filter and the graph."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from vislam.core.messages import Array, KeyframePacket, NavState
+from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
+from vislam.ekf.filtering import Filtering
+from vislam.imu import ImuBuffer, preintegrate
+from vislam.sensors import BodyState, Suite
+from vislam.sensors.body import between_keyframes
+
+_MAX_WAITING = 4096  # readings that wait for the filter to begin; older ones go
+_MAX_TRIED = 1024  # readings that a sensor begins with; of more every other one is kept
+_MORE = 1.2  # so many times the readings of the last attempt before the next
+_FREE_FORCE_M_S2 = 1.0  # what a body does between keyframes of which no IMU tells
+_MIN_PATH_NS = 1_000_000  # a span of less is no span
+
+
+@dataclass(slots=True, eq=False)
+class _Beginning:
+    """A sensor whose own variables have no values yet."""
+
+    readings: list[Reading] = field(default_factory=list)
+    bodies: list[BodyState] = field(default_factory=list)
+    tried_at: int = 0  # readings of the last attempt
+
+
+class ReadingIntake:
+    """Takes readings as they come, in any order; what nobody can use is counted and goes no further.
+
+    Own variables, as the heading of a map of fixes, have to be known roughly before one linear step can be trusted: a
+    sensor's first readings are compared with the path until `Sensor.begin` knows them.
+
+    Attributes:
+        counters: by sensor, what became of readings before the filter had a word.
+        notes: by sensor, why its first unusable reading was that.
+    """
+
+    def __init__(
+        self, suite: Suite, filtering: Filtering | None, buffer: ImuBuffer | None, gravity_m_s2: float
+    ) -> None:
+        """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data."""
+        self.counters = {name: dict.fromkeys(("readings", "unusable", "too_early"), 0) for name in suite.names}
+        self.notes: dict[str, str] = {}
+        self._suite = suite
+        self._filter, self._buffer = filtering, buffer
+        self._gravity = gravity_m_s2 if buffer is not None else 0.0
+        self._waiting: deque[Reading] = deque(maxlen=_MAX_WAITING)
+        self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}
+        self._starts: list[OwnStart] = []  # for the next keyframe
+        self._since: list[Reading] = []  # the newest keyframe
+        self._path: deque[tuple[int, Array]] = deque(maxlen=2)  # times and poses of frames, where there is no filter
+
+    def report(self) -> dict[str, dict[str, Any]]:
+        """Return, by sensor, what the filter found its own variables to be, and what was wrong with its readings."""
+        out: dict[str, dict[str, Any]] = {}
+        for name in self._suite.names:
+            names = [variable.name for variable in self._suite[name].variables]
+            entry: dict[str, Any] = {"begun": name not in self._beginning, "variables": names}
+            if self._filter is not None and self._filter.ekf.initialised and entry["begun"] and names:
+                values, sigmas = self._filter.ekf.own(name)
+                entry["filter"] = {"values": values.tolist(), "sigmas": sigmas.tolist()}
+            if name in self.notes:
+                entry["note"] = self.notes[name]
+            out[name] = entry
+        return out
+
+    def add(self, reading: Reading) -> None:
+        """Take a reading; the filter hears of it with the next `hand_on`."""
+        counts = self.counters.get(reading.sensor)
+        if counts is None:
+            self.notes.setdefault(reading.sensor, self._suite.why_unusable(reading))
+            return
+        counts["readings"] += 1
+        reason = self._suite.why_unusable(reading)
+        if reason:
+            counts["unusable"] += 1
+            self.notes.setdefault(reading.sensor, f"{reason} (at {reading.t_ns} ns)")
+            return
+        self._waiting.append(reading)
+
+    def give_up_filter(self) -> None:
+        """Go on with the path of vision alone: gravity could not be found."""
+        self._filter = self._buffer = None
+        self._gravity = 0.0
+
+    def see(self, t_ns: int, T_odom_body: Array | None) -> None:
+        """Take where a frame has the body; without a filter that is all there is to compare readings with."""
+        if self._filter is None and T_odom_body is not None:
+            self._path.append((t_ns, T_odom_body))
+            self.hand_on(t_ns)
+
+    def hand_on(self, newest_t_ns: int) -> None:
+        """Give the filter, or those that begin, all readings of up to a time at which the body is known."""
+        for _ in range(len(self._waiting)):
+            reading = self._waiting.popleft()
+            if reading.t_ns > newest_t_ns:
+                self._waiting.append(reading)
+            elif reading.sensor in self._beginning:
+                self._compare(reading)
+            else:
+                if self._filter is not None:
+                    self._filter.add_reading(reading)
+                self._since.append(reading)
+
+    def pack(self, packet: KeyframePacket, before_t_ns: int, state: NavState | None) -> KeyframePacket:
+        """Return a keyframe's packet with the readings since the one before, at `before_t_ns`.
+
+        `state` is the filter's at the keyframe; None without one, or where it has none.
+        """
+        t_ns = packet.keyframe.t_ns
+        here = [reading for reading in self._since if before_t_ns < reading.t_ns <= t_ns]
+        self._since = [reading for reading in self._since if reading.t_ns > t_ns]
+        placed = [self._placed(reading, before_t_ns, t_ns, state) for reading in here]
+        starts, self._starts = tuple(self._starts), []
+        return replace(packet, readings=tuple(one for one in placed if one is not None), own_starts=starts)
+
+    def _compare(self, reading: Reading) -> None:
+        """Compare a reading with the path, and begin the sensor once that tells its own variables."""
+        beginning = self._beginning[reading.sensor]
+        body = self._body_at(reading.t_ns)
+        if body is None:
+            self.counters[reading.sensor]["too_early"] += 1
+            return
+        if len(beginning.readings) >= _MAX_TRIED:
+            del beginning.readings[1::2], beginning.bodies[1::2]
+            beginning.tried_at = len(beginning.readings)
+        beginning.readings.append(reading)
+        beginning.bodies.append(body)
+        if len(beginning.readings) < _MORE * beginning.tried_at:
+            return
+        beginning.tried_at = len(beginning.readings)
+        begun = self._suite[reading.sensor].begin(beginning.readings, beginning.bodies)
+        if begun is None:
+            return
+        del self._beginning[reading.sensor]
+        start = OwnStart(reading.sensor, begun.values, begun.sigmas)
+        if self._filter is not None:
+            self._filter.begin_sensor(reading.t_ns, start)
+        self._starts.append(start)
+
+    def _body_at(self, t_ns: int) -> BodyState | None:
+        if self._filter is not None:
+            return self._filter.ekf.body_at(t_ns)
+        if len(self._path) < 2 or not self._path[0][0] <= t_ns <= self._path[1][0]:
+            return None
+        (t0_ns, T0), (t1_ns, T1) = self._path
+        station = _freely((t_ns - t0_ns) * 1e-9, (t1_ns - t0_ns) * 1e-9)
+        return between_keyframes(T0, T1, t_ns, station)
+
+    def _placed(self, reading: Reading, t0_ns: int, t1_ns: int, state: NavState | None) -> PlacedReading | None:
+        since_s, length_s = (reading.t_ns - t0_ns) * 1e-9, (t1_ns - t0_ns) * 1e-9
+        if self._buffer is None:
+            return PlacedReading(reading, _freely(since_s, length_s))
+        if state is None:
+            return None
+        whole = self._buffer.span(t0_ns, t1_ns)
+        part = self._buffer.span(t0_ns, reading.t_ns) if reading.t_ns - t0_ns > _MIN_PATH_NS else None
+        if whole is None or (part is None and reading.t_ns - t0_ns > _MIN_PATH_NS):
+            return None
+        gyro_bias, accel_bias = state.gyro_bias_rad_s, state.accel_bias_m_s2
+        all_of_it = preintegrate(whole, gyro_bias, accel_bias)
+        here = None if part is None else preintegrate(part, gyro_bias, accel_bias)
+        rates = whole.gyro_rad_s if part is None else part.gyro_rad_s
+        return PlacedReading(
+            reading,
+            Station(
+                since_s, length_s, np.eye(3) if here is None else here.dR, np.zeros(3) if here is None else here.dv_m_s,
+                np.zeros(3) if here is None else here.dp_m, all_of_it.dR, all_of_it.dp_m, self._gravity,
+                rates[0 if part is None else -1] - gyro_bias, gyro_bias, accel_bias,
+                float(np.sqrt(np.diag(state.covariance)[12:15].max())),
+            ),
+        )  # fmt: skip
+
+
+def _freely(since_s: float, length_s: float) -> Station:
+    """Return a station of a body of which only both ends are known."""
+    none = np.zeros(3)
+    return Station(
+        since_s, length_s, np.eye(3), none, none, np.eye(3), none, 0.0, none, none, none, _FREE_FORCE_M_S2
+    )  # fmt: skip
