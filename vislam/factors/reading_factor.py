@@ -100,6 +100,7 @@ class ReadingFactor:
         self._units = units
         self._failed = failed
         self._rows: list[_Row] = []
+        self._count = len(placed)
         self.size = 0  # of the residual
         for number, one in enumerate(placed):
             try:
@@ -112,6 +113,11 @@ class ReadingFactor:
             whitening = _whitening(system.noise)
             self._rows.append(_Row(number, one, whitening, limit, slice(self.size, self.size + m)))
             self.size += m
+
+    @property
+    def is_whole(self) -> bool:
+        """Return whether no reading had to be left out where the noise was taken."""
+        return len(self._rows) == self._count
 
     def factor(self, earlier: int, later: int, own: Sequence[int]) -> gtsam.CustomFactor:
         """Return the factor between the keys of both poses and of the own variables."""
@@ -132,7 +138,17 @@ class ReadingFactor:
     def losses(self, T_earlier: Array, T_later: Array, own: Array) -> Array:
         """Return a residual [M] half of whose square is the loss."""
         out = np.zeros(self.size)
-        for row, _, residual in self._systems(T_earlier, T_later, own):
+        poses = np.ascontiguousarray(T_earlier), np.ascontiguousarray(T_later)
+        for row in self._rows:
+            reading, station = row.placed.reading, row.placed.station
+            body = between_keyframes(*poses, reading.t_ns, station)
+            try:
+                residual = row.whitening @ np.asarray(self._sensor.residual(reading.values, body, own), np.float64)
+            except Exception:  # it is somebody else's code
+                residual = np.full(1, np.nan)
+            if residual.shape != (len(row.whitening),) or not np.isfinite(residual).all():
+                self._failed(row.number)
+                continue
             square = max(float(residual @ residual), _NOTHING)
             out[row.place] = residual * np.sqrt(row.cauchy_k2 * np.log1p(square / row.cauchy_k2) / square)
         return out

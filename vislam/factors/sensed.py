@@ -28,7 +28,7 @@ from vislam.sensors import Suite, Variable
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
 
 MOST = 10  # readings of one sensor between two keyframes that get factors; of more, as many evenly spaced
-_REFRESHED = 5  # entries, of one sensor and keyframe each, that are linearised anew with a keyframe at most
+_REFRESHED = 6  # readings that are linearised anew with a keyframe, or those of one entry where they are more
 _NEWEST, _BLOCK = 20, 40  # entries that are looked at with each keyframe: the newest, and older ones in turn
 _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided by
 
@@ -50,15 +50,14 @@ class _Place(NamedTuple):
     T_later: Array  # [4, 4]
     own: Array  # [V] in units of the keys
 
-    def is_left(self, now: _Place, config: GraphConfig) -> bool:
-        """Return whether the estimate has moved on by more than the solver itself takes for little."""
+    def left_by(self, now: _Place, config: GraphConfig) -> float:
+        """Return how far the estimate has moved on, over what the solver itself takes for little."""
+        farthest = float(np.abs(now.own - self.own).max(initial=0.0)) / RELINEARIZE_OWN
         for before, after in ((self.T_earlier, now.T_earlier), (self.T_later, now.T_later)):
             change = np.abs(after - before)
-            if change[:3, 3].max() > config.relinearize_translation_m:
-                return True
-            if change[:3, :3].max() > config.relinearize_rotation_rad:
-                return True
-        return bool(np.any(np.abs(now.own - self.own) > RELINEARIZE_OWN))
+            m, rad = float(change[:3, 3].max()), float(change[:3, :3].max())
+            farthest = max(farthest, m / config.relinearize_translation_m, rad / config.relinearize_rotation_rad)
+        return farthest
 
 
 @dataclass(slots=True, eq=False)
@@ -75,6 +74,7 @@ class _Entry:
     dt_s: list[float] = field(default_factory=list)  # of each: since that
     factor: ReadingFactor | None = None
     place: _Place | None = None
+    linear: gtsam.NonlinearFactor | None = None  # there
 
 
 class Readings:
@@ -82,7 +82,7 @@ class Readings:
 
     Factors are linear: gtsam copies all its values into each call of a function in Python, and would call it for all
     readings whenever a variable that they share moves. Those whose estimate has moved since are linearised anew, a few
-    with each keyframe, and all with each new start of the solver.
+    with each keyframe, and all of them with each new start of the solver.
     """
 
     def __init__(self, suite: Suite, config: GraphConfig) -> None:
@@ -165,22 +165,30 @@ class Readings:
             own = self._guesses(entry, values)
             guesses |= {key: guess for key, guess, new in zip(entry.keys, own, entry.new, strict=True) if new}
             factors += self._ties(entry)
-            entry.factor = None  # its noise hangs on the place, too
-            named[_label(entry)] = self._linearised(entry, _Place(T_earlier, T_later, np.array(own)))
+            place = _Place(T_earlier, T_later, np.array(own))
+            if entry.linear is None or entry.place is None or entry.place.left_by(place, self._config) > 1.0:
+                entry.linear = self._linearised(entry, place)
+            named[_label(entry)] = entry.linear
         return replace(step, factors=factors, named=named, own=guesses)
 
     def refreshed(self, values: gtsam.Values) -> dict[Label, gtsam.NonlinearFactor]:
-        """Return new factors for a few of those whose estimate has moved on; the newest are looked at each time."""
+        """Return new factors for a few of those whose estimate has moved on, those for which it has most."""
         newest = max(len(self._entries) - _NEWEST, 0)
         begin = self._next_old if self._next_old < newest else 0
         self._next_old = min(begin + _BLOCK, newest)
+        moved: list[tuple[float, _Entry, _Place]] = []
+        for entry in (*self._entries[newest:], *self._entries[begin : self._next_old]):
+            if entry.place is not None:
+                place = self._place(entry, values)
+                moved.append((entry.place.left_by(place, self._config), entry, place))
+        moved.sort(key=lambda item: -item[0])
         out: dict[Label, gtsam.NonlinearFactor] = {}
-        for entry in (*reversed(self._entries[newest:]), *self._entries[begin : self._next_old]):
-            if entry.place is None or len(out) == _REFRESHED:
-                continue
-            place = self._place(entry, values)
-            if entry.place.is_left(place, self._config):
-                out[_label(entry)] = self._linearised(entry, place)
+        count = 0
+        for by, entry, place in moved:
+            if by <= 1.0 or count >= _REFRESHED:
+                break
+            out[_label(entry)] = entry.linear = self._linearised(entry, place)
+            count += len(entry.placed)
         return out
 
     def loss(self, values: gtsam.Values) -> float:
@@ -263,7 +271,7 @@ class Readings:
     def _linearised(self, entry: _Entry, place: _Place) -> gtsam.NonlinearFactor:
         """Return the factor of an entry at a place."""
         units = self._units(entry.sensor)
-        if entry.factor is None:
+        if entry.factor is None or not entry.factor.is_whole:
 
             def failed(n: int) -> None:
                 self._failed.add((entry.number, n))
