@@ -55,6 +55,7 @@ class Drive:
         self.world, self.sensors, self.own, self.imu = world, sensors, own, imu
         self.rng = np.random.default_rng(world.seed + 1000)
         self.packets: list[KeyframePacket] = []
+        self.may_fail = False  # incremental Cholesky: then the ladder of solvers goes on with QR
         self.graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig(), Suite(sensors))
         self.graph.initialise(world.initial_state() if imu else None, None if imu else world.truth[0])
 
@@ -76,7 +77,7 @@ class Drive:
         for k in range(len(self.packets), self.world.count if end is None else end):
             self.packets.append(spoil(self.packet(k, starts)))
             update = self.graph.add(self.packets[-1], loops(k))
-            assert "gtsam failed" not in update.note
+            assert "gtsam failed" not in update.note or self.may_fail
         return self
 
     def error_m(self) -> float:
@@ -283,6 +284,7 @@ class Moody(Fixes):
 def test_a_sensor_whose_code_fails_says_nothing_where_it_does_and_is_counted() -> None:
     truth, start = drawn_fix(np.random.default_rng(7))
     drive = Drive(a_world(7), {"fixes": Fixes(0.05)}, {"fixes": truth})
+    drive.may_fail = True  # what the sensor says of where comes and goes
     drive.graph.readings._suite = Suite({"fixes": Moody(0.05)})
     drive.run((start,)).graph.finish()
     counts = drive.graph.readings.counts
