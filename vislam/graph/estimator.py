@@ -243,12 +243,13 @@ class Estimator(Generic[L]):
     def can_freeze(self, segment: Segment) -> bool:
         """Return whether loops and odometry alone tie these keyframes, which are of one submap and free to move.
 
-        A segment with readings of other sensors is never summed up: what they say hangs on more than relative poses.
+        A segment with readings of other sensors is never summed up: what they say hangs on more than relative poses. Nor
+        is one of a graph with velocities and biases, which a summary of poses would lose.
         """
         inside = segment.keyframes
         if any(map(self._readings.has, range(segment.first, segment.end + 1))):
             return False
-        if self._solver.reads_all or any(k in self._held for k in inside):
+        if self._solver.reads_all or self.has_imu or any(k in self._held for k in inside):
             return False
         return bool(np.all(np.isfinite(self._reach_m[segment.first : segment.end])))
 

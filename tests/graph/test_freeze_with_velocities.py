@@ -1,0 +1,19 @@
+"""Dense loops over a graph that has velocities and biases, too."""
+
+from __future__ import annotations
+
+from vislam.config import GraphConfig, WindowConfig
+from vislam.graph import PoseGraph
+from worlds.lap import RIG, World
+from worlds.parts import GRAVITY_M_S2
+
+
+def test_keyframes_with_velocities_stay_in_the_solver_however_dense_their_loops() -> None:
+    world = World(36.0, seed=3)
+    config = GraphConfig(coupling="loose", freeze_keyframes=10, freeze_after=20, anchor_after=5)
+    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph.initialise(world.initial_state())
+    for k in range(world.count):
+        graph.add(world.packet(k), [world.loop(k, k - 100, k)] if k > 102 else [])
+    assert not graph._estimator.frozen
+    assert len(graph.states()) == world.count
