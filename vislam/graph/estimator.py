@@ -243,8 +243,8 @@ class Estimator(Generic[L]):
     def can_freeze(self, segment: Segment) -> bool:
         """Return whether loops and odometry alone tie these keyframes, which are of one submap and free to move.
 
-        A segment with readings of other sensors is never summed up: what they say hangs on more than relative poses. Nor
-        is one of a graph with velocities and biases, which a summary of poses would lose.
+        A segment with readings of other sensors is never summed up, for what they say hangs on more than relative
+        poses; nor is one with velocities and biases, which a summary of poses would lose.
         """
         inside = segment.keyframes
         if any(map(self._readings.has, range(segment.first, segment.end + 1))):
