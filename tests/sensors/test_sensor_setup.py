@@ -94,6 +94,8 @@ WRONG = {
     "[sensors.a]\nkind='twist'\nfile='x'\nticks={ticks_per_turn=1,radius_m=1}": "option ticks: counts are those of",
     "[sensors.a]\nkind='wheels'\nfile='x'\nticks={radius_m=1}": "option ticks.ticks_per_turn: Field required",
     "[sensors.a]\nkind='wheels'\nfile='x'\nticks={ticks_per_turn=1,radius_m=1,bits=12}": "option ticks.bits",
+    "[sensors.a]\nkind='position'\nfile='x'\ngnss={datum=[95.0,0,0]}": "option gnss.datum: latitude 95 deg",
+    "[sensors.a]\nkind='position'\nfile='x'\ngnss={least_fix='good'}": "option gnss.least_fix",
     "[sensors.a]\nkind='range'": "0 anchors",
     "[sensors.a]\nkind='range'\nanchors={x=[0,0,0]}": "anchor 'x' has to be a number",
     "[sensors.a]\nkind='range'\nanchors={1=[0,0]}": "option anchors.1",

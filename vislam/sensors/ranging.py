@@ -54,15 +54,17 @@ def ranged_frame(seen: Ranges, prior: Prior) -> Begun | None:
     another one, such as a mirrored one, fits nearly as well; that are not sure of heading (5 deg) or place (a tenth
     of the ranges); that lie in a valley too bent for a covariance; and that fit worse than the ranges' noise allows.
     """
-    centred = seen.world_m - seen.world_m.mean(axis=0)
-    spread_m = math.sqrt(float((centred[:, :2] ** 2).sum(axis=1).mean())) if len(centred) else 0.0
-    if len(centred) < _FEWEST or spread_m < _CLEAR * float(np.median(seen.sigmas_m)):
+    if len(seen.ranges_m) < _FEWEST:
+        return None
+    spread_m = math.sqrt(float(seen.world_m[:, :2].var(axis=0).sum()))
+    if spread_m < _CLEAR * float(np.median(seen.sigmas_m)):
         return None
     solutions = [_solved(start, seen, prior) for start in _starts(seen, prior)]
     best = min(solutions, key=lambda solution: solution.cost)
     free = prior.sigmas > 0.0
     information = best.information[np.ix_(free, free)]
-    if np.linalg.cond(information / np.sqrt(np.outer(np.diag(information), np.diag(information)))) > 1e8:
+    size = np.sqrt(np.diag(information))
+    if not size.all() or np.linalg.cond(information / np.outer(size, size)) > 1e8:
         return None
     covariance = np.zeros((5, 5))
     covariance[np.ix_(free, free)] = best.scale**2 * np.linalg.inv(information)

@@ -15,6 +15,7 @@ from vislam.config.ranges import Finite, NonNegative, Probability
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.sensors.configured import Configured
+from vislam.sensors.geodetic import Geodetic, why_nowhere
 from vislam.sensors.gnss.fixes import GnssSettings
 from vislam.sensors.registry import kind_class
 from vislam.sensors.suite import Suite
@@ -129,4 +130,7 @@ def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> Sens
         raise UsageError(f"{where}: option format: {format_} holds fixes, for a kind that has east, north, up")
     if common.ticks and sensor.columns != ("left_m_s", "right_m_s"):
         raise UsageError(f"{where}: option ticks: counts are those of kind wheels, this is {common.kind}")
-    return SensorFile(path, format_, common.offset_s, common.ticks, common.gnss or GnssSettings())
+    gnss = common.gnss or GnssSettings()
+    if gnss.datum and (why := why_nowhere(Geodetic(*gnss.datum))):
+        raise UsageError(f"{where}: option gnss.datum: {why}")
+    return SensorFile(path, format_, common.offset_s, common.ticks, gnss)
