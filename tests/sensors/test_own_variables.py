@@ -103,8 +103,8 @@ def test_own_variables_are_found_as_surely_as_is_said(name: str) -> None:
 def test_noise_that_grows_with_what_is_told_makes_scales_wrong_by_little() -> None:
     """Readings that are too small by chance count as surer ones: a bias of twice the squared share."""
     sensor, bodies, off = Twist(TwistSettings(slip=0.02, turn_slip=0.05)), a_drive(), []
-    for seed in range(10):
+    for seed in range(20):
         own, _ = estimated(sensor, drawn_readings("it", sensor, bodies, np.ones(2), seed), bodies)
         off.append(own - 1.0)
     bias = np.abs(np.mean(off, axis=0))
-    assert bias[0] < 2.0 * 0.02**2 + 0.0005 and bias[1] < 2.0 * 0.05**2 + 0.002
+    assert bias[0] < 2.0 * 0.02**2 + 0.001 and bias[1] < 2.0 * 0.05**2 + 0.003
