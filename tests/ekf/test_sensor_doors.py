@@ -14,6 +14,7 @@ from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import Ekf, MsckfEkf, make_ekf
 from vislam.sensors import BodyState, Sensor, Suite
+from vislam.sensors.kinds.anchor_range import AnchorRange, AnchorRangeSettings
 from worlds import monte_carlo as mc
 from worlds.flight import MONO
 from worlds.motion import T0_NS
@@ -360,3 +361,20 @@ def test_the_body_at_a_time_is_the_state_there_and_the_rate_without_bias(kind: s
         np.testing.assert_allclose(body.rate_rad_s, seen - state.gyro_bias_rad_s, atol=1e-12)
     assert ekf.body_at(run.start.t_ns - 1) is None
     assert ekf.body_at(ekf.state().t_ns + 1) is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_several_anchors_may_be_ranged_at_once_and_each_only_once(kind: str) -> None:
+    anchors = {1.0: (4.0, 0.0, 0.0), 2.0: (0.0, 5.0, 0.0)}
+    radio = AnchorRange(AnchorRangeSettings(anchors={"1": anchors[1.0], "2": anchors[2.0]}, frame="known"))
+    ends = []
+    for order in ((1.0, 2.0), (2.0, 1.0)):
+        run, ekf = flown(kind, {"uwb": radio})
+        place = ekf.state().T_world_body[:3, 3]
+        for anchor in (*order, order[0]):
+            values = np.array([anchor, np.linalg.norm(place - anchors[anchor]) + 0.05])
+            ekf.update_sensor(Reading("uwb", int(run.way.t_ns[-1]), values))
+        assert ekf.counters["uwb_accepted"] == 2
+        assert ekf.counters["uwb_refused"] == 1
+        ends.append(numbers(ekf))
+    assert_same_bytes(*ends)

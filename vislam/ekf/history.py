@@ -148,11 +148,11 @@ class History(Generic[S, M]):
         return forgotten
 
 
-def _turn(event: Event[M]) -> tuple[int, int, str]:
+def _turn(event: Event[M]) -> tuple[int, int, str, tuple[float, ...]]:
     what = event.measurement
     if isinstance(what, Reading):
-        return event.t_ns, 2, what.sensor
-    return (event.t_ns, 1, what.sensor) if isinstance(what, OwnStart) else (event.t_ns, 0, "")
+        return event.t_ns, 2, what.sensor, tuple(what.values.tolist())
+    return (event.t_ns, 1, what.sensor, ()) if isinstance(what, OwnStart) else (event.t_ns, 0, "", ())
 
 
 def _stamp(item: Event[M] | Checkpoint[S]) -> int:

@@ -29,7 +29,7 @@ class SensedTimeline(Timeline[S, M]):
         if name not in self._core.sensing.suite.names:
             return self._refuse_unknown(name)
         reason = self._core.sensing.why_no_start(start)
-        if not reason and self._is_here(t_ns, OwnStart, name):
+        if not reason and self._has_start(t_ns, name):
             reason = f"sensor {name!r} has a start of {t_ns} ns already"
         return self._refuse(f"{name}_refused", reason) if reason else self._insert(Event(t_ns, start))
 
@@ -43,7 +43,7 @@ class SensedTimeline(Timeline[S, M]):
         if name not in self._core.sensing.suite.names:
             return self._refuse_unknown(name)
         reason = self._core.sensing.why_unusable(reading)
-        if not reason and self._is_here(reading.t_ns, Reading, name):
+        if not reason and self._has_reading(reading):
             reason = f"sensor {name!r} has a reading of {reading.t_ns} ns already"
         return self._refuse(f"{name}_refused", reason) if reason else self._insert(Event(reading.t_ns, reading))
 
@@ -69,8 +69,19 @@ class SensedTimeline(Timeline[S, M]):
         self._counts.setdefault("sensor_unknown", 0)  # a filter without sensors counts what it always did
         return self._refuse("sensor_unknown", f"no sensor is called {name!r}; there is {names or 'none'}")
 
-    def _is_here(self, t_ns: int, kind: type[Reading] | type[OwnStart], name: str) -> bool:
-        if self._history is None:
-            return False
-        known = (event.measurement for event in self._history.of(t_ns))
-        return any(isinstance(measurement, kind) and measurement.sensor == name for measurement in known)
+    def _has_start(self, t_ns: int, name: str) -> bool:
+        known = self._measurements_of(t_ns)
+        return any(isinstance(start, OwnStart) and start.sensor == name for start in known)
+
+    def _has_reading(self, reading: Reading) -> bool:
+        """Return whether the same thing was measured at the same time: a radio may range several anchors at once."""
+        channel = self._core.sensing.suite[reading.sensor].channel
+        return any(
+            isinstance(other, Reading)
+            and other.sensor == reading.sensor
+            and channel(other.values) == channel(reading.values)
+            for other in self._measurements_of(reading.t_ns)
+        )
+
+    def _measurements_of(self, t_ns: int) -> list[object]:
+        return [] if self._history is None else [event.measurement for event in self._history.of(t_ns)]

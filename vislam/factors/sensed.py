@@ -23,7 +23,7 @@ from vislam.factors.journal import KeyframeRecord
 from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
 from vislam.factors.reading_factor import ReadingFactor
 from vislam.factors.solvers import RELINEARIZE_OWN
-from vislam.sensors import Suite, Variable
+from vislam.sensors import Suite
 
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
 
@@ -37,7 +37,8 @@ _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided b
 class _Begun:
     """A sensor whose own variables have first values."""
 
-    start: Array  # [V]
+    guess: Array  # [V]
+    told: Array  # [V], with `units` as sigmas: readings before it are known by this alone
     units: Array  # [V]
     constant: set[int] = field(default_factory=set)  # numbers of variables that do not change and have their key
     newest: dict[int, int] = field(default_factory=dict)  # of walking ones, by number: keyframe of the newest key
@@ -229,9 +230,8 @@ class Readings:
         known = np.array([variable.sigma for variable in variables])
         units = np.where(sigmas > 0.0, np.minimum(known, sigmas), known)
         recalled = self._recalled.get(start.sensor)
-        if recalled is not None and recalled.shape == values.shape:
-            values = recalled
-        self._begun[start.sensor] = _Begun(values, np.maximum(units, _SIGMA_MIN))
+        guess = values if recalled is None or recalled.shape != values.shape else recalled
+        self._begun[start.sensor] = _Begun(guess, values, np.maximum(units, _SIGMA_MIN))
 
     def _is_usable(self, placed: PlacedReading) -> bool:
         if placed.reading.sensor not in self._suite.names:
@@ -299,7 +299,7 @@ class Readings:
         if not entry.keys:
             return []
         begun = self._begun[entry.sensor]
-        starts = (begun.start / begun.units).tolist()
+        starts = (begun.guess / begun.units).tolist()
         out = []
         for key, earlier, start in zip(entry.keys, entry.earlier, starts, strict=True):
             known = next((k for k in (key, earlier) if k is not None and values.exists(k)), None)
@@ -310,7 +310,8 @@ class Readings:
         """Return the priors of variables that are new, and the walks of those that are not."""
         if not entry.keys:
             return []
-        variables, units = self._suite[entry.sensor].variables, self._units(entry.sensor).tolist()
+        begun, variables = self._begun[entry.sensor], self._suite[entry.sensor].variables
+        told, units = (begun.told / begun.units).tolist(), begun.units.tolist()
         out: list[gtsam.NonlinearFactor] = []
         for n, (variable, unit) in enumerate(zip(variables, units, strict=True)):
             earlier = entry.earlier[n]
@@ -319,15 +320,9 @@ class Readings:
                 model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
                 out.append(gtsam.BetweenFactorDouble(earlier, entry.keys[n], 0.0, model))
             elif entry.new[n]:
-                out.append(_prior(entry.keys[n], variable, unit))
+                out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], gtsam.noiseModel.Unit.Create(1)))
         return out
 
 
 def _label(entry: _Entry) -> Label:
     return "reading", entry.number
-
-
-def _prior(key: int, variable: Variable, unit: float) -> gtsam.PriorFactorDouble:
-    """Return what is known of a variable before its first reading."""
-    model = gtsam.noiseModel.Isotropic.Sigma(1, max(variable.sigma, _SIGMA_MIN) / unit)
-    return gtsam.PriorFactorDouble(key, variable.start / unit, model)

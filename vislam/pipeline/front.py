@@ -9,7 +9,6 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
-from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, level_rotation, transform
 from vislam.core.memory import FrontMemory, FrontNews, StartFacts
 from vislam.core.messages import (
@@ -36,11 +35,9 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.feed import CameraFeed
 from vislam.frontend.pixel_noise import NoiseUsed
-from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import identity_motion, lost_motion, scaled_motion
 from vislam.frontend.start import Initialisation
 from vislam.frontend.stillness import Stillness
-from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.frontend.uniform_motion import UniformMotion
 from vislam.imu import (
     ConditionWatch,
@@ -51,10 +48,10 @@ from vislam.imu import (
     pose_after,
     subtract_bias,
 )
-from vislam.pipeline.front_report import FrontReport
+from vislam.pipeline.front_report import FrontReport, learned_of_camera
 from vislam.pipeline.gravity import GravityWait, Released
 from vislam.pipeline.readings import ReadingIntake
-from vislam.pipeline.settings import derived
+from vislam.pipeline.settings import derived, refuse_without_scale
 from vislam.pipeline.steps import Estimate, FrontStep
 from vislam.sensors import Suite
 from vislam.trajectory.continuity import in_odom
@@ -84,16 +81,7 @@ class Front:
         """
         self.config = config = derived(config, rig, noise)
         self.frontend = make_frontend(config.frontend, rig, config.seed)
-        if noise is None and self.frontend.mode == "mono":
-            raise UsageError(
-                "one camera without an IMU cannot see scale; use --frontend.mode stereo or rgbd where the recording "
-                "allows it, planar for a camera of known height above a floor, or record an IMU"
-            )
-        if config.ekf.vision == "accumulated" and self.frontend.mode == "mono":
-            raise UsageError(
-                "--ekf.vision accumulated sums up motion in metres, which one camera does not see; use --frontend.mode "
-                "stereo, rgbd or planar, or --ekf.vision relative"
-            )
+        refuse_without_scale(config.ekf, self.frontend.mode, noise is not None)
         self.counters = {
             "frames_lost": 0, "frames_degraded": 0, "longest_loss_ms": 0, "imu_outages": 0, "frames_at_rest": 0,
             "submaps": 1,
@@ -299,31 +287,9 @@ class Front:
 
     @property
     def calibration(self) -> dict[str, float]:
-        """What was learned of the camera, with standard deviations: its clock, and over a floor its mount."""
-        told = self.camera_clock
-        clock = {"camera_offset_s": told.applied_s, "camera_offset_sigma_s": told.sigma_s}
-        if told.drift_sigma > 0.0:
-            clock |= {"camera_drift": told.drift, "camera_drift_sigma": told.drift_sigma}
-        mount = self.frontend.calibration if isinstance(self.frontend, PlanarFrontEnd) else {}
-        return {**({**clock, **self._turned} if self._has_imu else {}), **mount}
-
-    @property
-    def _turned(self) -> dict[str, float]:
-        """By how much the camera stands turned on the body against what was told, in degrees, as rotations tell it."""
-        found, camera = self.camera_clock.estimate, self.news.filter_camera
-        turn, sigmas, prior_deg = found.R_correction, found.R_correction_sigma, float(np.rad2deg(TURN_SIGMA))
-        if camera is not None and camera[5:8].all():
-            turn, sigmas, prior_deg = camera[2:5], camera[5:8], self.config.ekf.tight_extrinsic_sigma_deg
-        elif not found.frames:
-            return {}
-        angle = float(np.linalg.norm(turn))
-        along = turn / max(angle, 1e-12)
-        sigma = float(np.sqrt(np.sum((along * sigmas) ** 2)))
-        return {
-            "camera_turn_deg": float(np.rad2deg(angle)),
-            "camera_turn_sigma_deg": float(np.rad2deg(sigma)),
-            "camera_turn_prior_deg": prior_deg,
-        }
+        """What was learned of the camera; see `learned_of_camera`."""
+        camera = self.news.filter_camera
+        return learned_of_camera(self.frontend, self.camera_clock, camera, self.config.ekf, self._has_imu)
 
     @property
     def all_counters(self) -> dict[str, dict[str, int]]:

@@ -5,8 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from vislam.config import EkfConfig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import StartFacts
+from vislam.core.messages import Array
+from vislam.frontend import FrontEnd
+from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.planar import PlanarFrontEnd
+from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.imu import InertialCondition, NoiseRatios
 from vislam.trajectory import Alignment, gauge_alignment
 
@@ -36,3 +44,35 @@ class FrontReport:
     def alignment(self) -> Alignment:
         """How the run may be moved onto a truth."""
         return gauge_alignment(self.start is not None, self.mode)
+
+
+def learned_of_camera(
+    frontend: FrontEnd, clock: CameraClock, filter_camera: Array | None, config: EkfConfig, has_imu: bool
+) -> dict[str, float]:
+    """Return what was learned of the camera, with standard deviations: its clock and turn, and over a floor its mount.
+
+    `filter_camera` [8] is what the filter learned, see `Filtering.camera`.
+    """
+    told = {"camera_offset_s": clock.applied_s, "camera_offset_sigma_s": clock.sigma_s}
+    if clock.drift_sigma > 0.0:
+        told |= {"camera_drift": clock.drift, "camera_drift_sigma": clock.drift_sigma}
+    mount = frontend.calibration if isinstance(frontend, PlanarFrontEnd) else {}
+    return {**({**told, **_turned(clock, filter_camera, config)} if has_imu else {}), **mount}
+
+
+def _turned(clock: CameraClock, filter_camera: Array | None, config: EkfConfig) -> dict[str, float]:
+    """Return by how much the camera stands turned on the body against what was told, in degrees, by rotations."""
+    found = clock.estimate
+    turn, sigmas, prior_deg = found.R_correction, found.R_correction_sigma, float(np.rad2deg(TURN_SIGMA))
+    if filter_camera is not None and filter_camera[5:8].all():
+        turn, sigmas, prior_deg = filter_camera[2:5], filter_camera[5:8], config.tight_extrinsic_sigma_deg
+    elif not found.frames:
+        return {}
+    angle = float(np.linalg.norm(turn))
+    along = turn / max(angle, 1e-12)
+    sigma = float(np.sqrt(np.sum((along * sigmas) ** 2)))
+    return {
+        "camera_turn_deg": float(np.rad2deg(angle)),
+        "camera_turn_sigma_deg": float(np.rad2deg(sigma)),
+        "camera_turn_prior_deg": prior_deg,
+    }

@@ -33,6 +33,22 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
     )
 
 
+def refuse_without_scale(ekf: EkfConfig, mode: str, has_imu: bool) -> None:
+    """Raise UsageError where one camera would have to tell metres."""
+    if mode != "mono":
+        return
+    if not has_imu:
+        raise UsageError(
+            "one camera without an IMU cannot see scale; use --frontend.mode stereo or rgbd where the recording "
+            "allows it, planar for a camera of known height above a floor, or record an IMU"
+        )
+    if ekf.vision == "accumulated":
+        raise UsageError(
+            "--ekf.vision accumulated sums up motion in metres, which one camera does not see; use --frontend.mode "
+            "stereo, rgbd or planar, or --ekf.vision relative"
+        )
+
+
 def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
     """Return the graph's settings where no IMU tells gravity: nothing shares its scale.
 

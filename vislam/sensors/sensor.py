@@ -76,6 +76,10 @@ class Sensor(ABC):
             np.array([variable.sigma for variable in self.variables], dtype=np.float64),
         )
 
+    def channel(self, values: Array) -> int:
+        """Return which of several things a reading measured; two of one thing and one stamp are a mistake."""
+        return 0
+
     def check(self, values: Array) -> str:
         """Return why values [C] that are finite cannot be a reading; empty: they can."""
         return ""

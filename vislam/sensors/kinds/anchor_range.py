@@ -101,6 +101,10 @@ class AnchorRange(Configured):
         """Return the variance [1, 1] of a range that brings none."""
         return np.array([[self.settings.sigma_m**2]])
 
+    def channel(self, values: Array) -> int:
+        """Return the anchor: several may be ranged at once."""
+        return int(values[0])
+
     def check(self, values: Array) -> str:
         """Return why a range is none: of another anchor, or negative."""
         if values[0] not in self._anchors:
