@@ -91,6 +91,8 @@ def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory) -> dict[
     refused = [verdict for verdict in result.loops if verdict.in_run and not verdict.kept]
     admitted = [verdict for verdict in result.loops if verdict.kept and not verdict.in_run]
     warnings = [result.note] if result.note else []
+    if names := sorted({placed.reading.sensor for k in log.keyframes for placed in k.packet.readings}):
+        warnings.append(f"the batch does not take readings of {', '.join(names)}: it goes by vision, IMU and loops")
     for verdict in refused:
         warnings.append(f"loop {verdict.from_id}-{verdict.to_id}, which the run had accepted: {verdict.reason}")
     return {
