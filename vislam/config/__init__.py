@@ -77,6 +77,7 @@ __all__ = [
     "dump",
     "from_data",
     "load",
+    "load_further_sensors",
     "load_sensors",
     "validated",
 ]
@@ -135,6 +136,14 @@ def load_sensors(path: Path | None = None) -> SensorsConfig:
     data.pop("sensors", None)  # further ones, of which `vislam.sensors.toml` makes something
     _refuse_unknown(data, SensorsConfig, str(path))
     return validated(SensorsConfig, data, str(path))
+
+
+def load_further_sensors(path: Path | None) -> FurtherSensorsConfig:
+    """Return where further sensors are described: in the file of a cart's sensors, if it has tables `[sensors.NAME]`.
+
+    Raises UsageError for a file that cannot be read.
+    """
+    return FurtherSensorsConfig(None if path is None or "sensors" not in _read_toml(path) else str(path))
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

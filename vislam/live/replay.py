@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -11,13 +12,17 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.readings import Reading
 from vislam.core.recording import Recording
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
 from vislam.live.frames import FrameSource
 from vislam.live.processes.child import Life
+from vislam.live.reading_source import ReadingSource, ReplayedReadings, refuse_unread
 from vislam.live.replayed_imu import InertialTable, ReplayedImu
+from vislam.run.further_sensors import FurtherReadings
 from vislam.run.sources import open_source
+from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 
 _NS = 1_000_000_000
@@ -70,6 +75,15 @@ class ReplaySource:
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what plays the frames."""
         return partial(ReplayedFrames, self._uri, self._seed, self._zero_ns, self._epoch, self._outages.camera)
+
+    def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
+        """Return what plays the files of further sensors, and draws those that are simulated on the truth.
+
+        Raises UsageError for a sensor that has neither.
+        """
+        refuse_unread(setup, {**setup.files, **setup.simulated_hz}, "a replay needs its file, or simulated_hz")
+        streams = partial(read_along, self._uri, setup, self._seed)
+        return partial(ReplayedReadings, setup.suite.names, streams, self._zero_ns, self._epoch)
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return nothing: it needs no other processes."""
@@ -136,6 +150,15 @@ class ReplayedFrames:
     def close(self) -> None:
         """Stop reading."""
         self._next = None
+
+
+def read_along(uri: str, setup: SensorSetup, seed: int) -> Iterator[Reading]:
+    """Return the readings of all further sensors beside a recording in time order.
+
+    Raises DataError where one cannot be read, or shall be drawn and the recording has no truth.
+    """
+    further = FurtherReadings(open_source(uri, seed), setup, seed)
+    return heapq.merge(*further.streams(), key=lambda reading: reading.t_ns)
 
 
 def is_out(since_s: float, outages: tuple[tuple[float, float], ...]) -> bool:

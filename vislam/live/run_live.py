@@ -32,10 +32,12 @@ from vislam.live.processes import front as front_process
 from vislam.live.processes import map as map_process
 from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded
 from vislam.live.processes.measured import measured
+from vislam.live.reading_source import ReadingSource, live_readings
 from vislam.live.wire.slot import remove
 from vislam.pipeline.settings import derived
 from vislam.run import imu_noise
 from vislam.run.folder import MapChoice
+from vislam.sensors import SensorSetup
 
 _LOG = logging.getLogger(__name__)
 _WATCH_S = 0.1
@@ -61,6 +63,13 @@ class LiveSource(Recording, Protocol):
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens the cameras; it travels to the front process."""
+        ...
+
+    def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
+        """Return what opens further sensors; it travels to the front process.
+
+        Raises UsageError for a sensor that cannot be read beside these, HardwareError for one that is not there.
+        """
         ...
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
@@ -106,7 +115,7 @@ class LiveRun:
             beginning: what `base` holds, or the run itself in `out` that is to be resumed; None: it begins anew.
 
         Raises:
-            UsageError: settings that only make sense with a recording, or a bridge that cannot be.
+            UsageError: settings that only make sense with a recording, a bridge or a further sensor that cannot be.
             DataError: the file of remembered biases is damaged.
             HardwareError: a sensor is not there.
         """
@@ -137,6 +146,7 @@ class LiveRun:
         base: MapChoice | None, beginning: Beginning | None,
     ) -> dict[str, Callable[[Life], None]]:  # fmt: skip
         """Return what each process does, with its ends of the wires."""
+        suite, open_readings = live_readings(config.sensors, source.readings)
         bridges = translator.asked(config.live)
         send_to = (*config.live.send_to, *(at for at, _ in bridges.values()))
         samples_in, samples_out = socket.socketpair()
@@ -155,15 +165,16 @@ class LiveRun:
             "fast": partial(
                 fast_process.run, config=fast, noise=noise, T_body_camera=rig.T_body_cams[0],
                 open_source=source.inertial(), samples=samples_in, inbox=[fast_hears_front, fast_hears_back],
-                memory=self._bias.memory, is_mag_calibrated=source.is_mag_calibrated,
+                memory=self._bias.memory, is_mag_calibrated=source.is_mag_calibrated, suite=suite,
             ),
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),
-                samples=samples_out, to_fast=front_says, to_back=packets_out, to_map=frames_out, beginning=beginning,
+                open_readings=open_readings, suite=suite, samples=samples_out, to_fast=front_says, to_back=packets_out,
+                to_map=frames_out, beginning=beginning,
             ),
             "back": partial(
                 back_process.run, config=config, rig=rig, noise=noise, keyframes=packets, to_fast=back_says,
-                to_map=keyframes_out, beginning=beginning,
+                to_map=keyframes_out, beginning=beginning, suite=suite,
             ),
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,

@@ -15,15 +15,19 @@ from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
+from vislam.hw.gnss_port import check_port
 from vislam.hw.sensors import calibration_of, check_devices, open_camera, open_inertial
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
 from vislam.live.frames import NO_CAMERA, FrameSource, NoCamera, OneCamera
+from vislam.live.port_readings import PortReadings
 from vislam.live.processes.child import Life
+from vislam.live.reading_source import ReadingSource, refuse_unread
 from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.place import PlaceOptions
+from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 
 
@@ -126,6 +130,18 @@ class CartSensors:
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens the camera."""
         return partial(_open_one, self._camera, self._sensors) if self.has_camera else NoCamera
+
+    def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
+        """Return what reads further sensors at their ports.
+
+        Raises UsageError for a sensor without a port, HardwareError for a port that is not there.
+        """
+        refuse_unread(
+            setup, setup.ports, "on a cart it needs a port (satellite receivers have one); a replay plays files"
+        )
+        for port in setup.ports.values():
+            check_port(port)
+        return partial(PortReadings, setup.ports)
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return nothing: real sensors need no processes."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from vislam.config import validated
-from vislam.config.ranges import Finite, NonNegative, Probability
+from vislam.config import SensorsConfig, validated
+from vislam.config.ranges import Count, Finite, NonNegative, Probability
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.sensors.configured import Configured
@@ -25,6 +25,7 @@ MOST_SENSORS = 64
 _MOST_BYTES = 2**20
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 FileFormat = Literal["csv", "nmea", "ubx"]
+_FIX_COLUMNS = ("east_m", "north_m", "up_m")
 _FORMATS: dict[str, FileFormat] = {".nmea": "nmea", ".ubx": "ubx"}  # all else is a table
 
 
@@ -37,6 +38,9 @@ class _Common:
     format: FileFormat | None = None  # None: by the file's ending
     simulated_hz: NonNegative = 0.0  # above 0, and without a file, readings are drawn on the truth of a recording
     offset_s: Finite = 0.0  # is added to the file's stamps, to have them by the IMU's clock
+    port: str = ""  # live: of a satellite receiver
+    baud: Count = 9600  # of that port
+    delay_s: NonNegative = 0.05  # from a fix's time to the first byte that tells of it at that port
     gate_probability: Probability = 0.999
     ticks: TicksSettings | None = None
     gnss: GnssSettings | None = None
@@ -54,13 +58,25 @@ class SensorFile:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorPort:
+    """Where a satellite receiver is plugged in, and how it is read."""
+
+    port: str
+    baud: int
+    format: Literal["nmea", "ubx"]
+    delay_s: float
+    gnss: GnssSettings
+
+
+@dataclass(frozen=True, slots=True)
 class SensorSetup:
-    """The sensors of a machine, and the files of those that have one."""
+    """The sensors of a machine, and the files and ports of those that have one."""
 
     suite: Suite
     sensors: Mapping[str, Configured]
     files: Mapping[str, SensorFile]
     simulated_hz: Mapping[str, float]  # of those whose readings are drawn
+    ports: Mapping[str, SensorPort]  # of those that are read live
 
 
 def load_sensor_setup(path: Path) -> SensorSetup:
@@ -77,7 +93,8 @@ def load_sensor_setup(path: Path) -> SensorSetup:
 
 def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSetup:
     """Return the sensors that plain data describe; `source` stands in errors, files are beside `folder`."""
-    if other := sorted(set(data) - {"sensors"}):
+    of_cart = {section.name for section in dataclasses.fields(SensorsConfig)}  # one file may describe all of a cart
+    if other := sorted(set(data) - {"sensors"} - of_cart):
         raise UsageError(f"{source}: no table [{other[0]}]; tables [sensors.NAME] are asked")
     tables = data.get("sensors", {})
     if not isinstance(tables, dict) or not 1 <= len(tables) <= MOST_SENSORS:
@@ -85,21 +102,24 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
     sensors: dict[str, Configured] = {}
     files: dict[str, SensorFile] = {}
     simulated: dict[str, float] = {}
+    ports: dict[str, SensorPort] = {}
     for name, table in tables.items():
         where = f"{source}: [sensors.{name}]"
         if not _NAME.fullmatch(name):
             raise UsageError(f"{where}: a name of letters, digits, - and _ is asked, a letter first, 32 at most")
         if not isinstance(table, dict):
             raise UsageError(f"{where}: a table is asked, got {table!r}")
-        sensors[name], file, rate_hz = _sensor(table, where, folder)
-        if file is not None:
+        sensors[name], common = _sensor(table, where)
+        if (file := _file(common, sensors[name], where, folder)) is not None:
             files[name] = file
-        elif rate_hz > 0.0:
-            simulated[name] = rate_hz
-    return SensorSetup(Suite(sensors), sensors, files, simulated)
+        elif common.simulated_hz > 0.0:
+            simulated[name] = common.simulated_hz
+        if (port := _port(common, sensors[name], where)) is not None:
+            ports[name] = port
+    return SensorSetup(Suite(sensors), sensors, files, simulated, ports)
 
 
-def _sensor(table: dict[str, Any], where: str, folder: Path) -> tuple[Configured, SensorFile | None, float]:
+def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:
     if not isinstance(table.get("kind"), str):
         raise UsageError(f'{where}: option kind: a name is asked, as kind = "position", got {table.get("kind")!r}')
     shared = {key.name for key in dataclasses.fields(_Common)}
@@ -118,7 +138,7 @@ def _sensor(table: dict[str, Any], where: str, folder: Path) -> tuple[Configured
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
     sensor.gate_probability = common.gate_probability
-    return sensor, _file(common, sensor, where, folder), common.simulated_hz
+    return sensor, common
 
 
 def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> SensorFile | None:
@@ -126,11 +146,25 @@ def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> Sens
         return None
     path = folder / common.file
     format_ = common.format or _FORMATS.get(path.suffix.lower(), "csv")
-    if format_ != "csv" and sensor.columns != ("east_m", "north_m", "up_m"):
+    if format_ != "csv" and sensor.columns != _FIX_COLUMNS:
         raise UsageError(f"{where}: option format: {format_} holds fixes, for a kind that has east, north, up")
     if common.ticks and sensor.columns != ("left_m_s", "right_m_s"):
         raise UsageError(f"{where}: option ticks: counts are those of kind wheels, this is {common.kind}")
+    return SensorFile(path, format_, common.offset_s, common.ticks, _gnss(common, where))
+
+
+def _port(common: _Common, sensor: Configured, where: str) -> SensorPort | None:
+    if not common.port:
+        return None
+    if sensor.columns != _FIX_COLUMNS:
+        raise UsageError(f"{where}: option port: fixes are read there, for a kind that has east, north, up")
+    if common.format == "csv":
+        raise UsageError(f"{where}: option format: nmea or ubx is read at a port, got csv")
+    return SensorPort(common.port, common.baud, common.format or "nmea", common.delay_s, _gnss(common, where))
+
+
+def _gnss(common: _Common, where: str) -> GnssSettings:
     gnss = common.gnss or GnssSettings()
     if gnss.datum and (why := why_nowhere(Geodetic(*gnss.datum))):
         raise UsageError(f"{where}: option gnss.datum: {why}")
-    return SensorFile(path, format_, common.offset_s, common.ticks, gnss)
+    return gnss

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import rewritten_line
-from vislam.config import Config, SensorsConfig, load, load_sensors
+from vislam.config import Config, SensorsConfig, load, load_further_sensors, load_sensors
 from vislam.config.ranges import Positive
 from vislam.core.errors import UsageError
 
@@ -57,7 +57,7 @@ OPTIONS = (LiveOptions, ResumeOptions)
 TAKEN = {
     "--config FILE": "TOML file of settings; options go before it",
     "--profile pi": "settings for a small computer; file and options go before it",
-    "--sensors FILE": "TOML file of sensors; options go before it",
+    "--sensors FILE": "TOML file of a cart's sensors, with tables [sensors.NAME] of further ones; options go before it",
     "--resume RUN": "go on with that run",
 }
 BRIEF = Brief(
@@ -83,7 +83,9 @@ def main(arguments: list[str]) -> int:
     if resumed is not None:
         return _resume(resumed, arguments, command)
     settings = load(take_path(arguments, "--config"), profile_name=take_option(arguments, "--profile"))
-    sensors = load_sensors(take_path(arguments, "--sensors"))
+    cart = take_path(arguments, "--sensors")
+    sensors, further = load_sensors(cart), load_further_sensors(cart)
+    settings = settings if further.file is None else replace(settings, sensors=further)
     defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
     if options.localize_only and options.map is None:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 # pyserial raises all of them at a device that goes away; its own SerialException is an OSError
-_PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
+PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
 _READ_BYTES = 4096
 _GLANCE_S = 0.05  # while the first sample is waited for, a port that cannot be opened is told so soon
 _BITS_PER_BYTE = 10  # start, eight, stop
@@ -60,7 +60,7 @@ class SerialBridge:
         Raises:
             HardwareError: no sample came, and why; pyserial is not installed.
         """
-        self._serial = _load_pyserial()
+        self._serial = load_pyserial()
         self._config = config
         self.rate_hz = _NOMINAL_HZ
         self.problem = f"{config.port} has not been opened"
@@ -148,7 +148,7 @@ class SerialBridge:
         if port is not None:
             try:
                 port.close()
-            except _PORT_ERRORS:
+            except PORT_ERRORS:
                 self._counts["close_failures"] += 1
 
     # ---- the port ---------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ class SerialBridge:
         try:
             # exclusive: two programs on one port would each get half of the bytes
             self._port = self._serial.Serial(config.port, config.baud, timeout=0, exclusive=True)
-        except _PORT_ERRORS as error:
+        except PORT_ERRORS as error:
             self._counts["open_failures"] += 1
             self.problem = why_not_open(config, error)
             return
@@ -213,7 +213,7 @@ class SerialBridge:
         try:
             ready, _, _ = select.select([port.fileno()], [], [], timeout_s)
             data = port.read(_READ_BYTES) if ready else b""
-        except _PORT_ERRORS as error:
+        except PORT_ERRORS as error:
             self._lose("port_lost", f"{config.port} went away: {error}; plug it in again")
             return []
         arrival_ns = time.monotonic_ns()
@@ -351,11 +351,12 @@ class _Watch:
         return self._repeats
 
 
-def _load_pyserial() -> Any:
+def load_pyserial() -> Any:
+    """Return the module; raises HardwareError where it is not installed."""
     try:
         import serial as module
     except ImportError as error:
-        raise HardwareError("the serial bridge needs pyserial; install it: pip install 'vislam[hw]'") from error
+        raise HardwareError("a serial port needs pyserial; install it: pip install 'vislam[hw]'") from error
     return module
 
 

@@ -30,7 +30,7 @@ from vislam.live.handover import FrontEnded, KeyframeOut, Seen
 from vislam.live.notices import CameraHealth, Doubted, Rebase, Start, ToFast
 from vislam.live.pace import Pace
 from vislam.live.processes.child import Life
-from vislam.live.readings import ReadingSource
+from vislam.live.reading_source import ReadingSource
 from vislam.live.rehearsal import rehearse_front
 from vislam.live.wire.mail import Outbox
 from vislam.live.wire.publisher import PoseReader
@@ -93,7 +93,7 @@ def run(
         if life.ready():
             process.loop(camera, SampleReceiver(samples), readings)
             process.end()
-        process.closing(camera.counters())
+        process.closing(camera.counters(), readings.counters())
 
 
 class FrontProcess:
@@ -144,11 +144,14 @@ class FrontProcess:
         for odometry in self.front.give_up_waiting():
             self._put_keyframe(KeyframeOut(odometry, *self._first()))
 
-    def closing(self, camera_counters: dict[str, int]) -> None:
+    def closing(self, camera_counters: dict[str, int], reading_counters: dict[str, dict[str, int]]) -> None:
         """Say good-bye to the others; what happened goes to the map process, which writes it down."""
         self._to_back.close()
         report = self._report()
-        report = replace(report, counters={**report.counters, "camera": camera_counters})
+        counters = {**report.counters, "camera": camera_counters}
+        for name, read in reading_counters.items():
+            counters[f"sensor {name}"] = {**counters.get(f"sensor {name}", {}), **read}
+        report = replace(report, counters=counters)
         ended = FrontEnded(report, self.front.start, self.front.news, self.clock.summary_ms())
         self._put(self._to_map, ended)
         self._to_map.close()

@@ -13,18 +13,20 @@ from pathlib import Path
 import numpy as np
 
 from vislam.config import Config, Gy85Config
-from vislam.core.errors import DataError
+from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.imu import ImuNoise
 from vislam.live.epoch import Epoch
 from vislam.live.frames import FrameSource, NoCamera
 from vislam.live.processes.child import Life
+from vislam.live.reading_source import ReadingSource
 from vislam.live.virtual.imu import VirtualGy85
 from vislam.live.virtual.motion import Drive, Segment, locate
 from vislam.live.virtual.pilot import CommandReader, PathFollower
 from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, course, virtual_rig
 from vislam.live.virtual.virtual_camera import VirtualCamera, run_camera
 from vislam.live.wire.slot import remove
+from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 
 _NS = 1_000_000_000
@@ -87,6 +89,12 @@ class VirtualCart:
         if not self.has_camera:
             return NoCamera
         return partial(VirtualCamera, f"{self._shared}-camera")
+
+    def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
+        """Raise UsageError: nobody draws them while it drives."""
+        raise UsageError(
+            "the virtual cart has no further sensors; play a recording with them instead: --source replay:SOURCE"
+        )
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return the processes that move it and that render."""

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Protocol
 
+from vislam.config import FurtherSensorsConfig
+from vislam.core.errors import UsageError
 from vislam.core.readings import Reading
 from vislam.live.epoch import Epoch
+from vislam.sensors import SensorSetup, Suite, load_sensor_setup
 
 _MISSING_S = 2.0  # without a reading for so long, a sensor is said to be silent
 
@@ -24,9 +29,34 @@ class ReadingSource(Protocol):
         """Return in a word how each sensor is: "well", or what ails it."""
         ...
 
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return by sensor how many readings came, and how often each fault occurred."""
+        ...
+
     def close(self) -> None:
         """Give all devices back; may be called twice."""
         ...
+
+
+def live_readings(
+    config: FurtherSensorsConfig, opener: Callable[[SensorSetup], Callable[[], ReadingSource]]
+) -> tuple[Suite, Callable[[], ReadingSource]]:
+    """Return the further sensors that a live run is told, and what opens them; an empty suite without any.
+
+    `opener` is that of the run's source. Raises UsageError for a file that cannot be used, or a sensor that `opener`
+    refuses.
+    """
+    if config.file is None:
+        return Suite(), NoReadings
+    setup = load_sensor_setup(Path(config.file))
+    return setup.suite, opener(setup)
+
+
+def refuse_unread(setup: SensorSetup, readable: Mapping[str, object], asked: str) -> None:
+    """Raise UsageError for the first sensor that is not among the readable ones; `asked` says what it needs."""
+    missing = [name for name in setup.suite.names if name not in readable]
+    if missing:
+        raise UsageError(f"[sensors.{missing[0]}]: {asked}; docs/more-sensors.md, Live")
 
 
 class NoReadings:
@@ -40,6 +70,10 @@ class NoReadings:
         """Return nothing."""
         return {}
 
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return nothing."""
+        return {}
+
     def close(self) -> None:
         """Do nothing."""
 
@@ -50,12 +84,14 @@ class Heard:
     def __init__(self, names: tuple[str, ...]) -> None:
         """Begin with none heard."""
         self._last_s = dict.fromkeys(names, -float("inf"))
+        self.count = Counter(dict.fromkeys(names, 0))
 
     def hear(self, readings: list[Reading]) -> None:
         """Note readings that have come just now."""
         now_s = time.monotonic()
         for reading in readings:
             self._last_s[reading.sensor] = now_s
+            self.count[reading.sensor] += 1
 
     def status(self) -> dict[str, str]:
         """Return "well" for sensors heard of late, and how long the others have been silent."""
@@ -88,6 +124,10 @@ class ReplayedReadings:
     def status(self) -> dict[str, str]:
         """Return which sensors are silent."""
         return self._heard.status()
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return how many readings of each sensor were played."""
+        return {name: {"played": count} for name, count in self._heard.count.items()}
 
     def close(self) -> None:
         """Stop reading."""
