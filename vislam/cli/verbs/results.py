@@ -21,7 +21,7 @@ def written_up(out: Path, command: Sequence[str], is_hurried: Callable[[], bool]
 
     An interrupt that was answered with an end in order is told by `is_hurried`.
     """
-    from vislam import report  # what draws is loaded by the first use, when the run has given its memory back
+    from vislam.run import report  # what draws is loaded by the first use, when the run has given its memory back
 
     with log_to(out, command):
         try:
