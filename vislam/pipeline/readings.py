@@ -16,10 +16,11 @@ from vislam.sensors import BodyState, Suite
 from vislam.sensors.body import between_keyframes
 
 _MAX_WAITING = 4096  # readings that wait for the filter to begin; older ones go
+_MAX_SINCE = 16384  # readings that wait for a keyframe; older ones go
 _MAX_TRIED = 1024  # readings that a sensor begins with; of more every other one is kept
 _MORE = 1.2  # so many times the readings of the last attempt before the next
 _FREE_FORCE_M_S2 = 1.0  # what a body does between keyframes of which no IMU tells
-_MIN_PATH_NS = 1_000_000  # a span of less is no span
+_MIN_PATH_NS = 1_000  # a span of less is no span, and gains no speed that shows
 
 
 @dataclass(slots=True, eq=False)
@@ -29,32 +30,39 @@ class _Beginning:
     readings: list[Reading] = field(default_factory=list)
     bodies: list[BodyState] = field(default_factory=list)
     tried_at: int = 0  # readings of the last attempt
+    newest_t_ns: int = 0
 
 
 class ReadingIntake:
     """Takes readings as they come, in any order; what nobody can use is counted and goes no further.
 
+    A sensor is somebody else's code: where its `check` raises the reading goes, where its `begin` raises the sensor.
+
     Own variables, as the heading of a map of fixes, have to be known roughly before one linear step can be trusted: a
     sensor's first readings are compared with the path until `Sensor.begin` knows them.
 
     Attributes:
-        counters: by sensor, what became of readings before the filter had a word.
-        notes: by sensor, why its first unusable reading was that.
+        counters: by sensor, what became of readings before the filter had a word: `dropped` are those that had to wait
+            for too long, `late` came when the graph had their keyframe already, `unplaced` where it has no inertial
+            data.
+        notes: by sensor, why its first unusable reading was that, or why the sensor is left out.
     """
 
     def __init__(
         self, suite: Suite, filtering: Filtering | None, buffer: ImuBuffer | None, gravity_m_s2: float
     ) -> None:
         """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data."""
-        self.counters = {name: dict.fromkeys(("readings", "unusable", "too_early"), 0) for name in suite.names}
+        became = ("readings", "unusable", "too_early", "dropped", "late", "unplaced")
+        self.counters = {name: dict.fromkeys(became, 0) for name in suite.names}
         self.notes: dict[str, str] = {}
         self._suite = suite
         self._filter, self._buffer = filtering, buffer
         self._gravity = gravity_m_s2 if buffer is not None else 0.0
-        self._waiting: deque[Reading] = deque(maxlen=_MAX_WAITING)
+        self._waiting: deque[Reading] = deque()
         self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}
         self._starts: list[OwnStart] = []  # for the next keyframe
-        self._since: list[Reading] = []  # the newest keyframe
+        self._since: deque[Reading] = deque()  # the newest keyframe
+        self._left_out: set[str] = set()  # sensors whose code failed
         self._path: deque[tuple[int, Array]] = deque(maxlen=2)  # times and poses of frames, where there is no filter
 
     def report(self) -> dict[str, dict[str, Any]]:
@@ -78,12 +86,12 @@ class ReadingIntake:
             self.notes.setdefault(reading.sensor, self._suite.why_unusable(reading))
             return
         counts["readings"] += 1
-        reason = self._suite.why_unusable(reading)
+        reason = self._why_unusable(reading)
         if reason:
             counts["unusable"] += 1
             self.notes.setdefault(reading.sensor, f"{reason} (at {reading.t_ns} ns)")
             return
-        self._waiting.append(reading)
+        self._queue(self._waiting, reading, _MAX_WAITING)
 
     def give_up_filter(self) -> None:
         """Go on with the path of vision alone: gravity could not be found."""
@@ -102,12 +110,14 @@ class ReadingIntake:
             reading = self._waiting.popleft()
             if reading.t_ns > newest_t_ns:
                 self._waiting.append(reading)
+            elif reading.sensor in self._left_out:
+                self.counters[reading.sensor]["unusable"] += 1
             elif reading.sensor in self._beginning:
                 self._compare(reading)
             else:
                 if self._filter is not None:
                     self._filter.add_reading(reading)
-                self._since.append(reading)
+                self._queue(self._since, reading, _MAX_SINCE)
 
     def pack(self, packet: KeyframePacket, before_t_ns: int, state: NavState | None) -> KeyframePacket:
         """Return a keyframe's packet with the readings since the one before, at `before_t_ns`.
@@ -115,11 +125,32 @@ class ReadingIntake:
         `state` is the filter's at the keyframe; None without one, or where it has none.
         """
         t_ns = packet.keyframe.t_ns
-        here = [reading for reading in self._since if before_t_ns < reading.t_ns <= t_ns]
-        self._since = [reading for reading in self._since if reading.t_ns > t_ns]
-        placed = [self._placed(reading, before_t_ns, t_ns, state) for reading in here]
+        placed, later = [], deque[Reading]()
+        for reading in self._since:
+            if reading.t_ns > t_ns:
+                later.append(reading)
+            elif reading.t_ns <= before_t_ns:
+                self.counters[reading.sensor]["late"] += 1
+            elif (one := self._placed(reading, before_t_ns, t_ns, state)) is not None:
+                placed.append(one)
+            else:
+                self.counters[reading.sensor]["unplaced"] += 1
+        self._since = later
         starts, self._starts = tuple(self._starts), []
-        return replace(packet, readings=tuple(one for one in placed if one is not None), own_starts=starts)
+        return replace(packet, readings=tuple(placed), own_starts=starts)
+
+    def _why_unusable(self, reading: Reading) -> str:
+        if reading.sensor in self._left_out:
+            return "its sensor is left out"
+        try:
+            return self._suite.why_unusable(reading)
+        except Exception as error:
+            return f"its check failed: {_told(error)}"
+
+    def _queue(self, queue: deque[Reading], reading: Reading, most: int) -> None:
+        queue.append(reading)
+        if len(queue) > most:
+            self.counters[queue.popleft().sensor]["dropped"] += 1
 
     def _compare(self, reading: Reading) -> None:
         """Compare a reading with the path, and begin the sensor once that tells its own variables."""
@@ -131,19 +162,41 @@ class ReadingIntake:
         if len(beginning.readings) >= _MAX_TRIED:
             del beginning.readings[1::2], beginning.bodies[1::2]
             beginning.tried_at = len(beginning.readings)
+        beginning.newest_t_ns = max(beginning.newest_t_ns, reading.t_ns)
         beginning.readings.append(reading)
         beginning.bodies.append(body)
         if len(beginning.readings) < _MORE * beginning.tried_at:
             return
         beginning.tried_at = len(beginning.readings)
-        begun = self._suite[reading.sensor].begin(beginning.readings, beginning.bodies)
-        if begun is None:
+        start = self._begun(reading.sensor, beginning)
+        if start is None:
             return
         del self._beginning[reading.sensor]
-        start = OwnStart(reading.sensor, begun.values, begun.sigmas)
         if self._filter is not None:
-            self._filter.begin_sensor(reading.t_ns, start)
+            # a start holds for what has its stamp, and the newest of its readings would be used twice
+            self._filter.begin_sensor(beginning.newest_t_ns + 1, start)
         self._starts.append(start)
+
+    def _begun(self, name: str, beginning: _Beginning) -> OwnStart | None:
+        """Return first values of a sensor's own variables; None: too early, or the sensor is left out from here on."""
+        sensor = self._suite[name]
+        try:
+            begun = sensor.begin(beginning.readings, beginning.bodies)
+            if begun is None:
+                return None
+            start = OwnStart(name, np.asarray(begun.values, float), np.asarray(begun.sigmas, float))
+            asked = (len(sensor.variables),)
+            if start.values.shape != asked or start.sigmas.shape != asked:
+                raise ValueError(f"{start.values.shape} values and {start.sigmas.shape} sigmas, {asked} asked")
+            if not (np.isfinite(start.values).all() and np.isfinite(start.sigmas).all() and (start.sigmas >= 0).all()):
+                raise ValueError("values that are not finite, or sigmas that are not finite and at least 0")
+        except Exception as error:
+            self.notes[name] = f"left out, it cannot begin: {_told(error)}"
+            self._left_out.add(name)
+            beginning.readings.clear()
+            beginning.bodies.clear()
+            return None
+        return start
 
     def _body_at(self, t_ns: int) -> BodyState | None:
         if self._filter is not None:
@@ -177,6 +230,10 @@ class ReadingIntake:
                 float(np.sqrt(np.diag(state.covariance)[12:15].max())),
             ),
         )  # fmt: skip
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def _freely(since_s: float, length_s: float) -> Station:
