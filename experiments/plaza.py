@@ -32,7 +32,7 @@ from vislam.ekf.filtering import Filtering
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.graph import PoseGraph
 from vislam.imu import ImuBuffer, ImuNoise
-from vislam.pipeline.readings import ReadingIntake
+from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.sensors import Suite
 from vislam.sensors.kinds.anchor_range import AnchorRange, AnchorRangeSettings
 from vislam.sensors.kinds.height import Height, HeightSettings

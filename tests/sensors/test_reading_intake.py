@@ -14,7 +14,7 @@ from vislam.core.messages import ImuSample, KeyframePacket, NavState, no_observa
 from vislam.core.readings import OwnStart, Reading
 from vislam.imu import ImuBuffer
 from vislam.pipeline import readings as intake_module
-from vislam.pipeline.readings import ReadingIntake
+from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.sensors import Begun, BodyState, Sensor, Suite, Variable
 from vislam.sensors.body import between_keyframes
 from worlds.parts import GRAVITY_M_S2, bare_keyframe, derivative, ideal_imu

@@ -50,7 +50,7 @@ from vislam.imu import (
 )
 from vislam.pipeline.front_report import FrontReport, learned_of_camera
 from vislam.pipeline.gravity import GravityWait, Released
-from vislam.pipeline.readings import ReadingIntake
+from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.pipeline.settings import derived, refuse_without_scale
 from vislam.pipeline.steps import Estimate, FrontStep
 from vislam.sensors import Suite
