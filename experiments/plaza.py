@@ -3,8 +3,8 @@
 Both get the same measurements, through the same definition of each sensor: turns of the gyroscope as the IMU's (the
 accelerometer, which the tables lack, is one of a body that may accelerate as it likes), speeds as a `twist`, ranges,
 and that the floor is level. The anchors are surveyed; where the robot starts and that this radio's ranges are 7 % too
-long, both have to find. The tables come with GTSAM's package. Djugash, Hamner and Roth, "Navigating with ranging radios: five
-data sets with ground truth", Journal of Field Robotics 2009.
+long, both have to find. The tables come with GTSAM's package. Djugash, Hamner and Roth, "Navigating with ranging
+radios: five data sets with ground truth", Journal of Field Robotics 2009.
 
     python experiments/plaza.py --out runs/plaza
 """
