@@ -98,7 +98,7 @@ def test_a_sensor_that_nobody_could_read_is_refused_before_anything_starts(tmp_p
     assert setup.ports["gnss"].baud == 38400
     command = ["vislam", "live"]
     with pytest.raises(UsageError, match=r"\[sensors.gnss\]: a replay needs its file, or simulated_hz"):
-        LiveRun(ReplaySource("points:room,seconds=2"), settings(file), tmp_path / "run", "replay", command)
+        LiveRun(ReplaySource("points:still"), settings(file), tmp_path / "run", "replay", command)
     cart, _ = open_live("gy85+none", settings(file), SensorsConfig())
     with pytest.raises(HardwareError, match="there is no port /dev/absent"):
         cart.readings(setup)
