@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,8 +20,7 @@ from vislam.core import interrupts
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
-from vislam.core.messages import Frame, ImuSample, Localisation, LoopDecision, MagSample, Submaps, Tracking
-from vislam.core.readings import Reading
+from vislam.core.messages import Localisation, LoopDecision, Submaps, Tracking
 from vislam.core.recording import Recording
 from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
@@ -36,6 +35,7 @@ from vislam.run.further_sensors import further_readings
 from vislam.run.loop_gallery import LoopGallery
 from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, sensors_entry, verdict_entry
 from vislam.run.pipeline import Pipeline
+from vislam.run.run_input import RunInput
 from vislam.run.session import Session, SessionWriter, recall
 from vislam.run.show import show_map, show_paths, show_step
 from vislam.run.sources import shaken, without_idle_cameras
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
 _LOG = logging.getLogger(__name__)
-_INERTIAL_BEFORE_NS = 1_000_000_000  # given again before the keyframe at which a run is resumed
 
 
 def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
@@ -78,12 +77,12 @@ class Run:
         """
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
         self.recording = shaken(without_idle_cameras(recording, config), config.imu.vibration)
-        self._further = None if slam else further_readings(recording, config.sensors, config.seed)
-        suite = None if self._further is None else self._further.suite
+        further = None if slam else further_readings(recording, config.sensors, config.seed)
+        self._input = RunInput(self.recording, further, out)
         self.config = config
         self.out = out
         self.noise = imu_noise(config.imu, recording.imu_noise)
-        self.slam: Pipeline = Slam(config, recording.rig, self.noise, suite) if slam is None else slam
+        self.slam: Pipeline = Slam(config, recording.rig, self.noise, self._input.suite) if slam is None else slam
         self.log = RunLog()
         self.cost = CostMeter()
         self.gallery = LoopGallery()
@@ -186,7 +185,7 @@ class Run:
 
     def _feed(self, progress: Progress | None) -> None:
         assert isinstance(self.slam, Slam)
-        values = iter(self._values())
+        values = self._input.values(self._from)
         with interrupts.counted() as asked:
             while not asked.count:
                 with self.slam.clock.measure("read"):
@@ -198,30 +197,6 @@ class Run:
                     if progress is not None:
                         progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
         raise KeyboardInterrupt  # between two values, where the pipeline is whole
-
-    def _values(self) -> Iterator[ImuSample | MagSample | Frame | Reading]:
-        """Yield the recording with the readings of further sensors, or what is left of it."""
-        if self._from is None:
-            yield from self._events()
-            return
-        begin_ns = self._from.camera_t_ns
-        samples_ns = min(begin_ns, self._from.t_ns) - _INERTIAL_BEFORE_NS
-        begun = False
-        for value in self._events(begin_ns):
-            if value.t_ns < (begin_ns if isinstance(value, Frame) else samples_ns):
-                continue
-            if isinstance(value, Frame) and not begun:
-                if value.t_ns != begin_ns:
-                    raise DataError(
-                        f"{self.recording.name} has no frame at {begin_ns} ns, where the last keyframe of {self.out} "
-                        "is; give the recording that the run began with"
-                    )
-                begun = True
-            yield value
-
-    def _events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
-        events = self.recording.events(from_ns)
-        return events if self._further is None else self._further.among(events)
 
     def _take(self, step: Step) -> None:
         if self._from is not None and step.front.frame.t_ns <= self._from.t_ns:
@@ -361,7 +336,7 @@ class Run:
             "counters": counters,
             "nis": front.nis,
             "sensors": sensors_entry(front.sensors, None if back is None else back.graph),
-            "problems": {**self.recording.problems, **({} if self._further is None else self._further.problems)},
+            "problems": self._input.problems,
             "loops": loops,
             "graph_revisions": self.log.revisions,
             "coverage_frames": evidence.coverage,

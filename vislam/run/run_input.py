@@ -1,0 +1,61 @@
+"""What a run is fed with: a recording with the readings of further sensors, or what of it is left to process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from vislam.core.errors import DataError
+from vislam.core.memory import FrontMemory
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.readings import Reading
+from vislam.core.recording import Recording
+from vislam.run.further_sensors import FurtherReadings
+from vislam.sensors import Suite
+
+_INERTIAL_BEFORE_NS = 1_000_000_000  # given again before the keyframe at which a run is resumed
+
+
+class RunInput:
+    """The values of a recording and of the sensors beside it, by their stamps."""
+
+    def __init__(self, recording: Recording, further: FurtherReadings | None, out: Path) -> None:
+        """Take a recording and readings beside it, for the run in the folder `out`."""
+        self._recording, self._further, self._out = recording, further, out
+
+    @property
+    def suite(self) -> Suite | None:
+        """The further sensors; None without any."""
+        return None if self._further is None else self._further.suite
+
+    @property
+    def problems(self) -> dict[str, int]:
+        """What could not be read so far, with how often."""
+        return {**self._recording.problems, **({} if self._further is None else self._further.problems)}
+
+    def values(self, front: FrontMemory | None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
+        """Yield all values, or those from the newest keyframe of an earlier process on, and some samples before it.
+
+        Raises DataError when the recording has no frame there.
+        """
+        if front is None:
+            yield from self._events(None)
+            return
+        begin_ns = front.camera_t_ns
+        samples_ns = min(begin_ns, front.t_ns) - _INERTIAL_BEFORE_NS
+        begun = False
+        for value in self._events(begin_ns):
+            if value.t_ns < (begin_ns if isinstance(value, Frame) else samples_ns):
+                continue
+            if isinstance(value, Frame) and not begun:
+                if value.t_ns != begin_ns:
+                    raise DataError(
+                        f"{self._recording.name} has no frame at {begin_ns} ns, where the last keyframe of {self._out} "
+                        "is; give the recording that the run began with"
+                    )
+                begun = True
+            yield value
+
+    def _events(self, from_ns: int | None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
+        events = self._recording.events(from_ns)
+        return events if self._further is None else self._further.among(events)
