@@ -316,3 +316,46 @@ def test_an_evaluation_of_another_shape_is_named(copy, spoil):
     (copy / "loops_eval.json").write_text(json.dumps(evaluation))
     page = Page(write_report(copy).read_text())
     assert any("loops_eval.json cannot be drawn" in part for part in page.texts)
+
+
+def _with_sensors(copy, sensors, nis):
+    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics["sensors"], metrics["nis"] = sensors, nis
+    metrics["counters"]["sensor wheels"] = {"readings": 396, "unusable": 7, "too_early": 17}
+    metrics["counters"]["ekf"] = {"wheels_accepted": 371, "wheels_gated": 6, "wheels_refused": 5}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    return Page(write_report(copy).read_text())
+
+
+def test_further_sensors_are_shown_with_their_readings_and_own_variables(copy):
+    found = {"values": [1.0125], "sigmas": [0.0021]}
+    wheels = {
+        "begun": True,
+        "variables": ["scale_left"],
+        "filter": found,
+        "graph": {"values": [0.9987], "sigmas": [0.0032]},
+    }
+    broken = {"begun": False, "variables": ["offset_m"], "note": "left out, it cannot <begin>"}
+    page = _with_sensors(copy, {"wheels": wheels, "broken": broken}, {"wheels": [371, 742.0, 1484]})
+    assert "Further sensors" in page.headings
+    assert {"396", "371", "6", "5", "7", "0.50", "1.0125", "0.0021", "0.9987", "0.0032"} <= set(page.texts)
+    assert {"scale_left", "left out, it cannot <begin>"} <= set(page.texts)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "nis"),
+    [
+        ({"wheels": 3}, {"wheels": [1, 2]}),
+        (
+            {"wheels": {"begun": True, "variables": ["a", "b"], "filter": {"values": [1.0]}, "graph": 7}},
+            {"wheels": [1, "x", 3]},
+        ),
+        ({"wheels": {"variables": 4}}, []),
+    ],
+)
+def test_further_sensors_of_another_shape_do_not_stop_the_report(copy, sensors, nis):
+    assert "Further sensors" in _with_sensors(copy, sensors, nis).headings
+
+
+def test_a_run_without_further_sensors_has_no_section_about_them(copy):
+    assert "Further sensors" not in _with_sensors(copy, {}, {}).headings

@@ -142,6 +142,6 @@ class RecordConfig:
 
 @dataclass(frozen=True, slots=True)
 class FurtherSensorsConfig:
-    """Sensors other than IMU and camera; docs/sensors.md."""
+    """Sensors other than IMU and camera; docs/more-sensors.md."""
 
     file: str | None = None  # TOML with a table `[sensors.NAME]` for each, beside which their readings lie

@@ -32,6 +32,7 @@ from vislam.run.report.html import (
 from vislam.run.report.loop_section import loops_section
 from vislam.run.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_run
 from vislam.run.report.scene import Scene, build_scene
+from vislam.run.report.sensor_section import sensors_section
 from vislam.run.verdict import verdict_sentence
 
 
@@ -55,6 +56,7 @@ def write_report(run: Path) -> Path:
             loops_section(files, scene),
             _timing(files),
             _biases(files, scene),
+            sensors_section(files),
             _lost(files),
             _manifest(files),
         )
