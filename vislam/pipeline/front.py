@@ -105,7 +105,10 @@ class Front:
         self._readings: ReadingIntake | None = None
         if suite is not None and len(suite):
             buffer = None if noise is None else self._buffer
-            self._readings = ReadingIntake(suite, self._filter, buffer, config.imu.gravity_m_s2)
+            self._readings = ReadingIntake(
+                suite, self._filter, buffer, config.imu.gravity_m_s2,
+                0.0 if noise is None else noise.accel_noise_density,
+            )  # fmt: skip
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
         self._graph_state: NavState | None = None  # at the newest keyframe that the graph has told of

@@ -49,15 +49,20 @@ class ReadingIntake:
     """
 
     def __init__(
-        self, suite: Suite, filtering: Filtering | None, buffer: ImuBuffer | None, gravity_m_s2: float
-    ) -> None:
-        """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data."""
+        self, suite: Suite, filtering: Filtering | None, buffer: ImuBuffer | None, gravity_m_s2: float,
+        accel_noise_density: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data.
+
+        `accel_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
+        """
         became = ("readings", "unusable", "too_early", "dropped", "late", "unplaced")
         self.counters = {name: dict.fromkeys(became, 0) for name in suite.names}
         self.notes: dict[str, str] = {}
         self._suite = suite
         self._filter, self._buffer = filtering, buffer
         self._gravity = gravity_m_s2 if buffer is not None else 0.0
+        self._accel_density = accel_noise_density
         self._waiting: deque[Reading] = deque()
         self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}
         self._starts: list[OwnStart] = []  # for the next keyframe
@@ -221,13 +226,15 @@ class ReadingIntake:
         all_of_it = preintegrate(whole, gyro_bias, accel_bias)
         here = None if part is None else preintegrate(part, gyro_bias, accel_bias)
         rates = whole.gyro_rad_s if part is None else part.gyro_rad_s
+        white = self._accel_density * whole.noise.accel
+        force_variance = float(np.diag(state.covariance)[12:15].max()) + white**2 / length_s
         return PlacedReading(
             reading,
             Station(
                 since_s, length_s, np.eye(3) if here is None else here.dR, np.zeros(3) if here is None else here.dv_m_s,
                 np.zeros(3) if here is None else here.dp_m, all_of_it.dR, all_of_it.dp_m, self._gravity,
                 rates[0 if part is None else -1] - gyro_bias, gyro_bias, accel_bias,
-                float(np.sqrt(np.diag(state.covariance)[12:15].max())),
+                float(np.sqrt(force_variance)),
             ),
         )  # fmt: skip
 
