@@ -34,9 +34,9 @@ def test_the_stages_get_what_config_json_says(tmp_path, monkeypatch, rig, coupli
             super().__init__(config, *rest)
 
     class SpiedGraph(PoseGraph):
-        def __init__(self, graph, noise, gravity_m_s2, rig, window):
+        def __init__(self, graph, noise, gravity_m_s2, rig, window, *rest):
             got["graph"], got["window"] = graph, window
-            super().__init__(graph, noise, gravity_m_s2, rig, window)
+            super().__init__(graph, noise, gravity_m_s2, rig, window, *rest)
 
     def spied_frontend(config, rig, seed):
         got["frontend"] = config
