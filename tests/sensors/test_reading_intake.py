@@ -13,7 +13,7 @@ from vislam.core.geometry import transform
 from vislam.core.messages import ImuSample, KeyframePacket, NavState, no_observations
 from vislam.core.readings import OwnStart, Reading
 from vislam.imu import ImuBuffer
-from vislam.pipeline import readings as intake_module
+from vislam.pipeline import reading_intake as intake_module
 from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.sensors import Begun, BodyState, Sensor, Suite, Variable
 from vislam.sensors.body import between_keyframes
