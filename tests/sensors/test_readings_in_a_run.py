@@ -209,6 +209,7 @@ def test_an_interrupted_run_is_resumed_with_its_sensors(told, clean, tmp_path):
         ("[sensors.wheels]\nkind = 'whels'\n", 2, "no kind of sensor is called 'whels'"),
         ("[sensors.wheels\n", 2, "cannot be read"),
         (f"{WHEELS}simulated_hz = -1.0\n", 2, "simulated_hz"),
+        (WHEELS, 2, "[sensors.wheels] has no readings here"),
         (f"{WHEELS}file = 'nothing.csv'\n", 3, "nothing.csv cannot be read"),
     ],
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vislam.config import FurtherSensorsConfig
-from vislam.core.errors import DataError
+from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.core.recording import Recording
@@ -46,8 +46,16 @@ class FurtherReadings:
     """
 
     def __init__(self, recording: Recording, setup: SensorSetup, seed: int) -> None:
-        """Prepare to read the files of a setup, and to draw what it says is simulated; see `drawn`."""
+        """Prepare to read the files of a setup, and to draw what it says is simulated; see `drawn`.
+
+        Raises UsageError for a sensor that has neither.
+        """
         self.suite, self.problems = setup.suite, Problems()
+        for name in setup.suite.names:
+            if name not in setup.files and name not in setup.simulated_hz:
+                raise UsageError(
+                    f"[sensors.{name}] has no readings here: give its file, or simulated_hz to draw them on the truth"
+                )
         self._setup = setup
         self._drawn = drawn(recording, setup, seed)
 
