@@ -40,6 +40,7 @@ class _Begun:
     guess: Array  # [V]
     told: Array  # [V], with `units` as sigmas: readings before it are known by this alone
     units: Array  # [V]
+    first: int = -1  # number of the first entry
     constant: set[int] = field(default_factory=set)  # numbers of variables that do not change and have their key
     newest: dict[int, int] = field(default_factory=dict)  # of walking ones, by number: keyframe of the newest key
 
@@ -255,6 +256,7 @@ class Readings:
         if not self._suite[name].variables:
             return entry
         begun, first = self._begun[name], self._suite.own(name).start
+        begun.first = entry.number if begun.first < 0 else begun.first
         for n, variable in enumerate(self._suite[name].variables, first):
             at = begun.newest.get(n)
             walks = variable.walk > 0.0
@@ -320,7 +322,10 @@ class Readings:
                 model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
                 out.append(gtsam.BetweenFactorDouble(earlier, entry.keys[n], 0.0, model))
             elif entry.new[n]:
-                out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], gtsam.noiseModel.Unit.Create(1)))
+                # what walks and begins anew with a submap has walked nobody knows how far since it was told
+                sigma = 1.0 if entry.number == begun.first else max(variable.sigma / unit, 1.0)
+                model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+                out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], model))
         return out
 
 
