@@ -1,4 +1,4 @@
-"""Sensors other than IMU and camera: one definition of each, which filters, graph and batch use alike."""
+"""Sensors other than IMU and camera: one definition of each, which both filters and the graph use alike."""
 
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured
