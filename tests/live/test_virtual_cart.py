@@ -226,7 +226,17 @@ def test_a_whole_run_of_the_virtual_cart(tmp_path: Path) -> None:
     base = load(None, {"view.enabled": False, "live.name": name, "live.send_to": ()})
     asked = "virtual-cart,camera_hz=4,image_width_px=320,imu_out=9:10"
     source, config = open_live(asked, base, SensorsConfig())
-    metrics = LiveRun(source, config, out, asked, ["vislam", "live"]).execute(duration_s=14.0)
+    missed: list[bool] = []
+
+    def until_plugged_in_again(run: LiveRun) -> None:
+        status = run.notes.get("fast", {}).get("status")
+        if status:
+            missed.append(Health.IMU_MISSING in Health(status["health"]))
+            if any(missed) and not any(missed[-8:]):
+                run.stop()
+
+    live = LiveRun(source, config, out, asked, ["vislam", "live"])
+    metrics = live.execute(until_plugged_in_again, duration_s=60.0)
     assert metrics["mode"] == "planar"
     assert metrics["frames"] > 5
     late = {role: cost["late_kernels"] for role, cost in metrics["cost"]["processes"].items()}
