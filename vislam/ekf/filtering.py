@@ -22,6 +22,7 @@ from vislam.sensors import Suite
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
 
+_MOST_TOLD = 4096  # readings of further sensors; only a live run asks for them, many times a second
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
@@ -42,7 +43,7 @@ class Filtering:
         self.ekf: Ekf | MsckfEkf = make_ekf(config, gravity_m_s2=gravity_m_s2, rig=rig, noise=noise, suite=suite)
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._told: list[Correction] = []  # since somebody asked
-        self._told_readings: list[ToldReading] = []  # since somebody asked
+        self._told_readings: deque[ToldReading] = deque(maxlen=_MOST_TOLD)  # since somebody asked, if anybody does
         self._start_ns = 0
         self._noise_told = AS_MODELLED
 
@@ -108,7 +109,8 @@ class Filtering:
 
     def take_told_readings(self) -> list[ToldReading]:
         """Return what the filter was told of other sensors since this was asked last, in that order."""
-        told, self._told_readings = self._told_readings, []
+        told = list(self._told_readings)
+        self._told_readings.clear()
         return told
 
     def motion(self, from_t_ns: int, to_t_ns: int) -> Array | None:
