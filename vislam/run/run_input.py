@@ -57,5 +57,5 @@ class RunInput:
             yield value
 
     def _events(self, from_ns: int | None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
-        events = self._recording.events(from_ns)
+        events = self._recording.events() if from_ns is None else self._recording.events(from_ns)
         return events if self._further is None else self._further.among(events)
