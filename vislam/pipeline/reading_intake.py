@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from vislam.core.messages import Array, KeyframePacket, NavState
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState
 from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, preintegrate
@@ -131,13 +132,14 @@ class ReadingIntake:
         """
         t_ns = packet.keyframe.t_ns
         placed, later = [], deque[Reading]()
+        path = self._path_between(before_t_ns, t_ns, state) if self._since else None
         for reading in self._since:
             if reading.t_ns > t_ns:
                 later.append(reading)
             elif reading.t_ns <= before_t_ns:
                 self.counters[reading.sensor]["late"] += 1
-            elif (one := self._placed(reading, before_t_ns, t_ns, state)) is not None:
-                placed.append(one)
+            elif path is not None and (station := path(reading.t_ns)) is not None:
+                placed.append(PlacedReading(reading, station))
             else:
                 self.counters[reading.sensor]["unplaced"] += 1
         self._since = later
@@ -212,30 +214,43 @@ class ReadingIntake:
         station = _freely((t_ns - t0_ns) * 1e-9, (t1_ns - t0_ns) * 1e-9)
         return between_keyframes(T0, T1, t_ns, station)
 
-    def _placed(self, reading: Reading, t0_ns: int, t1_ns: int, state: NavState | None) -> PlacedReading | None:
-        since_s, length_s = (reading.t_ns - t0_ns) * 1e-9, (t1_ns - t0_ns) * 1e-9
+    def _path_between(self, t0_ns: int, t1_ns: int, state: NavState | None) -> Callable[[int], Station | None] | None:
+        """Return what gives the station of a time between two keyframes; None where inertial data do not cover them."""
+        length_s = (t1_ns - t0_ns) * 1e-9
         if self._buffer is None:
-            return PlacedReading(reading, _freely(since_s, length_s))
-        if state is None:
+            return lambda t_ns: _freely((t_ns - t0_ns) * 1e-9, length_s)
+        whole = None if state is None else self._buffer.span(t0_ns, t1_ns)
+        if state is None or whole is None:
             return None
-        whole = self._buffer.span(t0_ns, t1_ns)
-        part = self._buffer.span(t0_ns, reading.t_ns) if reading.t_ns - t0_ns > _MIN_PATH_NS else None
-        if whole is None or (part is None and reading.t_ns - t0_ns > _MIN_PATH_NS):
-            return None
-        gyro_bias, accel_bias = state.gyro_bias_rad_s, state.accel_bias_m_s2
-        all_of_it = preintegrate(whole, gyro_bias, accel_bias)
-        here = None if part is None else preintegrate(part, gyro_bias, accel_bias)
-        rates = whole.gyro_rad_s if part is None else part.gyro_rad_s
         white = self._accel_density * whole.noise.accel
         force_variance = float(np.diag(state.covariance)[12:15].max()) + white**2 / length_s
-        return PlacedReading(
-            reading,
-            Station(
-                since_s, length_s, np.eye(3) if here is None else here.dR, np.zeros(3) if here is None else here.dv_m_s,
-                np.zeros(3) if here is None else here.dp_m, all_of_it.dR, all_of_it.dp_m, self._gravity,
-                rates[0 if part is None else -1] - gyro_bias, gyro_bias, accel_bias,
-                float(np.sqrt(force_variance)),
-            ),
+        return _InertialPath(self._buffer, whole, state, self._gravity, float(np.sqrt(force_variance))).station
+
+
+class _InertialPath:
+    """Inertial data between two keyframes, of which the whole is integrated once for all readings."""
+
+    def __init__(
+        self, buffer: ImuBuffer, whole: ImuSpan, state: NavState, gravity_m_s2: float, force_sigma_m_s2: float
+    ) -> None:
+        self._buffer, self._samples, self._gravity, self._sigma = buffer, whole, gravity_m_s2, force_sigma_m_s2
+        self._biases = state.gyro_bias_rad_s, state.accel_bias_m_s2
+        self._whole = preintegrate(whole, *self._biases)
+
+    def station(self, t_ns: int) -> Station | None:
+        """Return the station of a time; None where the samples held do not reach it."""
+        t0_ns, whole, (gyro_bias, accel_bias) = int(self._samples.t_ns[0]), self._whole, self._biases
+        dR, dv, dp, rate = np.eye(3), np.zeros(3), np.zeros(3), self._samples.gyro_rad_s[0]
+        if t_ns - t0_ns > _MIN_PATH_NS:
+            part = self._buffer.span(t0_ns, t_ns)
+            if part is None:
+                return None
+            here = preintegrate(part, gyro_bias, accel_bias)
+            dR, dv, dp, rate = here.dR, here.dv_m_s, here.dp_m, part.gyro_rad_s[-1]
+        since_s, length_s = (t_ns - t0_ns) * 1e-9, (int(self._samples.t_ns[-1]) - t0_ns) * 1e-9
+        return Station(
+            since_s, length_s, dR, dv, dp, whole.dR, whole.dp_m, self._gravity, rate - gyro_bias, gyro_bias, accel_bias,
+            self._sigma,
         )  # fmt: skip
 
 
