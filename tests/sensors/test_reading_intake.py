@@ -222,7 +222,7 @@ def test_queues_are_bounded_and_what_leaves_them_is_counted(monkeypatch):
     assert intake.counters["plain"]["dropped"] == 3
     intake.hand_on(100 * MS)
     assert stamps_ms(filtering.told) == [30, 40, 50, 60, 70]
-    assert intake.counters["plain"]["dropped"] == 4  # the graph has room for four
+    assert intake.counters["plain"]["crowded"] == 1  # the graph has room for four
     assert len(intake.pack(packet(100), 0, None).readings) == 4
     for k in range(50):
         intake.add(reading("offset", 10 * k))
@@ -334,4 +334,5 @@ def test_without_an_imu_the_path_of_vision_begins_sensors_and_carries_their_read
     for one in packed.readings:
         body = between_keyframes(*ends, one.reading.t_ns, one.station)
         assert body.position_m[0] == pytest.approx(one.reading.values[0] - 5.0)
-    assert intake.report()["offset"] == {"begun": True, "variables": ["offset_m"]}
+    report = intake.report()["offset"]
+    assert report == {"begun": True, "variables": ["offset_m"], "queued": 0, "since_keyframe": 0}

@@ -158,6 +158,21 @@ def test_the_filter_uses_what_came_after_the_beginning(clean, readings):
         assert filter_[f"{name}_refused"] == filter_[f"{name}_waiting"] == 0
 
 
+def test_every_reading_is_accounted_for_in_filter_and_graph(clean, readings):
+    """Each ends in one way in the filter and in one way in the graph."""
+    for name, offered in readings.items():
+        counted = clean.metrics["sensors"][name]["readings"]
+        filter_, graph = counted["filter"], counted["graph"]
+        print(name, counted)
+        assert counted["came"] == len(offered)
+        assert sum(filter_.values()) == len(offered)
+        of_used = graph["outliers"] + graph["failed"]
+        assert sum(graph.values()) - of_used == len(offered)
+        assert graph["used"] + graph["thinned"] > 0.7 * len(offered)
+        assert of_used < 0.05 * graph["used"]
+        assert filter_["beginning"] == graph["beginning"] > 0
+
+
 # ---- again
 
 

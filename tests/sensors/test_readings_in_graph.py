@@ -315,6 +315,25 @@ def test_what_cannot_be_used_is_left_out_and_counted() -> None:
     }  # fmt: skip
 
 
+def test_wild_readings_are_told_as_outliers_at_the_final_estimate() -> None:
+    truth, start = drawn_fix(np.random.default_rng(10))
+    drive = Drive(a_world(10, 12.0), {"fixes": Fixes(0.05)}, {"fixes": truth})
+    wild = range(10, drive.world.count, 10)
+
+    def leap(packet: KeyframePacket) -> KeyframePacket:
+        if packet.keyframe.id not in wild:
+            return packet
+        (one,) = packet.readings
+        far = replace(one.reading, values=one.reading.values + 50.0)
+        return replace(packet, readings=(replace(one, reading=far),))
+
+    drive.run((start,), leap).graph.finish()
+    said = drive.graph.sensed("fixes")
+    assert said["used"] == drive.world.count - 2
+    assert len(wild) <= said["outliers"] <= len(wild) + 2
+    assert drive.graph.sensed("nobody")["used"] == 0
+
+
 def test_two_wandering_offsets_of_two_submaps_know_nothing_of_each_other() -> None:
     world = a_world(9, 6.0)
     drive = Drive(world, {"speed": Speed()}, {"speed": np.array([1.0, 0.05])}, imu=False)

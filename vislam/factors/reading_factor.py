@@ -6,7 +6,7 @@ apply one: the linearised rows carry the root of the weight, and the error is th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -138,6 +138,18 @@ class ReadingFactor:
     def losses(self, T_earlier: Array, T_later: Array, own: Array) -> Array:
         """Return a residual [M] half of whose square is the loss."""
         out = np.zeros(self.size)
+        for row, residual in self._residuals(T_earlier, T_later, own):
+            square = max(float(residual @ residual), _NOTHING)
+            out[row.place] = residual * np.sqrt(row.cauchy_k2 * np.log1p(square / row.cauchy_k2) / square)
+        return out
+
+    def outliers(self, T_earlier: Array, T_later: Array, own: Array) -> int:
+        """Return how many readings fail the gate of their sensor: there the kernel's weight is below a half."""
+        residuals = self._residuals(T_earlier, T_later, own)
+        return sum(float(residual @ residual) > row.cauchy_k2 for row, residual in residuals)
+
+    def _residuals(self, T_earlier: Array, T_later: Array, own: Array) -> Iterator[tuple[_Row, Array]]:
+        """Yield each reading with its whitened residual; those that fail are left out."""
         poses = np.ascontiguousarray(T_earlier), np.ascontiguousarray(T_later)
         for row in self._rows:
             reading, station = row.placed.reading, row.placed.station
@@ -149,9 +161,7 @@ class ReadingFactor:
             if residual.shape != (len(row.whitening),) or not np.isfinite(residual).all():
                 self._failed(row.number)
                 continue
-            square = max(float(residual @ residual), _NOTHING)
-            out[row.place] = residual * np.sqrt(row.cauchy_k2 * np.log1p(square / row.cauchy_k2) / square)
-        return out
+            yield row, residual
 
     def weighted(self, T_earlier: Array, T_later: Array, own: Array) -> tuple[Array, Array, Array, Array]:
         """Return the residual [M] and its Jacobians [M, 6], [M, 6] and [M, V], whitened and weighted."""

@@ -7,8 +7,7 @@ keyframe with readings, tied to the one before, and begins anew with each submap
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -21,9 +20,10 @@ from vislam.core.readings import OwnStart, PlacedReading
 from vislam.factors.builder import Label, Step
 from vislam.factors.journal import KeyframeRecord
 from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
+from vislam.factors.reading_counts import ReadingCounts
 from vislam.factors.reading_factor import ReadingFactor
 from vislam.factors.solvers import RELINEARIZE_OWN
-from vislam.sensors import Suite
+from vislam.sensors import Suite, Variable
 
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
 
@@ -78,6 +78,10 @@ class _Entry:
     place: _Place | None = None
     linear: gtsam.NonlinearFactor | None = None  # there
 
+    def outliers(self, place: _Place, units: Array) -> int:
+        """Return how many of its readings fail the gate of their sensor at a place."""
+        return 0 if self.factor is None else self.factor.outliers(place.T_earlier, place.T_later, place.own * units)
+
 
 class Readings:
     """Owns the readings of a run as records; factors are built from them at any estimate, as often as asked.
@@ -97,28 +101,35 @@ class Readings:
         self._newest: dict[str, _Entry] = {}  # of each sensor
         self._next_old = 0  # where the next block of older entries begins that is looked at
         self._t_ns: list[int] = []
-        self._failed: set[tuple[int, int]] = set()  # entries and the readings in them
-        self._counts: Counter[str] = Counter()
+        self._counts = ReadingCounts()
         self._recalled: dict[str, Array] = {}
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return how many readings have factors, and how many do not for which reason.
+        """Return how the readings of all sensors ended, as `counts_of`; `unknown`: the suite lacks their sensor."""
+        return self._counts.total
 
-        `used`: in factors; `unknown`: of a sensor that the suite does not have; `unusable`: the sensor refuses them;
-        `early`: own variables had no start yet; `thinned`: too many between two keyframes; `dropped`: where a submap
-        begins; `failed`: of those used, the sensor's own code failed at some estimate, and they say nothing there.
+    def counts_of(self, name: str, values: gtsam.Values) -> dict[str, int]:
+        """Return how many readings of a sensor came with keyframes, and what became of them.
+
+        `used`: in factors; `unusable`: the sensor refuses them; `early`: own variables had no start yet; `thinned`: too
+        many between two keyframes; `dropped`: where a submap begins. Of those used, `failed`: the sensor's own code did
+        at some estimate, and they say nothing there; `outliers`: they fail its gate at `values`.
         """
-        return {**self._counts, "failed": len(self._failed)}
+        mine = [entry for entry in self._entries if entry.sensor == name]
+        outliers = sum(entry.outliers(self._place(entry, values), self._units(name)) for entry in mine)
+        return {**self._counts.of(name), "outliers": outliers}
 
     def recall(self, own: Iterable[OwnStart]) -> None:
         """Take the last estimate of an earlier run as first guess of the keyframes that are appended next."""
         self._recalled = {one.sensor: np.asarray(one.values, dtype=np.float64) for one in own}
 
-    def append(self, record: KeyframeRecord, offered: int) -> None:
-        """Take the next keyframe, with which so many readings were `offered`."""
+    def append(self, record: KeyframeRecord, offered: Sequence[PlacedReading]) -> None:
+        """Take the next keyframe, with which these readings were `offered`: where a submap begins it has none."""
         self._t_ns.append(record.t_ns)
-        self._counts["dropped"] += offered - len(record.readings)
+        if not record.readings:
+            for one in offered:
+                self._counts.add(one.reading.sensor, "dropped")
         if record.begins_submap:
             for begun in self._begun.values():
                 begun.newest.clear()
@@ -130,7 +141,7 @@ class Readings:
                 by_sensor.setdefault(one.reading.sensor, []).append(one)
         for name, placed in by_sensor.items():
             if self._suite[name].variables and name not in self._begun:
-                self._counts["early"] += len(placed)
+                self._counts.add(name, "early", len(placed))
                 continue
             entry = self._newest[name] = self._entry(name, placed, record)
             self._entries.append(entry)
@@ -166,7 +177,7 @@ class Readings:
         for entry in self._by_keyframe[k]:
             own = self._guesses(entry, values)
             guesses |= {key: guess for key, guess, new in zip(entry.keys, own, entry.new, strict=True) if new}
-            factors += self._ties(entry)
+            factors += _ties(entry, self._begun.get(entry.sensor), self._suite[entry.sensor].variables)
             place = _Place(T_earlier, T_later, np.array(own))
             if entry.linear is None or entry.place is None or entry.place.left_by(place, self._config) > 1.0:
                 entry.linear = self._linearised(entry, place)
@@ -236,22 +247,23 @@ class Readings:
 
     def _is_usable(self, placed: PlacedReading) -> bool:
         if placed.reading.sensor not in self._suite.names:
-            self._counts["unknown"] += 1
+            self._counts.add(placed.reading.sensor, "unknown")
             return False
         try:
             why = self._suite.why_unusable(placed.reading)
         except Exception as error:  # its check is somebody else's code
             why = str(error) or type(error).__name__
-        self._counts["unusable"] += bool(why)
+        if why:
+            self._counts.add(placed.reading.sensor, "unusable")
         return not why
 
     def _entry(self, name: str, placed: list[PlacedReading], record: KeyframeRecord) -> _Entry:
         """Return what a sensor says with a keyframe; the keys do not hang on whether its code works."""
         if len(placed) > MOST:
-            self._counts["thinned"] += len(placed) - MOST
+            self._counts.add(name, "thinned", len(placed) - MOST)
             chosen = np.linspace(0.0, len(placed) - 1.0, MOST).round().astype(int).tolist()
             placed = [placed[n] for n in chosen]
-        self._counts["used"] += len(placed)
+        self._counts.add(name, "used", len(placed))
         entry = _Entry(len(self._entries), name, record.id, placed)
         if not self._suite[name].variables:
             return entry
@@ -276,7 +288,7 @@ class Readings:
         if entry.factor is None or not entry.factor.is_whole:
 
             def failed(n: int) -> None:
-                self._failed.add((entry.number, n))
+                self._counts.fail(entry.sensor, entry.number, n)
 
             sensor, poses = self._suite[entry.sensor], (place.T_earlier, place.T_later)
             entry.factor = ReadingFactor(sensor, entry.placed, poses, place.own * units, units, failed)
@@ -308,25 +320,25 @@ class Readings:
             out.append(start if known is None else float(values.atDouble(known)))
         return out
 
-    def _ties(self, entry: _Entry) -> list[gtsam.NonlinearFactor]:
-        """Return the priors of variables that are new, and the walks of those that are not."""
-        if not entry.keys:
-            return []
-        begun, variables = self._begun[entry.sensor], self._suite[entry.sensor].variables
-        told, units = (begun.told / begun.units).tolist(), begun.units.tolist()
-        out: list[gtsam.NonlinearFactor] = []
-        for n, (variable, unit) in enumerate(zip(variables, units, strict=True)):
-            earlier = entry.earlier[n]
-            if earlier is not None:
-                sigma = max(variable.walk * np.sqrt(max(entry.dt_s[n], 0.0)), _SIGMA_MIN) / unit
-                model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-                out.append(gtsam.BetweenFactorDouble(earlier, entry.keys[n], 0.0, model))
-            elif entry.new[n]:
-                # what walks and begins anew with a submap has walked nobody knows how far since it was told
-                sigma = 1.0 if entry.number == begun.first else max(variable.sigma / unit, 1.0)
-                model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-                out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], model))
-        return out
+
+def _ties(entry: _Entry, begun: _Begun | None, variables: Sequence[Variable]) -> list[gtsam.NonlinearFactor]:
+    """Return the priors of variables that are new, and the walks of those that are not."""
+    if begun is None:
+        return []
+    told, units = (begun.told / begun.units).tolist(), begun.units.tolist()
+    out: list[gtsam.NonlinearFactor] = []
+    for n, (variable, unit) in enumerate(zip(variables, units, strict=True)):
+        earlier = entry.earlier[n]
+        if earlier is not None:
+            sigma = max(variable.walk * np.sqrt(max(entry.dt_s[n], 0.0)), _SIGMA_MIN) / unit
+            model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+            out.append(gtsam.BetweenFactorDouble(earlier, entry.keys[n], 0.0, model))
+        elif entry.new[n]:
+            # what walks and begins anew with a submap has walked nobody knows how far since it was told
+            sigma = 1.0 if entry.number == begun.first else max(variable.sigma / unit, 1.0)
+            model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+            out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], model))
+    return out
 
 
 def _label(entry: _Entry) -> Label:

@@ -137,7 +137,7 @@ class PoseGraph:
         guesses = self._source.restore(self._keyframes, memory)
         self.readings.recall(memory.own)
         for packet, record in zip(memory.packets, self._keyframes, strict=True):
-            self.readings.append(record, len(packet.readings))
+            self.readings.append(record, packet.readings)
         for k in [record.id for record in self._keyframes if record.begins_submap]:
             self._submaps = self._submaps.begun(k)
             self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
@@ -196,7 +196,7 @@ class PoseGraph:
         said = self._source.add(packet, record, T_odom_body)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
-        self.readings.append(record, len(packet.readings))
+        self.readings.append(record, packet.readings)
         self._said = said[-1] if said else None
         self._journal += [self._start, record, *said] if previous is None else [record, *said]
         if previous is None:
@@ -246,6 +246,10 @@ class PoseGraph:
         Those that walk are as with the newest reading. None while none of them has a factor.
         """
         return self.readings.own(name, self._estimator.values, self._estimator.joint_covariance)
+
+    def sensed(self, name: str) -> dict[str, int]:
+        """Return what became of a sensor's readings, at the estimate as it is; see `Readings.counts_of`."""
+        return self.readings.counts_of(name, self._estimator.values)
 
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
@@ -356,11 +360,9 @@ class PoseGraph:
         """Return the poses that moved since they were last published, and remember them."""
         self._count_joined()
         poses, known = self._estimator.poses, self._published
-        ids = self._estimator.take_read()
-        if everything:
-            ids = self.ids
-        grown = len(poses) - len(known)
-        if grown > 0:
+        read = self._estimator.take_read()
+        ids = self.ids if everything else read
+        if (grown := len(poses) - len(known)) > 0:
             known = np.concatenate([known, np.full((grown + len(poses) // 2, 4, 4), np.inf)])
         fresh, old = poses[ids], known[ids]
         shift = np.linalg.norm(fresh[:, :3, 3] - old[:, :3, 3], axis=1)

@@ -62,10 +62,15 @@ class EndedGraph:
     nav_states: list[NavState]
     reports: list[EdgeReport]
     own_variables: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # of further sensors, with sigmas
+    readings: dict[str, dict[str, int]] = field(default_factory=dict)  # of further sensors: what became of them
 
     def own(self, name: str) -> tuple[Array, Array] | None:
         """Return own variables of a further sensor and their sigmas; None where it has none in the graph."""
         return self.own_variables.get(name)
+
+    def sensed(self, name: str) -> dict[str, int]:
+        """Return what became of the readings of a further sensor; empty where nobody knows."""
+        return self.readings.get(name, {})
 
     def poses(self) -> Array:
         """Return T_map_body [M, 4, 4]."""

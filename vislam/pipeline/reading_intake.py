@@ -43,9 +43,11 @@ class ReadingIntake:
     sensor's first readings are compared with the path until `Sensor.begin` knows them.
 
     Attributes:
-        counters: by sensor, what became of readings before the filter had a word: `dropped` are those that had to wait
-            for too long, `late` came when the graph had their keyframe already, `unplaced` where it has no inertial
-            data.
+        counters: by sensor, what became of readings before filter and graph had a word: `too_early` are from before
+            the filter; `dropped` had to wait for it for too long; with those of `beginning` a sensor looked for its own
+            variables; `told` are those that the filter was given. And of these the graph never saw those that are
+            `late`, as it had their keyframe already; `unplaced`, where it has no inertial data; `crowded` out, as too
+            many waited for a keyframe.
         notes: by sensor, why its first unusable reading was that, or why the sensor is left out.
     """
 
@@ -57,7 +59,9 @@ class ReadingIntake:
 
         `accel_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
         """
-        became = ("readings", "unusable", "too_early", "dropped", "late", "unplaced")
+        became = (
+            "readings", "unusable", "too_early", "dropped", "beginning", "told", "late", "unplaced", "crowded",
+        )  # fmt: skip
         self.counters = {name: dict.fromkeys(became, 0) for name in suite.names}
         self.notes: dict[str, str] = {}
         self._suite = suite
@@ -77,6 +81,8 @@ class ReadingIntake:
         for name in self._suite.names:
             names = [variable.name for variable in self._suite[name].variables]
             entry: dict[str, Any] = {"begun": name not in self._beginning, "variables": names}
+            queues = {"queued": self._waiting, "since_keyframe": self._since}
+            entry |= {key: sum(one.sensor == name for one in queue) for key, queue in queues.items()}
             if self._filter is not None and self._filter.ekf.initialised and entry["begun"] and names:
                 values, sigmas = self._filter.ekf.own(name)
                 entry["filter"] = {"values": values.tolist(), "sigmas": sigmas.tolist()}
@@ -97,7 +103,7 @@ class ReadingIntake:
             counts["unusable"] += 1
             self.notes.setdefault(reading.sensor, f"{reason} (at {reading.t_ns} ns)")
             return
-        self._queue(self._waiting, reading, _MAX_WAITING)
+        self._queue(self._waiting, reading, _MAX_WAITING, "dropped")
 
     def give_up_filter(self) -> None:
         """Go on with the path of vision alone: gravity could not be found."""
@@ -123,7 +129,8 @@ class ReadingIntake:
             else:
                 if self._filter is not None:
                     self._filter.add_reading(reading)
-                self._queue(self._since, reading, _MAX_SINCE)
+                    self.counters[reading.sensor]["told"] += 1
+                self._queue(self._since, reading, _MAX_SINCE, "crowded")
 
     def pack(self, packet: KeyframePacket, before_t_ns: int, state: NavState | None) -> KeyframePacket:
         """Return a keyframe's packet with the readings since the one before, at `before_t_ns`.
@@ -154,10 +161,10 @@ class ReadingIntake:
         except Exception as error:
             return f"its check failed: {_told(error)}"
 
-    def _queue(self, queue: deque[Reading], reading: Reading, most: int) -> None:
+    def _queue(self, queue: deque[Reading], reading: Reading, most: int, left_as: str) -> None:
         queue.append(reading)
         if len(queue) > most:
-            self.counters[queue.popleft().sensor]["dropped"] += 1
+            self.counters[queue.popleft().sensor][left_as] += 1
 
     def _compare(self, reading: Reading) -> None:
         """Compare a reading with the path, and begin the sensor once that tells its own variables."""
@@ -166,6 +173,7 @@ class ReadingIntake:
         if body is None:
             self.counters[reading.sensor]["too_early"] += 1
             return
+        self.counters[reading.sensor]["beginning"] += 1
         if len(beginning.readings) >= _MAX_TRIED:
             del beginning.readings[1::2], beginning.bodies[1::2]
             beginning.tried_at = len(beginning.readings)

@@ -335,7 +335,7 @@ class Run:
             "cost": self.cost.entry(timing_ms),
             "counters": counters,
             "nis": front.nis,
-            "sensors": sensors_entry(front.sensors, None if back is None else back.graph),
+            "sensors": sensors_entry(front.sensors, front.counters, None if back is None else back.graph),
             "problems": self._input.problems,
             "loops": loops,
             "graph_revisions": self.log.revisions,

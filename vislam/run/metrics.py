@@ -13,6 +13,10 @@ from vislam.run.pipeline import FinalGraph
 from vislam.run.verdict import Evidence, Verdict
 from vislam.trajectory import Alignment, Trajectory, evaluate
 
+_BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that neither filter nor graph was told
+_BY_FILTER = ("accepted", "gated", "refused", "waiting", "failed")
+_BY_GRAPH = ("used", "thinned", "early")
+_NOT_IN_GRAPH = ("late", "unplaced", "crowded")
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
@@ -78,14 +82,43 @@ def verdict_entry(evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def sensors_entry(told: dict[str, dict[str, Any]], graph: FinalGraph | None) -> dict[str, dict[str, Any]]:
-    """Return what is known of further sensors, `told` by the front half, with their own variables in the graph."""
+def sensors_entry(
+    told: dict[str, dict[str, Any]], counters: dict[str, dict[str, int]], graph: FinalGraph | None
+) -> dict[str, dict[str, Any]]:
+    """Return what is known of further sensors, `told` by the front half, with their own variables in the graph.
+
+    And what became of their readings: all that came, and where each is in the filter and in the graph.
+    """
     out = {}
     for name, entry in told.items():
         found = None if graph is None or not entry["variables"] else graph.own(name)
         by_graph = {} if found is None else {"graph": {"values": found[0].tolist(), "sigmas": found[1].tolist()}}
-        out[name] = entry | by_graph
+        queued, since = int(entry.get("queued", 0)), int(entry.get("since_keyframe", 0))
+        came = counters.get(f"sensor {name}", {})
+        both = {end: came.get(end, 0) for end in _BEFORE} | {"queued": queued}
+        readings = {
+            "came": came.get("readings", 0),
+            "filter": both | _in_filter(name, came, counters.get("ekf", {})),
+            "graph": both | _in_graph(came, {} if graph is None else graph.sensed(name), since),
+        }
+        told_here = {key: value for key, value in entry.items() if key not in {"queued", "since_keyframe"}}
+        out[name] = {**told_here, **by_graph, "readings": readings}
     return out
+
+
+def _in_filter(name: str, came: dict[str, int], ekf: dict[str, int]) -> dict[str, int]:
+    """Return what the filter did with readings; `outside` are older than its history, or not its time yet."""
+    did = {end: ekf.get(f"{name}_{end}", 0) for end in _BY_FILTER}
+    return did | {"outside": max(came.get("told", 0) - sum(did.values()), 0)}
+
+
+def _in_graph(came: dict[str, int], did: dict[str, int], since: int) -> dict[str, int]:
+    """Return what the graph did with readings; those `after` its last keyframe hang on nothing."""
+    used = {end: did.get(end, 0) for end in _BY_GRAPH} | {"at_submap": did.get("dropped", 0)}
+    unusable = came.get("unusable", 0) + did.get("unusable", 0)
+    never = {end: came.get(end, 0) for end in _NOT_IN_GRAPH}
+    of_used = {end: did.get(end, 0) for end in ("outliers", "failed")}
+    return {**never, "after": since, **used, "unusable": unusable, **of_used}
 
 
 def refuse(metrics: dict[str, Any], out: Path) -> None:

@@ -108,6 +108,10 @@ class FinalGraph(Protocol):
         """Return own variables [V] of a further sensor and their sigmas [V]; None where it has none in the graph."""
         ...
 
+    def sensed(self, name: str) -> dict[str, int]:
+        """Return what became of the readings of a further sensor, see `PoseGraph.sensed`."""
+        ...
+
     def edge_reports(self) -> list[EdgeReport]:
         """Return what became of every offered loop."""
         ...

@@ -71,7 +71,10 @@ def run(
     else:
         update = back.finish()
         own = {name: found for name in suite.names if (found := back.graph.own(name)) is not None}
-        graph = EndedGraph(back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports(), own)
+        sensed = {name: back.graph.sensed(name) for name in suite.names}
+        graph = EndedGraph(
+            back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports(), own, sensed
+        )
         ended = BackEnded(graph, update, back.graph.take_news(), back.counters, clock.summary_ms())
     _put(life, outbox, ended)
     outbox.close()

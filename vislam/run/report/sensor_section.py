@@ -6,6 +6,8 @@ from vislam.run.report.html import Cell, card, note, number, section, table
 from vislam.run.report.run_files import RunFiles, as_dict, as_list
 
 _ESTIMATORS = ("filter", "graph")
+_IN_GRAPH = ["sensor", "used", "outliers", "failed", "thinned", "beginning", "not there"]
+_NOT_THERE = ("late", "unplaced", "at_submap", "after", "too_early", "early", "dropped", "crowded", "queued")
 
 
 def sensors_section(run: RunFiles) -> str:
@@ -23,11 +25,19 @@ def sensors_section(run: RunFiles) -> str:
         "Accepted, gated and refused by the filter; before a sensor has begun its readings find its own variables. "
         "A filter that knows its own uncertainty has a NIS of 1 per degree of freedom."
     )
+    in_graph = [row for name in sensors if (row := _in_graph(name, as_dict(sensors, name, "readings", "graph")))]
+    graph_text = (
+        "Used: in factors; outliers, of these, fail the sensor's gate at the final estimate. Thinned: too many between "
+        "two keyframes. Beginning: in the prior of own variables instead. Not there: late, without inertial data, at "
+        "the start of a submap, after the last keyframe, or from before the graph."
+    )
     variables = table(["sensor", "variable", "filter", "± σ", "graph", "± σ"], own, text_columns=(0, 1))
     return section(
         "Further sensors",
         card(table(head, readings, text_columns=(0, 7))),
         note(text),
+        card(table(_IN_GRAPH, in_graph, text_columns=(0,)), title="Readings in the graph") if in_graph else "",
+        note(graph_text) if in_graph else "",
         card(variables, title="Own variables") if own else "",
     )
 
@@ -42,6 +52,15 @@ def _readings(run: RunFiles, name: str) -> list[str | Cell]:
         name, number(counted.get("readings"), 0), *by_filter, number(counted.get("unusable"), 0), nis,
         Cell(said, kind="text long"),
     ]  # fmt: skip
+
+
+def _in_graph(name: str, counted: dict[str, object]) -> list[str | Cell]:
+    """Return a row about a sensor; empty where nobody counted."""
+    if not counted:
+        return []
+    missing = sum(value for key in _NOT_THERE if isinstance(value := counted.get(key), int))
+    shown = [counted.get(key) for key in ("used", "outliers", "failed", "thinned", "beginning")]
+    return [name, *(number(value, 0) for value in (*shown, missing))]
 
 
 def _nis_per_degree(statistics: list[object]) -> float | None:
