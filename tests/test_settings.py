@@ -75,6 +75,16 @@ def test_deriving_twice_changes_nothing(settings, rig):
     assert derived(once, source.rig, source.imu_noise) == once
 
 
+@pytest.mark.parametrize(("rate_hz", "gap_s"), [(0.0, 0.1), (1.0, 0.1), (5.0, 0.3), (20.0, 0.1), (200.0, 0.1)])
+def test_the_time_between_two_samples_of_a_slow_imu_is_no_outage(rate_hz, gap_s):
+    source = recording("stereo")
+    config = derived(load(None, {}), source.rig, replace(source.imu_noise, rate_hz=rate_hz))
+    gaps = config.imu.max_gap_s, config.ekf.max_gap_s, config.window.imu_max_gap_s, config.graph.imu_max_gap_s
+    assert gaps == pytest.approx((gap_s,) * 4)
+    wider = derived(load(None, {"graph.imu_max_gap_s": 0.4}), source.rig, replace(source.imu_noise, rate_hz=rate_hz))
+    assert wider.graph.imu_max_gap_s == 0.4
+
+
 def test_over_a_floor_the_height_says_how_sure_metres_are():
     source = recording()
     config = derived(load(None, FLOOR), source.rig, source.imu_noise)

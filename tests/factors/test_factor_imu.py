@@ -4,11 +4,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, WindowConfig
 from vislam.core.messages import ImuSpan
 from vislam.factors.preintegration import Preintegrator
+from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
-from worlds.lap import EUROC_NOISE, World
+from worlds.lap import EUROC_NOISE, RIG, World, rmse_m
 from worlds.parts import GRAVITY_M_S2
 
 SILENT = ImuNoise(1e-12, 1e-12, 1e-12, 1e-12, 200.0)
@@ -88,6 +89,27 @@ def test_uncovered_ends_count_as_outage_and_long_ones_drop_the_factor() -> None:
     assert _preintegrator().integrate(None, 0, 1, NO_BIAS) is None
     outside = ImuSpan(span.t_ns[:1], span.gyro_rad_s[:1], span.accel_m_s2[:1])
     assert _preintegrator().integrate(outside, 10**9, 2 * 10**9, NO_BIAS) is None
+
+
+@pytest.mark.parametrize("imu_hz", [5.0, 20.0])
+def test_a_slow_imu_carries_keyframes_where_vision_is_lost_once_its_rate_is_told(imu_hz: float) -> None:
+    noise = replace(EUROC_NOISE, rate_hz=imu_hz)
+    world = World(12.0, keyframe_hz=1.0, imu_hz=imu_hz, noise=noise)
+    packets = [world.packet(k, lost=k in (8, 9)) for k in range(world.count)]
+    errors_m, notes = {}, {}
+    for rate_hz in (imu_hz, 200.0):
+        config = GraphConfig(coupling="loose")
+        graph = PoseGraph(config, replace(noise, rate_hz=rate_hz), GRAVITY_M_S2, RIG, WindowConfig())
+        graph.initialise(world.initial_state(0.02, 0.15))
+        said = [graph.add(packet).note for packet in packets]
+        errors_m[rate_hz], notes[rate_hz] = rmse_m(graph.poses(), world.truth), said
+    print(errors_m, notes)
+    assert not any("IMU" in note and "bridged by IMU" not in note for note in notes[imu_hz])
+    if imu_hz < 10.0:  # told a rate that it has not, every sample is an outage
+        assert any("IMU" in note for note in notes[200.0])
+        assert errors_m[imu_hz] < 0.5 * errors_m[200.0]
+    else:
+        assert errors_m[imu_hz] == errors_m[200.0]
 
 
 def test_bias_walk_is_floored_against_gtsams_pivot_test() -> None:

@@ -68,6 +68,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"gyro_noise": 0.05}, "gyroscope noise is 2.9 deg after a second"),
         ({"accel_noise": 0.6}, "accelerometer noise is 0.60 m/s"),
         ({"rate_hz": 50.0}, "come at 50 Hz, told were 200"),
+        ({"rate_hz": 5.0, "longest_gap_s": 0.2}, "come every 0.20 s and more than 0.10 s is an outage"),
         ({"longest_gap_s": 1.5}, "no inertial sample for 1.50 s"),
         ({"saturated": ("gyro z",)}, "saturated: gyro z"),
         ({"force_m_s2": 1.0}, "reads 1.00 m/s2 where gravity is 9.81"),

@@ -33,7 +33,8 @@ class ImuConfig:
     buffer_s: Positive = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
     # a run whose quietest second has less than a third of the white noise told is warned
     noise_tolerance: Positive = 3.0
-    max_gap_s: NonNegative = 0.1  # a longer hole between samples is an outage, not something to interpolate across
+    # a longer hole between samples is an outage; of an IMU of 3 to 15 Hz, 1.5 of its periods; so in the estimators
+    max_gap_s: NonNegative = 0.1
     max_wait_s: NonNegative = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
     vibration: VibrationConfig = field(default_factory=VibrationConfig)
 

@@ -10,6 +10,8 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array, ImuSample, MagSample
 
 _SINGULAR = 1e-6  # determinant
+_USUAL_PERIODS = 1.5  # a longer hole lacks a sample
+_LONGEST_GAP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +26,14 @@ class ImuNoise:
     # relative, of scale factors and misalignment that calibration left; None: not known, see `ImuConfig`
     gyro_scale_sigma: float | None = None
     accel_scale_sigma: float | None = None
+
+    def gap_s(self, told_s: float) -> float:
+        """Return how long a hole between samples is no outage: as told, and one and a half periods of a slow IMU.
+
+        Not beyond half a second: what a body does between samples further apart, nobody has measured.
+        """
+        usual_s = _USUAL_PERIODS / self.rate_hz if self.rate_hz > 0.0 else 0.0
+        return max(told_s, usual_s) if usual_s <= _LONGEST_GAP_S else told_s
 
 
 def _zero() -> Array:

@@ -34,6 +34,7 @@ class Preintegrator:
     def __init__(self, config: GraphConfig, noise: ImuNoise, gravity_m_s2: float) -> None:
         """Set up the noise of the IMU, its walks floored as `config` says; spans scale the white part."""
         self._config = config
+        self._max_gap_s = noise.gap_s(config.imu_max_gap_s)
         self._gravity_m_s2 = gravity_m_s2
         self._gyro_density = noise.gyro_noise_density
         self._accel_density = noise.accel_noise_density
@@ -45,14 +46,15 @@ class Preintegrator:
     ) -> Preintegrated | None:
         """Return the span integrated over [t0_ns, t1_ns] at `bias`; None when it is missing or has too long an outage.
 
-        Between samples the mean of both ends is integrated. Where samples are more than `imu_max_gap_s` apart, or an
-        end is not covered, the missing motion is interpolated and carries the outage sigmas of the configuration.
+        Between samples the mean of both ends is integrated. Where samples are more than `imu_max_gap_s` apart, or more
+        than is usual for a slow IMU, or an end is not covered, the missing motion is interpolated and carries the
+        outage sigmas of the configuration.
         """
         if span is None or len(span.t_ns) == 0:
             return None
         t_s, gyro, accel = self._covering(span, t0_ns, t1_ns)
         dt = np.diff(t_s)
-        outage = dt > self._config.imu_max_gap_s
+        outage = dt > self._max_gap_s
         outage_s = float(dt[outage].sum())
         if len(dt) == 0 or outage_s > self._config.imu_max_outage_s:
             return None

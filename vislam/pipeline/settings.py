@@ -15,14 +15,16 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
     """Return the configuration with all that follows from the sensors; deriving it again changes nothing.
 
     That is: the front end's mode and the filter's coupling where they are `auto`, the rolling shutter's readout where
-    it is the front end's, the error that all metres have in common, and the factor on motions over a floor. `noise` is
-    the IMU's, None without one. `Front` derives for itself; who writes settings down or sends them to other processes
-    does so before there is one. Raises UsageError for settings that contradict each other.
+    it is the front end's, the error that all metres have in common, the factor on motions over a floor, and how long
+    a hole between samples is no outage of a slow IMU. `noise` is the IMU's, None without one. `Front` derives for
+    itself; who writes settings down or sends them to other processes does so before there is one. Raises UsageError for
+    settings that contradict each other.
     """
     mode = mode_for(config.frontend, rig)
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
     lasting = lasting_scale_sigma(config.frontend, rig, noise)
     by_imu = noise is not None and not rig.is_stereo and not rig.has_depth
+    config = config if noise is None else _for_slow(config, noise)
     graph = replace(config.graph, scale_sigma=max(config.graph.scale_sigma, lasting), edges_share_scale=by_imu)
     return replace(
         config,
@@ -56,6 +58,17 @@ def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
     """
     coupling = graph.coupling if rig.is_stereo or rig.has_depth else "loose"
     return replace(graph, coupling=coupling, edges_share_scale=False)
+
+
+def _for_slow(config: Config, noise: ImuNoise) -> Config:
+    """Return the configuration for the rate of an IMU: the time between any two samples of a slow one is no outage."""
+    return replace(
+        config,
+        imu=replace(config.imu, max_gap_s=noise.gap_s(config.imu.max_gap_s)),
+        ekf=replace(config.ekf, max_gap_s=noise.gap_s(config.ekf.max_gap_s)),
+        window=replace(config.window, imu_max_gap_s=noise.gap_s(config.window.imu_max_gap_s)),
+        graph=replace(config.graph, imu_max_gap_s=noise.gap_s(config.graph.imu_max_gap_s)),
+    )
 
 
 def _filter(config: Config, mode: str, lasting_scale_sigma: float) -> EkfConfig:

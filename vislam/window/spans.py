@@ -20,6 +20,7 @@ class LinkStore:
         """Start empty; without `noise` there is no IMU."""
         self._config = config
         self._noise = noise
+        self._max_gap_s = config.imu_max_gap_s if noise is None else noise.gap_s(config.imu_max_gap_s)
         self._gravity_m_s2 = gravity_m_s2
         self._spans: list[ImuSpan | None] = []
         size = config.keyframes + 2
@@ -115,7 +116,7 @@ class LinkStore:
     def _holes_s(self, span: ImuSpan) -> Array:
         """Return the lengths [N - 1] of steps that are outages, 0 for the others."""
         steps = np.diff(span.t_ns) * 1e-9
-        return np.where(steps > self._config.imu_max_gap_s, steps, 0.0)
+        return np.where(steps > self._max_gap_s, steps, 0.0)
 
     def _outage(self, span: ImuSpan, duration_s: float) -> Array:
         """Return the covariance [9, 9] that holes add: an unknown constant rate and force inside of each."""

@@ -194,9 +194,16 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     if (speed := e.accel_noise or 0.0) > c.accel_noise_m_s:
         yield f"accelerometer noise is {speed:.2f} m/s after a second, even at its quietest: mount it on something soft"
     off = 0.0 if e.rate_hz is None or not e.rate_told_hz else abs(e.rate_hz / e.rate_told_hz - 1.0)
-    if off > c.rate_error and not _misses_samples(e, c):
+    if (period_s := 0.0 if e.rate_hz is None else 1.0 / e.rate_hz) > e.max_gap_s:
+        yield (
+            f"inertial samples come every {period_s:.2f} s and more than {e.max_gap_s:.2f} s is an outage: filter and "
+            "graph went without them, and without the readings between them; tell their rate in the IMU's sensor file "
+            "(3 Hz at least), or raise --imu.max-gap-s, --ekf.max-gap-s, --window.imu-max-gap-s and "
+            "--graph.imu-max-gap-s"
+        )
+    elif off > c.rate_error and not _misses_samples(e, c):
         yield f"inertial samples come at {e.rate_hz:.0f} Hz, told were {e.rate_told_hz:.0f}: look for what loses them"
-    if e.longest_gap_s > e.max_gap_s:
+    if e.longest_gap_s > max(e.max_gap_s, 1.5 * period_s):
         yield f"no inertial sample for {e.longest_gap_s:.2f} s: look at the cable, the bus and the load of the machine"
     if e.saturated:
         yield f"saturated: {', '.join(e.saturated)}; set a wider range in the sensor, or move more gently"
