@@ -22,6 +22,10 @@ PARTS = {
     "rotation": slice(0, 3), "position": slice(3, 6), "velocity": slice(6, 9),
     "gyro_bias": slice(9, 12), "accel_bias": slice(12, 15),
 }  # fmt: skip
+NUDGE = 1e-6  # by which derivatives are found
+_STEPS: Array = NUDGE * np.eye(3)
+_ABOUT: Array = np.array([np.cross(axis, np.eye(3)).T for axis in _STEPS])  # [3, 3, 3] the skew matrix of each step
+_TURNS: Array = np.eye(3) + _ABOUT + 0.5 * _ABOUT @ _ABOUT  # the rotation by each step, exact to double precision
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +54,23 @@ class BodyState:
             accel_bias_m_s2=self.accel_bias_m_s2 + error[12:15],
             rate_rad_s=self.rate_rad_s - error[9:12],
         )
+
+    def nudged(self, part: str) -> list[BodyState]:
+        """Return the three states that `moved` makes of an error `NUDGE` in each number of one part.
+
+        Derivatives are found with some ten of them at each reading: all but what moves is shared.
+        """
+        t_ns, R, position, velocity = self.t_ns, self.R_world_body, self.position_m, self.velocity_m_s
+        gyro, accel, rate = self.gyro_bias_rad_s, self.accel_bias_m_s2, self.rate_rad_s
+        if part == "rotation":
+            return [BodyState(t_ns, turned, position, velocity, gyro, accel, rate) for turned in R @ _TURNS]
+        if part == "position":
+            return [BodyState(t_ns, R, moved, velocity, gyro, accel, rate) for moved in position + _STEPS]
+        if part == "velocity":
+            return [BodyState(t_ns, R, position, moved, gyro, accel, rate) for moved in velocity + _STEPS]
+        if part == "gyro_bias":
+            return [BodyState(t_ns, R, position, velocity, gyro + step, accel, rate - step) for step in _STEPS]
+        return [BodyState(t_ns, R, position, velocity, gyro, moved, rate) for moved in accel + _STEPS]
 
     def later(self, by_s: float) -> BodyState:
         """Return the state a moment later, at the same velocity and rate."""

@@ -9,10 +9,8 @@ import numpy as np
 from vislam.core.errors import VislamError
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
-from vislam.sensors.body import ERRORS, PARTS, BodyState
+from vislam.sensors.body import ERRORS, NUDGE, PARTS, BodyState
 from vislam.sensors.sensor import Sensor
-
-_STEP = 1e-6
 
 
 class SensorError(VislamError):
@@ -39,7 +37,7 @@ def linearised(sensor: Sensor, reading: Reading, body: BodyState, own: Array) ->
             raise ValueError(f"residual of shape {residual.shape}, it has to be [m]")
         m = len(residual)
         given = sensor.jacobians(reading.values, body, own)
-        H, H_own = derived(sensor, reading.values, body, own) if given is None else given
+        H, H_own = derived(sensor, reading.values, body, own, residual) if given is None else given
         noise = sensor.noise(reading.values) if reading.covariance is None else reading.covariance
         parts = {"H": (H, (m, ERRORS)), "H_own": (H_own, (m, len(own))), "noise": (noise, (m, m))}
         for name, (value, shape) in parts.items():
@@ -55,23 +53,23 @@ def linearised(sensor: Sensor, reading: Reading, body: BodyState, own: Array) ->
     return linear
 
 
-def derived(sensor: Sensor, values: Array, body: BodyState, own: Array) -> tuple[Array, Array]:
-    """Return H [m, 15] and H_own [m, V] by central differences of the residual."""
-    columns = [np.arange(PARTS[part].start, PARTS[part].stop) for part in sensor.touches]
-    error = np.zeros(ERRORS)
-    H: Array | None = None
-    for k in np.concatenate(columns).tolist() if columns else []:
-        error[k] = _STEP
-        change = sensor.residual(values, body.moved(error), own) - sensor.residual(values, body.moved(-error), own)
-        error[k] = 0.0
-        H = np.zeros((len(change), ERRORS)) if H is None else H
-        H[:, k] = change / (-2.0 * _STEP)
-    by_own = []
-    for k in range(len(own)):
-        more, less = own.copy(), own.copy()
-        more[k] += _STEP
-        less[k] -= _STEP
-        change = sensor.residual(values, body, more) - sensor.residual(values, body, less)
-        by_own.append(change / (-2.0 * _STEP))
-    m = len(by_own[0]) if H is None and by_own else (0 if H is None else len(H))
-    return np.zeros((m, ERRORS)) if H is None else H, np.array(by_own).T if by_own else np.zeros((m, 0))
+def derived(
+    sensor: Sensor, values: Array, body: BodyState, own: Array, residual: Array | None = None
+) -> tuple[Array, Array]:
+    """Return H [m, 15] and H_own [m, V] by differences of the residual, which is as given where somebody knows it [m].
+
+    Forward ones, for they cost half as much as central ones: a residual whose second derivative is 1 gets a first one
+    that is off by half the step, 5e-7. That moves no estimate by anything near its sigma.
+    """
+    here = sensor.residual(values, body, own) if residual is None else residual
+    columns: list[int] = []
+    there: list[Array] = []
+    for part in sensor.touches:
+        columns += range(PARTS[part].start, PARTS[part].stop)
+        there += [sensor.residual(values, moved, own) for moved in body.nudged(part)]
+    there += [sensor.residual(values, body, moved) for moved in own + NUDGE * np.eye(len(own))]
+    H, H_own = np.zeros((len(here), ERRORS)), np.zeros((len(here), len(own)))
+    if there:
+        minus_slopes = ((here - np.array(there)) / NUDGE).T
+        H[:, columns], H_own[:] = minus_slopes[:, : len(columns)], minus_slopes[:, len(columns) :]
+    return H, H_own
