@@ -109,10 +109,12 @@ def test_a_receiver_that_is_unplugged_goes_on_in_the_frame_it_had(
 
     try:
         until(lambda: sensors.counters()["gnss"]["opened"] == 1, state)
+        assert sensors.datums() == {}
         said_ns = time.monotonic_ns()
         receiver.say(burst(0))
         until(comes(1), state)
         assert sensors.status() == {"gnss": "well"}
+        datum = sensors.datums()["gnss"]
         assert found[0].sensor == "gnss"
         assert said_ns <= found[0].t_ns + 250_000_000 <= time.monotonic_ns()
         receiver.unplug()
@@ -126,6 +128,7 @@ def test_a_receiver_that_is_unplugged_goes_on_in_the_frame_it_had(
     finally:
         sensors.close()
         sensors.close()
+    assert sensors.datums()["gnss"] == datum
     counts = sensors.counters()["gnss"]
     assert counts["fixes"] == 2
     assert counts["damaged"] == 1

@@ -31,6 +31,7 @@ simulated_hz = 20.0
 kind = "position"
 simulated_hz = 5.0
 sigma_m = 0.3
+gnss = {datum = [47.0, 8.0, 400.0]}
 
 [sensors.baro]
 kind = "height"
@@ -73,6 +74,7 @@ def test_sensors_begin_in_filter_and_graph_of_a_live_run(run: tuple[dict, list[s
     at = sensors["wheels"]["variables"].index("track_width_m")
     assert sensors["wheels"]["graph"]["sigmas"][at] < 0.9 * Wheels().variables[at].sigma  # it was driven, not guessed
     assert not sensors["baro"]["begun"]
+    assert sensors["gnss"]["datum"] == {"latitude_deg": 47.0, "longitude_deg": 8.0, "height_m": 400.0}
 
 
 def test_the_published_filter_takes_the_readings_of_vision_s_side(run: tuple[dict, list[str]]) -> None:

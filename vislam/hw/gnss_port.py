@@ -17,6 +17,7 @@ from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
 from vislam.hw.bridge.bridge import PORT_ERRORS, load_pyserial, why_not_open
 from vislam.hw.gnss_stream import FixStream, NmeaStream, UbxStream
+from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.gnss import Fix, FixReadings
 from vislam.sensors.toml import SensorPort
 
@@ -87,6 +88,12 @@ class GnssPort:
     def counters(self) -> dict[str, int]:
         """Return how many fixes were good, and how often each fault occurred."""
         return dict(self._counts)
+
+    @property
+    def datum(self) -> Geodetic | None:
+        """Where the frame of the readings begins: as told, or the first good fix; None before that."""
+        frame = self._readings.frame
+        return None if frame is None else frame.datum
 
     def close(self) -> None:
         """Stop reading; may be called twice."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from vislam.core.readings import Reading
 from vislam.hw.gnss_port import GnssPort
+from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.toml import SensorPort
 
 
@@ -27,6 +28,10 @@ class PortReadings:
     def counters(self) -> dict[str, dict[str, int]]:
         """Return what came, and how often each fault occurred."""
         return {name: receiver.counters() for name, receiver in self._receivers.items()}
+
+    def datums(self) -> dict[str, Geodetic]:
+        """Return the first good fix of each receiver that had one, or the datum that was told."""
+        return {name: datum for name, receiver in self._receivers.items() if (datum := receiver.datum) is not None}
 
     def close(self) -> None:
         """Stop reading; may be called twice."""

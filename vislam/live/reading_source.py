@@ -14,6 +14,7 @@ from vislam.core.errors import UsageError
 from vislam.core.readings import Reading
 from vislam.live.epoch import Epoch
 from vislam.sensors import SensorSetup, Suite, load_sensor_setup
+from vislam.sensors.geodetic import Geodetic
 
 _MISSING_S = 2.0  # without a reading for so long, a sensor is said to be silent
 
@@ -31,6 +32,10 @@ class ReadingSource(Protocol):
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return by sensor how many readings came, and how often each fault occurred."""
+        ...
+
+    def datums(self) -> dict[str, Geodetic]:
+        """Return by sensor where on the earth its frame begins, as far as a receiver has told it by now."""
         ...
 
     def close(self) -> None:
@@ -71,6 +76,10 @@ class NoReadings:
         return {}
 
     def counters(self) -> dict[str, dict[str, int]]:
+        """Return nothing."""
+        return {}
+
+    def datums(self) -> dict[str, Geodetic]:
         """Return nothing."""
         return {}
 
@@ -128,6 +137,10 @@ class ReplayedReadings:
     def counters(self) -> dict[str, dict[str, int]]:
         """Return how many readings of each sensor were played."""
         return {name: {"played": count} for name, count in self._heard.count.items()}
+
+    def datums(self) -> dict[str, Geodetic]:
+        """Return nothing: those of files are known without playing them."""
+        return {}
 
     def close(self) -> None:
         """Stop reading."""

@@ -32,6 +32,7 @@ from vislam.run.cost import CostMeter
 from vislam.run.evidence import KeyframeWitness, front_evidence, whole_evidence
 from vislam.run.folder import RunLog
 from vislam.run.further_sensors import further_readings
+from vislam.run.geodetic_outputs import GeodeticOutputs, datums_of
 from vislam.run.loop_gallery import LoopGallery
 from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, sensors_entry, verdict_entry
 from vislam.run.pipeline import Pipeline
@@ -83,6 +84,7 @@ class Run:
         self.out = out
         self.noise = imu_noise(config.imu, recording.imu_noise)
         self.slam: Pipeline = Slam(config, recording.rig, self.noise, self._input.suite) if slam is None else slam
+        self._geodetic = GeodeticOutputs(datums_of(config.sensors))
         self.log = RunLog()
         self.cost = CostMeter()
         self.gallery = LoopGallery()
@@ -256,6 +258,9 @@ class Run:
             with self.slam.clock.measure("pictures"):
                 write_pictures(mapper, self.out / "map", final.positions_m, is_level)
         metrics = self._metrics(final, truth, wall_s, loops)
+        estimates = {"filter": self.log.odometry_trajectory(), "graph": final}
+        if (datum := self._geodetic.write(self.out, metrics["sensors"], estimates)) is not None:
+            self.session.tell({"datum": datum})
         write_json(self.out / "metrics.json", metrics)
         for warning in metrics["warnings"]:
             _LOG.warning("%s", warning)

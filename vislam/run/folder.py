@@ -40,6 +40,7 @@ from vislam.loop.injection import is_injected
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
 from vislam.mapping.products import FILES as MAP_FILES
 from vislam.pipeline.steps import KeyframeStep, Step
+from vislam.run.geodetic_outputs import LINES, TABLES
 from vislam.run.session import Session, has_frames
 from vislam.run.sources import recorded_path
 from vislam.trajectory import Alignment, Trajectory, write_states_csv, write_tum
@@ -53,7 +54,8 @@ _RUN_FILES = (
     "retrieved.csv", "loops_eval.json", "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal",
     "session.db-shm", "session.db-journal", "run.rrd",
     "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
-    "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv", "map/grid.yaml",
+    "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
+    *TABLES.values(), LINES, "map/grid.yaml",
     "map/drive.yaml", "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
 TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "submap", "reason")

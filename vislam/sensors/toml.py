@@ -77,6 +77,7 @@ class SensorSetup:
     files: Mapping[str, SensorFile]
     simulated_hz: Mapping[str, float]  # of those whose readings are drawn
     ports: Mapping[str, SensorPort]  # of those that are read live
+    datums: Mapping[str, Geodetic]  # of those that are told where on the earth their frame begins
 
 
 def load_sensor_setup(path: Path) -> SensorSetup:
@@ -103,6 +104,7 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
     files: dict[str, SensorFile] = {}
     simulated: dict[str, float] = {}
     ports: dict[str, SensorPort] = {}
+    datums: dict[str, Geodetic] = {}
     for name, table in tables.items():
         where = f"{source}: [sensors.{name}]"
         if not _NAME.fullmatch(name):
@@ -116,7 +118,9 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
             simulated[name] = common.simulated_hz
         if (port := _port(common, sensors[name], where)) is not None:
             ports[name] = port
-    return SensorSetup(Suite(sensors), sensors, files, simulated, ports)
+        if (datum := _gnss(common, where).datum) is not None:
+            datums[name] = Geodetic(*datum)
+    return SensorSetup(Suite(sensors), sensors, files, simulated, ports, datums)
 
 
 def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:

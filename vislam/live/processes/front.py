@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -93,7 +93,7 @@ def run(
         if life.ready():
             process.loop(camera, SampleReceiver(samples), readings)
             process.end()
-        process.closing(camera.counters(), readings.counters())
+        process.closing(camera.counters(), readings)
 
 
 class FrontProcess:
@@ -144,14 +144,16 @@ class FrontProcess:
         for odometry in self.front.give_up_waiting():
             self._put_keyframe(KeyframeOut(odometry, *self._first()))
 
-    def closing(self, camera_counters: dict[str, int], reading_counters: dict[str, dict[str, int]]) -> None:
+    def closing(self, camera_counters: dict[str, int], readings: ReadingSource) -> None:
         """Say good-bye to the others; what happened goes to the map process, which writes it down."""
         self._to_back.close()
         report = self._report()
         counters = {**report.counters, "camera": camera_counters}
-        for name, read in reading_counters.items():
+        for name, read in readings.counters().items():
             counters[f"sensor {name}"] = {**counters.get(f"sensor {name}", {}), **read}
-        report = replace(report, counters=counters)
+        datums = {name: {"datum": asdict(datum)} for name, datum in readings.datums().items()}
+        sensors = {name: entry | datums.get(name, {}) for name, entry in report.sensors.items()}
+        report = replace(report, counters=counters, sensors=sensors)
         ended = FrontEnded(report, self.front.start, self.front.news, self.clock.summary_ms())
         self._put(self._to_map, ended)
         self._to_map.close()

@@ -1,0 +1,140 @@
+"""Trajectories as latitude, longitude and height where a further sensor has a datum: tables, and lines on a map."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vislam.config import FurtherSensorsConfig
+from vislam.core.errors import DataError
+from vislam.core.files import write_text
+from vislam.core.messages import Array
+from vislam.datasets.sensor_files import local_frame
+from vislam.loop.table import csv_text
+from vislam.sensors.geodetic import Geodetic, LocalFrame
+from vislam.sensors.measuring_frame import frame_pose, frame_variables
+from vislam.sensors.toml import load_sensor_setup
+from vislam.trajectory import Trajectory
+
+COLUMNS = ("t_ns", "latitude_deg", "longitude_deg", "height_m")
+LINES = "trajectory.geojson"
+TABLES = {"filter": "trajectory_ekf_geodetic.csv", "graph": "trajectory_graph_geodetic.csv"}
+_FRAME = [variable.name for variable in frame_variables("own")]
+_DIGITS, _HEIGHT_DIGITS = 9, 4  # of degrees, 0.1 mm, and of metres
+
+
+def datums_of(config: FurtherSensorsConfig) -> dict[str, Geodetic]:
+    """Return, by sensor, the datum of its frame: as told, or of the first good fix in the file of a receiver.
+
+    Raises UsageError as `load_sensor_setup`.
+    """
+    if config.file is None:
+        return {}
+    setup = load_sensor_setup(Path(config.file))
+    datums = dict(setup.datums)
+    for name, file in setup.files.items():
+        if name not in datums and file.format != "csv":
+            try:
+                datums[name] = local_frame(file).datum
+            except DataError:  # no good fix: whoever reads the file says so
+                continue
+    return datums
+
+
+class GeodeticOutputs:
+    """Knows which sensors have a datum, and writes trajectories by the first one whose frame was found."""
+
+    def __init__(self, datums: Mapping[str, Geodetic]) -> None:
+        """Take the datums that are known before the run."""
+        self._datums = dict(datums)
+
+    def write(
+        self, out: Path, sensors: dict[str, dict[str, Any]], trajectories: Mapping[str, Trajectory]
+    ) -> dict[str, Any] | None:
+        """Write tables and lines of a run, if a sensor has a datum; return the sensor's name and its datum.
+
+        Args:
+            out: the folder of the run.
+            sensors: what `metrics.json` has of further sensors; their datum is added. A receiver at a port has told
+                its own there.
+            trajectories: of the filter in `odom` and of the graph in `map`, by "filter" and "graph".
+        """
+        told = {name: Geodetic(**entry["datum"]) for name, entry in sensors.items() if "datum" in entry}
+        used = None
+        for name, datum in {**self._datums, **told}.items():
+            if (entry := sensors.get(name)) is None:
+                continue
+            entry["datum"] = asdict(datum)
+            places = {
+                by: places_of(trajectory, frame, datum)
+                for by, trajectory in trajectories.items()
+                if len(trajectory) and (frame := _frame(entry, by)) is not None
+            }
+            if used is None and places:
+                used = {"sensor": name, **asdict(datum)}
+                _write(out, {by: trajectories[by] for by in places}, places)
+        return used
+
+
+def places_of(trajectory: Trajectory, frame: Array, datum: Geodetic) -> list[Geodetic]:
+    """Return where the body was: by `T_frame_world` as yaw, x, y, z [4], or [0] of a world that is the frame."""
+    local, (R, t) = LocalFrame(datum), frame_pose(frame)
+    return [local.geodetic(place) for place in trajectory.positions_m @ R.T + t]
+
+
+def lines_on_a_map(places: Mapping[str, list[Geodetic]]) -> dict[str, Any]:
+    """Return lines as GeoJSON (RFC 7946: longitude first, cut where they cross the meridian of 180 degrees)."""
+    features = []
+    for name, line in places.items():
+        parts = [part for part in _cut(line) if len(part) > 1]
+        if parts:
+            kind, coordinates = ("LineString", parts[0]) if len(parts) == 1 else ("MultiLineString", parts)
+            geometry = {"type": kind, "coordinates": coordinates}
+            features.append({"type": "Feature", "properties": {"estimator": name}, "geometry": geometry})
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _frame(entry: Mapping[str, Any], by: str) -> Array | None:
+    """Return the frame's variables by an estimator [4], [0] of a known frame; None where they are not found yet."""
+    names, found = entry["variables"], entry.get(by)
+    if not set(_FRAME) <= set(names):
+        return np.zeros(0) if entry["begun"] else None
+    return None if found is None else np.array([found["values"][names.index(name)] for name in _FRAME])
+
+
+def _write(out: Path, trajectories: Mapping[str, Trajectory], places: Mapping[str, list[Geodetic]]) -> None:
+    for by, trajectory in trajectories.items():
+        rows = [(t_ns, *_told(place)) for t_ns, place in zip(trajectory.t_ns.tolist(), places[by], strict=True)]
+        write_text(out / TABLES[by], csv_text(COLUMNS, rows))
+    write_text(out / LINES, json.dumps(lines_on_a_map(places)) + "\n")
+
+
+def _told(place: Geodetic) -> tuple[str, str, str]:
+    latitude, longitude = (f"{angle:.{_DIGITS}f}" for angle in (place.latitude_deg, place.longitude_deg))
+    return latitude, longitude, f"{place.height_m:.{_HEIGHT_DIGITS}f}"
+
+
+def _cut(line: list[Geodetic]) -> list[list[list[float]]]:
+    """Return a line in parts that stay on their side of the meridian of 180 degrees, as longitude, latitude, height."""
+    parts: list[list[list[float]]] = [[]]
+    for k, place in enumerate(line):
+        here = [place.longitude_deg, place.latitude_deg, place.height_m]
+        before = [line[k - 1].longitude_deg, line[k - 1].latitude_deg, line[k - 1].height_m] if k else here
+        if abs(here[0] - before[0]) > 180.0:
+            side = 180.0 if before[0] > 0.0 else -180.0
+            way = here[0] + 2.0 * side - before[0]  # of longitude, the short way round
+            share = (side - before[0]) / way if way else 0.5
+            middle = [b + share * (h - b) for b, h in zip(before[1:], here[1:], strict=True)]
+            parts[-1].append(_rounded([side, *middle]))
+            parts.append([_rounded([-side, *middle])])
+        parts[-1].append(_rounded(here))
+    return parts
+
+
+def _rounded(place: list[float]) -> list[float]:
+    return [round(place[0], _DIGITS), round(place[1], _DIGITS), round(place[2], _HEIGHT_DIGITS)]
