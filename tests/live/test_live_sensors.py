@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vislam.config import Config, SensorsConfig, load, load_further_sensors, load_sensors
+from vislam.config import Config, SensorsConfig, load, load_cart, load_sensors
 from vislam.core.errors import HardwareError, UsageError
 from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveRun
@@ -129,11 +129,12 @@ def test_a_port_that_gives_no_fixes_is_refused(tmp_path: Path, table: str, why: 
 def test_one_file_describes_all_of_a_cart(tmp_path: Path) -> None:
     file = tmp_path / "cart.toml"
     file.write_text('[serial]\nbaud = 1000000\n[sensors.gnss]\nkind = "position"\nport = "/dev/ttyACM0"\n')
-    assert load_sensors(file).serial.baud == 1_000_000
-    assert load_further_sensors(file).file == str(file)
+    cart, further = load_cart(file)
+    assert cart.serial.baud == load_sensors(file).serial.baud == 1_000_000
+    assert further.file == str(file)
     assert load_sensor_setup(file).suite.names == ("gnss",)
     file.write_text("[serial]\nbaud = 1000000\n")
-    assert load_further_sensors(file).file is None
+    assert load_cart(file)[1].file is None
     file.write_text('[wheels]\nkind = "wheels"\n')
     with pytest.raises(UsageError, match=r"no table \[wheels\]"):
         load_sensor_setup(file)

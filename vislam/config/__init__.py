@@ -77,7 +77,7 @@ __all__ = [
     "dump",
     "from_data",
     "load",
-    "load_further_sensors",
+    "load_cart",
     "load_sensors",
     "validated",
 ]
@@ -132,18 +132,18 @@ def load(path: Path | None = None, overrides: dict[str, Any] | None = None, prof
 
 def load_sensors(path: Path | None = None) -> SensorsConfig:
     """Return the sensors of a cart as a TOML file describes them; raises UsageError as `load` does."""
-    data = {} if path is None else _read_toml(path)
-    data.pop("sensors", None)  # further ones, of which `vislam.sensors.toml` makes something
-    _refuse_unknown(data, SensorsConfig, str(path))
-    return validated(SensorsConfig, data, str(path))
+    return load_cart(path)[0]
 
 
-def load_further_sensors(path: Path | None) -> FurtherSensorsConfig:
-    """Return where further sensors are described: in the file of a cart's sensors, if it has tables `[sensors.NAME]`.
+def load_cart(path: Path | None) -> tuple[SensorsConfig, FurtherSensorsConfig]:
+    """Return the sensors of a cart, and where further ones are described: in the same file, by `[sensors.NAME]`.
 
-    Raises UsageError for a file that cannot be read.
+    Raises UsageError as `load` does.
     """
-    return FurtherSensorsConfig(None if path is None or "sensors" not in _read_toml(path) else str(path))
+    data = {} if path is None else _read_toml(path)
+    has_further = data.pop("sensors", None) is not None  # `vislam.sensors.toml` makes something of them
+    _refuse_unknown(data, SensorsConfig, str(path))
+    return validated(SensorsConfig, data, str(path)), FurtherSensorsConfig(str(path) if has_further else None)
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import rewritten_line
-from vislam.config import Config, SensorsConfig, load, load_further_sensors, load_sensors
+from vislam.config import Config, SensorsConfig, load, load_cart
 from vislam.config.ranges import Positive
 from vislam.core.errors import UsageError
 
@@ -83,8 +83,7 @@ def main(arguments: list[str]) -> int:
     if resumed is not None:
         return _resume(resumed, arguments, command)
     settings = load(take_path(arguments, "--config"), profile_name=take_option(arguments, "--profile"))
-    cart = take_path(arguments, "--sensors")
-    sensors, further = load_sensors(cart), load_further_sensors(cart)
+    sensors, further = load_cart(take_path(arguments, "--sensors"))
     settings = settings if further.file is None else replace(settings, sensors=further)
     defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
