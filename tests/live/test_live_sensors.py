@@ -107,8 +107,9 @@ def test_a_sensor_that_nobody_could_read_is_refused_before_anything_starts(tmp_p
     file.write_text('[sensors.baro]\nkind = "height"\nsimulated_hz = 5\n')
     with pytest.raises(UsageError, match=r"\[sensors.baro\]: on a cart it needs a port"):
         cart.readings(load_sensor_setup(file))
+    file.write_text('[sensors.baro]\nkind = "height"\nfile = "baro.csv"\n')
     virtual, config = open_live("virtual-cart", settings(file), SensorsConfig())
-    with pytest.raises(UsageError, match="the virtual cart has no further sensors"):
+    with pytest.raises(UsageError, match=r"\[sensors.baro\]: the virtual cart draws its sensors; give simulated_hz"):
         LiveRun(virtual, config, tmp_path / "run", "virtual-cart", command)
 
 

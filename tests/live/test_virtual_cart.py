@@ -24,9 +24,42 @@ from vislam.live.virtual.imu import _truth
 from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
 from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
 from vislam.live.virtual.place import course
+from vislam.live.virtual.virtual_readings import VirtualReadings
 from vislam.live.wire.slot import SlotWriter
 from vislam.run.folder import prepare
 from vislam.run.session import Session
+from vislam.sensors import load_sensor_setup
+
+
+def test_its_further_sensors_are_drawn_on_its_motion(tmp_path: Path) -> None:
+    file = tmp_path / "cart.toml"
+    file.write_text(
+        '[sensors.wheels]\nkind = "wheels"\nsimulated_hz = 20.0\nslip = 0.0\nturn_slip = 0.0\nsigma_m_s = 1e-9\n'
+        '[sensors.baro]\nkind = "height"\nsimulated_hz = 5.0\n'
+    )
+    setup = load_sensor_setup(file)
+    name, epoch = f"vislam-test-{uuid.uuid4().hex}", Epoch()
+    drive = Drive(name, 1.0, 2.0, 0.5)
+    try:
+        drive.advance(8.0, 0.6, 0.3)  # the future is known here, and the last six seconds of it kept
+        begin_ns = epoch.begin_ns() - 4 * 10**9
+        epoch.begin_ns = lambda: begin_ns  # type: ignore[method-assign]
+        readings = VirtualReadings(name, epoch, setup, 0)
+        found = readings.read()
+        wheels = [reading for reading in found if reading.sensor == "wheels"]
+        assert len(wheels) >= 70
+        assert len(found) - len(wheels) >= 17
+        scales = np.array([one.values for one in wheels[60:]]) * readings._own["wheels"][:2]
+        for told, reading in zip(scales, wheels[60:], strict=True):
+            here = drive.at((reading.t_ns - begin_ns) * 1e-9)
+            half = 0.5 * readings._own["wheels"][2] * here.rate_rad_s
+            np.testing.assert_allclose(told, [here.speed_m_s - half, here.speed_m_s + half], atol=1e-6)
+        assert readings.status() == {"wheels": "well", "baro": "well"}
+        begin_ns -= 60 * 10**9  # nobody asked for a minute
+        readings.read()
+        assert readings.counters()["wheels"]["missed"] > 1000
+    finally:
+        drive.close()
 
 
 def test_a_segment_is_the_exact_integral_of_its_accelerations() -> None:

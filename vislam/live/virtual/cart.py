@@ -13,18 +13,19 @@ from pathlib import Path
 import numpy as np
 
 from vislam.config import Config, Gy85Config
-from vislam.core.errors import DataError, UsageError
+from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.imu import ImuNoise
 from vislam.live.epoch import Epoch
 from vislam.live.frames import FrameSource, NoCamera
 from vislam.live.processes.child import Life
-from vislam.live.reading_source import ReadingSource
+from vislam.live.reading_source import ReadingSource, refuse_unread
 from vislam.live.virtual.imu import VirtualGy85
 from vislam.live.virtual.motion import Drive, Segment, locate
 from vislam.live.virtual.pilot import CommandReader, PathFollower
 from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, course, virtual_rig
 from vislam.live.virtual.virtual_camera import VirtualCamera, run_camera
+from vislam.live.virtual.virtual_readings import VirtualReadings
 from vislam.live.wire.slot import remove
 from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
@@ -91,10 +92,10 @@ class VirtualCart:
         return partial(VirtualCamera, f"{self._shared}-camera")
 
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
-        """Raise UsageError: nobody draws them while it drives."""
-        raise UsageError(
-            "the virtual cart has no further sensors; play a recording with them instead: --source replay:SOURCE"
-        )
+        """Return what draws further sensors while it drives; raises UsageError for one without `simulated_hz`."""
+        asked = "the virtual cart draws its sensors; give simulated_hz, and neither file nor port"
+        refuse_unread(setup, {name: 0 for name in setup.simulated_hz if name not in setup.ports}, asked)
+        return partial(VirtualReadings, f"{self._shared}-cart", self._epoch, setup, self.options.seed)
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return the processes that move it and that render."""

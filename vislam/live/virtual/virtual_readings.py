@@ -1,0 +1,75 @@
+"""Further sensors of the virtual cart: drawn on its true motion as it drives."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from vislam.core.readings import Reading
+from vislam.live.epoch import Epoch
+from vislam.live.reading_source import Heard
+from vislam.live.virtual.motion import Follower, Segment
+from vislam.live.virtual.place import BODY_HEIGHT_M
+from vislam.sensors import BodyState, SensorSetup
+from vislam.sensors.geodetic import Geodetic
+
+_NS = 1_000_000_000
+_KNOWN_S = 5.0  # of the motion; whoever asks later missed what was before
+
+
+class VirtualReadings:
+    """Satisfies `ReadingSource`; own variables are drawn by their sigmas, as of a recording."""
+
+    def __init__(self, cart: str, epoch: Epoch, setup: SensorSetup, seed: int) -> None:
+        """Put the simulated sensors of a setup on the cart whose segments are published under a name."""
+        self._follower, self._epoch, self._setup = Follower.waiting(cart), epoch, setup
+        self._rngs, self._own = {}, {}
+        for number, name in enumerate(setup.simulated_hz):
+            at, rng = setup.suite.own(name), np.random.default_rng([seed, number])
+            self._own[name] = setup.suite.starts[at] + setup.suite.sigmas[at] * rng.normal(size=at.stop - at.start)
+            self._rngs[name] = rng
+        self._drawn = dict.fromkeys(setup.simulated_hz, 0)  # how many of each, those that were missed included
+        self._missed = dict.fromkeys(setup.simulated_hz, 0)
+        self._heard = Heard(tuple(setup.simulated_hz))
+
+    def read(self) -> list[Reading]:
+        """Return the readings whose time has come; see `ReadingSource`."""
+        begin_ns = self._epoch.begin_ns()
+        now_s = (time.monotonic_ns() - begin_ns) / _NS
+        out = []
+        for name, rate_hz in self._setup.simulated_hz.items():
+            while (t_s := self._drawn[name] / rate_hz) <= now_s:
+                self._drawn[name] += 1
+                if t_s < now_s - _KNOWN_S:
+                    self._missed[name] += 1
+                    continue
+                body = body_at(self._follower.at(t_s), begin_ns + round(t_s * _NS))
+                values = self._setup.sensors[name].draw(body, self._own[name].copy(), self._rngs[name])
+                out.append(Reading(name, body.t_ns, values))
+        self._heard.hear(out)
+        return out
+
+    def status(self) -> dict[str, str]:
+        """Return which sensors are silent."""
+        return self._heard.status()
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return how many readings of each sensor were drawn, and how many nobody asked for in time."""
+        return {name: {"drawn": count, "missed": self._missed[name]} for name, count in self._heard.count.items()}
+
+    def datums(self) -> dict[str, Geodetic]:
+        """Return nothing: what is told is known without them."""
+        return {}
+
+    def close(self) -> None:
+        """Do nothing; may be called twice."""
+
+
+def body_at(segment: Segment, t_ns: int) -> BodyState:
+    """Return the body at a time, above the middle of the axle, level."""
+    T, none = segment.T_world_body(BODY_HEIGHT_M), np.zeros(3)
+    ahead = np.array([math.cos(segment.yaw_rad), math.sin(segment.yaw_rad), 0.0])
+    rate = np.array([0.0, 0.0, segment.rate_rad_s])
+    return BodyState(t_ns, T[:3, :3], T[:3, 3], segment.speed_m_s * ahead, none, none, rate)
