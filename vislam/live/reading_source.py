@@ -58,8 +58,11 @@ def live_readings(
 
 
 def refuse_unread(setup: SensorSetup, readable: Mapping[str, object], asked: str) -> None:
-    """Raise UsageError for the first sensor that is not among the readable ones; `asked` says what it needs."""
-    missing = [name for name in setup.suite.names if name not in readable]
+    """Raise UsageError for the first sensor that is not among the readable ones; `asked` says what it needs.
+
+    What the board's own magnetometer feeds comes with the IMU.
+    """
+    missing = [name for name in setup.suite.names if name not in readable and not setup.suite[name].from_magnetometer]
     if missing:
         raise UsageError(f"[sensors.{missing[0]}]: {asked}; docs/more-sensors.md, Live")
 

@@ -183,6 +183,8 @@ class Front:
         """Take a sample of an inertial sensor, or a reading of another; the filter predicts at once."""
         if isinstance(value, MagSample):
             self._mag = value
+            if self._readings is not None:
+                self._readings.add_field(value)
         elif isinstance(value, Reading):
             if self._readings is not None:
                 self._readings.add(value)

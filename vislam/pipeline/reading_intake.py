@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState
 from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, preintegrate
@@ -65,6 +65,7 @@ class ReadingIntake:
         self.counters = {name: dict.fromkeys(became, 0) for name in suite.names}
         self.notes: dict[str, str] = {}
         self._suite = suite
+        self._of_magnetometer = [name for name in suite.names if suite[name].from_magnetometer]
         self._filter, self._buffer = filtering, buffer
         self._gravity = gravity_m_s2 if buffer is not None else 0.0
         self._accel_density = accel_noise_density
@@ -88,6 +89,8 @@ class ReadingIntake:
                 entry["filter"] = {"values": values.tolist(), "sigmas": sigmas.tolist()}
             if name in self.notes:
                 entry["note"] = self.notes[name]
+            elif not self.counters[name]["readings"]:
+                entry["note"] = "no reading came"
             out[name] = entry
         return out
 
@@ -104,6 +107,11 @@ class ReadingIntake:
             self.notes.setdefault(reading.sensor, f"{reason} (at {reading.t_ns} ns)")
             return
         self._queue(self._waiting, reading, _MAX_WAITING, "dropped")
+
+    def add_field(self, sample: MagSample) -> None:
+        """Take what the machine's own magnetometer measured, for the sensors that it feeds."""
+        for name in self._of_magnetometer:
+            self.add(Reading(name, sample.t_ns, sample.field_ut))
 
     def give_up_filter(self) -> None:
         """Go on with the path of vision alone: gravity could not be found."""

@@ -52,7 +52,7 @@ class FurtherReadings:
         """
         self.suite, self.problems = setup.suite, Problems()
         for name in setup.suite.names:
-            if name not in setup.files and name not in setup.simulated_hz:
+            if name not in setup.files and name not in setup.simulated_hz and not setup.suite[name].from_magnetometer:
                 raise UsageError(
                     f"[sensors.{name}] has no readings here: give its file, or simulated_hz to draw them on the truth"
                 )

@@ -15,6 +15,7 @@ _KINDS: dict[str, type[Configured]] = {
     "range": built_in.AnchorRange,
     "height": built_in.Height,
     "heading": built_in.Heading,
+    "magnetic_field": built_in.MagneticField,
     "wheels": built_in.Wheels,
     "ackermann": built_in.Ackermann,
     "twist": built_in.Twist,

@@ -38,12 +38,14 @@ class Sensor(ABC):
             "accel_bias". Numerical derivatives are taken by these only.
         variables: own ones, estimated with the body's state by every estimator; each has its own values.
         gate_probability: that a good reading passes the test of its innovation.
+        from_magnetometer: its readings are the samples of the machine's own magnetometer, as they come with the IMU's.
     """
 
     columns: ClassVar[tuple[str, ...]] = ()
     touches: ClassVar[tuple[str, ...]] = ("rotation", "position", "velocity")
     variables: tuple[Variable, ...] = ()
     gate_probability: float = 0.999
+    from_magnetometer: bool = False
 
     @abstractmethod
     def residual(self, values: Array, body: BodyState, own: Array) -> Array:

@@ -116,6 +116,7 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
             files[name] = file
         elif common.simulated_hz > 0.0:
             simulated[name] = common.simulated_hz
+        sensors[name].from_magnetometer &= name not in files and name not in simulated
         if (port := _port(common, sensors[name], where)) is not None:
             ports[name] = port
         if (datum := _gnss(common, where).datum) is not None:
