@@ -48,4 +48,9 @@ KINDS = {
     "noise": Kind(
         o.NoiseOptions, "inertial.noise.calibrate_noise", "white noise and bias walk of an IMU that stands still"
     ),
+    "sensors": Kind(
+        o.SensorsOptions,
+        "extrinsics.run_sensors.calibrate_sensors",
+        "wheel scales, track width, lever arms: what a run found of its further sensors",
+    ),
 }

@@ -164,3 +164,17 @@ class MagOptions:
     """Replace what an earlier calibration wrote"""
     json: bool = False
     """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
+class SensorsOptions:
+    """Options of `vislam calibrate sensors`."""
+
+    run: Positional[Path]
+    """Finished run with further sensors (--sensors.file): a drive with turns both ways, loops or fixes"""
+    out: Path = Path("calibration")
+    """Folder for sensors.toml and sensors.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""

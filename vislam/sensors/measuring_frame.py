@@ -34,10 +34,10 @@ def frame_variables(
     if kind == "known":
         return ()
     return (
-        Variable("yaw_rad", math.pi, 0.0, walk_rad),
-        Variable("x_m", ANYWHERE_M, 0.0, walk_m),
-        Variable("y_m", ANYWHERE_M, 0.0, walk_m),
-        Variable("z_m", up[1], up[0], walk_m),
+        Variable("yaw_rad", math.pi, 0.0, walk_rad, of_machine=False),
+        Variable("x_m", ANYWHERE_M, 0.0, walk_m, of_machine=False),
+        Variable("y_m", ANYWHERE_M, 0.0, walk_m, of_machine=False),
+        Variable("z_m", up[1], up[0], walk_m, of_machine=False),
     )
 
 

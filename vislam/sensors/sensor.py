@@ -20,6 +20,7 @@ class Variable(NamedTuple):
     sigma: float  # of what is known before the first reading
     start: float = 0.0
     walk: float = 0.0  # per square root of a second; 0: it does not change
+    of_machine: bool = True  # another run finds the same; False: it is of one run's world, as the heading of a frame
 
 
 class Begun(NamedTuple):

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vislam.config import SensorsConfig, validated
-from vislam.config.ranges import Count, Finite, NonNegative, Probability
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic, why_nowhere
 from vislam.sensors.gnss.fixes import GnssSettings
 from vislam.sensors.registry import kind_class
+from vislam.sensors.sensor import Variable
 from vislam.sensors.suite import Suite
 from vislam.sensors.ticks import TicksSettings
 
@@ -42,6 +43,7 @@ class _Common:
     baud: Count = 9600  # of that port
     delay_s: NonNegative = 0.05  # from a fix's time to the first byte that tells of it at that port
     gate_probability: Probability = 0.999
+    known: dict[str, tuple[Finite, Positive]] | None = None  # own variables that are known: value and sigma
     ticks: TicksSettings | None = None
     gnss: GnssSettings | None = None
 
@@ -143,7 +145,19 @@ def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
     sensor.gate_probability = common.gate_probability
+    sensor.variables = _with_known(sensor.variables, common.known or {}, where)
     return sensor, common
+
+
+def _with_known(
+    variables: tuple[Variable, ...], known: Mapping[str, tuple[float, float]], where: str
+) -> tuple[Variable, ...]:
+    names = [variable.name for variable in variables]
+    if unknown := [name for name in known if name not in names]:
+        there = f"there are: {', '.join(names)}" if names else "it has none"
+        raise UsageError(f"{where}: option known: no own variable {unknown[0]!r} with these settings; {there}")
+    as_told = [known.get(variable.name, (variable.start, variable.sigma)) for variable in variables]
+    return tuple(v._replace(start=start, sigma=sigma) for v, (start, sigma) in zip(variables, as_told, strict=True))
 
 
 def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> SensorFile | None:

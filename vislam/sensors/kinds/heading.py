@@ -42,7 +42,8 @@ class Heading(Configured):
     def __init__(self, settings: HeadingSettings | None = None) -> None:
         """Take settings; the defaults without any."""
         self.settings = s = settings or HeadingSettings()
-        self.variables = (Variable("offset_rad", s.offset_sigma_rad, s.offset_rad, s.offset_walk_rad_per_sqrt_s),)
+        walk = s.offset_walk_rad_per_sqrt_s
+        self.variables = (Variable("offset_rad", s.offset_sigma_rad, s.offset_rad, walk, of_machine=False),)
         self._sense = -1.0 if s.clockwise else 1.0
 
     def residual(self, values: Array, body: BodyState, own: Array) -> Array:

@@ -38,7 +38,8 @@ class Height(Configured):
     def __init__(self, settings: HeightSettings | None = None) -> None:
         """Take settings; the defaults without any."""
         self.settings = s = settings or HeightSettings()
-        self.variables = (Variable("offset_m", s.offset_sigma_m, s.offset_m, s.offset_walk_m_per_sqrt_s),)
+        walk = s.offset_walk_m_per_sqrt_s
+        self.variables = (Variable("offset_m", s.offset_sigma_m, s.offset_m, walk, of_machine=False),)
         self._lever_m: Array = np.array(s.lever_m, dtype=np.float64)
 
     def residual(self, values: Array, body: BodyState, own: Array) -> Array:

@@ -48,7 +48,7 @@ class MagneticField(Configured):
         """Take settings; the defaults without any."""
         self.settings = s = settings or MagneticFieldSettings()
         self.variables = tuple(
-            Variable(f"field_{axis}_ut", s.field_sigma_ut, start, s.field_walk_ut_per_sqrt_s)
+            Variable(f"field_{axis}_ut", s.field_sigma_ut, start, s.field_walk_ut_per_sqrt_s, of_machine=False)
             for axis, start in zip("xyz", s.field_ut, strict=True)
         )
         if s.bias_sigma_ut > 0.0:
