@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,6 +76,28 @@ def test_fixes_find_their_frame_as_soon_as_the_path_is_long_enough(sigma_m: floa
     assert 0.5 < np.mean(np.square(off)) < 2.0
     assert np.abs(off).max() < 6.0
     assert (np.mean(counts) < 8) == (sigma_m < 0.1), "the noisier, the longer"
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_lever_arm_that_is_not_known_is_in_the_frame_that_fixes_find(turns: bool) -> None:
+    """All fixes share its error: however many there are, the frame is not known better than it."""
+    told = PositionSettings(0.02, 0.04, lever_m=(0.2, 0.1, 0.5), lever_sigma_m=0.3)
+    sensor, bodies, off = Position(told), a_walk(60.0, size_m=15.0), []
+    if not turns:
+        bodies = [replace(body, R_world_body=so3_exp(np.array([0.0, 0.0, 1.0]))) for body in bodies]
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        truth = frame_at_random(rng)
+        own = np.concatenate([truth, np.array(told.lever_m) + told.lever_sigma_m * rng.normal(size=3)])
+        readings = drawn_readings("gnss", sensor, bodies, own, seed)
+        _, found = first_begin(sensor, readings, bodies)
+        late = sensor.begin(readings, bodies)
+        assert late is not None
+        assert (found.sigmas[4:] == 0.3).all() and late.sigmas[3] >= 0.3
+        off += [off_by_sigmas(Begun(begun.values[:4], begun.sigmas[:4]), truth) for begun in (found, late)]
+    print(np.mean(np.square(off), axis=0))
+    assert np.mean(np.square(off), axis=0).max() < 1.6
+    assert np.mean(np.square(off), axis=0)[1:].min() > 0.3
 
 
 def test_fixes_of_a_body_that_stands_tell_no_heading() -> None:

@@ -46,6 +46,20 @@ def aligned_frame(world_m: Array, frame_m: Array, variances_m2: Array) -> Begun 
     return Begun(np.array([yaw, *shift, up]), np.array([sigma_yaw, *sigmas_xy, sigma_up]))
 
 
+def by_shared_error(world_m: Array, yaw: float, directions: Array) -> Array:
+    """Return how much yaw, x, y, z [4, K] of an aligned frame move with errors that all its points [N, 3] share.
+
+    `directions` [N, 3, K] is where an error moves each point in the world, as a lever arm's error turns with the body.
+    Such an error does not get less by more points, unlike those that `aligned_frame` knows of.
+    """
+    mean, across = world_m.mean(axis=0), world_m[:, :2] - world_m[:, :2].mean(axis=0)
+    shared = directions.mean(axis=0)
+    turn = np.einsum("n,nk->k", across[:, 0], directions[:, 1]) - np.einsum("n,nk->k", across[:, 1], directions[:, 0])
+    turn /= np.sum(across**2)
+    shift = about_up(yaw)[:2, :2] @ (shared[:2] - np.outer([-mean[1], mean[0]], turn))
+    return np.vstack([turn, shift, shared[2:]])
+
+
 def with_starts(found: Begun | None, variables: Sequence[Variable]) -> Begun | None:
     """Return a beginning of the first own variables completed by the starts of the others."""
     if found is None:
