@@ -100,6 +100,26 @@ def test_a_lever_arm_that_is_not_known_is_in_the_frame_that_fixes_find(turns: bo
     assert np.mean(np.square(off), axis=0)[1:].min() > 0.3
 
 
+@pytest.mark.parametrize(("anchor_m", "lever_m", "bias_m"), [(0.2, 0.0, 0.0), (0.0, 0.1, 0.0), (0.2, 0.1, 0.3)])
+def test_places_of_anchors_that_are_not_known_are_in_the_frame_that_ranges_find(
+    anchor_m: float, lever_m: float, bias_m: float
+) -> None:
+    told = AnchorRangeSettings(
+        ROOM, 0.05, anchor_sigma_m=anchor_m, lever_m=(0.1, 0.0, 0.3), lever_sigma_m=lever_m, bias_sigma_m=bias_m
+    )
+    sensor, bodies, off = AnchorRange(told), a_walk(40.0), []
+    for seed in FEWER:
+        rng = np.random.default_rng(seed)
+        own = np.array([variable.start + variable.sigma * rng.normal() for variable in sensor.variables])
+        own[:4] = frame_at_random(rng)
+        found = sensor.begin(drawn_readings("uwb", sensor, bodies, own, seed), bodies)
+        assert found is not None
+        off.append(off_by_sigmas(Begun(found.values[:4], found.sigmas[:4]), own[:4]))
+    print(np.mean(np.square(off), axis=0))
+    assert np.mean(np.square(off), axis=0).max() < 2.5
+    assert np.mean(np.square(off)) > 0.3
+
+
 def test_fixes_of_a_body_that_stands_tell_no_heading() -> None:
     sensor = Position(PositionSettings(0.5, 1.0))
     bodies = [a_walk(1.0)[0]] * 500

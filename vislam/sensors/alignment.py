@@ -46,18 +46,29 @@ def aligned_frame(world_m: Array, frame_m: Array, variances_m2: Array) -> Begun 
     return Begun(np.array([yaw, *shift, up]), np.array([sigma_yaw, *sigmas_xy, sigma_up]))
 
 
-def by_shared_error(world_m: Array, yaw: float, directions: Array) -> Array:
-    """Return how much yaw, x, y, z [4, K] of an aligned frame move with errors that all its points [N, 3] share.
+def with_shared_errors(
+    found: Begun, rows: Sequence[int], variables: Sequence[Variable], H_own: Array, noise: Array
+) -> Begun:
+    """Return a beginning whose variables `rows` were found from readings, made less sure by the others' sigmas.
 
-    `directions` [N, 3, K] is where an error moves each point in the world, as a lever arm's error turns with the body.
-    Such an error does not get less by more points, unlike those that `aligned_frame` knows of.
+    An error that readings share, as that of a lever arm or of an anchor's place, does not get less by more of them. It
+    moves what is found as it moves least squares.
+
+    Args:
+        found: all own variables; those that are not in `rows` with what is known of them.
+        rows: of the variables that were found.
+        variables: what was known before.
+        H_own: [M, V] by the own variables, of the residuals of all readings.
+        noise: [M] standard deviations of the residuals.
     """
-    mean, across = world_m.mean(axis=0), world_m[:, :2] - world_m[:, :2].mean(axis=0)
-    shared = directions.mean(axis=0)
-    turn = np.einsum("n,nk->k", across[:, 0], directions[:, 1]) - np.einsum("n,nk->k", across[:, 1], directions[:, 0])
-    turn /= np.sum(across**2)
-    shift = about_up(yaw)[:2, :2] @ (shared[:2] - np.outer([-mean[1], mean[0]], turn))
-    return np.vstack([turn, shift, shared[2:]])
+    others = np.setdiff1d(np.arange(len(found.sigmas)), rows)
+    known = np.diag([variables[row].sigma ** -2.0 for row in rows])
+    white = H_own / noise[:, None]
+    J, K = white[:, rows], white[:, others]
+    moves = np.linalg.solve(J.T @ J + known, J.T @ K) * found.sigmas[others]
+    sigmas = found.sigmas.copy()
+    sigmas[rows] = np.hypot(sigmas[rows], np.linalg.norm(moves, axis=1))
+    return Begun(found.values, sigmas)
 
 
 def with_starts(found: Begun | None, variables: Sequence[Variable]) -> Begun | None:

@@ -13,6 +13,7 @@ from vislam.config.sensors import Vector3
 from vislam.core.errors import UsageError
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
+from vislam.sensors.alignment import with_shared_errors
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import (
@@ -136,7 +137,8 @@ class AnchorRange(Configured):
         if found is None:
             return None
         usual.values[rows], usual.sigmas[rows] = found.values[: len(rows)], found.sigmas[: len(rows)]
-        return usual
+        H_own = np.vstack([self.jacobians(r.values, b, usual.values)[1] for r, b in zip(readings, bodies, strict=True)])
+        return with_shared_errors(usual, rows, self.variables, H_own, seen.sigmas_m)
 
     def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
         """Return the range from a true body to an anchor that is chosen by chance."""

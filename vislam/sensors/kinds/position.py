@@ -11,7 +11,7 @@ from vislam.config.ranges import NonNegative, Positive
 from vislam.config.sensors import Vector3
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
-from vislam.sensors.alignment import aligned_frame, by_shared_error, with_starts
+from vislam.sensors.alignment import aligned_frame, with_shared_errors, with_starts
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import (
@@ -78,12 +78,13 @@ class Position(Configured):
         covariances = [self.noise(r.values) if r.covariance is None else r.covariance for r in readings]
         variances = np.array([[0.5 * (c[0, 0] + c[1, 1]), c[2, 2]] for c in covariances])
         variances += self.settings.lever_sigma_m**2
-        found = aligned_frame(world, np.array([r.values for r in readings]), variances)
+        values = np.array([r.values for r in readings])
+        found = with_starts(aligned_frame(world, values, variances), self.variables)
         if found is None:
             return None
-        turned = by_shared_error(world, float(found.values[0]), np.array([body.R_world_body for body in bodies]))
-        by_lever = self.settings.lever_sigma_m * np.linalg.norm(turned, axis=1)
-        return with_starts(Begun(found.values, np.hypot(found.sigmas, by_lever)), self.variables)
+        H_own = np.vstack([self.jacobians(r.values, b, found.values)[1] for r, b in zip(readings, bodies, strict=True)])
+        noise = np.sqrt(variances[:, [0, 0, 1]]).ravel()
+        return with_shared_errors(found, range(self._frame), self.variables, H_own, noise)
 
     def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
         """Return a fix of a true body."""
