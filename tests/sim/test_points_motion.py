@@ -15,7 +15,7 @@ from vislam.core.messages import Array
 from vislam.run.sources import measured_inertial
 from vislam.sim import MeasuredInertial
 from vislam.sim.motion.measured import MeasuredMotion
-from vislam.sim.motion.motions import laps, straight, turn_in_place
+from vislam.sim.motion.motions import cart_laps, laps, straight, turn_in_place
 from vislam.trajectory import Trajectory
 from worlds.recordings import angles_rad, real
 
@@ -197,3 +197,14 @@ def test_laps_come_back_to_the_same_place() -> None:
     gaps = np.linalg.norm(xy[600:] - xy[0], axis=1)
     assert gaps.min() < 0.3 and np.ptp(xy, axis=0) == pytest.approx([12.0, 7.0], abs=0.6)
     assert np.linalg.norm(spline.at(np.array([1.0])).velocity_world_m_s) < 1e-9
+
+
+def test_a_cart_in_laps_goes_where_it_looks_and_stops() -> None:
+    motion = cart_laps(np.random.default_rng(0), 120.0).at(np.arange(0.0, 120.0, 0.02))
+    R, velocity = motion.T_world_body[:, :3, :3], motion.velocity_world_m_s
+    forward, left, up = np.einsum("nji,nj->ni", R, velocity).T
+    assert np.abs(left).max() < 0.005 and np.abs(up).max() < 0.03
+    assert 0.99 < forward.max() < 1.01 and forward.min() > -1e-6
+    begins = np.flatnonzero(np.diff((np.linalg.norm(velocity, axis=1) < 1e-3).astype(int)) == 1)
+    assert len(begins) == 4  # every 25 m
+    assert 90.0 < 0.02 * forward.sum() < 115.0

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.messages import Array
-from vislam.sim.motion.path import rounded_path, smoothstep, wander
+from vislam.sim.motion.path import Travel, rounded_path, smoothstep, wander
 from vislam.sim.motion.spline import BodySpline
 from vislam.sim.worlds.table import WORLDS
 
@@ -26,6 +26,8 @@ _START_BLEND_S = 2.0
 _ROUND_S = 12.0  # from stop to stop
 _GO_SHARE = 2.0 / 3.0  # of it is motion
 _ROUND_M = 5.0
+_CART_HEIGHT_M = 0.3
+_CART_LEG_M = 25.0  # from stop to stop
 
 
 def still(_rng: np.random.Generator, duration_s: float) -> BodySpline:
@@ -112,6 +114,28 @@ def stop_and_go(rng: np.random.Generator, duration_s: float) -> BodySpline:
     return BodySpline.from_design(design, duration_s, _SPACING_S)
 
 
+def cart_laps(rng: np.random.Generator, duration_s: float) -> BodySpline:
+    """Return a body on wheels, lap after lap around a block of 30 x 18 m, which stands for 2 s every 25 m."""
+    path = rounded_path([(8.0, 0.0), (30.0, 0.0), (30.0, 18.0), (0.0, 18.0), (0.0, 0.0), (8.0, 0.0)], 1.5)
+    farthest_m = _SPEED_M_S * duration_s
+    stops = tuple(np.arange(_CART_LEG_M, farthest_m, _CART_LEG_M).tolist())
+    travel = Travel(farthest_m + _CART_LEG_M, _SPEED_M_S, 1.5, _REST_S, 0.0, stops, 2.0)
+    shake_seed = int(rng.integers(0, 2**32))
+
+    def design(t: Array) -> tuple[Array, Array]:
+        arc = travel.arc_m(t)
+        turns = np.floor(arc / path.length_m)
+        xy, heading = path.at(arc - turns * path.length_m)
+        # a floor shakes a cart while it moves: along the way, not in time
+        shaking = wander(arc, np.random.default_rng(shake_seed), 1.0, (0.4, 2.5), 3) * [0.003, 0.003, 0.0008]
+        shaking *= smoothstep(arc, 0.05, 0.5)[:, None]
+        z = _CART_HEIGHT_M + shaking[:, 2]
+        angles = np.column_stack([shaking[:, 0], shaking[:, 1], heading + 2.0 * np.pi * turns])
+        return np.column_stack([xy, z]), angles
+
+    return BodySpline.from_design(design, duration_s, _SPACING_S)
+
+
 @dataclass(frozen=True, slots=True)
 class PointWorld:
     """A motion through a cloud of landmarks."""
@@ -142,6 +166,10 @@ POINT_WORLDS: dict[str, PointWorld] = {
     "stop-and-go": PointWorld(
         "3 s of rest, then 5 m by hand and 4 s of rest, again and again", stop_and_go, 60.0, _HOURS_S,
         (0.05, 0.02, 0.03),
+    ),
+    "cart-laps": PointWorld(
+        "3 s of rest, then on wheels in laps of 93 m, with a stop every 25 m", cart_laps, 120.0, _HOURS_S,
+        (0.2, 0.02, 0.3),
     ),
 }  # fmt: skip
 
