@@ -29,6 +29,8 @@ from vislam.core.geometry import skew, so3_exp, transform
 from vislam.core.messages import Array, Frame, ImuSample, Keyframe, KeyframePacket, NavState, no_observations
 from vislam.core.readings import Reading
 from vislam.ekf.filtering import Filtering
+from vislam.ekf.loose.kernels import ERRORS
+from vislam.factors.keys import X, own_key
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.graph import PoseGraph
 from vislam.imu import ImuBuffer, ImuNoise
@@ -43,6 +45,9 @@ _SETTINGS = {
     "imu.max_gap_s": 1.0, "ekf.max_gap_s": 1.0, "graph.imu_max_gap_s": 1.0,  # samples come five times a second
 }  # fmt: skip
 _STEP_NS = 1_000_000_000  # between keyframes
+_FRAME = 4  # of the own variables of ranges: heading and place of their frame
+_TRUTH_M = 0.02  # sigma of the truth per axis: RTK, as the tables' authors have it
+_NEES_EVERY = 10  # keyframes of the final graph
 _NO_RIG = Rig((Camera(64, 48, 50.0, 50.0, 32.0, 24.0),), (np.eye(4),))  # nobody looks through it
 _START_SIGMAS = np.repeat([1e-3, 1e-3, 0.5, 0.01, 0.3], 3)  # rotation, position, velocity, biases
 
@@ -118,6 +123,7 @@ class Drive:
         self.graph = PoseGraph(config.graph, noise, self.gravity_m_s2, _NO_RIG, config.window, suite)
         self._plaza, self._suite = plaza, suite
         self.cpu_s = {"filter": 0.0, "graph": 0.0}
+        self.covariances: list[Array] = []  # [2, 2] of the filter's places among the anchors, of each keyframe
 
     def run(self) -> tuple[Trajectory, Trajectory]:
         """Return the paths of filter, causal, and of the graph, both in the frame of the anchors."""
@@ -145,6 +151,7 @@ class Drive:
             self._add(len(stamps), t_ns, key_ns, state)
             self.cpu_s["graph"] += time.process_time() - begun_s
             by_filter.append((t_ns, state.T_world_body, self.filter.ekf.own("uwb")[0]))
+            self.covariances.append(self._of_filter(state.T_world_body))
             stamps.append(t_ns)
             key_ns = t_ns
         begun_s = time.process_time()
@@ -157,6 +164,24 @@ class Drive:
             Trajectory(np.array([t_ns for t_ns, _, _ in by_filter]), np.array(causal)),
             Trajectory(np.array(stamps), np.array([in_anchors(found[0], T) for T in self.graph.poses()])),
         )
+
+    def of_graph(self, k: int) -> Array | None:
+        """Return the covariance [2, 2] of a keyframe's place among the anchors; None where gtsam gives none."""
+        readings, estimator = self.graph.readings, self.graph._estimator  # nothing public tells of both together
+        keys = [X(k), *(own_key(n) for n in range(*self._suite.own("uwb").indices(self._suite.size))[:_FRAME])]
+        joint = estimator.joint_covariance(keys)
+        found, T = self.graph.own("uwb"), self.graph.poses()[k]
+        if joint is None or found is None:
+            return None
+        turned = np.eye(6 + _FRAME)
+        turned[3:6, 3:6] = T[:3, :3]  # from the body's axes
+        turned[6:, 6:] *= readings._units("uwb")[:_FRAME]
+        return in_anchors_covariance(found[0], T, turned @ joint @ turned.T)
+
+    def _of_filter(self, T: Array) -> Array:
+        at, P = self._suite.own("uwb").start, self.filter.ekf._state.P
+        chosen = [*range(6), *range(ERRORS + at, ERRORS + at + _FRAME)]
+        return in_anchors_covariance(self.filter.ekf.own("uwb")[0], T, P[np.ix_(chosen, chosen)])
 
     def _begin(self) -> int:
         t_ns = int(self._plaza.t_ns[0])
@@ -184,6 +209,26 @@ class Drive:
 def in_anchors(own: Array, T: Array) -> Array:
     """Return a pose [4, 4] in the anchors' frame, whose heading and place own variables tell."""
     return transform(so3_exp(np.array([0.0, 0.0, own[0]])), own[1:4]) @ T
+
+
+def in_anchors_covariance(own: Array, T: Array, joint: Array) -> Array:
+    """Return the covariance [2, 2] of east and north in the anchors' frame.
+
+    `joint` [10, 10] is that of the body's rotation and its position in world, and of the frame's heading and place.
+    """
+    R = so3_exp(np.array([0.0, 0.0, own[0]]))
+    J = np.hstack([np.zeros((3, 3)), R, np.cross([0.0, 0.0, 1.0], R @ T[:3, 3])[:, None], np.eye(3)])
+    return np.asarray((J @ joint @ J.T)[:2, :2])
+
+
+def nees_per_dof(path: Trajectory, covariances: list[Array | None], truth: Trajectory, after_s: float) -> float:
+    """Return the mean squared horizontal error over its covariance and that of the truth, per degree of freedom."""
+    squares = []
+    for t_ns, position, P in zip(path.t_ns.tolist(), path.positions_m, covariances, strict=True):
+        if P is not None and truth.t_ns[0] + after_s * 1e9 <= t_ns <= truth.t_ns[-1]:
+            away = position[:2] - truth.at(t_ns)[:2, 3]
+            squares.append(away @ np.linalg.solve(P + _TRUTH_M**2 * np.eye(2), away))
+    return float(np.mean(squares)) / 2.0
 
 
 def _flat(x: float, y: float, yaw: float) -> Array:
@@ -225,6 +270,9 @@ def main(
         for name, path in (("filter", by_filter), ("graph", by_graph)):
             errors, whole = (errors_m(path, plaza.truth, after_s) for after_s in (settled_s, 0.0))
             entry[name] = {"rmse_m": _rms(errors), "max_m": float(errors.max()), "with_start_rmse_m": _rms(whole)}
+        some = [drive.of_graph(k) if k % _NEES_EVERY == 0 else None for k in range(len(by_graph))]
+        entry["filter"]["nees_per_dof"] = nees_per_dof(by_filter, list(drive.covariances), plaza.truth, settled_s)
+        entry["graph"]["nees_per_dof"] = nees_per_dof(by_graph, some, plaza.truth, settled_s)
         nis = drive.filter.ekf.nis_statistics
         entry["filter"]["nis_per_dof"] = {name: total / dof for name, (_, total, dof) in nis.items() if dof}
         answer[f"plaza{number}"] = entry
