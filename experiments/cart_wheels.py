@@ -102,14 +102,16 @@ def of_way(path: Trajectory, truth: Trajectory) -> dict[str, float]:
 def gone_on(path: Trajectory, truth: Trajectory, begin_ns: int, end_ns: int) -> dict[str, float]:
     """Return how far a path errs at the end of a stretch whose beginning is put on the truth, and that of the way.
 
-    Heading and place are the truth's at the last pose before the stretch; the end is the last pose within it.
+    Heading and place are the truth's at the last pose before it. Its end is the first pose from then on, for a graph
+    may have none within.
     """
     pairs = associate(path, truth)
     first = int(np.searchsorted(pairs.t_ns, begin_ns, side="right")) - 1
-    last = int(np.searchsorted(pairs.t_ns, end_ns, side="right")) - 1
+    last = min(int(np.searchsorted(pairs.t_ns, end_ns)), len(pairs) - 1)
     moved = (np.linalg.inv(T[first]) @ T[last] for T in (pairs.estimate, pairs.reference))
     estimated, true = (T[:3, 3] for T in moved)
-    way = Trajectory(pairs.t_ns[first : last + 1], pairs.reference[first : last + 1]).path_m
+    between = (truth.t_ns >= pairs.t_ns[first]) & (truth.t_ns <= pairs.t_ns[last])
+    way = Trajectory(truth.t_ns[between], truth.T_world_body[between]).path_m
     error = float(np.linalg.norm(estimated - true))
     return {"way_m": way, "error_m": error, "share": error / way}
 
