@@ -82,6 +82,7 @@ def test_a_cluster_gives_the_bytes_that_this_machine_gives(cluster, tmp_path, ca
     tables = [list(csv.DictReader((tmp_path / out / "runs.csv").open())) for out in ("here", "there")]
     ours, theirs = ([row["sha256"] for row in rows] for rows in tables)
     assert ours == theirs
+    assert here[1]["table_sha256"] == there[1]["table_sha256"]
     assert all(theirs)
     assert (tmp_path / "here" / "winners.csv").read_bytes() == (tmp_path / "there" / "winners.csv").read_bytes()
     assert compare(tmp_path, capsys, "there", "--engine", "slurm")[1]["new"] == 0

@@ -12,7 +12,7 @@ from vislam.experiment.jobs import Job
 from vislam.experiment.plan import Estimator, Plan, Sequence
 from vislam.experiment.report.exports import latex, runs_csv, shown_spread, summary_csv
 from vislam.experiment.statistics import compare, groups, holm, spread
-from vislam.experiment.trials import BY_NAME, Trial
+from vislam.experiment.trials import BY_NAME, Trial, table_sha256
 
 
 def trial(estimator, ate_m, sequence="s", seed=0, member=0, output="ekf", failure="", **values):
@@ -97,6 +97,28 @@ def test_paired_test_is_scipys_on_the_medians_of_the_ensembles():
     assert found.first_better == sum(x < y for x, y in zip(a, b, strict=True))
     assert found.ratio == pytest.approx(np.median(np.array(a) / np.array(b)))
     assert found.p_holm == found.p
+
+
+def test_seeds_of_one_sequence_are_one_pair_where_the_plan_says_so():
+    trials = [
+        trial(name, better + 0.01 * seed + 0.1 * k, f"s{k}", seed=seed)
+        for k in range(7) for seed in range(3) for name, better in (("a", 0.1), ("b", 0.2 + 0.001 * k))
+    ]  # fmt: skip
+    assert compare(trials, "ate_m")[0].pairs == 21
+    (found,) = compare(trials, "ate_m", by_seed=False)
+    assert (found.pairs, found.first_better) == (7, 7)
+    assert found.p == pytest.approx(2 / 2**7)  # the least that seven pairs can say
+    assert found.ratio == pytest.approx(np.median([(0.11 + 0.1 * k) / (0.21 + 0.101 * k) for k in range(7)]))
+
+
+def test_the_table_is_the_same_whoever_made_it_in_whatever_order_and_time():
+    trials = [trial(name, 0.1, f"s{k}", cpu_s_per_s=1.0) for k in range(3) for name in "ab"]
+    known = table_sha256(trials)
+    assert table_sha256(trials[::-1]) == known
+    assert table_sha256([trial(t.job.estimator, 0.1, t.job.sequence, cpu_s_per_s=2.0) for t in trials]) == known
+    assert table_sha256([*trials[1:], trial("a", 0.1 + 1e-12, "s0")]) != known
+    assert table_sha256([*trials[1:], trial("a", 0.1, "s0", failure="lost")]) != known
+    assert table_sha256(trials[1:]) != known
 
 
 def test_a_failure_loses_its_pair_by_the_largest_rank():

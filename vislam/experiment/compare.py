@@ -23,7 +23,7 @@ from vislam.experiment.report.page import comparison_page
 from vislam.experiment.slurm import run_on_slurm
 from vislam.experiment.statistics import compare, groups
 from vislam.experiment.store import ResultStore
-from vislam.experiment.trials import Trial, trials
+from vislam.experiment.trials import Trial, table_sha256, trials
 from vislam.experiment.verify import read_manifest, verify
 from vislam.run.folder import storage
 
@@ -105,7 +105,7 @@ def write_results(
         out.mkdir(parents=True, exist_ok=True)
     found = trials(plan, jobs, results)
     grouped = groups(found)
-    by_metric = {metric: compare(found, metric) for metric in TESTED}
+    by_metric = {metric: compare(found, metric, plan.pairs == "seed") for metric in TESTED}
     tests = [comparison for comparisons in by_metric.values() for comparison in comparisons]
     overall = [winner for comparisons in by_metric.values() for winner in winners.of_plan(comparisons)]
     ranked = overall + winners.of_sequences(grouped, TESTED[0])
@@ -121,8 +121,10 @@ def write_results(
     lines = [f"{len(results)} results, {new} of them new, {len(failed)} failed"]
     lines += [f"failed: {job.label}: {results[job.key]['reason'].splitlines()[0]}" for job in failed[:10]]
     lines += [winners.told(winner) for winner in overall]
-    lines.append(f"report: {out / 'report.html'}")
-    return Answer(lines, {"out": str(out), "results": len(results), "new": new, "failed": len(failed)})
+    table = manifest["table_sha256"]
+    lines += [f"table: {table}", f"report: {out / 'report.html'}"]
+    data = {"out": str(out), "results": len(results), "new": new, "failed": len(failed), "table_sha256": table}
+    return Answer(lines, data)
 
 
 def _check(options: CompareOptions) -> None:
@@ -165,6 +167,7 @@ def _manifest(text: str, jobs: Sequence[Job], found: Sequence[Trial], command: l
         "code_revision": code_revision(),
         "environment": environment(),
         "plan_text": text,
+        "table_sha256": table_sha256(found),
         "sources": source_identities(jobs),
         "results": [
             {

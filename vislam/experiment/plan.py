@@ -87,6 +87,8 @@ class Plan:
     seeds: tuple[int, ...] = (0,)  # of the simulation and of the pipeline
     members: int = 6  # of each ensemble: gravity differs by 1e-9 between neighbours, which shows chaos
     timeout_s: float = 1800.0  # a job that takes longer is stopped and counts as failed
+    # what a paired test takes as one pair: seeds of one sequence say nothing about other sequences
+    pairs: Literal["seed", "sequence"] = "seed"
     map: bool = False  # mapping does not change trajectories and takes time
 
     def axes_of(self, sequence: str) -> tuple[Axis, ...]:

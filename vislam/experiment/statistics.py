@@ -98,16 +98,18 @@ def groups(trials: Sequence[Trial]) -> list[Group]:
     return [Group(*key, tuple(members)) for key, members in found.items()]
 
 
-def compare(trials: Sequence[Trial], metric: str) -> list[Comparison]:
+def compare(trials: Sequence[Trial], metric: str, by_seed: bool = True) -> list[Comparison]:
     """Return the test of every two causal estimates and of every two final ones, by a metric of kind "error".
 
     A pair is one sequence, condition and seed; the median over the ensemble stands for it, for its members are no
-    independent samples. A failure is worse than any number; two failures are equal. Pairs that only one side
-    measured (a path too short for the segment) are left out. P values follow Holm 1979.
+    independent samples. Without `by_seed` a pair is one sequence and condition, and the median is over its seeds, too:
+    then the test speaks of sequences like these, not of these ones with other noise. A failure is worse than any
+    number; two failures are equal. Pairs that only one side measured (a path too short for the segment) are left out.
+    P values follow Holm 1979.
     """
     values: dict[str, dict[tuple[str, Variant, int], float]] = {}
     causal: dict[str, bool] = {}
-    for unit, members in _by_unit(trials).items():
+    for unit, members in _by_unit(trials, by_seed).items():
         measured = [math.inf if t.failure else t.values[metric] for t in members if t.failure or metric in t.values]
         if measured:
             values.setdefault(unit[0], {})[unit[1:]] = _median(np.sort(np.array(measured)))
@@ -132,11 +134,11 @@ def holm(p: Sequence[float]) -> list[float]:
     return corrected
 
 
-def _by_unit(trials: Sequence[Trial]) -> dict[tuple[str, str, Variant, int], list[Trial]]:
+def _by_unit(trials: Sequence[Trial], by_seed: bool) -> dict[tuple[str, str, Variant, int], list[Trial]]:
     found: dict[tuple[str, str, Variant, int], list[Trial]] = {}
     for trial in trials:
         job = trial.job
-        found.setdefault((trial.estimate, job.sequence, job.variant, job.seed), []).append(trial)
+        found.setdefault((trial.estimate, job.sequence, job.variant, job.seed if by_seed else 0), []).append(trial)
     return found
 
 

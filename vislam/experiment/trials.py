@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from vislam.experiment.identity import sha256_of
 from vislam.experiment.jobs import Job
 from vislam.experiment.plan import Plan
 
@@ -104,6 +105,24 @@ def trials(plan: Plan, jobs: Sequence[Job], results: Mapping[str, dict[str, Any]
         if job.key in results
         for output in sorted(outputs[job.estimator], key=list(OUTPUT_TITLES).index)
     ]
+
+
+def table_sha256(found: Sequence[Trial]) -> str:
+    """Return the SHA-256 of all that a plan's results say, whoever computed them, in whatever order.
+
+    Every trajectory counts by its own SHA-256, and every number but what time and memory were used: those are never
+    twice the same.
+    """
+    timed = {metric.name for metric in METRICS if metric.kind == "cost"}
+    rows = [
+        [
+            t.job.sequence, t.job.variant, t.job.estimator, t.output, t.job.seed, t.job.member,
+            bool(t.failure), t.sha256,
+            sorted((name, value) for name, value in t.values.items() if name not in timed),
+        ]
+        for t in found
+    ]  # fmt: skip
+    return sha256_of(sorted(rows, key=repr))
 
 
 def _trial(job: Job, output: str, result: dict[str, Any]) -> Trial:

@@ -50,8 +50,8 @@ _MEASURED = (
     "Cells: median [range] over seeds and ensemble members, from 20 trials on [5 %, 95 %]. Members differ by 1e-9 of "
     "gravity: what they spread is chaos of the estimator, not a property of the data.",
     "Failed trials count as infinitely wrong in errors and their tests, and are left out of time and memory.",
-    "Tests: Wilcoxon signed-rank on the median of each sequence, condition and seed, corrected by Holm's method. With "
-    "n pairs no p value is below 2/2^n.",
+    "Tests: Wilcoxon signed-rank on the median of each sequence, condition and seed (pairs = 'sequence': over its seeds, "
+    "too), corrected by Holm's method. With n pairs no p value is below 2/2^n.",
     "Time per frame is that of the whole pipeline, on one thread of the machine that ran the job beside other jobs. "
     "CPU time is that of all threads of the run, reading and decoding included, without compilation.",
 )
@@ -102,7 +102,8 @@ def _head(plan: Plan, trials: Sequence[Trial], manifest: dict[str, Any]) -> str:
         tile(str(len(failed)), "", "of them failed", "bad" if failed else "good"),
     )
     revision = str(manifest.get("code_revision") or "not under version control")
-    lead = f'<p class="lead">vislam {escape(revision[:26])}, {escape(manifest.get("finished", ""))}</p>'
+    told = f"vislam {revision[:26]}, {manifest.get('finished', '')}, table {manifest.get('table_sha256', '')[:16]}"
+    lead = f'<p class="lead">{escape(told)}</p>'
     return f'<h1>{escape(plan.title or plan.name)}</h1>{lead}<div class="tiles">{"".join(tiles)}</div>'
 
 
