@@ -12,10 +12,10 @@ cached on disk and compiles our kernels, does not count.
 
 Peers play at the pace of the recording (`--pace`), for their threads use what time they get; ours does not depend on
 it. ORB-SLAM3 wants a vocabulary: --vocabulary ORBvoc.txt; without, one of the recordings' own images is made, which is
-smaller and loads faster than the real one. Basalt needs g++, for a shim (peers/basalt_shim.cpp) that stands in for its
-device, and has no loops. ATE is that of the causal poses after SE(3) alignment: what the CPU was spent on. ORB-SLAM3
-turns and scales its world when its IMU has been initialised, and its causal ATE with an IMU contains that; its first
-pose with one camera has no metres yet.
+smaller and loads faster than the real one. Basalt needs g++, for a shim (basalt_shim.cpp beside its driver) that
+stands in for its device, and has no loops. ATE is that of the causal poses after SE(3) alignment: what the CPU was
+spent on. ORB-SLAM3 turns and scales its world when its IMU has been initialised, and its causal ATE with an IMU
+contains that; its first pose with one camera has no metres yet.
 
 This process stays small, for a child's peak memory begins with that of who started it.
 """
@@ -33,7 +33,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PEERS = ROOT / "benchmarks" / "peers"
+PEERS = ROOT / "vislam" / "experiment" / "peer_drivers"
 TIMEOUT_S = 900.0
 _VISLAM = "from vislam.cli import main; main()"
 _ATE = """
@@ -149,7 +149,7 @@ class Bench:
         source, path, poses = f"{case.reader}:{case.path(self._data)}", case.path(self._data), out.with_suffix(".tum")
         commands: dict[str, list[str | Path]] = {
             "vislam run": ["-c", _VISLAM, "run", source, "--out", out, "--overwrite", "--frontend.mode", case.mode],
-            "vislam, poses": [PEERS / "vislam_poses.py", source, case.mode, poses],
+            "vislam, poses": [ROOT / "benchmarks" / "peers" / "vislam_poses.py", source, case.mode, poses],
             "orbslam3": [PEERS / "orbslam3_peer.py", case.mode, path, poses, self._vocabulary or "", self._pace],
             "basalt": [PEERS / "basalt_peer.py", "run", path, poses, self._pace],
         }

@@ -20,7 +20,9 @@ from vislam.config import Config
 from vislam.core.errors import UsageError
 from vislam.core.messages import Frame
 from vislam.core.recording import Recording
+from vislam.experiment.peers import driver_identity
 from vislam.experiment.programs import ProgramError, setup_of, write_metrics
+from vislam.experiment.stated import split_stated
 from vislam.run.cost import per_frame
 from vislam.trajectory import read_tum, write_tum
 
@@ -54,7 +56,11 @@ def check(command: Sequence[str]) -> None:
 
 def identity(command: Sequence[str]) -> list[str]:
     """Return what a command is: its words, and the SHA-256 of those that are files."""
-    return [hashlib.sha256(Path(word).read_bytes()).hexdigest() if Path(word).is_file() else word for word in command]
+    return [driver_identity(word) or _word_identity(word) for word in command]
+
+
+def _word_identity(word: str) -> str:
+    return hashlib.sha256(Path(word).read_bytes()).hexdigest() if Path(word).is_file() else word
 
 
 def run_command(
@@ -75,11 +81,15 @@ def run_command(
         failure, paid = _run([word.format_map(places) for word in command], Path(work))
     wanted = [files[name] for name in outputs_of(command)]
     missing = [path.name for path in wanted if not path.is_file()]
+    for path in wanted:
+        if path.is_file():
+            split_stated(path, out / f"states_{path.stem.removeprefix('trajectory_')}.csv")
+    # those known in time come first: what is known in the end says nothing about when a pose was there
     begins_ns = [int(poses.t_ns[0]) for path in wanted if path.is_file() and len(poses := read_tum(path))]
     cost = {
         **per_frame(paid.cpu_s, len(t_ns), {}),
         "peak_memory_mb": paid.peak_memory_mb,
-        "first_pose_s": (min(begins_ns) - t_ns[0]) * 1e-9 if begins_ns and t_ns else None,
+        "first_pose_s": (begins_ns[0] - t_ns[0]) * 1e-9 if begins_ns and t_ns else None,
         "first_pose_cpu_s": None,
     }
     metrics = write_metrics(out, command[0], setup, t_ns, cost)

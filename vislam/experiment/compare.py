@@ -49,7 +49,7 @@ def run_comparison(options: CompareOptions, command: list[str], progress: Progre
         DataError, StorageError: recordings, store or output cannot be used.
     """
     _check(options)
-    plan = load_plan(options.plan, programs=options.estimator)
+    plan = load_plan(options.plan, programs=options.estimator, known=options.peer)
     jobs = expand(plan)
     if options.verify is not None:
         return _verify(options, plan, jobs, progress)
@@ -61,7 +61,9 @@ def run_comparison(options: CompareOptions, command: list[str], progress: Progre
         new = run_missing(jobs, store, options, progress)
         results = {job.key: result for job in unique(jobs) if (result := store.get(job.key)) is not None}
     out = options.out or Path("results") / plan.name
-    return write_results(plan, plan_text(options.plan, options.estimator), jobs, results, out, command, new)
+    return write_results(
+        plan, plan_text(options.plan, options.estimator, options.peer), jobs, results, out, command, new
+    )
 
 
 def run_missing(
@@ -200,7 +202,7 @@ def _verify(options: CompareOptions, plan: Plan, jobs: Sequence[Job], progress: 
                     progress(len(results), len(wanted), result["status"])
         return results
 
-    text = plan_text(options.plan, options.estimator)
+    text = plan_text(options.plan, options.estimator, options.peer)
     verdicts, remarks = verify(plan, text, jobs, manifest, options.sample, rerun)
     counts = Counter(verdict.outcome for verdict in verdicts)
     lines = [f"remark: {remark}" for remark in remarks]

@@ -19,7 +19,9 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 _PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "llvmlite")
 # they show results or ask for them and cannot change a number; all other code can
 _WITHOUT_EFFECT = ("cli/", "__main__.py", "report/", "run/viewer/", "experiment/")
-_MEASURING = tuple(f"experiment/{name}.py" for name in ("worker", "measures", "recordings", "programs", "commands"))
+_MEASURING = tuple(
+    f"experiment/{name}.py" for name in ("worker", "measures", "recordings", "programs", "commands", "stated")
+)
 
 
 @cache

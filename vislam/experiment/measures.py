@@ -24,6 +24,7 @@ from vislam.trajectory import (
 from vislam.trajectory.consistency import anees, chi_square_mean, stated_scale_sigma
 
 _STATES = {"ekf": "states_ekf.csv", "graph": "states_graph.csv", "batch": "states_batch.csv"}
+_STATES |= {name: f"states_{name}.csv" for name in ("causal", "final")}  # where an estimator by others gives them
 _CURVE_POINTS = 240  # of each trajectory that are kept for pictures
 SEGMENTS_M = (1, 5, 10)
 

@@ -19,6 +19,9 @@ class CompareOptions:
     """TOML file that says what to compare on what; docs/experiments.md"""
     estimator: tuple[str, ...] = ()
     """More estimators for the plan: FILE.py, FILE.py:CLASS or MODULE:CLASS; docs/experiments.md, examples/09"""
+    peer: tuple[str, ...] = ()
+    """More estimators that are programs of their own: orbslam3 (GPL-3.0) or basalt (BSD-3), or NAME=PYTHON with the
+    interpreter that has pyorbslam3 or depthai; vislam installs neither; docs/experiments.md"""
     out: Path | None = None
     """Folder for report, tables and manifest; None: results/NAME of the plan"""
     workers: Count = 2

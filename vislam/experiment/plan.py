@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from vislam.config import validated
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
-from vislam.experiment import commands
+from vislam.experiment import commands, peers
 from vislam.experiment.recordings import is_on_disk
 from vislam.run.sources import is_world, split_source
 
@@ -44,7 +44,8 @@ class Sequence:
 class Estimator:
     """One configuration of the pipeline, or a program of somebody else, and which of its trajectories are compared.
 
-    A program is a class (`program`, see `programs`) or a command line (`command`, see `commands`).
+    A program is a class (`program`, see `programs`) or a command line (`command`, see `commands`), which is known of
+    some systems (`peer`, see `peers`).
     """
 
     name: str
@@ -54,6 +55,7 @@ class Estimator:
     program: str = ""  # FILE.py, FILE.py:CLASS or MODULE:CLASS
     options: dict[str, Scalar] = field(default_factory=dict)  # of the program: by name to its class
     command: tuple[str, ...] = ()  # words, with places such as {recording} and {causal}; $VARIABLES are replaced
+    peer: str = ""  # NAME or NAME=PYTHON: the command of a system that vislam knows; empty: none
 
     @property
     def compared(self) -> tuple[Output, ...]:
@@ -101,8 +103,11 @@ class Plan:
         return list(dict.fromkeys(axis.name for axis in self.axes))
 
 
-def plan_text(path: Path, programs: Iterable[str] = ()) -> str:
-    """Return the text of a plan with more estimators, which are programs. Raises UsageError when it cannot be read."""
+def plan_text(path: Path, programs: Iterable[str] = (), known: Iterable[str] = ()) -> str:
+    """Return the text of a plan with more estimators: programs, and known systems by name.
+
+    Raises UsageError when it cannot be read.
+    """
     try:
         text = read_text(path)
     except (OSError, ValueError) as error:
@@ -112,22 +117,32 @@ def plan_text(path: Path, programs: Iterable[str] = ()) -> str:
         where = str(Path(place).resolve()) if place.endswith(".py") else place
         name = f"{Path(place).stem} {cls}".strip()
         text += f"\n[[estimators]]\nname = {json.dumps(name)}\nprogram = {json.dumps(where + colon + cls)}\n"
+    for asked in known:
+        name, equals, python = asked.partition("=")
+        place = os.path.abspath(python) if "/" in python else python  # links stay: they are how an environment is told
+        text += f"\n[[estimators]]\nname = {json.dumps(name)}\npeer = {json.dumps(name + equals + place)}\n"
     return text
 
 
-def load_plan(path: Path, variables: Mapping[str, str] | None = None, programs: Iterable[str] = ()) -> Plan:
+def load_plan(
+    path: Path,
+    variables: Mapping[str, str] | None = None,
+    programs: Iterable[str] = (),
+    known: Iterable[str] = (),
+) -> Plan:
     """Read a plan; sources and programs come back with variables and paths resolved.
 
     Args:
         path: TOML file, see docs/experiments.md.
         variables: values of $NAMES in sources; None: the environment.
         programs: more estimators, see `plan_text`.
+        known: and more of them, which are peers.
 
     Raises:
         UsageError: naming the file, the field, what was asked and what is allowed.
     """
     try:
-        data = tomllib.loads(plan_text(path, programs))
+        data = tomllib.loads(plan_text(path, programs, known))
     except (ValueError, RecursionError) as error:
         raise UsageError(_unreadable(path, error)) from error
     return plan_from_data(data, str(path), path.resolve().parent, os.environ if variables is None else variables)
@@ -139,6 +154,7 @@ def plan_from_data(data: dict[str, Any], where: str, folder: Path, variables: Ma
     plan = validated(Plan, data, where)
     sequences = tuple(_resolved(sequence, where, folder, variables) for sequence in plan.sequences)
     estimators = tuple(_placed(estimator, where, folder, variables) for estimator in plan.estimators)
+    estimators = tuple(_fitting(estimator, sequences, where) for estimator in estimators)
     plan = dataclasses.replace(plan, sequences=sequences, estimators=estimators)
     _check(plan, where)
     return plan
@@ -151,9 +167,35 @@ def _unreadable(path: Path, error: Exception) -> str:
 def _placed(estimator: Estimator, where: str, folder: Path, variables: Mapping[str, str]) -> Estimator:
     """Return an estimator whose program's file has an absolute path, and whose command its variables."""
     command = tuple(_replaced(word, where, variables) for word in estimator.command)
+    if estimator.peer:
+        if command or estimator.program:
+            raise UsageError(f"{where}: estimator '{estimator.name}' is either a peer, a program or a command")
+        name, equals, python = _replaced(estimator.peer, where, variables).partition("=")
+        if "/" in python:
+            python = str(folder / python)
+        try:
+            command = peers.command_of(f"{name}{equals}{python}", variables)
+        except UsageError as error:
+            raise UsageError(f"{where}: estimator '{estimator.name}': {error}") from error
     place, colon, name = estimator.program.partition(":")
     program = f"{folder / place}{colon}{name}" if place.endswith(".py") else estimator.program
     return dataclasses.replace(estimator, program=program, command=command)
+
+
+def _fitting(estimator: Estimator, sequences: Iterable[Sequence], where: str) -> Estimator:
+    """Return a peer, unless told otherwise, with the sequences that it can read; any other estimator as it is."""
+    if not estimator.peer or estimator.sequences:
+        return estimator
+    modes = ("auto", *peers.PEERS[estimator.peer.partition("=")[0]].modes)
+    fitting = tuple(
+        s.name for s in sequences if is_on_disk(s.source) and s.config.get("frontend.mode", "auto") in modes
+    )
+    if not fitting:
+        raise UsageError(
+            f"{where}: estimator '{estimator.name}' can run on none of the sequences: it needs a recording on disk "
+            f"or a rendered world, mode {', '.join(modes)}"
+        )
+    return dataclasses.replace(estimator, sequences=fitting)
 
 
 def _replaced(text: str, where: str, variables: Mapping[str, str]) -> str:

@@ -19,12 +19,13 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core.camera import Rig
-from vislam.core.errors import UsageError, VislamError
+from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
+from vislam.experiment.stated import checked, write_stated
 from vislam.factors.keys import nearest_rigid
 from vislam.frontend import mode_for
 from vislam.run.cost import CostMeter
@@ -58,12 +59,18 @@ class Program(Protocol):
         """Take an inertial sample; all come in the order of time, together with the frames."""
         ...
 
-    def frame(self, frame: Frame) -> Array | None:
-        """Take a frame; return T_world_body [4, 4] at its time as it is known now, None where it is not."""
+    def frame(self, frame: Frame) -> Array | tuple[Array, Array] | None:
+        """Take a frame; return T_world_body [4, 4] at its time as it is known now, None where it is not.
+
+        Or (T_world_body, covariance [6, 6]): of rotation on the body side [rad] and position in world axes [m].
+        """
         ...
 
-    def answer(self) -> Trajectory:
-        """Return the trajectory as it is known after all measurements."""
+    def answer(self) -> Trajectory | tuple[Trajectory, Array]:
+        """Return the trajectory as it is known after all measurements.
+
+        Or (trajectory, covariances [N, 6, 6]), NaN all over where a pose has none.
+        """
         ...
 
 
@@ -163,6 +170,7 @@ class _Run:
         self._t_ns: list[int] = []  # of all frames
         self._known: list[tuple[int, Array]] = []
         self._final: Trajectory | None = None
+        self._stated: dict[str, dict[int, Array]] = {"causal": {}, "final": {}}  # covariances by time
         cls = load(program)
         make: Callable[..., Any] = cls
         try:
@@ -185,9 +193,7 @@ class _Run:
             elif self._setup.imu_noise is not None:
                 self._asked(partial(self._estimator.inertial, value), f"inertial sample at {value.t_ns} ns")
         answer = self._asked(self._estimator.answer, "in the end")
-        if not isinstance(answer, Trajectory):
-            raise ProgramError(f"{self._program}: answer() gave {type(answer).__name__}; a Trajectory is wanted")
-        self._final = answer
+        self._final = self._told(answer)
 
     def write(self, out: Path) -> dict[str, Any]:
         """Write what is known; return the metrics, those of the pipeline that an estimator by others has, too."""
@@ -196,15 +202,26 @@ class _Run:
             write_tum(truth, out / "trajectory_truth.tum")
         if self._known:
             t_ns, T = zip(*self._known, strict=True)
-            write_tum(Trajectory(np.array(t_ns), np.array(T)), out / "trajectory_causal.tum")
+            self._write(out, "causal", Trajectory(np.array(t_ns), np.array(T)))
         if self._final is not None:
-            write_tum(self._final, out / "trajectory_final.tum")
+            self._write(out, "final", self._final)
         return write_metrics(out, self._program, self._setup, self._t_ns, self._cost.entry({}))
+
+    def _write(self, out: Path, name: str, trajectory: Trajectory) -> None:
+        write_tum(trajectory, out / f"trajectory_{name}.tum")
+        if stated := self._stated[name]:
+            known = np.isin(trajectory.t_ns, list(stated))
+            t_ns, poses = trajectory.t_ns[known], trajectory.T_world_body[known]
+            write_stated(out / f"states_{name}.csv", t_ns, poses, [stated[t] for t in t_ns.tolist()])
 
     def _see(self, frame: Frame) -> None:
         where = f"frame {len(self._t_ns)} at {frame.t_ns} ns"
         answered = self._asked(partial(self._estimator.frame, frame), where)
         self._t_ns.append(frame.t_ns)
+        if isinstance(answered, tuple) and len(answered) == 2:
+            answered, given = answered
+            if given is not None:
+                self._stated["causal"][frame.t_ns] = self._covariance(given, where)
         if answered is not None:
             self._known.append((frame.t_ns, self._pose(answered, where)))
         self._cost.count(frame.t_ns, answered is not None)
@@ -215,6 +232,32 @@ class _Run:
             return ask()
         except Exception as error:
             raise ProgramError(f"{self._program}: {where}: {type(error).__name__}: {error}") from error
+
+    def _told(self, answer: Any) -> Trajectory:
+        """Return the trajectory of an answer, and keep the covariances that came with it."""
+        given = None
+        if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Trajectory):
+            answer, given = answer
+        if not isinstance(answer, Trajectory):
+            raise ProgramError(f"{self._program}: answer() gave {type(answer).__name__}; a Trajectory is wanted")
+        if given is None:
+            return answer
+        try:
+            covariances = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ProgramError(f"{self._program}: answer(): {error}; covariances [N, 6, 6] are wanted") from error
+        if len(covariances) != len(answer):
+            raise ProgramError(f"{self._program}: answer() gave {len(answer)} poses and {len(covariances)} covariances")
+        for t_ns, P in zip(answer.t_ns.tolist(), covariances, strict=True):
+            if not np.isnan(P).all():
+                self._stated["final"][t_ns] = self._covariance(P, f"answer(), pose at {t_ns} ns")
+        return answer
+
+    def _covariance(self, given: Any, where: str) -> Array:
+        try:
+            return checked(given, where)
+        except (TypeError, ValueError, DataError) as error:
+            raise ProgramError(f"{self._program}: {where}: {str(error).removeprefix(f'{where}: ')}") from error
 
     def _pose(self, answered: Any, where: str) -> Array:
         try:

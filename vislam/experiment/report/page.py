@@ -50,8 +50,8 @@ _MEASURED = (
     "Cells: median [range] over seeds and ensemble members, from 20 trials on [5 %, 95 %]. Members differ by 1e-9 of "
     "gravity: what they spread is chaos of the estimator, not a property of the data.",
     "Failed trials count as infinitely wrong in errors and their tests, and are left out of time and memory.",
-    "Tests: Wilcoxon signed-rank on the median of each sequence, condition and seed (pairs = 'sequence': over its seeds, "
-    "too), corrected by Holm's method. With n pairs no p value is below 2/2^n.",
+    "Tests: Wilcoxon signed-rank on the median of each sequence, condition and seed (or over its seeds, where the "
+    "plan says so), corrected by Holm's method. With n pairs no p value is below 2/2^n.",
     "Time per frame is that of the whole pipeline, on one thread of the machine that ran the job beside other jobs. "
     "CPU time is that of all threads of the run, reading and decoding included, without compilation.",
 )

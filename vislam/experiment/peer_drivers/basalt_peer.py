@@ -1,23 +1,26 @@
 """Basalt's visual-inertial odometry (in package depthai) over one stereo recording, in a process of its own.
 
+    python basalt_peer.py MODE ROOT OUT.tum WORK PACE "depthai VERSION"    all of it; WORK is a folder to throw away
     DAI_CALIB=CALIBRATION python basalt_peer.py calibrate ROOT
     LD_PRELOAD=shim.so DAI_LIB=libdepthaicore….so DAI_CALIB=CALIBRATION python basalt_peer.py run ROOT OUT.tum PACE
 
 ROOT is a EuRoC folder. The node reads its calibration from a device; basalt_shim.cpp gives it the one that `calibrate`
 wrote. PACE: how many times as fast as it was recorded the recording is played; frames wait for the estimator, none is
-dropped. Basalt closes no loops.
+dropped. Basalt closes no loops. Basalt is BSD-3, depthai MIT.
 """
 
 import os
+import subprocess
 import sys
 import threading
 import time
 from datetime import timedelta
+from pathlib import Path
 
 import cv2
 import depthai
 import numpy as np
-from slam_recording import Euroc, Outcome, image, wait_until
+from slam_recording import Euroc, Outcome, image, require, wait_until
 
 _LEFT, _RIGHT = depthai.CameraBoardSocket.CAM_B, depthai.CameraBoardSocket.CAM_C
 _CM_PER_M = 100.0
@@ -152,9 +155,26 @@ def _rotation(x, y, z, w):
     ])  # fmt: skip
 
 
+def prepared(mode, root, out, work, pace, package):
+    """Compile the shim and write the calibration into a folder; become the process that runs with both."""
+    require(package)
+    if mode != "stereo":
+        sys.exit(f"Basalt does stereo with an IMU only, not {mode}")
+    calibrate(Euroc(root, ["cam0", "cam1"]), f"{work}/calibration.json")
+    shim = str(Path(__file__).with_name("basalt_shim.cpp"))
+    subprocess.run(["g++", "-std=c++17", "-shared", "-fPIC", "-O1", shim, "-o", f"{work}/shim.so", "-ldl"], check=True)
+    library = next(Path(depthai.__file__).parent.glob("depthai.libs/libdepthaicore*.so"), None)
+    if library is None:
+        sys.exit(f"this depthai ({depthai.__file__}) has no libdepthaicore to put the shim before")
+    told = {"DAI_CALIB": f"{work}/calibration.json", "DAI_LIB": library.name, "LD_PRELOAD": f"{work}/shim.so"}
+    os.execve(sys.executable, [sys.executable, __file__, "run", root, out, pace], {**os.environ, **told})
+
+
 def main():
-    """Write the calibration, or run."""
+    """Write the calibration, run, or both."""
     cv2.setNumThreads(1)
+    if sys.argv[1] not in ("calibrate", "run"):
+        prepared(*sys.argv[1:7])
     recording = Euroc(sys.argv[2], ["cam0", "cam1"])
     if sys.argv[1] == "calibrate":
         calibrate(recording, os.environ["DAI_CALIB"])

@@ -1,7 +1,8 @@
 """What the SLAM peers need of a recording, read without vislam so that they do not pay for its imports.
 
 `Euroc` and `TumRgbd` list images, inertial samples and calibration; `Outcome` keeps the poses that a peer published and
-tells what it cost. Used by orbslam3_peer.py and basalt_peer.py, which benchmarks/peers_cost.py runs.
+tells what it cost. Used by orbslam3_peer.py and basalt_peer.py, which `vislam compare --peer` and
+benchmarks/peers_cost.py run in processes of their own, with an interpreter that has the peer.
 """
 
 import csv
@@ -17,6 +18,7 @@ import yaml
 
 FR1_CAMERA = [517.306408, 516.469215, 318.643040, 255.313989], [0.262383, -0.953104, -0.005358, 0.002628, 1.163314]
 FR1_DEPTH_UNITS_PER_M = 5000.0
+_RADTAN = ("radial-tangential", "radtan", "plumb_bob", "none")  # what the peers' pinhole cameras understand
 _PAIRED_S = 0.02  # most between a colour and a depth image
 
 
@@ -34,13 +36,24 @@ class Euroc:
     def __init__(self, root, cameras):
         """List the frames that all of `cameras` ("cam0", "cam1") have."""
         self._mav = Path(root) / "mav0"
+        if not (self._mav / "imu0" / "sensor.yaml").is_file():
+            sys.exit(f"{root} is no EuRoC folder with an IMU: mav0/imu0/sensor.yaml is missing")
+        if missing := [camera for camera in cameras if not (self._mav / camera / "sensor.yaml").is_file()]:
+            sys.exit(f"{root} has no camera {missing[0]}")
         self.sensors = [self._yaml(camera) for camera in cameras]
+        for sensor in self.sensors:
+            if sensor.get("distortion_model", "none") not in _RADTAN:
+                sys.exit(
+                    f"{root}: lenses of model {sensor['distortion_model']} are not for this peer; radial-tangential"
+                )
         self.T_body_cams = [np.array(s["T_BS"]["data"], dtype=float).reshape(4, 4) for s in self.sensors]
         self.imu = self._yaml("imu0")
         images = [self._images(camera) for camera in cameras]
         self.t_ns = sorted(set.intersection(*map(set, images)))
         self.paths = [[each[t_ns] for each in images] for t_ns in self.t_ns]
         rows = self._rows("imu0")
+        if not self.t_ns or not rows:
+            sys.exit(f"{root} has {len(self.t_ns)} frames that all cameras have, and {len(rows)} inertial samples")
         self.imu_t_ns = np.array([int(row[0]) for row in rows])
         self.imu_values = np.array([[float(value) for value in row[1:7]] for row in rows])  # gyro, accelerometer [N, 6]
 
@@ -61,6 +74,8 @@ class TumRgbd:
 
     def __init__(self, root):
         """List the colour images with a depth image within 20 ms."""
+        if not (Path(root) / "depth.txt").is_file():
+            sys.exit(f"{root} is no TUM RGB-D folder: depth.txt is missing")
         colour, depth = self._list(Path(root), "rgb.txt"), self._list(Path(root), "depth.txt")
         stamps_s = np.array([t_ns * 1e-9 for t_ns, _ in depth])
         self.t_ns, self.paths = [], []
@@ -73,6 +88,13 @@ class TumRgbd:
     def _list(self, root, name):
         rows = [line.split() for line in (root / name).read_text().splitlines() if line and not line.startswith("#")]
         return [(int(row[0].replace(".", "").ljust(19, "0")), root / row[1]) for row in rows]
+
+
+def require(words):
+    """End the process when a package has another version than "NAME VERSION" says: it is part of what a result is."""
+    name, wanted = words.split()
+    if version(name) != wanted:
+        sys.exit(f"{name} {version(name)} is installed here, {wanted} was asked for")
 
 
 def wait_until(t_ns, first_ns, begun_s, pace):
@@ -89,24 +111,29 @@ class Outcome:
         """`t_ns`: of all frames that the peer is given."""
         self._versions = {package: version(package)}
         self._first_ns, self._frames = t_ns[0], len(t_ns)
-        self._rows, self._first = [], (None, None)
+        self.rows, self._first = [], (None, None)
 
     def add(self, t_ns, T_world_body, cpu_s=None):
         """Take a published pose [4, 4]; `cpu_s` is what this process had used when it came, by default until now."""
-        if not self._rows:
+        if not self.rows:
             self._first = (t_ns - self._first_ns) * 1e-9, time.process_time() if cpu_s is None else cpu_s
-        self._rows.append((t_ns, T_world_body))
+        self.rows.append((t_ns, T_world_body))
 
     def tell(self, out):
         """Write the trajectory to `out` and print the rest as a line of JSON."""
-        with Path(out).open("w") as file:
-            for t_ns, T in self._rows:
-                seconds, rest = divmod(t_ns, 10**9)
-                numbers = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *_quaternion_xyzw(T[:3, :3])))
-                file.write(f"{seconds}.{rest:09d} {numbers}\n")
-        told = {"versions": self._versions, "frames": self._frames, "poses": len(self._rows)}
+        write_tum(out, self.rows)
+        told = {"versions": self._versions, "frames": self._frames, "poses": len(self.rows)}
         print(json.dumps(told | {"first_pose_s": self._first[0], "first_pose_cpu_s": self._first[1]}))
         sys.stdout.flush()
+
+
+def write_tum(out, rows):
+    """Write (t_ns, T_world_body [4, 4]) as a TUM file."""
+    with Path(out).open("w") as file:
+        for t_ns, T in rows:
+            seconds, rest = divmod(t_ns, 10**9)
+            numbers = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *_quaternion_xyzw(T[:3, :3])))
+            file.write(f"{seconds}.{rest:09d} {numbers}\n")
 
 
 def _quaternion_xyzw(R):
