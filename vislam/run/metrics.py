@@ -90,9 +90,7 @@ def sensors_entry(
     And what became of their readings: all that came, and where each is in the filter and in the graph.
     """
     out = {}
-    for name, entry in told.items():
-        found = None if graph is None or not entry["variables"] else graph.own(name)
-        by_graph = {} if found is None else {"graph": {"values": found[0].tolist(), "sigmas": found[1].tolist()}}
+    for name, entry in with_own_of_graph(told, graph).items():
         queued, since = int(entry.get("queued", 0)), int(entry.get("since_keyframe", 0))
         came = counters.get(f"sensor {name}", {})
         both = {end: came.get(end, 0) for end in _BEFORE} | {"queued": queued}
@@ -102,8 +100,19 @@ def sensors_entry(
             "graph": both | _in_graph(came, {} if graph is None else graph.sensed(name), since),
         }
         told_here = {key: value for key, value in entry.items() if key not in {"queued", "since_keyframe"}}
-        out[name] = {**told_here, **by_graph, "readings": readings}
+        out[name] = {**told_here, "readings": readings}
     return out
+
+
+def with_own_of_graph(sensors: dict[str, dict[str, Any]], graph: FinalGraph | None) -> dict[str, dict[str, Any]]:
+    """Return entries of sensors with their own variables as a graph has them now."""
+    found = {name: graph.own(name) for name, entry in sensors.items() if graph is not None and entry["variables"]}
+    return {
+        name: entry if (own := found.get(name)) is None else entry | {
+            "graph": {"values": own[0].tolist(), "sigmas": own[1].tolist()}
+        }
+        for name, entry in sensors.items()
+    }  # fmt: skip
 
 
 def _in_filter(name: str, came: dict[str, int], ekf: dict[str, int]) -> dict[str, int]:

@@ -23,7 +23,7 @@ from vislam.loop.table import read_loops
 from vislam.run.folder import RunLog, read_metrics, recorded_alignment
 from vislam.run.further_sensors import suite_of
 from vislam.run.geodetic_outputs import LINES, TABLES, GeodeticOutputs
-from vislam.run.metrics import sensors_entry
+from vislam.run.metrics import with_own_of_graph
 from vislam.run.session import Session, SessionWriter, recall
 from vislam.trajectory import evaluate, read_tum, write_states_csv, write_tum
 
@@ -162,7 +162,7 @@ def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any]) -> l
     metrics = read_metrics(run)
     if metrics:
         metrics |= {"loops": counts, "loops_changed": answer}
-        metrics["sensors"] = sensors_entry(metrics.get("sensors", {}), graph)
+        metrics["sensors"] = with_own_of_graph(metrics.get("sensors", {}), graph)
         estimates = {"filter": log.odometry_trajectory(), "graph": final}
         if GeodeticOutputs({}).write(run, metrics["sensors"], estimates) is not None:
             written += [TABLES["graph"], LINES]
