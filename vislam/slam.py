@@ -20,6 +20,7 @@ from vislam.core.readings import Reading
 from vislam.pipeline.back import Back, KeyframeIntake
 from vislam.pipeline.front import Front
 from vislam.pipeline.in_map import InMap
+from vislam.pipeline.silence import SilentCamera
 from vislam.pipeline.steps import Finish, Step
 from vislam.sensors import Suite
 
@@ -34,6 +35,7 @@ class Slam:
         self._intake = KeyframeIntake(rig, self.front, self.clock, suite)
         self._in_map = InMap(config.publish)
         self._frames: deque[Frame] = deque()
+        self._silence = SilentCamera() if suite is not None and len(suite) and noise is not None else None
 
     @property
     def back(self) -> Back | None:
@@ -71,12 +73,16 @@ class Slam:
     def feed(self, value: ImuSample | MagSample | Reading | Frame) -> list[Step]:
         """Take one measurement; return a step for every frame that could be processed with it.
 
-        A frame waits until one inertial sample newer than it has come, so that its span ends exactly at its time.
+        A frame waits until one inertial sample newer than it has come, so that its span ends exactly at its time. With
+        further sensors, a camera that is silent for long is taken for a covered one: there are steps of dark frames.
         """
         if isinstance(value, Frame):
             self._frames.append(value)
+            if self._silence is not None:
+                self._silence.see(value)
         else:
             self.front.add(value)
+            self._go_on_without_images(value)
         steps = []
         while self._frames and self.front.is_ready(self._frames[0].t_ns, self._frames[-1].t_ns):
             steps.append(self._step(self._frames.popleft()))
@@ -87,6 +93,13 @@ class Slam:
         steps = [self._step(self._frames.popleft()) for _ in range(len(self._frames))]
         keyframes = self._intake.add(self.front.give_up_waiting())
         return Finish(steps, keyframes, *self._intake.finish())
+
+    def _go_on_without_images(self, value: ImuSample | MagSample | Reading) -> None:
+        if self._silence is None or not isinstance(value, ImuSample) or self.front.initialisation is None:
+            return
+        stand_in = self._silence.stand_in(value.t_ns)
+        if stand_in is not None:
+            self._frames.append(stand_in)
 
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)

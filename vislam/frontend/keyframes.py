@@ -97,8 +97,8 @@ class KeyframeLife:
         return -1 if self.keyframe is None else self.keyframe.id
 
     def begin_at(self, keyframe_id: int, seeks_place: bool) -> None:
-        """Number the first keyframe; see FrontEnd.begin_at."""
-        self._first_id = keyframe_id
+        """Number the first keyframe, which the next one is; see FrontEnd.begin_at."""
+        self.keyframe, self._first_id = None, keyframe_id
         if seeks_place:
             self._since_restart = 0
 

@@ -18,7 +18,6 @@ from vislam.core.messages import (
     GraphUpdate,
     ImuSample,
     ImuSpan,
-    Keyframe,
     KeyframePacket,
     MagSample,
     NavState,
@@ -53,6 +52,7 @@ from vislam.pipeline.gravity import GravityWait, Released
 from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.pipeline.settings import derived, refuse_without_scale
 from vislam.pipeline.steps import Estimate, FrontStep
+from vislam.pipeline.waypoints import Waypoints, surer_gyro_bias, unseen_keyframe
 from vislam.sensors import Suite
 from vislam.trajectory.continuity import in_odom
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
@@ -109,6 +109,7 @@ class Front:
                 suite, self._filter, buffer, config.imu.gravity_m_s2,
                 0.0 if noise is None else noise.accel_noise_density,
             )  # fmt: skip
+        self._waypoints = Waypoints()
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
         self._graph_state: NavState | None = None  # at the newest keyframe that the graph has told of
@@ -222,7 +223,7 @@ class Front:
         before = None if self._filter is None else self._filter.state
         with self._clock.measure("track"):
             track = self.frontend.track(frame, *self._without_bias(span, before), self._predicted(frame.t_ns, before))
-            track = self._linked(frame, track)
+            track = self._with_waypoint(frame, self._linked(frame, track))
             track = replace(track, vo=self.camera_clock.loosened(track.vo, span, before))
         self._track_noise.add(track.sigma_px, track.observations)
         still_image = self._has_imu and self._stillness.add(frame.t_ns, track.observations)
@@ -335,14 +336,25 @@ class Front:
         memory, self._resumed = self._resumed, None
         if memory is not None and track.keyframe is None:  # too little to see there for a start: a lost keyframe
             self.frontend.begin_at(memory.keyframe_id + 1, memory.news)
-            bare = np.empty((0, 2)), np.empty((0, 32), np.uint8)
-            keyframe = Keyframe(memory.keyframe_id, frame.t_ns, frame, *bare, None)
             vo = identity_motion(frame.t_ns, memory.keyframe_id, track.vo.has_scale, 0)
-            return replace(track, keyframe=keyframe, vo=vo)
+            return replace(track, keyframe=unseen_keyframe(memory.keyframe_id, frame), vo=vo)
         is_alone = track.keyframe is not None and track.vo.keyframe_id == track.keyframe.id
         if memory is None and is_alone and self._keyframe_id >= 0:
             return replace(track, vo=lost_motion(frame.t_ns, self._keyframe_id, track.vo.has_scale))
         return track
+
+    def _with_waypoint(self, frame: Frame, track: TrackResult) -> TrackResult:
+        """Return the track, as that of a keyframe where vision gives none for long and the filter knows the way."""
+        state = None if self._filter is None or self._gravity.holds_keyframes else self._filter.ekf.state_at(frame.t_ns)
+        if self._readings is None or state is None or not self._waypoints.wants(track.vo, track.keyframe is not None):
+            return track
+        variance_m2 = float(np.trace(state.covariance[3:6, 3:6]))
+        if not self._bridged(frame.t_ns, self._buffer.span(self._keyframe_t_ns, frame.t_ns), variance_m2):
+            return track
+        self.counters["waypoints"] = self.counters.get("waypoints", 0) + 1
+        keyframe = unseen_keyframe(self._keyframe_id + 1, frame)
+        self.frontend.begin_at(keyframe.id + 1, FrontNews(self.frontend.news.next_track_id), seeks_place=True)
+        return replace(track, keyframe=keyframe, vo=lost_motion(frame.t_ns, self._keyframe_id, track.vo.has_scale))
 
     def _span(self, from_t_ns: int | None, to_t_ns: int) -> ImuSpan | None:
         if not self._has_imu or from_t_ns is None:
@@ -434,27 +446,14 @@ class Front:
         if state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
         # a correction may enter with a later sample only, so what the filter was told is no measure of it
-        gyro_bias, sigma_rad_s = self._gyro_bias(last)
+        walk = 0.0 if self.noise is None else self.noise.gyro_bias_walk
+        gyro_bias, sigma_rad_s = surer_gyro_bias(last, self._graph_state, walk)
         turning = replace(last, gyro_bias_rad_s=gyro_bias)
         before = pose_after(turning, span, self.config.imu.gravity_m_s2)
         way_m = float(np.linalg.norm(before[:3, 3] - last.T_world_body[:3, 3]))
         if at_rest and way_m < _SWAY_M_S * (int(span.t_ns[-1]) - int(span.t_ns[0])) * 1e-9:
             before = last.T_world_body
         return Estimate(before, after, sigma_rad_s), state
-
-    def _gyro_bias(self, state: NavState) -> tuple[Array, float]:
-        """Return the gyroscope's bias [3] and its largest sigma, of the filter or of the graph: whoever is surer.
-
-        For what is published only: the graph has seen the same images longer, and the filter stays what it is alone.
-        """
-        graph, sigma_rad_s = self._graph_state, float(np.sqrt(np.diag(state.covariance)[9:12].max()))
-        if graph is None or self.noise is None:
-            return state.gyro_bias_rad_s, sigma_rad_s
-        walked = self.noise.gyro_bias_walk**2 * max(state.t_ns - graph.t_ns, 0) * 1e-9
-        graph_rad_s = float(np.sqrt(np.diag(graph.covariance)[9:12].max() + walked))
-        if graph_rad_s < sigma_rad_s:
-            return graph.gyro_bias_rad_s, graph_rad_s
-        return state.gyro_bias_rad_s, sigma_rad_s
 
     def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:
         """Return the pose in `odom`, where it is to be continuous without the jumps of corrections."""

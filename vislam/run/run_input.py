@@ -10,6 +10,7 @@ from vislam.core.memory import FrontMemory
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.core.recording import Recording
+from vislam.pipeline.silence import dark
 from vislam.run.further_sensors import FurtherReadings
 from vislam.sensors import Suite
 
@@ -43,10 +44,13 @@ class RunInput:
             return
         begin_ns = front.camera_t_ns
         samples_ns = min(begin_ns, front.t_ns) - _INERTIAL_BEFORE_NS
-        begun = False
+        begun, stand_in = False, self._stand_in(begin_ns)
         for value in self._events(begin_ns):
             if value.t_ns < (begin_ns if isinstance(value, Frame) else samples_ns):
                 continue
+            if stand_in is not None and value.t_ns > begin_ns:
+                yield stand_in
+                begun, stand_in = True, None
             if isinstance(value, Frame) and not begun:
                 if value.t_ns != begin_ns:
                     raise DataError(
@@ -55,6 +59,14 @@ class RunInput:
                     )
                 begun = True
             yield value
+
+    def _stand_in(self, begin_ns: int) -> Frame | None:
+        """Return the dark frame that the last keyframe was, where the camera was silent, see `SilentCamera`."""
+        if self._further is None:
+            return None
+        frames = (value for value in self._recording.events(begin_ns) if isinstance(value, Frame))
+        first = next((frame for frame in frames if frame.t_ns >= begin_ns), None)
+        return None if first is None or first.t_ns == begin_ns else dark(first, begin_ns)
 
     def _events(self, from_ns: int | None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
         events = self._recording.events() if from_ns is None else self._recording.events(from_ns)
