@@ -53,4 +53,6 @@ def test_a_system_without_solution_is_a_data_error():
 def test_covariances_that_gtsam_cannot_give_are_nan():
     values = gtsam.Values()
     values.insert(X(0), gtsam.Pose3())
-    assert np.isnan(adjust.covariances(gtsam.NonlinearFactorGraph(), values, 1, False)).all()
+    marginals = adjust.marginals_at(gtsam.NonlinearFactorGraph(), values)
+    assert np.isnan(adjust.covariances(marginals, values, 1, False)).all()
+    assert adjust.variances(marginals, [X(0)]) is None

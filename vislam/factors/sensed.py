@@ -178,11 +178,16 @@ class Readings:
             own = self._guesses(entry, values)
             guesses |= {key: guess for key, guess, new in zip(entry.keys, own, entry.new, strict=True) if new}
             factors += _ties(entry, self._begun.get(entry.sensor), self._suite[entry.sensor].variables)
-            place = _Place(T_earlier, T_later, np.array(own))
-            if entry.linear is None or entry.place is None or entry.place.left_by(place, self._config) > 1.0:
-                entry.linear = self._linearised(entry, place)
-            named[_label(entry)] = entry.linear
+            named[_label(entry)] = self._linear(entry, _Place(T_earlier, T_later, np.array(own)))
         return replace(step, factors=factors, named=named, own=guesses)
+
+    def factors(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
+        """Return all factors at an estimate that has all keys; see `complete`."""
+        out: list[gtsam.NonlinearFactor] = []
+        for entry in self._entries:
+            out += _ties(entry, self._begun.get(entry.sensor), self._suite[entry.sensor].variables)
+            out.append(self._linear(entry, self._place(entry, values)))
+        return out
 
     def refreshed(self, values: gtsam.Values) -> dict[Label, gtsam.NonlinearFactor]:
         """Return new factors for a few of those whose estimate has moved on, those for which it has most."""
@@ -281,6 +286,12 @@ class Readings:
             else:
                 begun.constant.add(n)
         return entry
+
+    def _linear(self, entry: _Entry, place: _Place) -> gtsam.NonlinearFactor:
+        """Return the factor of an entry, at a place or so near to it that it makes no difference."""
+        if entry.linear is None or entry.place is None or entry.place.left_by(place, self._config) > 1.0:
+            entry.linear = self._linearised(entry, place)
+        return entry.linear
 
     def _linearised(self, entry: _Entry, place: _Place) -> gtsam.NonlinearFactor:
         """Return the factor of an entry at a place."""

@@ -113,14 +113,30 @@ def solve(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, states: list[
     raise DataError(f"the run cannot be optimised: {'; '.join(notes)}; its own trajectory stays as it is")
 
 
+def marginals_at(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | None:
+    """Return what marginal covariances come from; None where gtsam gives none."""
+    try:
+        return gtsam.Marginals(graph, values)
+    except FAILURES:
+        return None
+
+
+def variances(marginals: gtsam.Marginals | None, keys: list[int]) -> Array | None:
+    """Return the variances of variables of one number as a diagonal matrix; None where gtsam gives none."""
+    if marginals is None:
+        return None
+    try:
+        return np.diag([float(np.asarray(marginals.marginalCovariance(key))[0, 0]) for key in keys])
+    except FAILURES:
+        return None
+
+
 def covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int, has_imu: bool
+    marginals: gtsam.Marginals | None, values: gtsam.Values, count: int, has_imu: bool
 ) -> NDArray[np.float64]:
     """Return the marginal covariances [K, 15, 15] in NavState's order and axes; NaN where gtsam gives none."""
     out = np.full((count, 15, 15), np.nan)
-    try:
-        marginals = gtsam.Marginals(graph, values)
-    except FAILURES:
+    if marginals is None:
         return out
     for k in range(count):
         R = values.atPose3(X(k)).rotation().matrix()

@@ -1,7 +1,8 @@
 """A finished run estimated again, all at once: visual-inertial bundle adjustment over its factor log.
 
 Poses, velocities and biases of all keyframes, and the points that their tracks saw, under projection, depth, inertial,
-rest and loop factors. Loops are chosen first, as of pose-graph files (`graph_auto`); tracks are judged between rounds.
+rest and loop factors, and those of further sensors with their own variables. Loops are chosen first, as of pose-graph
+files (`graph_auto`); tracks are judged between rounds.
 """
 
 from __future__ import annotations
@@ -11,7 +12,16 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from vislam.batch.bundle.adjust import L, Solution, VisualNoise, covariances, solve, visual_factors
+from vislam.batch.bundle.adjust import (
+    L,
+    Solution,
+    VisualNoise,
+    covariances,
+    marginals_at,
+    solve,
+    variances,
+    visual_factors,
+)
 from vislam.batch.bundle.chain import Chain
 from vislam.batch.bundle.loops import Loops, LoopVerdict
 from vislam.batch.bundle.rays import Mask, Tracks, collect, residuals, triangulate
@@ -22,6 +32,8 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Array, NavState
 from vislam.factors.factor_log import FactorLog
 from vislam.factors.keys import B, V, X, nearest_rigid
+from vislam.factors.sensed import Readings
+from vislam.sensors import Suite
 
 _MEDIAN_CHI2_2, _MEDIAN_CHI2_1 = 1.386, 0.455  # medians of chi-square with two degrees of freedom and with one
 _GLOBAL_S = 0.004  # a shorter readout than this counts as a global shutter: one that has none came out at 3.5 ms
@@ -46,28 +58,36 @@ class BatchResult:
     readout_s: float  # of a rolling shutter; 0: global
     loops: list[LoopVerdict]
     tied_by_odometry: list[int]  # keyframes that saw too few landmarks
+    own: dict[str, tuple[Array, Array]]  # own variables of further sensors [V] and their sigmas [V], NaN if not known
+    readings: dict[str, dict[str, int]]  # of further sensors, what became of them; see `Readings.counts_of`
     note: str  # what was out of the ordinary
 
 
-def optimize_run(log: FactorLog, config: Config) -> BatchResult:
-    """Estimate a run anew from its factor log; deterministic.
+def optimize_run(log: FactorLog, config: Config, suite: Suite | None = None) -> BatchResult:
+    """Estimate a run anew from its factor log; deterministic. Readings of the sensors in `suite` are factors, too.
 
     Raises DataError when the log cannot be used or no solver finds a solution.
     """
-    return _Batch(log, config).run()
+    return _Batch(log, config, Suite() if suite is None else suite).run()
 
 
 class _Batch:
     """The state of one optimisation: current values, and which measurements still count."""
 
-    def __init__(self, log: FactorLog, config: Config) -> None:
+    def __init__(self, log: FactorLog, config: Config, suite: Suite) -> None:
         self._log = log
+        self._suite = suite
         self._config: BatchConfig = config.batch
         self._chain = Chain(log, config.graph)
         self._T_body_cam0 = log.rig.T_body_cams[0]
         self._loops = Loops(log.edges, self._chain, config.graph, self._T_body_cam0[:3, 3])
+        self._readings = Readings(suite, config.graph)
+        for record, keyframe in zip(self._chain.records, log.keyframes, strict=True):
+            self._readings.append(record, keyframe.packet.readings)
+        self._own_keys = self._readings.keys_of(range(len(self._chain.records)))
         self._tracks = collect(log, config.frontend)
         self._values = self._chain.initial()
+        self._readings.complete(self._values)
         self._points: Array = np.zeros((self._tracks.points, 3))
         self._keep: Mask = np.zeros(len(self._tracks), dtype=bool)
         self._with_depth: Mask = np.isfinite(self._tracks.rho)
@@ -158,6 +178,7 @@ class _Batch:
         factors, self._tied = self._chain.factors(self._values, seen, config.min_seen)
         factors += visual_factors(tracks, keep, self._with_depth, self._T_body_cam0, noise)
         factors += self._loops.factors(self._poses())
+        factors += self._readings.factors(self._values)
         graph, values, states = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
         for factor in factors:
             graph.add(factor)
@@ -168,6 +189,9 @@ class _Batch:
                 values.insert(V(k), self._values.atVector(V(k)))
                 values.insert(B(k), self._values.atConstantBias(B(k)))
                 states += [V(k), B(k)]
+        for key in self._own_keys:
+            values.insert(key, self._values.atDouble(key))
+        states += self._own_keys
         for j in np.unique(tracks.point[keep]).tolist():
             values.insert(L(j), self._points[j])
         solution = solve(graph, values, states, config.iterations)
@@ -221,9 +245,12 @@ class _Batch:
         tracks, keep = self._tracks, self._keep
         poses = self._poses()
         usable = np.isfinite(tracks.rho)
+        marginals = marginals_at(self._graph, self._values) if self._config.covariances else None
+        names = self._suite.names
+        own = {name: self._readings.own(name, self._values, lambda keys: variances(marginals, keys)) for name in names}
         return BatchResult(
             T_map_body=poses,
-            states=self._states(poses),
+            states=self._states(poses, marginals),
             cost_before=self._cost_at(start),
             cost_after=solution.cost_after,
             iterations=self._iterations,
@@ -236,6 +263,8 @@ class _Batch:
             readout_s=self._applied_readout_s,
             loops=[self._loops.verdicts[i] for i in sorted(self._loops.verdicts)],
             tied_by_odometry=self._tied,
+            own={name: found for name, found in own.items() if found is not None},
+            readings={name: self._readings.counts_of(name, self._values) for name in names},
             note="; ".join(self._notes),
         )
 
@@ -245,15 +274,15 @@ class _Batch:
         poses = np.array([start.atPose3(X(k)).matrix() for k in range(count)])
         placed = triangulate(tracks, self._keep, poses @ self._T_body_cam0, self._sigma_px)
         values = gtsam.Values(start)
+        for key in self._own_keys:  # the run's own are not in its log
+            values.update(key, self._values.atDouble(key))
         for j in np.unique(tracks.point[self._keep]).tolist():
             values.insert(L(j), placed.points_m[j])
         return float(self._graph.error(values))
 
-    def _states(self, poses: Array) -> list[NavState]:
+    def _states(self, poses: Array, marginals: gtsam.Marginals | None) -> list[NavState]:
         count, has_imu = len(poses), self._chain.has_imu
-        known = np.full((count, 15, 15), np.nan)
-        if self._config.covariances:
-            known = covariances(self._graph, self._values, count, has_imu)
+        known = covariances(marginals, self._values, count, has_imu)
         states = []
         for k, record in enumerate(self._chain.records):
             velocity = gyro = accel = np.full(3, np.nan)

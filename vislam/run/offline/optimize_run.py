@@ -18,11 +18,13 @@ from vislam.core.files import write_json
 from vislam.core.messages import NavState
 from vislam.factors.factor_log import FactorLog
 from vislam.run.folder import read_metrics, recorded_alignment
+from vislam.run.further_sensors import suite_of
 from vislam.run.session import Session
+from vislam.sensors import Suite
 from vislam.trajectory import Alignment, Trajectory, evaluate, read_tum, write_states_csv, write_tum
 
 _TAKEN = ("ekf", "live", "graph", "truth")  # names of trajectories that the run itself wrote
-_SECTIONS = ("frontend", "graph", "imu")  # of the run's settings that batch goes by
+_SECTIONS = ("frontend", "graph", "imu", "sensors")  # of the run's settings that batch goes by
 
 
 def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, Any]:
@@ -34,10 +36,12 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     _check(run, name)
     start = time.perf_counter()
     log, settings = _read(run, config)
-    result = optimize_run(log, settings)
+    suite, problems = _suite(settings, log)
+    result = optimize_run(log, settings, suite)
     trajectory = _placed(log, result.states, settings.imu.max_gap_s)
     metrics = read_metrics(run)
-    entry = _entry(result, log, trajectory)
+    entry = _entry(result, log, trajectory, problems)
+    entry["sensors"] = _sensors(result, suite)
     alignment = recorded_alignment(metrics)  # so that the batch's errors stand beside the run's
     accuracy = _accuracy(run, trajectory, log, alignment, entry["warnings"])
     entry |= {"accuracy": accuracy, "wall_s": time.perf_counter() - start, "config": asdict(config)}
@@ -87,12 +91,35 @@ def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config]:
         raise DataError(f"{error}; the settings stored with the run are damaged, run the recording again") from error
 
 
-def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory) -> dict[str, Any]:
+def _suite(settings: Config, log: FactorLog) -> tuple[Suite | None, list[str]]:
+    """Return the further sensors of the run, and why some of their readings are left out."""
+    suite, why = None, "the run was told no file of them"
+    try:
+        suite = suite_of(settings.sensors)
+    except UsageError as error:
+        why = str(error)
+    known = () if suite is None else suite.names
+    told = {placed.reading.sensor for k in log.keyframes for placed in k.packet.readings}
+    left_out = sorted(told.difference(known))
+    return suite, [f"the batch goes without the readings of {', '.join(left_out)}: {why}"] if left_out else []
+
+
+def _sensors(result: BatchResult, suite: Suite | None) -> dict[str, Any]:
+    """Return own variables and what became of readings, by sensor."""
+    out: dict[str, Any] = {}
+    for name, readings in result.readings.items():
+        assert suite is not None
+        out[name] = {"variables": [variable.name for variable in suite[name].variables], "readings": readings}
+        if (own := result.own.get(name)) is not None:
+            out[name] |= {"values": own[0].tolist(), "sigmas": own[1].tolist()}
+    return out
+
+
+def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory, problems: list[str]) -> dict[str, Any]:
     refused = [verdict for verdict in result.loops if verdict.in_run and not verdict.kept]
     admitted = [verdict for verdict in result.loops if verdict.kept and not verdict.in_run]
     warnings = [result.note] if result.note else []
-    if names := sorted({placed.reading.sensor for k in log.keyframes for placed in k.packet.readings}):
-        warnings.append(f"the batch does not take readings of {', '.join(names)}: it goes by vision, IMU and loops")
+    warnings += problems
     for verdict in refused:
         warnings.append(f"loop {verdict.from_id}-{verdict.to_id}, which the run had accepted: {verdict.reason}")
     return {

@@ -1,0 +1,89 @@
+"""Readings of further sensors in `vislam optimize RUN`: what they add, what is told of them, and without their file."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vislam.cli import run_verb
+from vislam.config import BatchConfig
+from vislam.run.offline.optimize_run import optimize
+from vislam.sensors.toml import load_sensor_setup
+
+SOURCE = "points:workshop-cart,rig=stereo,duration_s=16,camera_hz=10,tracks=100"
+SENSORS = """
+[sensors.gnss]
+kind = "position"
+sigma_m = 0.02
+sigma_up_m = 0.05
+lever_sigma_m = 0.3
+simulated_hz = 5.0
+[sensors.height]
+kind = "height"
+simulated_hz = 2.0
+"""
+OWN = BatchConfig()
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("driven")
+    (folder / "cart.toml").write_text(SENSORS)
+    told = ["--sensors.file", str(folder / "cart.toml"), "--map.no-enabled", "--view.no-enabled"]
+    assert run_verb(["run", SOURCE, "--out", str(folder / "run"), *told]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def entry(driven: Path) -> dict[str, Any]:
+    return optimize(driven / "run", OWN)
+
+
+def test_readings_are_factors_and_own_variables_are_found(driven: Path, entry: dict[str, Any]) -> None:
+    setup = load_sensor_setup(driven / "cart.toml")
+    assert not [warning for warning in entry["warnings"] if "readings" in warning]
+    for number, name in enumerate(setup.simulated_hz):  # own variables are drawn with the run's seed, 0
+        found, variables = entry["sensors"][name], setup.suite[name].variables
+        counts = found["readings"]
+        assert counts["used"] > 20 and counts["failed"] == counts["early"] == 0
+        assert counts["outliers"] < 0.1 * counts["used"]
+        assert found["variables"] == [variable.name for variable in variables]
+        draws = np.random.default_rng([0, number]).normal(size=len(variables))
+        for variable, draw, value, sigma in zip(variables, draws, found["values"], found["sigmas"], strict=True):
+            assert 0.0 < sigma < variable.sigma
+            if variable.of_machine:  # the rest hangs on where the estimate's world is
+                print(name, variable.name, value, sigma, variable.start + variable.sigma * draw)
+                assert abs(value - variable.start - variable.sigma * draw) < 4.0 * sigma
+
+
+def test_without_their_file_the_batch_says_so_and_goes_by_the_rest(
+    driven: Path, entry: dict[str, Any], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(driven / "run", run)
+    config = driven / "cart.toml"
+    aside = config.rename(config.with_suffix(".aside"))
+    try:
+        without = optimize(run, OWN)
+    finally:
+        aside.rename(config)
+    assert [w for w in without["warnings"] if "goes without the readings of gnss, height" in w and "cart.toml" in w]
+    assert without["sensors"] == {}
+    rmse_m = [found["accuracy"]["se3"]["ate_rmse_m"] for found in (entry, without)]
+    print("ATE with and without [m]:", rmse_m)
+    assert rmse_m[0] < rmse_m[1] + 0.003
+    assert rmse_m[0] != rmse_m[1]
+
+
+def test_two_batches_give_identical_bytes(driven: Path, entry: dict[str, Any]) -> None:
+    optimize(driven / "run", OWN, "again")
+    for name in ("trajectory_{}.tum", "states_{}.csv"):
+        first, second = ((driven / "run" / name.format(which)).read_bytes() for which in ("batch", "again"))
+        assert first == second
+    again = json.loads((driven / "run" / "metrics.json").read_text())["batch"]["again"]
+    assert again["sensors"] == entry["sensors"]
