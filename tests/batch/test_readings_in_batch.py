@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vislam.cli import run_verb
 from vislam.config import BatchConfig
 from vislam.run.offline.optimize_run import optimize
 from vislam.sensors.toml import load_sensor_setup
+from worlds.sensed_drive import drive
 
-SOURCE = "points:workshop-cart,rig=stereo,duration_s=16,camera_hz=10,tracks=100"
 SENSORS = """
 [sensors.gnss]
 kind = "position"
@@ -27,21 +26,17 @@ simulated_hz = 5.0
 kind = "height"
 simulated_hz = 2.0
 """
-OWN = BatchConfig()
+CONFIG = BatchConfig()
 
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("driven")
-    (folder / "cart.toml").write_text(SENSORS)
-    told = ["--sensors.file", str(folder / "cart.toml"), "--map.no-enabled", "--view.no-enabled"]
-    assert run_verb(["run", SOURCE, "--out", str(folder / "run"), *told]) == 0
-    return folder
+    return drive(tmp_path_factory.mktemp("driven"), SENSORS)
 
 
 @pytest.fixture(scope="module")
 def entry(driven: Path) -> dict[str, Any]:
-    return optimize(driven / "run", OWN)
+    return optimize(driven / "run", CONFIG)
 
 
 def test_readings_are_factors_and_own_variables_are_found(driven: Path, entry: dict[str, Any]) -> None:
@@ -69,7 +64,7 @@ def test_without_their_file_the_batch_says_so_and_goes_by_the_rest(
     config = driven / "cart.toml"
     aside = config.rename(config.with_suffix(".aside"))
     try:
-        without = optimize(run, OWN)
+        without = optimize(run, CONFIG)
     finally:
         aside.rename(config)
     assert [w for w in without["warnings"] if "goes without the readings of gnss, height" in w and "cart.toml" in w]
@@ -81,7 +76,7 @@ def test_without_their_file_the_batch_says_so_and_goes_by_the_rest(
 
 
 def test_two_batches_give_identical_bytes(driven: Path, entry: dict[str, Any]) -> None:
-    optimize(driven / "run", OWN, "again")
+    optimize(driven / "run", CONFIG, "again")
     for name in ("trajectory_{}.tum", "states_{}.csv"):
         first, second = ((driven / "run" / name.format(which)).read_bytes() for which in ("batch", "again"))
         assert first == second

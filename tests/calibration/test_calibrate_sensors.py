@@ -12,9 +12,8 @@ from vislam.cli import run_verb
 from vislam.core.errors import UsageError
 from vislam.sensors.toml import load_sensor_setup
 from worlds.calibration import refusal
+from worlds.sensed_drive import drive
 
-SOURCE = "points:workshop-cart,rig=stereo,duration_s=16,camera_hz=10,tracks=100"
-QUIET = ["--map.no-enabled", "--view.no-enabled"]
 SENSORS = """
 [sensors.wheels]
 kind = "wheels"
@@ -33,11 +32,7 @@ simulated_hz = 2.0
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("driven")
-    file = folder / "cart.toml"
-    file.write_text(SENSORS)
-    assert run_verb(["run", SOURCE, "--out", str(folder / "run"), "--sensors.file", str(file), *QUIET]) == 0
-    return folder
+    return drive(tmp_path_factory.mktemp("driven"), SENSORS)
 
 
 @pytest.fixture(scope="module")

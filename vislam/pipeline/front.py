@@ -345,11 +345,12 @@ class Front:
 
     def _with_waypoint(self, frame: Frame, track: TrackResult) -> TrackResult:
         """Return the track, as that of a keyframe where vision gives none for long and the filter knows the way."""
-        state = None if self._filter is None or self._gravity.holds_keyframes else self._filter.ekf.state_at(frame.t_ns)
-        if self._readings is None or state is None or not self._waypoints.wants(track.vo, track.keyframe is not None):
+        if self._readings is None or self._filter is None or self._gravity.holds_keyframes:
             return track
-        variance_m2 = float(np.trace(state.covariance[3:6, 3:6]))
-        if not self._bridged(frame.t_ns, self._buffer.span(self._keyframe_t_ns, frame.t_ns), variance_m2):
+        state = self._filter.ekf.state_at(frame.t_ns)
+        if state is None or not self._waypoints.wants(track.vo, track.keyframe is not None):
+            return track
+        if not self._bridged(frame.t_ns, self._buffer.span(self._keyframe_t_ns, frame.t_ns), state):
             return track
         self.counters["waypoints"] = self.counters.get("waypoints", 0) + 1
         keyframe = unseen_keyframe(self._keyframe_id + 1, frame)
@@ -486,8 +487,7 @@ class Front:
         if self._has_imu and self._keyframe_id >= 0:
             imu = self._buffer.span(self._keyframe_t_ns, keyframe.t_ns)
         at_rest = self._rested_since_keyframe and self._keyframe_id >= 0
-        variance_m2 = np.inf if state is None else float(np.trace(state.covariance[3:6, 3:6]))
-        begins_submap = track.vo.tracking is Tracking.LOST and not self._bridged(keyframe.t_ns, imu, variance_m2)
+        begins_submap = track.vo.tracking is Tracking.LOST and not self._bridged(keyframe.t_ns, imu, state)
         begins_submap = begins_submap or keyframe.id == self._first_id > 0
         self.counters["submaps"] += begins_submap
         packet = KeyframePacket(
@@ -496,7 +496,7 @@ class Front:
         if self._readings is not None and not (self._has_imu and self._gravity.holds_keyframes):
             packet = self._readings.pack(packet, self._keyframe_t_ns, state)
         self.camera_clock.took_keyframe()
-        self._keyframe_variance_m2 = variance_m2
+        self._keyframe_variance_m2 = _variance_m2(state)
         self._keyframe_id, self._keyframe_t_ns = keyframe.id, keyframe.t_ns
         self._rested_since_keyframe, self._mag = True, None
         self._T_vo_keyframe = self._T_vo_body.copy()
@@ -506,16 +506,16 @@ class Front:
         self._gravity.hold(OdometryKeyframe(packet, self._T_vo_body.copy()), T_odom_body)
         return self._give_up_if_late(keyframe.t_ns)
 
-    def _bridged(self, t_ns: int, imu: ImuSpan | None, variance_m2: float) -> bool:
+    def _bridged(self, t_ns: int, imu: ImuSpan | None, state: NavState | None) -> bool:
         """Return whether inertial data tell where a keyframe is from the one before, which vision has lost.
 
-        `variance_m2` is that of the filter's position at the keyframe, infinite before it has a state.
+        `state` is the filter's at the keyframe.
         """
         if imu is None:
             return False
         if not np.isfinite(self._keyframe_variance_m2):
             return (t_ns - self._keyframe_t_ns) * 1e-9 <= _BLIND_S
-        grown_m2 = variance_m2 - self._keyframe_variance_m2
+        grown_m2 = _variance_m2(state) - self._keyframe_variance_m2
         return bool(grown_m2 <= self.config.ekf.submap_sigma_m**2)
 
     def _give_up_if_late(self, now_t_ns: int) -> list[OdometryKeyframe]:
@@ -531,3 +531,8 @@ class Front:
         released = self._take_released(self._gravity.give_up(self._T_upright))
         self._T_vo_keyframe, self._T_vo_body = self._T_upright @ self._T_vo_keyframe, self._T_upright @ self._T_vo_body
         return released
+
+
+def _variance_m2(state: NavState | None) -> float:
+    """Return how unsure a filter is of where the body is; infinite before it has a state."""
+    return np.inf if state is None else float(np.trace(state.covariance[3:6, 3:6]))

@@ -83,10 +83,8 @@ def drawn(recording: Recording, setup: SensorSetup, seed: int) -> list[list[Read
         raise DataError(f"{recording.name} has no truth on which sensors can be drawn; give them files")
     out = []
     for number, (name, rate_hz) in enumerate(setup.simulated_hz.items()):
-        rng = np.random.default_rng([seed, number])
         begin_ns, end_ns = int(truth.t_ns[0]) + _EDGE_NS, int(truth.t_ns[-1]) - _EDGE_NS
         t_ns = np.arange(begin_ns, end_ns, round(1e9 / rate_hz), dtype=np.int64)
-        sensor, own = setup.sensors[name], setup.suite.own(name)
-        values = setup.suite.starts[own] + setup.suite.sigmas[own] * rng.normal(size=own.stop - own.start)
-        out.append(drawn_readings(name, sensor, bodies_on(truth, t_ns), values, seed))
+        own = setup.suite.drawn_own(name, np.random.default_rng([seed, number]))
+        out.append(drawn_readings(name, setup.sensors[name], bodies_on(truth, t_ns), own, seed))
     return out

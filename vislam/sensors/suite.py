@@ -43,6 +43,11 @@ class Suite:
         """Return where a sensor's own variables stand among all of them."""
         return self._slices[name]
 
+    def drawn_own(self, name: str, rng: np.random.Generator) -> Array:
+        """Return true own variables [V] of a simulated sensor, as its starts and sigmas have them."""
+        at = self._slices[name]
+        return self.starts[at] + self.sigmas[at] * rng.normal(size=at.stop - at.start)
+
     def why_unusable(self, reading: Reading) -> str:
         """Return why a reading cannot be used by anybody; empty: it can."""
         sensor = self._sensors.get(reading.sensor)

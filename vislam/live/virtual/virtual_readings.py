@@ -27,9 +27,8 @@ class VirtualReadings:
         self._follower, self._epoch, self._setup = Follower.waiting(cart), epoch, setup
         self._rngs, self._own = {}, {}
         for number, name in enumerate(setup.simulated_hz):
-            at, rng = setup.suite.own(name), np.random.default_rng([seed, number])
-            self._own[name] = setup.suite.starts[at] + setup.suite.sigmas[at] * rng.normal(size=at.stop - at.start)
-            self._rngs[name] = rng
+            self._rngs[name] = np.random.default_rng([seed, number])
+            self._own[name] = setup.suite.drawn_own(name, self._rngs[name])
         self._drawn = dict.fromkeys(setup.simulated_hz, 0)  # how many of each, those that were missed included
         self._missed = dict.fromkeys(setup.simulated_hz, 0)
         self._heard = Heard(tuple(setup.simulated_hz))
