@@ -157,6 +157,7 @@ class KeyframePacket:
     begins_submap: bool = False  # nothing measured the motion since the previous keyframe: a new submap
     readings: tuple[PlacedReading, ...] = ()  # of other sensors since the previous keyframe
     own_starts: tuple[OwnStart, ...] = ()  # of sensors that have begun since then
+    state_at_sight: NavState | None = None  # the filter's, at the first keyframe with sight after some without
 
 
 @dataclass(frozen=True, slots=True, eq=False)

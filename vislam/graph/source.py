@@ -187,6 +187,10 @@ class WindowSource:
     def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
         """See Source."""
         update = self._window.add(packet, T_odom_body)
+        if packet.state_at_sight is not None:
+            # by inertial data alone the window's speed is metres per second off, too far to be linearised there
+            self._window.initialise(packet.state_at_sight)
+            self._window.add(packet, T_odom_body)
         said = self._record(update, record)
         self._odometry.append(said)
         self._local.append(update.newest)

@@ -494,7 +494,7 @@ class Front:
             keyframe, track.vo, track.observations, imu, self._mag, at_rest, self.camera_clock.applied_s, begins_submap
         )
         if self._readings is not None and not (self._has_imu and self._gravity.holds_keyframes):
-            packet = self._readings.pack(packet, self._keyframe_t_ns, state)
+            packet = self._waypoints.marked(self._readings.pack(packet, self._keyframe_t_ns, state), state)
         self.camera_clock.took_keyframe()
         self._keyframe_variance_m2 = _variance_m2(state)
         self._keyframe_id, self._keyframe_t_ns = keyframe.id, keyframe.t_ns

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from vislam.core.messages import Array, Frame, Keyframe, NavState, Tracking, VoMeasurement
+from vislam.core.messages import Array, Frame, Keyframe, KeyframePacket, NavState, Tracking, VoMeasurement
 
 _PATIENCE_S = 5.0  # without sight; until then the camera may find the last keyframe again
 _EVERY_S = 1.0  # from then on
@@ -27,10 +29,12 @@ class Waypoints:
         """Start before the first keyframe."""
         self._seen_ns: int | None = None  # the last frame that was placed, or keyframe
         self._newest_ns: int | None = None  # waypoint since then
+        self._ends = False  # whether sight is back since `marked`
 
     def wants(self, vo: VoMeasurement, is_keyframe: bool) -> bool:
         """Take note of a frame; return whether it is time for a keyframe, though vision gives none."""
         if vo.tracking is not Tracking.LOST or is_keyframe or self._seen_ns is None:
+            self._ends = self._ends or self._newest_ns is not None
             self._seen_ns, self._newest_ns = vo.t_ns, None
             return False
         since_ns, wait_s = (self._seen_ns, _PATIENCE_S) if self._newest_ns is None else (self._newest_ns, _EVERY_S)
@@ -38,6 +42,11 @@ class Waypoints:
             return False
         self._newest_ns = vo.t_ns
         return True
+
+    def marked(self, packet: KeyframePacket, state: NavState | None) -> KeyframePacket:
+        """Return a keyframe's packet, with the filter's `state` there if it is the first with sight after waypoints."""
+        ends, self._ends = self._ends, False
+        return replace(packet, state_at_sight=state) if ends else packet
 
 
 def surer_gyro_bias(state: NavState, graph: NavState | None, walk: float) -> tuple[Array, float]:
