@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,6 +105,21 @@ def test_a_sensor_has_the_derivatives_that_it_says(name: str) -> None:
         np.testing.assert_allclose(H, wanted, **FORWARD)
         np.testing.assert_allclose(H_own, wanted_own, **FORWARD)
         assert len(H_own[0]) == len(sensor.variables)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_that_sees_motion_only_says_the_same_of_the_same_motion_elsewhere(name: str) -> None:
+    sensor, rng = SENSORS[name], np.random.default_rng(6)
+    body, own = a_body(rng), own_of(sensor, rng)
+    values, turn = sensor.draw(body, own, rng), so3_exp(np.array([0.0, 0.0, 0.7]))
+    elsewhere = replace(
+        body,
+        R_world_body=turn @ body.R_world_body,
+        position_m=turn @ body.position_m + np.array([0.4, -0.3, 0.2]),
+        velocity_m_s=turn @ body.velocity_m_s,
+    )
+    differs = np.abs(sensor.residual(values, elsewhere, own) - sensor.residual(values, body, own)).max()
+    assert (differs < 1e-9) == sensor.sees_motion_only
 
 
 @pytest.mark.parametrize("name", SENSORS)

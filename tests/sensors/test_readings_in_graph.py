@@ -14,9 +14,9 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import se3_exp
 from vislam.core.messages import Array, KeyframePacket, LoopEdge
 from vislam.core.readings import OwnStart, Reading
+from vislam.factors.admission import MOST
 from vislam.factors.keys import X, own_key
 from vislam.factors.reading_factor import ReadingFactor, system_of
-from vislam.factors.sensed import MOST
 from vislam.graph import PoseGraph
 from vislam.sensors import BodyState, Sensor, Suite
 from worlds.fake_window import FakeWindow

@@ -13,7 +13,7 @@ from vislam.window.spans import LinkStore
 from vislam.window.tracks import TrackTable
 from worlds.motion import EUROC_NOISE, Motion
 from worlds.parts import GRAVITY_M_S2
-from worlds.room import RGBD, STEREO, World, start_state
+from worlds.room import RGBD, STEREO, World, start_state, told_way
 
 
 class Scene(NamedTuple):
@@ -43,8 +43,10 @@ def make_scene(rig, seed: int) -> Scene:
         )
         tracks.add(packet.keyframe.id, packet.observations)
         if packet.imu is not None:
-            links.push(packet.imu, 0.2, X[-2][15:] + 1e-3, np.eye(4), at_rest=len(X) == 3)
+            told = [told_way(truths[1][0], truths[2][0], 0.01, 1.0, 0.02, rng)] if len(X) == 3 else []
+            links.push(packet.imu, 0.2, X[-2][15:] + 1e-3, np.eye(4), len(X) == 3, told)
     count = len(X)
+    links.hear(np.array(X), np.zeros(count, dtype=np.bool_))
     camera = Camera(
         T_body_cam=rig.T_body_cams[0],
         T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams]),

@@ -15,7 +15,7 @@ from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Obser
 from vislam.window import SlidingWindow, WindowUpdate, gate
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
 from worlds.parts import GRAVITY_M_S2
-from worlds.room import MONO, RGBD, STEREO, World, packet, start_state
+from worlds.room import MONO, RGBD, STEREO, World, packet, start_state, told_way
 
 HONEST = replace(WindowConfig(), keyframes=8)  # the simulated sensor has no vibration
 
@@ -172,6 +172,39 @@ def test_inertial_data_bridges_lost_vision_and_vision_bridges_lost_inertial_data
     assert position_rmse(updates, truths) < 0.01 * path_m(truths)
     sigma = [float(np.sqrt(np.trace(u.newest.covariance[6:9, 6:9]))) for u in updates]
     assert sigma[21] > 1.5 * sigma[17]  # without vision, velocity is known less well
+
+
+@pytest.mark.parametrize("rig", [MONO, STEREO], ids=["mono", "stereo"])
+def test_what_other_sensors_tell_of_motion_stands_in_for_lost_vision(rig: Rig) -> None:
+    """Six seconds blind: speed stays known, what was lost is found again, and the window knows how well."""
+    told_sigma, alone_sigma, squares, count = [], [], 0.0, 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        packets, truths = World(Motion.random(seed), rig, seed, duration_s=14.0, tracks=50).packets()
+        blind = range(30, 60)
+        nothing = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+        seen = [replace(p, observations=nothing) if k in blind else p for k, p in enumerate(packets)]
+        scale = 1.0 + 0.005 * rng.normal()
+        for tells, sigmas in ((True, told_sigma), (False, alone_sigma)):
+            window = SlidingWindow(HONEST, rig, EUROC_NOISE, GRAVITY_M_S2)
+            window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
+            for k, p in enumerate(seen):
+                ways = (
+                    [told_way(truths[k - 1][0], truths[k][0], 0.01, scale, 0.005, rng)] if tells and k in blind else []
+                )
+                update = window.add(p, motions=ways)
+                if k == blind[-1]:
+                    sigmas.append(float(np.sqrt(np.trace(update.newest.covariance[6:9, 6:9]))))
+                if tells and k in (blind[-1], len(seen) - 1):
+                    error = state_error(truths[k], update.newest)[[0, 1, *range(6, 15)]]  # what drifts is not judged
+                    index = np.ix_([0, 1, *range(6, 15)], [0, 1, *range(6, 15)])
+                    squares += float(error @ np.linalg.solve(update.newest.covariance[index], error))
+                    count += len(error)
+    known, alone = np.mean(told_sigma), np.mean(alone_sigma)
+    print(f"speed known to {known:.3f} m/s, without {alone:.3f}; NEES {squares / count:.2f}")
+    assert known < 0.5 * alone
+    low, high = chi2.ppf([0.0005, 0.9995], count)
+    assert low < squares < high
 
 
 def bad_packets(good: KeyframePacket) -> list[tuple[str, KeyframePacket]]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.core.camera import Camera, Rig
-from vislam.core.geometry import invert, so3_exp, transform
+from vislam.core.geometry import invert, skew, so3_exp, transform
 from vislam.core.messages import Array, KeyframePacket, NavState, Observations, Tracking, VoMeasurement
+from vislam.core.readings import Motion as Told
 from vislam.imu import ImuNoise
 from vislam.imu.series import ImuSeries
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion
@@ -129,3 +130,18 @@ def start_state(truth: tuple[Array, Array, Array], t_ns: int, rng: np.random.Gen
     T = T.copy()
     T[:3, :3] = T[:3, :3] @ so3_exp(-e[:3])
     return NavState(t_ns, T, v - e[6:9], bias[:3] - e[9:12], bias[3:] - e[12:15], np.diag(START_SIGMAS**2))
+
+
+def told_way(
+    T_a: Array, T_b: Array, sigma_m: float, scale: float, scale_sigma: float, rng: np.random.Generator
+) -> Told:
+    """Return what wheels would say of the way between two true poses [4, 4]: in body axes, `scale` times too long."""
+    said = scale * (T_a[:3, :3].T @ (T_b[:3, 3] - T_a[:3, 3])) + sigma_m * rng.normal(size=3)
+
+    def weighted(A: Array, B: Array) -> tuple[Array, Array, Array, Array]:
+        way = A[:3, :3].T @ (B[:3, 3] - A[:3, 3])
+        by_a = np.hstack([-skew(way), np.eye(3)]) / sigma_m
+        by_b = np.hstack([np.zeros((3, 3)), -A[:3, :3].T @ B[:3, :3]]) / sigma_m
+        return (said - way) / sigma_m, by_a, by_b, -(way * scale_sigma / sigma_m)[:, None]
+
+    return weighted

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from vislam.core.readings import OwnStart, PlacedReading
+    from vislam.core.readings import MotionReadings, OwnStart, PlacedReading
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -157,6 +157,7 @@ class KeyframePacket:
     begins_submap: bool = False  # nothing measured the motion since the previous keyframe: a new submap
     readings: tuple[PlacedReading, ...] = ()  # of other sensors since the previous keyframe
     own_starts: tuple[OwnStart, ...] = ()  # of sensors that have begun since then
+    motions: tuple[MotionReadings, ...] = ()  # the same where vision was lost: for a window, and not in `readings`
     state_at_sight: NavState | None = None  # the filter's, at the first keyframe with sight after some without
 
 

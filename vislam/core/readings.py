@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +23,13 @@ class OwnStart(NamedTuple):
     """First values of a sensor's own variables, found by comparing its first readings with the path."""
 
     sensor: str
+    values: Array  # [V]
+    sigmas: Array  # [V]
+
+
+class OwnNow(NamedTuple):
+    """A sensor's own variables as a filter has them at a keyframe."""
+
     values: Array  # [V]
     sigmas: Array  # [V]
 
@@ -54,3 +62,17 @@ class PlacedReading:
 
     reading: Reading
     station: Station
+
+
+# What a further sensor said between two keyframes, by both poses [4, 4]: residual [M], whitened and weighted, and its
+# Jacobians [M, 6] and [M, 6] by both (rotation, translation, body side) and [M, V] by own variables over their sigmas
+Motion = Callable[[Array, Array], tuple[Array, Array, Array, Array]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionReadings:
+    """What one sensor said of the motion between two keyframes that vision does not tie together."""
+
+    sensor: str
+    placed: tuple[PlacedReading, ...]
+    own: OwnNow

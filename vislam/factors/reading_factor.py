@@ -14,7 +14,7 @@ import numpy as np
 
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
-from vislam.core.readings import PlacedReading
+from vislam.core.readings import Motion, OwnNow, PlacedReading
 from vislam.factors.noise_models import conditioned
 from vislam.sensors import Sensor, SensorError, linearised
 from vislam.sensors.body import between_keyframes, by_keyframes, path_variances, rate_by_keyframes
@@ -185,3 +185,18 @@ class ReadingFactor:
             except (SensorError, ValueError):  # ValueError: a residual of another length than at first
                 self._failed(row.number)
         return out
+
+
+def as_motion(sensor: Sensor, placed: Sequence[PlacedReading], own: OwnNow, failed: Callable[[int], None]) -> Motion:
+    """Return readings of a sensor as a function of both poses, at own variables that somebody else estimates.
+
+    `failed` is told as that of a factor is; noise is as at the poses of the first call.
+    """
+    made: list[ReadingFactor] = []
+
+    def weighted(T_earlier: Array, T_later: Array) -> tuple[Array, Array, Array, Array]:
+        if not made:
+            made.append(ReadingFactor(sensor, placed, (T_earlier, T_later), own.values, own.sigmas, failed))
+        return made[0].weighted(T_earlier, T_later, own.values)
+
+    return weighted

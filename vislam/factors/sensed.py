@@ -17,6 +17,7 @@ import numpy as np
 from vislam.config import GraphConfig
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, PlacedReading
+from vislam.factors.admission import Admission
 from vislam.factors.builder import Label, Step
 from vislam.factors.journal import KeyframeRecord
 from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
@@ -27,7 +28,6 @@ from vislam.sensors import Suite, Variable
 
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
 
-MOST = 10  # readings of one sensor between two keyframes that get factors; of more, as many evenly spaced
 _REFRESHED = 6  # readings that are linearised anew with a keyframe, or those of one entry where they are more
 _NEWEST, _BLOCK = 20, 40  # entries that are looked at with each keyframe: the newest, and older ones in turn
 _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided by
@@ -102,6 +102,7 @@ class Readings:
         self._next_old = 0  # where the next block of older entries begins that is looked at
         self._t_ns: list[int] = []
         self._counts = ReadingCounts()
+        self.admission = Admission(suite, self._counts)
         self._recalled: dict[str, Array] = {}
 
     @property
@@ -112,9 +113,10 @@ class Readings:
     def counts_of(self, name: str, values: gtsam.Values) -> dict[str, int]:
         """Return how many readings of a sensor came with keyframes, and what became of them.
 
-        `used`: in factors; `unusable`: the sensor refuses them; `early`: own variables had no start yet; `thinned`: too
-        many between two keyframes; `dropped`: where a submap begins. Of those used, `failed`: the sensor's own code did
-        at some estimate, and they say nothing there; `outliers`: they fail its gate at `values`.
+        `used`: in factors; `in_window`: in the window's equations; `unusable`: the sensor refuses them; `early`: own
+        variables had no start yet; `thinned`: too many between two keyframes; `dropped`: where a submap begins.
+        `failed`: the sensor's own code did at some estimate, and they say nothing there. Of those used, `outliers` fail
+        its gate at `values`.
         """
         mine = [entry for entry in self._entries if entry.sensor == name]
         outliers = sum(entry.outliers(self._place(entry, values), self._units(name)) for entry in mine)
@@ -137,7 +139,7 @@ class Readings:
             self._begin(start)
         by_sensor: dict[str, list[PlacedReading]] = {}
         for one in record.readings:
-            if self._is_usable(one):
+            if self.admission.is_usable(one):
                 by_sensor.setdefault(one.reading.sensor, []).append(one)
         for name, placed in by_sensor.items():
             if self._suite[name].variables and name not in self._begun:
@@ -250,24 +252,9 @@ class Readings:
         guess = values if recalled is None or recalled.shape != values.shape else recalled
         self._begun[start.sensor] = _Begun(guess, values, np.maximum(units, _SIGMA_MIN))
 
-    def _is_usable(self, placed: PlacedReading) -> bool:
-        if placed.reading.sensor not in self._suite.names:
-            self._counts.add(placed.reading.sensor, "unknown")
-            return False
-        try:
-            why = self._suite.why_unusable(placed.reading)
-        except Exception as error:  # its check is somebody else's code
-            why = str(error) or type(error).__name__
-        if why:
-            self._counts.add(placed.reading.sensor, "unusable")
-        return not why
-
     def _entry(self, name: str, placed: list[PlacedReading], record: KeyframeRecord) -> _Entry:
         """Return what a sensor says with a keyframe; the keys do not hang on whether its code works."""
-        if len(placed) > MOST:
-            self._counts.add(name, "thinned", len(placed) - MOST)
-            chosen = np.linspace(0.0, len(placed) - 1.0, MOST).round().astype(int).tolist()
-            placed = [placed[n] for n in chosen]
+        placed = self.admission.thinned(name, placed)
         self._counts.add(name, "used", len(placed))
         entry = _Entry(len(self._entries), name, record.id, placed)
         if not self._suite[name].variables:

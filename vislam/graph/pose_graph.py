@@ -45,7 +45,7 @@ class PoseGraph:
     Coupling `loose`: motions of visual odometry and preintegrated IMU are its factors. Coupling `tight`: a sliding
     window optimises tracks and IMU of the newest keyframes, and its edges and tilts are the factors of poses alone.
     Bad input raises DataError before anything is touched. Whatever gtsam does, `add` returns an update; its note says
-    what happened when a plain one was not possible. Lost vision, IMU outages and refused loops are values.
+    what happened where not a plain one. Lost vision, IMU outages and refused loops are values.
     """
 
     def __init__(
@@ -193,7 +193,8 @@ class PoseGraph:
         elif record.begins_submap:
             before, config = self._estimator.poses[-1], self._config
             record = weak_link(record, before, self._T_odom_last, T_odom_body, self._noise is not None, config)
-        said = self._source.add(packet, record, T_odom_body)
+        heard = self.readings.admission.for_window(packet.motions, record.id)
+        said = self._source.add(packet, record, T_odom_body, heard)
         if self._config.coupling == "tight":
             record = replace(record, imu=None)  # the window has summarised it, and no rebuild asks for it
         self.readings.append(record, packet.readings)
@@ -221,8 +222,7 @@ class PoseGraph:
         """Iterate to convergence and return all poses; the note tells the cost and how it was reached."""
         if not self._keyframes:
             return GraphUpdate(self._revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
-        before = self._estimator.poses[-1].copy()
-        notes: list[str] = []
+        before, notes = self._estimator.poses[-1].copy(), list[str]()
         decided = self._loops.finish(notes)
         notes.append(self._estimator.converge())
         self._T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._T_map_odom

@@ -11,6 +11,7 @@ from vislam.config import GraphConfig
 from vislam.core.errors import DataError
 from vislam.core.memory import EdgeRecord, GraphMemory, GravityRecord, WindowRecord, at_pose
 from vislam.core.messages import Array, KeyframePacket, NavState
+from vislam.core.readings import Motion
 from vislam.factors.builder import Builder, Guess
 from vislam.factors.journal import KeyframeRecord, StartRecord, checked_poses
 from vislam.factors.keys import B, V, X, bias_of
@@ -23,6 +24,7 @@ from vislam.imu import ImuNoise
 from vislam.window.messages import WindowEdge, WindowUpdate
 
 _RATIO_MAX = 1e12  # eigenvalues of a covariance that is solved with
+_FAR_SURER = 4.0  # times, of the variance of velocity
 
 
 class Window(Protocol):
@@ -31,7 +33,9 @@ class Window(Protocol):
     def initialise(self, state: NavState | None, T_local_body: Array | None = None) -> None:
         """Set the state of keyframe 0; without an IMU its pose."""
 
-    def add(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> WindowUpdate:
+    def add(
+        self, packet: KeyframePacket, T_odom_body: Array | None = None, motions: Sequence[Motion] = ()
+    ) -> WindowUpdate:
         """Take a keyframe; DataError, and nothing changed, on a packet that cannot be used."""
 
 
@@ -52,9 +56,12 @@ class Source(Protocol):
     def begin_submap(self, start: StartRecord, state: NavState | None) -> None:
         """Take the first state of another recording, whose first keyframe comes next."""
 
-    def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
+    def add(
+        self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None, motions: Sequence[Motion]
+    ) -> list[WindowRecord]:
         """Take a keyframe, validated as `record`; return what else belongs into the journal.
 
+        `motions` is what further sensors say of the motion since the keyframe before, for a window.
         Raises DataError, and changes nothing, on observations that cannot be used.
         """
 
@@ -102,7 +109,9 @@ class MotionSource:
     def begin_submap(self, start: StartRecord, state: NavState | None) -> None:
         """See Source; the graph's own velocities and biases go on."""
 
-    def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
+    def add(
+        self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None, motions: Sequence[Motion]
+    ) -> list[WindowRecord]:
         """See Source."""
         self._odometry.append(record)
         self._newest_id = record.id
@@ -184,10 +193,12 @@ class WindowSource:
         """See Source."""
         self._window.initialise(state, start.T_map_body)
 
-    def add(self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None) -> list[WindowRecord]:
+    def add(
+        self, packet: KeyframePacket, record: KeyframeRecord, T_odom_body: Array | None, motions: Sequence[Motion]
+    ) -> list[WindowRecord]:
         """See Source."""
-        update = self._window.add(packet, T_odom_body)
-        if packet.state_at_sight is not None:
+        update = self._window.add(packet, T_odom_body, motions)
+        if packet.state_at_sight is not None and _is_far_surer(packet.state_at_sight, update.newest):
             # by inertial data alone the window's speed is metres per second off, too far to be linearised there
             self._window.initialise(packet.state_at_sight)
             self._window.add(packet, T_odom_body)
@@ -332,3 +343,10 @@ def _edge_records(edges: Sequence[WindowEdge], notes: list[str]) -> list[EdgeRec
 
 def _is_direction(v: Array) -> bool:
     return bool(abs(float(np.linalg.norm(v)) - 1.0) < 1e-6)
+
+
+def _is_far_surer(state: NavState, other: NavState | None) -> bool:
+    """Return whether a state knows its velocity far better than another does."""
+    if other is None:
+        return False
+    return float(np.trace(other.covariance[6:9, 6:9])) > _FAR_SURER * float(np.trace(state.covariance[6:9, 6:9]))

@@ -107,7 +107,7 @@ class Front:
             buffer = None if noise is None else self._buffer
             self._readings = ReadingIntake(
                 suite, self._filter, buffer, config.imu.gravity_m_s2,
-                0.0 if noise is None else noise.accel_noise_density,
+                0.0 if noise is None else noise.accel_noise_density, config.graph.coupling == "tight",
             )  # fmt: skip
         self._waypoints = Waypoints()
         self._published = in_odom(config)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState
-from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState, Tracking
+from vislam.core.readings import MotionReadings, OwnNow, OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, preintegrate
 from vislam.sensors import BodyState, Suite
@@ -53,11 +53,12 @@ class ReadingIntake:
 
     def __init__(
         self, suite: Suite, filtering: Filtering | None, buffer: ImuBuffer | None, gravity_m_s2: float,
-        accel_noise_density: float = 0.0,
+        accel_noise_density: float = 0.0, has_window: bool = False,
     ) -> None:  # fmt: skip
         """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data.
 
         `accel_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
+        `has_window` says that behind keyframes comes a sliding window.
         """
         became = (
             "readings", "unusable", "too_early", "dropped", "beginning", "told", "late", "unplaced", "crowded",
@@ -69,6 +70,7 @@ class ReadingIntake:
         self._filter, self._buffer = filtering, buffer
         self._gravity = gravity_m_s2 if buffer is not None else 0.0
         self._accel_density = accel_noise_density
+        self._has_window = has_window
         self._waiting: deque[Reading] = deque()
         self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}
         self._starts: list[OwnStart] = []  # for the next keyframe
@@ -159,7 +161,23 @@ class ReadingIntake:
                 self.counters[reading.sensor]["unplaced"] += 1
         self._since = later
         starts, self._starts = tuple(self._starts), []
-        return replace(packet, readings=tuple(placed), own_starts=starts)
+        motions = self._of_motion(packet, placed)
+        used = {motion.sensor for motion in motions}
+        rest = tuple(one for one in placed if one.reading.sensor not in used)
+        return replace(packet, readings=rest, own_starts=starts, motions=motions)
+
+    def _of_motion(self, packet: KeyframePacket, placed: list[PlacedReading]) -> tuple[MotionReadings, ...]:
+        """Return what is for the window to know: without sight it has inertial data alone, and is soon lost."""
+        if not self._has_window or self._filter is None or packet.begins_submap:
+            return ()
+        if packet.vo.tracking is not Tracking.LOST:
+            return ()
+        by_sensor: dict[str, list[PlacedReading]] = {}
+        for one in placed:
+            if self._suite[one.reading.sensor].sees_motion_only:
+                by_sensor.setdefault(one.reading.sensor, []).append(one)
+        own = self._filter.ekf.own
+        return tuple(MotionReadings(name, tuple(ones), OwnNow(*own(name))) for name, ones in by_sensor.items())
 
     def _why_unusable(self, reading: Reading) -> str:
         if reading.sensor in self._left_out:

@@ -15,7 +15,7 @@ from vislam.trajectory import Alignment, Trajectory, evaluate
 
 _BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that neither filter nor graph was told
 _BY_FILTER = ("accepted", "gated", "refused", "waiting", "failed")
-_BY_GRAPH = ("used", "thinned", "early")
+_BY_GRAPH = ("used", "in_window", "thinned", "early")
 _NOT_IN_GRAPH = ("late", "unplaced", "crowded")
 _MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 

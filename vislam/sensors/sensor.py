@@ -37,6 +37,8 @@ class Sensor(ABC):
         columns: what the values of a reading are, with units; also the columns of its file.
         touches: the parts of the body's state that show in it: "rotation", "position", "velocity", "gyro_bias",
             "accel_bias". Numerical derivatives are taken by these only.
+        sees_motion_only: neither place nor heading nor a frame of its own shows in it, as with wheels: the same motion
+            elsewhere gives the same reading. Then the sliding window takes it, too, where the camera is blind.
         variables: own ones, estimated with the body's state by every estimator; each has its own values.
         gate_probability: that a good reading passes the test of its innovation.
         from_magnetometer: its readings are the samples of the machine's own magnetometer, as they come with the IMU's.
@@ -44,6 +46,7 @@ class Sensor(ABC):
 
     columns: ClassVar[tuple[str, ...]] = ()
     touches: ClassVar[tuple[str, ...]] = ("rotation", "position", "velocity")
+    sees_motion_only: ClassVar[bool] = False
     variables: tuple[Variable, ...] = ()
     gate_probability: float = 0.999
     from_magnetometer: bool = False

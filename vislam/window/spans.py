@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.config import WindowConfig
+from vislam.core.geometry import transform
 from vislam.core.messages import Array, ImuSpan
+from vislam.core.readings import Motion
 from vislam.imu import ImuNoise, Preintegrated, preintegrate
-from vislam.window.equations import Links
+from vislam.window.equations import STATE, Links
 
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+_POSES = 12  # errors of two poses
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
 
 
@@ -23,6 +29,7 @@ class LinkStore:
         self._max_gap_s = config.imu_max_gap_s if noise is None else noise.gap_s(config.imu_max_gap_s)
         self._gravity_m_s2 = gravity_m_s2
         self._spans: list[ImuSpan | None] = []
+        self._motions: list[Sequence[Motion]] = []
         size = config.keyframes + 2
         self._links = Links(
             inertial=np.zeros(size, dtype=np.bool_),
@@ -37,6 +44,10 @@ class LinkStore:
             guess=np.tile(np.eye(4), (size, 1, 1)),
             guess_weight=np.zeros((size, 2)),
             velocity_weight=np.zeros(size),
+            told=np.zeros(size, dtype=np.bool_),
+            told_H=np.zeros((size, _POSES, _POSES)),
+            told_b=np.zeros((size, _POSES)),
+            told_at=np.zeros((size, 2, STATE)),
             rest_weight=np.zeros(size),
         )
 
@@ -56,15 +67,19 @@ class LinkStore:
             return False
         return float(self._holes_s(span).sum()) <= self._config.imu_max_outage_s
 
-    def push(self, span: ImuSpan | None, dt_s: float, bias: Array, guess: Array, at_rest: bool) -> bool:
+    def push(
+        self, span: ImuSpan | None, dt_s: float, bias: Array, guess: Array, at_rest: bool, motions: Sequence[Motion]
+    ) -> bool:
         """Append the link to a new keyframe `dt_s` later; return whether it is inertial.
 
         `guess` [4, 4] is the motion that is assumed, loosely, where there is no inertial data; `bias` [6] is taken off.
+        `motions` is what further sensors say of it, see `hear`.
         """
         k, links, config = len(self._spans), self._links, self._config
         inertial = self.usable(span)
         self._spans.append(span if inertial else None)
-        links.inertial[k], links.dt[k] = inertial, dt_s
+        self._motions.append(motions)
+        links.inertial[k], links.dt[k], links.told[k] = inertial, dt_s, False
         links.guess_weight[k], links.velocity_weight[k], links.rest_weight[k + 1] = 0.0, 0.0, 0.0
         if self._noise is not None:
             walk = np.repeat([self._noise.gyro_bias_walk, self._noise.accel_bias_walk], 3)
@@ -102,15 +117,37 @@ class LinkStore:
         for k in np.flatnonzero(far & self._links.inertial[:n]).tolist():
             self.integrate(k, biases[k])
 
+    def hear(self, X: Array, held: NDArray[np.bool_]) -> None:
+        """Linearise what further sensors said at X [n + 1, 21]; where the prior holds a state it stays as it was.
+
+        Own variables are not the window's: they are eliminated link by link, with the sigmas that they came with.
+        """
+        links = self._links
+        for k, motions in enumerate(self._motions):
+            if not motions or (links.told[k] and (held[k] or held[k + 1])):
+                continue
+            H, b = np.zeros((_POSES, _POSES)), np.zeros(_POSES)
+            R_a, R_b = X[k, :9].reshape(3, 3), X[k + 1, :9].reshape(3, 3)
+            T_a, T_b = transform(R_a, X[k, 9:12]), transform(R_b, X[k + 1, 9:12])
+            for motion in motions:
+                r, by_a, by_b, J_own = motion(T_a, T_b)
+                J = np.hstack([by_a[:, :3], by_a[:, 3:] @ R_a.T, by_b[:, :3], by_b[:, 3:] @ R_b.T])
+                own = np.linalg.solve(np.eye(J_own.shape[1]) + J_own.T @ J_own, J_own.T)
+                H += J.T @ (J - J_own @ (own @ J))
+                b += J.T @ (r - J_own @ (own @ r))
+            links.told[k], links.told_H[k], links.told_b[k] = True, 0.5 * (H + H.T), b
+            links.told_at[k, 0], links.told_at[k, 1] = X[k], X[k + 1]
+
     def pop_front(self) -> None:
         """Forget the oldest link, and whether the oldest keyframe was at rest."""
-        del self._spans[0]
+        del self._spans[0], self._motions[0]
         for array in self._links:
             array[:-1] = array[1:].copy()
 
     def clear(self) -> None:
         """Forget everything."""
         self._spans.clear()
+        self._motions.clear()
         self._links.rest_weight[:] = 0.0
 
     def _holes_s(self, span: ImuSpan) -> Array:

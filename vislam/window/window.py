@@ -7,6 +7,8 @@ leaves, the tracks that it saw give their first observations to the prior and go
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vislam.config import WindowConfig
@@ -14,6 +16,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, KeyframePacket, NavState
+from vislam.core.readings import Motion
 from vislam.imu import ImuNoise
 from vislam.window import gate
 from vislam.window.calibration import Calibration
@@ -91,12 +94,15 @@ class SlidingWindow:
         self._T_start = np.eye(4) if T_local_body is None else T_local_body.copy()
         self._clear()
 
-    def add(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> WindowUpdate:
+    def add(
+        self, packet: KeyframePacket, T_odom_body: Array | None = None, motions: Sequence[Motion] = ()
+    ) -> WindowUpdate:
         """Take a keyframe, optimise, let the oldest go if the window is full, and say what changed.
 
         Args:
             packet: the keyframe with its observations and the inertial span since the one before.
             T_odom_body: its pose [4, 4] by odometry, a start value where the IMU cannot give one.
+            motions: what further sensors say of the motion since the keyframe before.
 
         Raises:
             DataError: something in it is not finite, not in time order, or does not fit; the window is as before.
@@ -105,7 +111,7 @@ class SlidingWindow:
         if self._T_start is None:
             raise UsageError("the window has no first state yet; call initialise before add")
         check_packet(packet, T_odom_body, self._keyframes.newest)
-        self._push(packet, T_odom_body)
+        self._push(packet, T_odom_body, motions)
         doubted = self._doubt_newest()
         selection = self._select()
         solution = self._optimise(selection)
@@ -128,16 +134,15 @@ class SlidingWindow:
         self._known: Array | None = None  # covariance of newest velocity and biases, poses, calibration
         self._speed_sigma_m_s = 0.0
         self._last_edges: list[WindowEdge] = []
-        self._sure = False
-        self._at_rest = False
+        self._sure = self._at_rest = False
         self._hides_something = False  # the motion: scale, or which part of gravity is the accelerometer's bias
 
     # ---- what comes in
 
-    def _push(self, packet: KeyframePacket, T_odom_body: Array | None) -> None:
+    def _push(self, packet: KeyframePacket, T_odom_body: Array | None, motions: Sequence[Motion] = ()) -> None:
         """Append the keyframe with a first guess of its state."""
         keyframes = self._keyframes
-        x = self._first_state(packet) if len(keyframes) == 0 else self._predicted(packet, T_odom_body)
+        x = self._first_state(packet) if len(keyframes) == 0 else self._predicted(packet, T_odom_body, motions)
         keyframes.push(packet, x, T_odom_body, self._links.usable(packet.imu))
         if packet.at_rest and self._at_rest:
             # rest says that nothing moved; what else the pixels say is noise, and minutes of it would add up to drift
@@ -162,7 +167,7 @@ class SlidingWindow:
         x[:9], x[9:12] = T[:3, :3].ravel(), T[:3, 3]
         return x
 
-    def _predicted(self, packet: KeyframePacket, T_odom_body: Array | None) -> Array:
+    def _predicted(self, packet: KeyframePacket, T_odom_body: Array | None, motions: Sequence[Motion]) -> Array:
         """Return a first guess of the new keyframe's state, and append its link."""
         last, dt_s = self._keyframes.X[-1], float(packet.keyframe.t_ns - self._keyframes.t_ns[-1]) * 1e-9
         by_odometry = self._keyframes.odometry_to(T_odom_body)
@@ -170,7 +175,7 @@ class SlidingWindow:
         if motion is None:
             motion = self._keyframes.assumed_motion(packet, dt_s, self._full)
         span = packet.imu if self._full else None
-        inertial = self._links.push(span, dt_s, last[15:].copy(), motion, packet.at_rest and self._full)
+        inertial = self._links.push(span, dt_s, last[15:].copy(), motion, packet.at_rest and self._full, motions)
         x = last.copy()
         R = last[:9].reshape(3, 3)
         if inertial and (by_odometry is None or self._speed_sigma_m_s <= _UNKNOWN_SPEED_M_S):
@@ -229,6 +234,7 @@ class SlidingWindow:
         assert self._prior is not None
         keyframes = self._keyframes
         self._links.refresh(keyframes.X[:, 15:])
+        self._links.hear(keyframes.X, keyframes.held)
         self._hides_something = self._rests() or (not self._measures_scale and self._is_uniform())
         first, held = keyframes.X_first, keyframes.held
         if self._hides_something and held.any():

@@ -32,6 +32,7 @@ class Driven(Configured):
     """
 
     touches = ("rotation", "velocity", "gyro_bias")
+    sees_motion_only = True
 
     def __init__(self, mount: Mount, variables: tuple[Variable, ...]) -> None:
         """Take the mounting and the own variables besides."""

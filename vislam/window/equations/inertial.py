@@ -80,6 +80,30 @@ def guess_error(a: Array, b: Array, guess: Array, J: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _told_shift(a: Array, b: Array, at: Array) -> Array:
+    """Return how far both poses are from where further sensors were linearised [12]."""
+    out = np.empty(12)
+    da, db = difference(a, at[0]), difference(b, at[1])
+    for i in range(6):
+        out[i], out[6 + i] = da[i], db[i]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_told(d: Array, links: Links, where: Ints, k: int, A: Array, g: Array) -> None:
+    """Add what further sensors told of link k, at a shift d [12], to the normal equations."""
+    for i in range(12):
+        at_i = where[k + i // 6, i % 6]
+        total = links.told_b[k, i]
+        for j in range(12):
+            at_j = where[k + j // 6, j % 6]
+            total += links.told_H[k, i, j] * d[j]
+            if at_j >= at_i:
+                A[at_i, at_j] += links.told_H[k, i, j]
+        g[at_i] += total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _scatter(J: Array, information: Array, r: Array, where: Ints, k: int, A: Array, g: Array) -> None:
     """Add an error r [n] of keyframes k and k + 1 to the normal equations; `information` [n, n] is symmetric."""
     rows, width = J.shape
@@ -136,6 +160,12 @@ def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
                 total += (links.guess_weight[k, i // 3] * r[i]) ** 2
         for i in range(12, 15):
             total += (links.velocity_weight[k] * (X[k + 1, i] - X[k, i])) ** 2
+        if links.told[k]:
+            d = _told_shift(X[k], X[k + 1], links.told_at[k])
+            for i in range(12):
+                total += 2.0 * links.told_b[k, i] * d[i]
+                for j in range(12):
+                    total += d[i] * links.told_H[k, i, j] * d[j]
     return 0.5 * total
 
 
@@ -171,6 +201,8 @@ def linearise(
             for i in range(6):
                 weights[i, i] = links.guess_weight[k, i // 3] ** 2
             _scatter(J6, weights, r, where, k, A, g)
+        if links.told[k]:
+            _add_told(_told_shift(X[k], X[k + 1], links.told_at[k]), links, where, k, A, g)
     if full:
         for k in range(rests):
             weight = links.rest_weight[k] ** 2
