@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,11 +23,11 @@ from vislam.hw.chips import (
     adxl345,
     find_magnetometer,
     itg3205,
-    kernel_driver,
-    unbind_command,
 )
+from vislam.hw.field_watch import FieldWatch
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
+from vislam.hw.link import Link, refuse_shared
 from vislam.hw.timing import Clock, HostClock
 from vislam.hw.track import SampleTrack
 
@@ -37,21 +36,6 @@ _MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 1000.0  # the gyro samples at 1 kHz inside
 _START_ATTEMPTS = 3  # a wire may be disturbed just then
 _G_M_S2 = 9.80665
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
-_SILENT_MAG_READS = 20  # in a row without anything new, of a chip that measures faster than it is asked
-
-
-@dataclass(slots=True)
-class _Link:
-    """How it stands with one chip."""
-
-    retry_ns: int = 0
-    good_from_ns: int = 0
-    newest_ns: int = 0  # when it last gave something new
-    nacks: int = 0
-    repeats: int = 0  # equal samples in a row
-    silent: int = 0  # reads in a row that found nothing new
-    is_up: bool = False
-    self_test: SelfTest | None = None
 
 
 class Gy85:
@@ -85,19 +69,18 @@ class Gy85:
         gyro_unit = np.deg2rad(1.0 / itg3205.LSB_PER_DEG_S)
         self._gyro_map = Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, gyro_unit)
         self._accel_map = Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, _G_M_S2 / adxl345.LSB_PER_G)
-        self._mag_map = Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0)
+        self._field = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), config.stuck_samples)
         self._counts: Counter[str] = Counter()
         self._bus: I2cBus | None = None
         self._gyro: Itg3205 | None = None
         self._accel: Adxl345 | None = None
         self._mag: Magnetometer | None = None
-        self._gyro_link, self._accel_link, self._mag_link = _Link(), _Link(), _Link()
+        self._gyro_link, self._accel_link, self._mag_link = Link(), Link(), Link()
         self._events = Health(0)
         self._zero = GyroZero()
         self._temperature_c: float | None = None
         self._track = SampleTrack(config.accel_rate_hz)
         self._last_accel: Array = np.full(3, np.nan)
-        self._last_field_ut: Array = np.full(3, np.nan)
         self._pending: deque[tuple[int, Array]] = deque()  # gyro samples that wait for the accelerometer
         self._last_counts: tuple[int, int, int] | None = None
         self._last_gyro_ns = 0
@@ -148,7 +131,7 @@ class Gy85:
             link.newest_ns = now
         return self.self_tests
 
-    def _self_tested(self, link: _Link) -> SelfTest | None:
+    def _self_tested(self, link: Link) -> SelfTest | None:
         if not link.is_up:
             return None
         for _ in range(_START_ATTEMPTS):
@@ -310,27 +293,12 @@ class Gy85:
         except (BusError, SettingsLostError) as error:
             self._failed(link, error)
             return None
-        link.nacks = 0
-        if reading is None:
-            link.silent += 1
-            if link.silent >= _SILENT_MAG_READS:
-                self._counts["mag_silent"] += 1
-                self._drop(link, now)
-            return None
-        link.newest_ns, link.silent = now, 0
-        if reading.overflow:
-            self._counts["mag_overflow"] += 1
+        sample, fault = self._field.taken(reading, link, now, self._mag.rate_hz, self._counts)
+        if fault == "mag_overflow":
             self._events |= Health.MAG_FAULT
-            return None
-        link.repeats = link.repeats + 1 if (reading.field_ut == self._last_field_ut).all() else 0
-        self._last_field_ut = reading.field_ut
-        if link.repeats >= self._config.stuck_samples:
-            self._counts["mag_stuck"] += 1
+        elif fault:
             self._drop(link, now)
-            return None
-        # the measurement ended up to a period ago, and took most of one
-        t_ns = now - round(0.5 * _NS / self._mag.rate_hz)
-        return MagSample(t_ns, self._mag_map.matrix @ reading.field_ut + self._mag_map.offset)
+        return sample
 
     def _merge(self) -> list[ImuSample]:
         """Return the gyro samples for which accelerometer samples lie on both sides, with those interpolated."""
@@ -364,7 +332,7 @@ class Gy85:
 
     # ---- coming and going -------------------------------------------------------------------------------------
 
-    def _failed(self, link: _Link, error: BusError | SettingsLostError) -> None:
+    def _failed(self, link: Link, error: BusError | SettingsLostError) -> None:
         """Take note of a failed read; the chip is given up after several, or at once if the wire is dead."""
         if link is self._gyro_link:
             self._events |= Health.IMU_GAP
@@ -381,7 +349,7 @@ class Gy85:
             for other in (self._gyro_link, self._accel_link, self._mag_link):
                 self._drop(other, now)
 
-    def _drop(self, link: _Link, now: int) -> None:
+    def _drop(self, link: Link, now: int) -> None:
         """Take a chip for lost; it is looked for in the next round, then every `config.reopen_s`."""
         link.is_up = False
         link.retry_ns = max(link.retry_ns, now)
@@ -420,13 +388,13 @@ class Gy85:
         return problem
 
     def _start_gyro(self, bus: I2cBus) -> None:
-        _refuse_shared(bus, itg3205.ADDRESS)
+        refuse_shared(bus, itg3205.ADDRESS)
         self._gyro = Itg3205(bus, self._config.gyro_bandwidth_hz)
         self._gyro.configure(self._clock)
         self._gyro_link.good_from_ns = self._clock.now_ns() + round(itg3205.START_UP_S * _NS)
 
     def _start_accel(self, bus: I2cBus) -> None:
-        _refuse_shared(bus, adxl345.ADDRESS)
+        refuse_shared(bus, adxl345.ADDRESS)
         self._accel = Adxl345(bus, self._config.accel_rate_hz, self._config.accel_range_g)
         self._accel.configure()
         self._track.restart()
@@ -440,12 +408,3 @@ class Gy85:
             found.scale = self._mag.scale
         self._mag = found
         found.configure()
-
-
-def _refuse_shared(bus: I2cBus, address: int) -> None:
-    driver = kernel_driver(bus.path, address)
-    if driver is not None:
-        raise HardwareError(
-            f"{bus.path}: the kernel's driver {driver} owns the chip at 0x{address:02x}; release it: "
-            f"{unbind_command(bus.path, address, driver)}"
-        )
