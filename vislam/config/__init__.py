@@ -22,9 +22,11 @@ from vislam.config.profiles import merged, profile
 from vislam.config.ranges import Whole, check_ranges
 from vislam.config.sensors import (
     Axes,
+    BoardConfig,
     BridgeClockConfig,
     FurtherSensorsConfig,
     Gy85Config,
+    ImuChip,
     Matrix3,
     RecordConfig,
     SensorCalibration,
@@ -41,6 +43,7 @@ __all__ = [
     "AttitudeConfig",
     "Axes",
     "BatchConfig",
+    "BoardConfig",
     "BridgeClockConfig",
     "CalibrationConfig",
     "Config",
@@ -51,6 +54,7 @@ __all__ = [
     "GraphConfig",
     "GraphWorldConfig",
     "Gy85Config",
+    "ImuChip",
     "ImuConfig",
     "InitConfig",
     "LiveConfig",

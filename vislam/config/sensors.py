@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from vislam.config.frontend import CalibrationConfig
 from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Share
 
+ImuChip = Literal["auto", "lsm6dsox", "mpu6050", "icm20948"]
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 Axes = tuple[Axis, Axis, Axis]
 Vector3 = tuple[Finite, Finite, Finite]
@@ -53,6 +54,29 @@ class Gy85Config:
     silent_s: NonNegative = 0.1  # without a sample, a chip is set up again, and the source says that it is missing
     stuck_samples: Count = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
     max_temperature_change_c: NonNegative = 10.0  # since the biases were taken; an ITG3205 then drifts by up to 1 deg/s
+    calibration: SensorCalibration = field(default_factory=SensorCalibration)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardConfig:
+    """A board on an I2C bus whose inertial chip has a FIFO; docs/sensors.md lists the chips."""
+
+    chip: ImuChip = "auto"  # a family, known by its id; auto: whichever answers
+    bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
+    address: Count | None = None  # None: wherever such a chip can be
+    bus_timeout_s: NonNegative = 0.02  # of one transfer, in steps of 10 ms
+    rate_hz: Positive = 200.0  # or the next higher rate that the chip has; 400 Hz need a bus of 400 kHz
+    gyro_range_deg_s: Literal[250, 500, 1000, 2000] = 500  # a cart turns by 200 at most; in the hand ask for 2000
+    accel_range_g: Literal[2, 4, 8, 16] = 8  # wheels on thresholds give 5
+    delay_s: NonNegative | None = None  # of the gyro's filter, taken off the stamps; None: the chip's own
+    mag: bool | None = None  # a magnetometer must be there; None: it is used if there is one at the start
+    mag_rate_hz: Positive = 50.0  # how often it is asked
+    mag_range_ga: Positive = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
+    reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away
+    nacks_to_reopen: Count = 5  # in a row until a chip counts as gone: single ones are noise on the wire
+    silent_s: NonNegative = 0.1  # without a sample, the chip is set up again, and the source says that it is missing
+    stuck_samples: Count = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
+    max_temperature_change_c: NonNegative = 10.0  # since the biases were taken
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
 
@@ -118,6 +142,7 @@ class SensorsConfig:
     """The sensors of a cart, for `vislam record`; a TOML file with these sections describes one cart."""
 
     gy85: Gy85Config = field(default_factory=Gy85Config)
+    board: BoardConfig = field(default_factory=BoardConfig)
     serial: SerialConfig = field(default_factory=SerialConfig)
     webcam: WebcamConfig = field(default_factory=WebcamConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)

@@ -27,13 +27,12 @@ from vislam.hw.chips import (
 from vislam.hw.field_watch import FieldWatch
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.link import Link, refuse_shared
+from vislam.hw.link import START_ATTEMPTS, Link, first_connection, refuse_shared
 from vislam.hw.timing import Clock, HostClock
 from vislam.hw.track import SampleTrack
 
 _NS = 1_000_000_000
 _MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 1000.0  # the gyro samples at 1 kHz inside
-_START_ATTEMPTS = 3  # a wire may be disturbed just then
 _G_M_S2 = 9.80665
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
 
@@ -89,12 +88,7 @@ class Gy85:
         self._next_ns = self._clock.now_ns()
         self._next_mag_ns = 0
         self._retry_bus_ns = 0
-        problem = self._connect(self._clock.now_ns())
-        for _ in range(_START_ATTEMPTS - 1):
-            if problem is None or not must_be_there:
-                break
-            self._clock.sleep_until(self._clock.now_ns() + round(config.reopen_s * _NS))
-            problem = self._connect(self._clock.now_ns())
+        problem = first_connection(self._connect, self._clock, config.reopen_s, must_be_there)
         if must_be_there and problem is not None:
             self.close()
             raise problem
@@ -134,7 +128,7 @@ class Gy85:
     def _self_tested(self, link: Link) -> SelfTest | None:
         if not link.is_up:
             return None
-        for _ in range(_START_ATTEMPTS):
+        for _ in range(START_ATTEMPTS):
             self._clock.sleep_until(link.retry_ns if not link.is_up else 0)
             self._connect(self._clock.now_ns())
             if not link.is_up:
@@ -146,7 +140,7 @@ class Gy85:
                     link.self_test = self._mag.self_test(self._clock)
             except BusError as error:
                 self._failed(link, error)
-                self._drop(link, self._clock.now_ns())  # its stimulus may still be on: set it up again
+                link.drop(self._clock.now_ns())  # its stimulus may still be on: set it up again
             else:
                 return link.self_test
         return None
@@ -233,7 +227,7 @@ class Gy85:
         self._last_counts = (counts[0], counts[1], counts[2])
         if link.repeats >= self._config.stuck_samples:
             self._counts["gyro_stuck"] += 1
-            self._drop(link, asked)
+            link.drop(asked)
             return
         self._take_temperature(temperature)
         if max(map(abs, counts)) >= itg3205.LIMIT_LSB:
@@ -267,7 +261,7 @@ class Gy85:
         if len(counts) == 0:
             if asked - link.newest_ns > self._config.silent_s * _NS:
                 self._counts["accel_silent"] += 1
-                self._drop(link, asked)
+                link.drop(asked)
             return
         if (abs(counts) >= self._accel.limit_lsb).any():
             self._counts["accel_saturated"] += int((abs(counts) >= self._accel.limit_lsb).any(axis=1).sum())
@@ -280,7 +274,7 @@ class Gy85:
             self._last_accel = row
         if link.repeats >= self._config.stuck_samples:
             self._counts["accel_stuck"] += 1
-            self._drop(link, asked)
+            link.drop(asked)
 
     def _read_mag(self, now: int) -> MagSample | None:
         if self._mag is None or not self._mag_link.is_up:
@@ -297,7 +291,7 @@ class Gy85:
         if fault == "mag_overflow":
             self._events |= Health.MAG_FAULT
         elif fault:
-            self._drop(link, now)
+            link.drop(now)
         return sample
 
     def _merge(self) -> list[ImuSample]:
@@ -339,20 +333,15 @@ class Gy85:
         now = self._clock.now_ns()
         if isinstance(error, SettingsLostError):
             self._counts["settings_lost"] += 1
-            self._drop(link, now)
+            link.drop(now)
             return
         self._events |= Health.BUS_FAULT
         link.nacks += 1
         if error.kind != "nack" or link.nacks >= self._config.nacks_to_reopen:
-            self._drop(link, now)
+            link.drop(now)
         if error.kind == "gone":
             for other in (self._gyro_link, self._accel_link, self._mag_link):
-                self._drop(other, now)
-
-    def _drop(self, link: Link, now: int) -> None:
-        """Take a chip for lost; it is looked for in the next round, then every `config.reopen_s`."""
-        link.is_up = False
-        link.retry_ns = max(link.retry_ns, now)
+                other.drop(now)
 
     def _connect(self, now: int) -> HardwareError | None:
         """Set up what is down and due; return what keeps gyro or accelerometer from coming up."""
@@ -379,10 +368,8 @@ class Gy85:
                 problem = problem if problem is not None or link is self._mag_link else error
                 self._events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
                 continue
-            if link.newest_ns:
+            if link.came_up(now):
                 self._counts["reopened"] += 1
-            link.is_up, link.newest_ns = True, now
-            link.nacks = link.repeats = link.silent = 0
         if not any(link.is_up for link, _ in starts):
             self.close()  # an adapter that comes back has a new device file
         return problem

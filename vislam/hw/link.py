@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from vislam.core.errors import HardwareError
 from vislam.hw.chips import I2cBus, SelfTest, kernel_driver, unbind_command
+from vislam.hw.timing import Clock
+
+START_ATTEMPTS = 3  # a wire may be disturbed just then
 
 
 @dataclass(slots=True)
@@ -20,6 +24,31 @@ class Link:
     silent: int = 0  # reads in a row that found nothing new
     is_up: bool = False
     self_test: SelfTest | None = None
+
+    def drop(self, now_ns: int) -> None:
+        """Take the chip for lost; it is looked for in the next round, then at the board's own pace."""
+        self.is_up = False
+        self.retry_ns = max(self.retry_ns, now_ns)
+
+    def came_up(self, now_ns: int) -> bool:
+        """Take the chip for set up; return whether it was so before."""
+        was_up = self.newest_ns != 0
+        self.is_up, self.newest_ns = True, now_ns
+        self.nacks = self.repeats = self.silent = 0
+        return was_up
+
+
+def first_connection(
+    connect: Callable[[int], HardwareError | None], clock: Clock, reopen_s: float, must_be_there: bool
+) -> HardwareError | None:
+    """Return what keeps a board from coming up; where it must be there, a wire may be disturbed twice."""
+    problem = connect(clock.now_ns())
+    for _ in range(START_ATTEMPTS - 1):
+        if problem is None or not must_be_there:
+            break
+        clock.sleep_until(clock.now_ns() + round(reopen_s * 1e9))
+        problem = connect(clock.now_ns())
+    return problem
 
 
 def refuse_shared(bus: I2cBus, address: int) -> None:

@@ -1,4 +1,4 @@
-"""The sensors that a command line names: `gy85`, `serial:PORT`, a camera's index or path, a video file."""
+"""The sensors that a command line names: `gy85`, `board`, `serial:PORT`, a camera's index or path, a video file."""
 
 from __future__ import annotations
 
@@ -9,24 +9,34 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vislam.config import SensorCalibration, SensorsConfig
+from vislam.config import BoardConfig, ImuChip, SensorCalibration, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 
 if TYPE_CHECKING:
-    from vislam.hw.bridge.bridge import SerialBridge
     from vislam.hw.cameras.video import VideoCamera
     from vislam.hw.cameras.webcam import Webcam
-    from vislam.hw.gy85 import Gy85
+    from vislam.hw.source import InertialSource
+
+# chips with a FIFO as a command line names them, and the family of each as the settings do; board: whichever answers
+CHIPS: dict[str, ImuChip | None] = {
+    "board": None, "lsm6dsox": "lsm6dsox", "lsm6dso": "lsm6dsox", "ism330dhcx": "lsm6dsox",
+    "mpu6050": "mpu6050", "mpu6500": "mpu6050", "mpu9250": "mpu6050", "icm20948": "icm20948",
+}  # fmt: skip
+INERTIAL_KINDS = ("gy85", *CHIPS, "serial")
 
 
-def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) -> Gy85 | SerialBridge:
-    """Open `gy85[:BUS]` or `serial[:PORT]`; what is not named comes from the settings.
+def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) -> InertialSource:
+    """Open `gy85[:BUS]`, `board[:BUS]` or a chip in its place, or `serial[:PORT]`; the rest is in the settings.
 
     Raises:
         UsageError: there is no such kind of sensor.
         HardwareError: the sensor is missing and must be there.
     """
     kind, _, where = name.partition(":")
+    if kind in CHIPS:
+        from vislam.hw.fifo_board import FifoBoard
+
+        return FifoBoard(_board(kind, where, config), must_be_there=must_be_there)
     if kind == "gy85":
         from vislam.hw.gy85 import Gy85
 
@@ -37,7 +47,22 @@ def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) 
 
         bridge = replace(config.serial, port=where) if where else config.serial
         return SerialBridge(bridge, must_be_there)
-    raise UsageError(f"no IMU called '{name}'; there are: gy85, gy85:/dev/i2c-1, serial, serial:/dev/ttyUSB0")
+    raise UsageError(
+        f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, each with a place such as gy85:/dev/i2c-1, "
+        "serial:/dev/ttyUSB0"
+    )
+
+
+def _board(kind: str, where: str, config: SensorsConfig) -> BoardConfig:
+    """Return the settings of a board with what its name says."""
+    board = replace(config.board, bus=where) if where else config.board
+    family = CHIPS[kind]
+    return board if family is None else replace(board, chip=family)
+
+
+def rate_of(name: str, config: SensorsConfig) -> float:
+    """Return the samples per second that are asked of an inertial sensor."""
+    return config.board.rate_hz if name.partition(":")[0] in CHIPS else config.gy85.rate_hz
 
 
 def open_camera(
@@ -66,10 +91,11 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
     Raises HardwareError where one is missing or may not be opened.
     """
     kind, _, where = inertial.partition(":")
-    if kind == "gy85":
+    if kind == "gy85" or kind in CHIPS:
         from vislam.hw.chips import I2cBus
 
-        I2cBus(where or config.gy85.bus, config.gy85.bus_timeout_s).close()
+        board = config.gy85 if kind == "gy85" else config.board
+        I2cBus(where or board.bus, board.bus_timeout_s).close()
     elif kind == "serial":
         from vislam.hw.bridge.bridge import why_not_open
 
@@ -99,9 +125,12 @@ def with_raw_samples(config: SensorsConfig) -> SensorsConfig:
 
     gy85 = replace(config.gy85, calibration=raw(config.gy85.calibration))
     serial = replace(config.serial, calibration=raw(config.serial.calibration))
-    return replace(config, gy85=gy85, serial=serial)
+    board = replace(config.board, calibration=raw(config.board.calibration))
+    return replace(config, gy85=gy85, serial=serial, board=board)
 
 
 def calibration_of(name: str, config: SensorsConfig) -> SensorCalibration:
     """Return the calibration in the settings of an inertial sensor."""
+    if name.partition(":")[0] in CHIPS:
+        return config.board.calibration
     return config.serial.calibration if name.startswith("serial") else config.gy85.calibration

@@ -16,7 +16,7 @@ from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
 from vislam.hw.gnss_port import check_port
-from vislam.hw.sensors import calibration_of, check_devices, open_camera, open_inertial
+from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
 from vislam.live.frames import NO_CAMERA, FrameSource, NoCamera, OneCamera
@@ -50,10 +50,11 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
     if asked.startswith("replay:"):
         return ReplaySource(asked.removeprefix("replay:"), config.seed), config
     inertial, _, camera = asked.partition("+")
-    if not camera or inertial.partition(":")[0] not in ("gy85", "serial"):
+    if not camera or inertial.partition(":")[0] not in INERTIAL_KINDS:
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
-            "(a camera's index or path in place of webcam, or none: attitude by the IMU alone)"
+            f"(an IMU of {', '.join(INERTIAL_KINDS)}; a camera's index or path in place of webcam, or none: attitude "
+            "by the IMU alone)"
         )
     return CartSensors(inertial, camera, config, sensors), with_clock(config)
 
@@ -101,14 +102,14 @@ class CartSensors:
             if path is not None:
                 raise UsageError(
                     "live drivers take the calibration of their chips from the sensors file (--sensors FILE, section "
-                    f"calibration of gy85 or serial), not from --calibration.{name}"
+                    f"calibration of gy85, board or serial), not from --calibration.{name}"
                 )
         self.name = f"live {inertial}+{camera}"
         self.has_camera = camera != "none"
         told, ideal = calibration_of(inertial, sensors), SensorCalibration()
         self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
         self.rig = _rig(config.calibration.camera) if self.has_camera else NO_CAMERA
-        rate_hz = sensors.gy85.rate_hz
+        rate_hz = rate_of(inertial, sensors)
         self.imu_noise: ImuNoise | None = ImuNoise(
             sensors.gyro_noise_density, sensors.accel_noise_density, sensors.gyro_bias_walk, sensors.accel_bias_walk,
             rate_hz,

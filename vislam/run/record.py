@@ -85,7 +85,7 @@ def record(
 
     Args:
         out: folder to make.
-        imu: `gy85[:BUS]`, `serial[:PORT]` or `none`.
+        imu: `gy85[:BUS]`, `board[:BUS]` or a chip's name, `serial[:PORT]`, or `none`.
         camera: index, device file, `webcam`, video file or `none`.
         sensors: settings of both.
         config: budget and queues.

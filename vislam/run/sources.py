@@ -12,6 +12,7 @@ import numpy as np
 from vislam.config import CalibrationConfig, Config, VibrationConfig, validated
 from vislam.core.errors import DataError, UsageError
 from vislam.core.recording import Recording
+from vislam.hw.sensors import INERTIAL_KINDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 _SCHEMES = re.compile(r"(?:[a-z]+:)+")
 _SHIPPED = "gtsam"  # the package that brings a table of real tracks
 _SHIPPED_TABLE = "eqvio_processed_30s.csv"
-_SENSORS = re.compile(r"virtual-cart(,|$)|gy85\+|serial:")
+_SENSORS = re.compile(rf"virtual-cart(,|$)|({'|'.join(INERTIAL_KINDS)})(:[^+]*)?\+|serial:")
 
 
 def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None = None) -> Recording:

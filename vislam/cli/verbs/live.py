@@ -28,7 +28,8 @@ class LiveOptions:
     out: Path
     """Folder to make for everything that the run leaves"""
     source: str = "virtual-cart"
-    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, serial:PORT+webcam, gy85+none"""
+    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, board+webcam,
+    serial:PORT+webcam, gy85+none"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     seconds: Positive | None = None
@@ -70,7 +71,7 @@ BRIEF = Brief(
     ),
     (
         *COMMON, "live.send_to", "live.allow_remote", "live.ros2_domain", "live.mavlink", "live.realtime_priority",
-        "power_up.memory", "sensors.gy85.bus", "sensors.serial.port", "sensors.webcam.device",
+        "power_up.memory", "sensors.gy85.bus", "sensors.board.bus", "sensors.serial.port", "sensors.webcam.device",
     ),
     TAKEN,
 )  # fmt: skip

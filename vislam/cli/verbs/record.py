@@ -21,7 +21,8 @@ class RecordOptions:
     out: Path
     """Folder to make for the recording (ASL layout)"""
     imu: str = "gy85"
-    """gy85[:/dev/i2c-1], serial[:/dev/ttyUSB0] (without a path as the settings say), or none"""
+    """gy85[:/dev/i2c-1], board[:/dev/i2c-1] (whichever chip answers) or a chip's name, serial[:/dev/ttyUSB0] (without
+    a path as the settings say), or none"""
     camera: str = "webcam"
     """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), a video file in place of a camera, or none"""
     seconds: Positive | None = None

@@ -3,8 +3,10 @@
 from vislam.hw.chips.adxl345 import Adxl345
 from vislam.hw.chips.bus import BusError, I2cBus, SettingsLostError, kernel_driver, unbind_command
 from vislam.hw.chips.field import Magnetometer
+from vislam.hw.chips.fifo_imu import FifoImu, ImuSetup
 from vislam.hw.chips.hmc5883l import Hmc5883l
 from vislam.hw.chips.ids import identify
+from vislam.hw.chips.imus import find_imu
 from vislam.hw.chips.itg3205 import Itg3205
 from vislam.hw.chips.magnetometer import find_magnetometer
 from vislam.hw.chips.self_test import SelfTest
@@ -12,12 +14,15 @@ from vislam.hw.chips.self_test import SelfTest
 __all__ = [
     "Adxl345",
     "BusError",
+    "FifoImu",
     "Hmc5883l",
     "I2cBus",
+    "ImuSetup",
     "Itg3205",
     "Magnetometer",
     "SelfTest",
     "SettingsLostError",
+    "find_imu",
     "find_magnetometer",
     "identify",
     "kernel_driver",

@@ -106,7 +106,7 @@ class EmulatedBus:
     def _chip(self, address: int, byte_count: int) -> Chip:
         self._spend((9 * (1 + byte_count) + 1) * self._bit_ns)
         chip = self.chips.get(address)
-        if chip is None:
+        if chip is None or not chip.is_on_bus:
             raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
         return chip
 

@@ -31,6 +31,11 @@ class Chip:
         self._pointer = 0
         self.power_cycle()
 
+    @property
+    def is_on_bus(self) -> bool:
+        """Whether it answers at its address."""
+        return True
+
     def power_cycle(self) -> None:
         """Set the registers as after power-up."""
         self.registers[:] = bytes(256)

@@ -1,8 +1,9 @@
-"""Virtual HMC5883L (or DA5883), QMC5883L and QMC5883P."""
+"""Virtual HMC5883L (or DA5883), QMC5883L, QMC5883P, LIS3MDL, AK09916 and AK8963."""
 
 from __future__ import annotations
 
 import struct
+from typing import Protocol
 
 from vislam.hw.emulator.chips import Chip, NowNs
 from vislam.hw.emulator.sensing import IDEAL, SensorError, Triple, Truth, quantised
@@ -142,3 +143,130 @@ class VirtualQmc5883(Chip):
     def _end_read(self, first: int, count: int) -> None:
         if first <= self._data + 5 and first + count > self._data:
             self.registers[self._status] = 0
+
+
+class VirtualLis3mdl(Chip):
+    """Little-endian X, Y, Z; a register's number moves on only with its highest bit set; ready until data are read."""
+
+    _RATES_HZ = (0.625, 1.25, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
+    _LSB_PER_GA = (6842.0, 3421.0, 2281.0, 1711.0)
+
+    def power_cycle(self) -> None:
+        """Come up powered down."""
+        super().power_cycle()
+        self.registers[0x0F], self.registers[0x20], self.registers[0x22] = 0x3D, 0x10, 0x03
+        self._start_ns, self._sample = self._now_ns(), 0
+
+    def write(self, data: bytes) -> None:
+        """Take a message: the pointer and whether it moves on, then values for registers."""
+        self._moves_on = bool(data[0] & 0x80) if data else False
+        super().write(bytes((data[0] & 0x7F,)) + data[1:] if data else data)
+
+    def _next(self, pointer: int) -> int:
+        return pointer + 1 & 0x7F if self._moves_on else pointer
+
+    def _write_register(self, register: int, value: int) -> None:
+        if 0x20 <= register <= 0x24:
+            self.registers[register] = value
+            self._start_ns, self._sample = self._now_ns(), 0
+
+    def _begin_read(self, first: int, count: int) -> None:
+        rate_hz = self._RATES_HZ[self.registers[0x20] >> 2 & 7] * self._rate
+        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
+        if self.registers[0x22] & 3 or sample == self._sample or self.is_frozen:
+            return
+        self._sample = sample
+        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
+        _, _, field, temperature_c = self._truth(t_ns)
+        value = self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
+        lsb = self._LSB_PER_GA[self.registers[0x21] >> 5 & 3]
+        struct.pack_into("<3h", self.registers, 0x28, *quantised(value, lsb / _UT_PER_GA, -32768, 32767))
+        self.registers[0x27] |= 0x08
+
+    def _end_read(self, first: int, count: int) -> None:
+        if first <= 0x2D and first + count > 0x28:
+            self.registers[0x27] = 0
+
+
+class _Around(Protocol):
+    """A chip with a magnetometer inside, which is on the bus or not."""
+
+    @property
+    def lets_through(self) -> bool: ...
+
+
+class VirtualAkm(Chip):
+    """AK09916 ("AK09916") or AK8963 inside another chip: silent until that lets the bus through.
+
+    Reading the second status frees the data for the next; the AK8963 keeps its sensitivity in fuses.
+    """
+
+    def __init__(
+        self,
+        truth: Truth,
+        now_ns: NowNs,
+        error: SensorError = IDEAL,
+        seed: int = 0,
+        variant: str = "AK09916",
+        around: _Around | None = None,
+        fuses: tuple[int, int, int] = (176, 178, 166),
+    ) -> None:
+        """Take the motion, the host's clock and the errors, in axes of the chip around; `fuses` of an AK8963."""
+        self._is_8963, self._around, self._fuses = variant == "AK8963", around, fuses
+        self._data, self._control = (0x02, 0x0A) if self._is_8963 else (0x10, 0x31)
+        super().__init__(truth, now_ns, error, seed)
+
+    @property
+    def is_on_bus(self) -> bool:
+        """Whether it answers at all."""
+        return self._around is None or self._around.lets_through
+
+    def power_cycle(self) -> None:
+        """Come up powered down."""
+        super().power_cycle()
+        self.registers[0x00] = 0x48
+        if not self._is_8963:
+            self.registers[0x01] = 0x09
+        self._start_ns, self._sample, self._is_held = self._now_ns(), 0, False
+
+    def _write_register(self, register: int, value: int) -> None:
+        if register == self._control:
+            self.registers[register] = value
+            self._start_ns, self._sample, self._is_held = self._now_ns(), 0, False
+            in_fuses = self._is_8963 and value & 0x0F == 0x0F
+            if self._is_8963:
+                self.registers[0x10:0x13] = bytes(self._fuses) if in_fuses else bytes(3)
+
+    def _rate_hz(self) -> float:
+        mode = self.registers[self._control] & 0x1F
+        if self._is_8963:
+            return {0x12: 8.0, 0x16: 100.0}.get(mode, 0.0)
+        return {0x02: 10.0, 0x04: 20.0, 0x06: 50.0, 0x08: 100.0}.get(mode, 0.0)
+
+    def _begin_read(self, first: int, count: int) -> None:
+        rate_hz = self._rate_hz() * self._rate
+        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
+        if not rate_hz or sample == self._sample or self._is_held or self.is_frozen:
+            return
+        self._sample = sample
+        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
+        _, _, field, temperature_c = self._truth(t_ns)
+        x, y, z = self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
+        own = (y, x, -z) if self._is_8963 else (x, -y, -z)
+        if self._is_8963:
+            a, b, c = (1.0 + (fuse - 128) / 256.0 for fuse in self._fuses)
+            own = (own[0] / a, own[1] / b, own[2] / c)
+        struct.pack_into("<3h", self.registers, self._data + 1, *quantised(own, 1.0 / 0.15, -32752, 32752))
+        self.registers[self._data] |= 0x01
+        self.registers[self._second_status()] = (0x08 if sum(map(abs, own)) > 4912.0 else 0) | 0x10 * self._is_8963
+
+    def _second_status(self) -> int:
+        return 0x09 if self._is_8963 else 0x18
+
+    def _end_read(self, first: int, count: int) -> None:
+        last = first + count - 1
+        if first <= self._data + 6 and last > self._data:
+            self._is_held = True
+        if first <= self._second_status() <= last:
+            self._is_held = False
+            self.registers[self._data] = 0

@@ -1,0 +1,203 @@
+"""What chips with a FIFO say, byte by byte: decoding, pairing, scales, and what is written to their registers."""
+
+import struct
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vislam.core.errors import HardwareError
+from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, lsm6dsox, mpu6050
+from vislam.hw.chips.fifo_imu import divided, next_of
+from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualLsm6dsox, VirtualMpu6050, emulated_bus
+from worlds.gy85 import still
+
+SETUP = ImuSetup(200.0, 500, 8)
+COUNTS = st.tuples(*[st.integers(-32768, 32767)] * 3)
+
+
+class Words:
+    """A chip at 0x6a whose FIFO gives words that a test has put there."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.pointer = bytearray(data), 0
+
+    is_on_bus = True
+
+    def power_cycle(self) -> None: ...
+
+    def write(self, data: bytes) -> None:
+        self.pointer = data[0]
+
+    def read(self, count: int) -> bytes:
+        assert self.pointer == 0x78
+        taken, self.data = bytes(self.data[:count]), self.data[count:]
+        return taken
+
+
+def word(sensor: int, slot: int, counts: tuple[int, ...]) -> bytes:
+    tag = sensor << 3 | (slot & 3) << 1
+    return bytes((tag | tag.bit_count() & 1,)) + struct.pack("<3h", *counts)
+
+
+@given(st.lists(st.tuples(COUNTS, COUNTS), min_size=1, max_size=60), st.booleans(), st.integers(1, 41))
+def test_words_of_the_lsm6dsox_are_paired_by_their_slot(
+    samples: list[tuple[tuple[int, ...], tuple[int, ...]]], gyro_first: bool, at_once: int
+) -> None:
+    data = word(2, 3, (7, 7, 7)) + word(3, 3, (1, 2, 3))  # no gyro yet, and a temperature
+    for slot, (gyro, accel) in enumerate(samples):
+        words = [word(1, slot, gyro), word(2, slot, accel)]
+        data += b"".join(words if gyro_first else reversed(words))
+    bus = EmulatedBus({0x6A: Words(data)})  # type: ignore[dict-item]
+    with emulated_bus(bus):
+        chip = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
+        got_gyro, got_accel, left = [], [], len(data) // 7
+        while left:
+            raw = chip.take(min(at_once, left))
+            left -= min(at_once, left)
+            assert len(raw.gyro) == len(raw.accel)
+            got_gyro += raw.gyro.tolist()
+            got_accel += raw.accel.tolist()
+    assert got_gyro == [list(map(float, gyro)) for gyro, _ in samples]
+    assert got_accel == [list(map(float, accel)) for _, accel in samples]
+
+
+@given(st.binary(min_size=0, max_size=700))
+def test_any_bytes_in_the_fifo_of_an_lsm6dsox_give_finite_pairs_or_nothing(data: bytes) -> None:
+    whole = data[: len(data) // 7 * 7]
+    bus = EmulatedBus({0x6A: Words(whole)})  # type: ignore[dict-item]
+    with emulated_bus(bus):
+        raw = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP).take(len(whole) // 7)
+    assert len(raw.gyro) == len(raw.accel) <= len(whole) // 14
+    assert np.isfinite(raw.gyro).all()
+    assert (abs(raw.accel) <= 32768).all()
+
+
+@given(st.lists(st.tuples(COUNTS, COUNTS), max_size=85))
+def test_bytes_of_the_mpu_are_accelerometer_then_gyro_high_byte_first(
+    samples: list[tuple[tuple[int, ...], tuple[int, ...]]],
+) -> None:
+    raw = mpu6050.decoded(b"".join(struct.pack(">6h", *accel, *gyro) for gyro, accel in samples))
+    assert raw.gyro.tolist() == [list(gyro) for gyro, _ in samples]
+    assert raw.accel.tolist() == [list(accel) for _, accel in samples]
+
+
+def test_what_is_written_to_an_lsm6dsox_is_what_the_data_sheet_says() -> None:
+    clock = SteppedClock()
+    chip = VirtualLsm6dsox(still, clock.now_ns)
+    bus = EmulatedBus({0x6A: chip}, clock=clock)
+    with emulated_bus(bus):
+        driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
+        driver.configure(clock)
+        assert chip.registers[0x10] == 0b0101_11_00, "208 Hz, 8 g"
+        assert chip.registers[0x11] == 0b0101_01_00, "208 Hz, 500 deg/s"
+        assert chip.registers[0x12] == 0x44, "data that belong together, the pointer moves on"
+        assert (chip.registers[0x09], chip.registers[0x0A]) == (0x55, 0x06), "both batched at 208 Hz, continuous"
+        assert driver.gyro_rad_s == pytest.approx(np.deg2rad(17.5e-3))
+        assert driver.accel_m_s2 == pytest.approx(0.244e-3 * 9.80665)
+        chip.power_cycle()
+        with pytest.raises(SettingsLostError, match="5c54"):
+            driver.temperature_c()
+
+
+def test_the_oscillator_s_own_error_is_taken_from_the_chip() -> None:
+    clock = SteppedClock()
+    chip = VirtualLsm6dsox(still, clock.now_ns)
+    bus = EmulatedBus({0x6A: chip}, clock=clock)
+    for raw, share in ((0x7F, 0.1905), (0x80, -0.192), (0xFF, -0.0015)):
+        chip.power_cycle()
+        chip._rate = 1.0 + share
+        with emulated_bus(bus):
+            driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
+            driver.configure(clock)
+        assert chip.registers[0x63] == raw
+        assert driver.rate_hz == pytest.approx(6667.0 / 32 * (1.0 + share))
+
+
+@pytest.mark.parametrize(("who_am_i", "accel_filter"), [(0x68, 0), (0x71, 2)])
+def test_what_is_written_to_an_mpu_is_what_the_register_map_says(who_am_i: int, accel_filter: int) -> None:
+    clock = SteppedClock()
+    chip = VirtualMpu6050(still, clock.now_ns, who_am_i=who_am_i)
+    bus = EmulatedBus({0x68: chip}, clock=clock)
+    with emulated_bus(bus):
+        driver = mpu6050.Mpu6050(I2cBus(bus.path, 0.02), SETUP)
+        driver.configure(clock)
+        assert bytes(chip.registers[0x19:0x1D]) == bytes((4, 2, 0x08, 0x10)), "1 kHz / 5, 98 Hz, 500 deg/s, 8 g"
+        assert chip.registers[0x1D] == accel_filter
+        assert (chip.registers[0x23], chip.registers[0x6A], chip.registers[0x6B]) == (0x78, 0x40, 0x01)
+        assert chip.lets_through, "to the magnetometer behind it"
+        assert driver.gyro_rad_s == pytest.approx(np.deg2rad(1.0 / 65.5))
+        assert driver.accel_m_s2 == pytest.approx(9.80665 / 4096.0)
+        assert driver.temperature_c() == pytest.approx(30.0, abs=0.01)
+        chip.power_cycle()
+        with pytest.raises(SettingsLostError, match="04020810"):
+            driver.temperature_c()
+
+
+def test_an_overflow_of_an_mpu_loses_the_boundaries_and_is_thrown_away() -> None:
+    clock = SteppedClock()
+    chip = VirtualMpu6050(still, clock.now_ns)
+    bus = EmulatedBus({0x68: chip}, clock=clock)
+    with emulated_bus(bus):
+        driver = mpu6050.Mpu6050(I2cBus(bus.path, 0.02), SETUP)
+        driver.configure(clock)
+        clock.advance(420_500_000)
+        assert driver.waiting().units == 84, "1024 bytes hold one more, which is left as a margin"
+        clock.advance(20_000_000)
+        assert len(chip.fifo) > 0
+        found = driver.waiting()
+        assert (found.units, found.is_overrun) == (0, True)
+        clock.advance(20_000_000)
+        assert driver.waiting().units in (3, 4)
+        raw = driver.take(3)
+        np.testing.assert_allclose(raw.accel[:, 2], 4096, atol=1)
+
+
+def test_an_overrun_of_an_lsm6dsox_leaves_the_newest_512_words() -> None:
+    clock = SteppedClock()
+    chip = VirtualLsm6dsox(still, clock.now_ns)
+    bus = EmulatedBus({0x6A: chip}, clock=clock)
+    with emulated_bus(bus):
+        driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
+        driver.configure(clock)
+        clock.advance(5_000_000_000)
+        found = driver.waiting()
+        assert (found.units, found.is_overrun) == (512, True)
+        assert len(driver.take(512)) == 256
+        found = driver.waiting()
+        assert found.units < 50
+        assert not found.is_overrun, "told once"
+
+
+def test_a_chip_that_never_leaves_its_reset_is_refused() -> None:
+    clock = SteppedClock()
+    chip = VirtualLsm6dsox(still, clock.now_ns)
+    chip._write_register = chip.registers.__setitem__  # type: ignore[method-assign]
+    bus = EmulatedBus({0x6A: chip}, clock=clock)
+    with emulated_bus(bus), pytest.raises(HardwareError, match="does not come out of its reset"):
+        lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP).configure(clock)
+
+
+def test_a_transfer_that_breaks_off_is_a_bus_error() -> None:
+    clock = SteppedClock()
+    chip = VirtualMpu6050(still, clock.now_ns)
+    bus = EmulatedBus({0x68: chip}, clock=clock)
+    with emulated_bus(bus):
+        counts: Counter[str] = Counter()
+        driver = mpu6050.Mpu6050(I2cBus(bus.path, 0.02, counts), SETUP)
+        driver.configure(clock)
+        bus.nack_every = 1
+        with pytest.raises(BusError, match="vislam doctor"):
+            driver.waiting()
+        assert counts["nack"] == 1
+
+
+def test_the_next_rate_and_range_that_a_chip_has() -> None:
+    assert next_of(300, {250: 0, 500: 1}) == 500
+    assert next_of(9000, {250: 0, 500: 1}) == 500
+    assert divided(200.0, 1000.0) == 5
+    assert divided(300.0, 1000.0) == 3
+    assert divided(1.0, 1000.0) == 256
+    assert divided(5000.0, 1000.0) == 1

@@ -1,0 +1,90 @@
+"""Virtual MPU-6050, MPU-6500, MPU-9250: a FIFO of bytes that overwrites the oldest, by the register maps."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from vislam.hw.emulator.chips import NowNs
+from vislam.hw.emulator.fifo_chip import FifoChip
+from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
+
+_G_M_S2 = 9.80665
+_LSB_PER_DEG_S = (131.0, 65.5, 32.8, 16.4)
+
+
+class VirtualMpu6050(FifoChip):
+    """Wakes up asleep; FIFO and its reset by USER_CTRL; an overflow loses the boundaries of samples."""
+
+    FIFO_REGISTER = 0x74
+
+    def __init__(
+        self,
+        truth: Truth,
+        now_ns: NowNs,
+        gyro: SensorError = IDEAL,
+        accel: SensorError = IDEAL,
+        seed: int = 0,
+        who_am_i: int = 0x68,
+    ) -> None:
+        """Take the motion, the host's clock and the errors; `who_am_i` 0x71 is a MPU-9250."""
+        self._who_am_i = who_am_i
+        self.FIFO_BYTES = 1024 if who_am_i == 0x68 else 512
+        later = who_am_i != 0x68
+        self.gyro_delay_ns, self.accel_delay_ns = (3_900_000, 2_880_000) if later else (2_800_000, 3_000_000)
+        super().__init__(truth, now_ns, gyro, accel, seed)
+
+    @property
+    def lets_through(self) -> bool:
+        """Whether a magnetometer behind it is on the bus."""
+        return bool(self.registers[0x37] & 0x02) and not self.registers[0x6A] & 0x20
+
+    def power_cycle(self) -> None:
+        """Come up asleep (the later ones awake) with the FIFO off."""
+        super().power_cycle()
+        self.registers[0x75] = self._who_am_i
+        self.registers[0x6B] = 0x40 if self._who_am_i == 0x68 else 0x01
+
+    def _rate_hz(self) -> float:
+        inside = 8000.0 if self.registers[0x1A] & 7 in (0, 7) else 1000.0
+        return inside / (1 + self.registers[0x19])
+
+    def _write_register(self, register: int, value: int) -> None:
+        self._run()
+        if register in (0x3A, 0x72, 0x73, 0x75) or 0x3B <= register <= 0x48:
+            return
+        if register == 0x6B and value & 0x80:
+            self.power_cycle()
+            return
+        self.registers[register] = value
+        if register == 0x6A and value & 0x04:
+            self.fifo.clear()
+            self.registers[0x6A] &= ~0x04 & 0xFF
+        runs = self.registers[0x6A] & 0x40 and self.registers[0x23] == 0x78 and not self.registers[0x6B] & 0x40
+        if not runs:
+            self._next_ns = math.inf
+        elif register in (0x6A, 0x23, 0x6B, 0x19, 0x1A):
+            self._start()
+
+    def _packed(self, t_ns: int) -> bytes:
+        gyro_lsb = _LSB_PER_DEG_S[self.registers[0x1B] >> 3 & 3] * 180.0 / math.pi
+        accel_lsb = 16384.0 / (1 << (self.registers[0x1C] >> 3 & 3)) / _G_M_S2
+        gyro, accel = self._counts(t_ns, gyro_lsb, accel_lsb)
+        return struct.pack(">6h", *accel, *gyro)
+
+    def _overran(self) -> None:
+        if self.registers[0x38] & 0x10:
+            self.registers[0x3A] |= 0x10
+
+    def _begin_read(self, first: int, count: int) -> None:
+        struct.pack_into(">H", self.registers, 0x72, len(self.fifo))
+        temperature_c = self._truth(self._now_ns())[3]
+        is_first = self._who_am_i == 0x68
+        raw = (temperature_c - 36.53) * 340.0 if is_first else (temperature_c - 21.0) * 333.87
+        struct.pack_into(">h", self.registers, 0x41, round(raw))
+
+    def _read_byte(self, register: int) -> int:
+        value = super()._read_byte(register)
+        if register == 0x3A:
+            self.registers[0x3A] = 0
+        return value

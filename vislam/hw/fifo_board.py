@@ -1,0 +1,277 @@
+"""A board whose inertial chip has a FIFO: clock, stamps, faults and reconnection for every chip of `hw.chips.imus`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+
+import numpy as np
+
+from vislam.config import BoardConfig
+from vislam.core.errors import HardwareError, UsageError
+from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.hw.affine import Affine
+from vislam.hw.chips import BusError, FifoImu, I2cBus, ImuSetup, Magnetometer, SelfTest, SettingsLostError, find_imu
+from vislam.hw.chips.magnetometer import find_any_magnetometer
+from vislam.hw.field_watch import FieldWatch
+from vislam.hw.fifo_samples import FifoSamples
+from vislam.hw.gyro_zero import GyroZero
+from vislam.hw.health import Health
+from vislam.hw.link import Link, first_connection, refuse_shared
+from vislam.hw.timing import Clock, HostClock
+
+_NS = 1_000_000_000
+_WATCH_S = 0.5  # between looks at temperature and settings
+_ASKED_PER_SAMPLE = 1.07  # no whole number: questions then sweep over the samples' phase, which narrows their times
+
+
+class FifoBoard:
+    """Satisfies `InertialSource`. The chip paces gyro and accelerometer; its FIFO says how many samples are new.
+
+    Stamps are those of the chip's clock as the counts place it in the host's, less the delay of the gyro's filter; the
+    accelerometer is interpolated to them. A host that comes late loses nothing until the FIFO is full. One thread
+    only. Transfers are bounded by `config.bus_timeout_s`.
+    """
+
+    stamped_by = "the chip's clock, from the counts of its FIFO"
+
+    def __init__(self, config: BoardConfig, clock: Clock | None = None, must_be_there: bool = True) -> None:
+        """Open the bus, find the chip and set it up.
+
+        With `must_be_there` False a missing board is not an error: it is looked for as after unplugging.
+
+        Raises:
+            UsageError: a rate that no such board has.
+            HardwareError: bus or chip is missing or is another chip; smbus2 is not installed.
+        """
+        if not config.rate_hz <= 1000.0:
+            raise UsageError(f"board.rate_hz must be at most 1000, got {config.rate_hz:g}")
+        self._config = config
+        self._clock: Clock = HostClock() if clock is None else clock
+        self._setup = ImuSetup(config.rate_hz, config.gyro_range_deg_s, config.accel_range_g)
+        self.rate_hz = config.rate_hz
+        self.self_tests: tuple[SelfTest, ...] = ()
+        c = config.calibration
+        self._mag_watch = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), config.stuck_samples)
+        self._counts: Counter[str] = Counter()
+        self._bus: I2cBus | None = None
+        self._imu: FifoImu | None = None
+        self._mag: Magnetometer | None = None
+        self._imu_link, self._mag_link = Link(), Link()
+        self._wants_mag = config.mag is True
+        self._samples = FifoSamples(config)
+        self._events = Health(0)
+        self._must_empty = False
+        self._last_out_ns = self._next_ns = self._clock.now_ns()
+        self._next_mag_ns = self._next_watch_ns = self._retry_bus_ns = 0
+        problem = first_connection(self._connect, self._clock, config.reopen_s, must_be_there)
+        if must_be_there and problem is not None:
+            self.close()
+            raise problem
+        self._next_ns = self._clock.now_ns()
+
+    @property
+    def temperature_c(self) -> float | None:
+        """Temperature of the chip, smoothed over a second; None before it was read."""
+        return self._samples.temperature_c
+
+    @property
+    def imu(self) -> FifoImu | None:
+        """The inertial chip; None before one was found."""
+        return self._imu
+
+    @property
+    def magnetometer_name(self) -> str | None:
+        """Which magnetometer was found; None if there is none."""
+        return None if self._mag is None else self._mag.name
+
+    @property
+    def stamp_bound_ms(self) -> float | None:
+        """By how much stamps can be off, beside the filters' delays; see `FifoStamps`."""
+        return self._samples.stamps.bound_ms
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        self._samples.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
+
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
+        deadline = self._clock.now_ns() + round(timeout_s * _NS)
+        while True:
+            if self._next_ns > deadline:
+                self._clock.sleep_until(deadline)
+                return []
+            self._clock.sleep_until(self._next_ns)
+            samples = self._poll()
+            if samples:
+                return samples
+
+    def health(self) -> Health:
+        """Return the sensor bits that hold now and the events since the last call."""
+        word, self._events = self._events, Health(0)
+        if self._clock.now_ns() - self._last_out_ns > self._config.silent_s * _NS:
+            word |= Health.IMU_MISSING
+        if not self._imu_link.is_up:
+            word |= Health.GYRO_FAULT | Health.ACCEL_FAULT
+        if self._wants_mag and not self._mag_link.is_up:
+            word |= Health.MAG_FAULT
+        if self._bus is None:
+            word |= Health.BUS_FAULT
+        if self._samples.is_far:
+            word |= Health.TEMPERATURE_DRIFT
+        return word
+
+    def counters(self) -> dict[str, int]:
+        """Return how often each fault occurred since the start."""
+        return dict(self._counts)
+
+    def close(self) -> None:
+        """Close the bus; may be called twice."""
+        if self._bus is not None:
+            self._bus.close()
+        self._bus = None
+        self._imu_link.is_up = self._mag_link.is_up = False
+
+    # ---- one round --------------------------------------------------------------------------------------------
+
+    def _poll(self) -> list[ImuSample | MagSample]:
+        now = self._clock.now_ns()
+        if not self._imu_link.is_up or (self._wants_mag and not self._mag_link.is_up):
+            self._connect(now)
+        samples: list[ImuSample | MagSample] = []
+        if self._imu is not None and self._imu_link.is_up:
+            try:
+                samples += self._inertial(self._imu)
+                self._look(self._imu, now)
+            except (BusError, SettingsLostError) as error:
+                self._failed(self._imu_link, error)
+        mag = self._magnetic(now) if self._wants_mag and now >= self._next_mag_ns else None
+        if mag is not None:
+            samples.append(mag)
+            samples.sort(key=lambda sample: sample.t_ns)
+        period_ns = round(_NS / (_ASKED_PER_SAMPLE * self.rate_hz))
+        late = max(self._clock.now_ns() - self._next_ns, 0) // period_ns
+        self._next_ns += (late + 1) * period_ns
+        if not self._imu_link.is_up:
+            self._next_ns = max(self._next_ns, self._imu_link.retry_ns)
+        return samples
+
+    def _inertial(self, imu: FifoImu) -> list[ImuSample]:
+        if self._must_empty:
+            imu.empty()
+            self._samples.restart()
+            self._must_empty = False
+        link = self._imu_link
+        asked = self._clock.now_ns()
+        waiting = imu.waiting()
+        answered = self._clock.now_ns()
+        link.nacks = 0
+        if waiting.is_overrun:
+            self._counts["fifo_overrun"] += 1
+            self._events |= Health.IMU_GAP
+            self._samples.restart()
+            link.newest_ns = asked  # it lives
+        self._must_empty = True  # until all are fetched: a transfer that breaks off leaves parts of samples
+        raw = imu.take(waiting.units) if waiting.units else None
+        self._must_empty = False
+        if raw is None or len(raw) == 0:
+            if asked - link.newest_ns > self._config.silent_s * _NS:
+                self._counts["imu_silent"] += 1
+                link.drop(asked)
+            return []
+        link.newest_ns = asked
+        made = self._samples.made(raw, asked, answered, self._counts)
+        self._events |= made.events
+        if made.is_stuck:
+            link.drop(asked)
+        if made.samples:
+            self._last_out_ns = self._clock.now_ns()
+        return made.samples
+
+    def _look(self, imu: FifoImu, now: int) -> None:
+        """Take the temperature and see that the settings are still there."""
+        if now < self._next_watch_ns:
+            return
+        self._next_watch_ns = now + round(_WATCH_S * _NS)
+        self._samples.take_temperature(imu.temperature_c())
+
+    def _magnetic(self, now: int) -> MagSample | None:
+        if self._mag is None or not self._mag_link.is_up:
+            return None
+        rate_hz = min(self._config.mag_rate_hz, self._mag.rate_hz)
+        self._next_mag_ns = max(self._next_mag_ns + round(_NS / rate_hz), now)
+        try:
+            reading = self._mag.read()
+        except (BusError, SettingsLostError) as error:
+            self._failed(self._mag_link, error)
+            return None
+        sample, fault = self._mag_watch.taken(reading, self._mag_link, now, self._mag.rate_hz, self._counts)
+        if fault == "mag_overflow":
+            self._events |= Health.MAG_FAULT
+        elif fault:
+            self._mag_link.drop(now)
+        return sample
+
+    # ---- coming and going -------------------------------------------------------------------------------------
+
+    def _failed(self, link: Link, error: BusError | SettingsLostError) -> None:
+        """Take note of a failed transfer; the chip is given up after several, or at once if the wire is dead."""
+        now = self._clock.now_ns()
+        if isinstance(error, SettingsLostError):
+            self._counts["settings_lost"] += 1
+            self._events |= Health.IMU_GAP if link is self._imu_link else Health(0)
+            link.drop(now)
+            return
+        self._events |= Health.BUS_FAULT | (Health.IMU_GAP if self._must_empty else Health(0))
+        link.nacks += 1
+        if error.kind != "nack" or link.nacks >= self._config.nacks_to_reopen:
+            link.drop(now)
+        if error.kind == "gone":
+            self._imu_link.drop(now)
+            self._mag_link.drop(now)
+
+    def _connect(self, now: int) -> HardwareError | None:
+        """Set up what is down and due; return what keeps the inertial chip from coming up."""
+        reopen_ns = round(self._config.reopen_s * _NS)
+        if self._bus is None:
+            if now < self._retry_bus_ns:
+                return None
+            self._retry_bus_ns = now + reopen_ns
+            try:
+                self._bus = I2cBus(self._config.bus, self._config.bus_timeout_s, self._counts)
+            except BusError as error:
+                self._imu_link.retry_ns = self._retry_bus_ns
+                return error
+        problem: HardwareError | None = None
+        for link, start in ((self._imu_link, self._start_imu), (self._mag_link, self._start_mag)):
+            if link.is_up or now < link.retry_ns or (link is self._mag_link and not self._wants_mag):
+                continue
+            link.retry_ns = now + reopen_ns
+            try:
+                start(self._bus)
+            except HardwareError as error:
+                problem = error if link is self._imu_link else problem
+                self._events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
+                continue
+            if link.came_up(self._clock.now_ns()):
+                self._counts["reopened"] += 1
+        if not (self._imu_link.is_up or self._mag_link.is_up):
+            self.close()  # an adapter that comes back has a new device file
+        return problem
+
+    def _start_imu(self, bus: I2cBus) -> None:
+        imu = find_imu(bus, self._setup, self._config.chip, self._config.address)
+        refuse_shared(bus, imu.address)
+        imu.configure(self._clock)
+        self._samples.begin(imu, self._clock.now_ns() + round(imu.start_up_s * _NS))
+        self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, False
+        if self._config.mag is None and not self._wants_mag:
+            with suppress(BusError):  # one that is on the board answers now: what is inside the chip is on the bus
+                self._wants_mag = find_any_magnetometer(bus, self._config.mag_range_ga) is not None
+
+    def _start_mag(self, bus: I2cBus) -> None:
+        found = find_any_magnetometer(bus, self._config.mag_range_ga)
+        if found is None:
+            raise HardwareError(f"{bus.path}: no magnetometer answers")
+        self._mag = found
+        found.configure()

@@ -1,0 +1,121 @@
+"""From the counts of a FIFO to calibrated samples: stamps, scale, saturation, a sensor that hangs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vislam.config import BoardConfig
+from vislam.core.messages import Array, ImuSample
+from vislam.hw.affine import Affine
+from vislam.hw.chips import FifoImu
+from vislam.hw.chips.fifo_imu import SATURATED_LSB, RawSamples
+from vislam.hw.fifo_stamps import FifoStamps
+from vislam.hw.gyro_zero import GyroZero
+from vislam.hw.health import Health
+
+
+@dataclass(slots=True)
+class _Watch:
+    """Whether one of the two sensors of a chip still measures, and within its range."""
+
+    name: str
+    saturated: Health
+    last: Array = field(default_factory=lambda: np.full(3, np.nan))
+    repeats: int = 0  # equal samples in a row
+
+    def looked(self, counts: Array, tallies: Counter[str]) -> Health:
+        """Take counts [N, 3]; return the health bit of saturation."""
+        for row in counts:
+            self.repeats = self.repeats + 1 if (row == self.last).all() else 0
+            self.last = row
+        beyond = int((abs(counts) >= SATURATED_LSB).any(axis=1).sum())
+        if beyond:
+            tallies[f"{self.name}_saturated"] += beyond
+        return self.saturated if beyond else Health(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What one look into the FIFO gave."""
+
+    samples: list[ImuSample]
+    events: Health
+    is_stuck: bool  # a sensor hangs: the chip must be set up again
+
+
+class FifoSamples:
+    """Owns the calibration, the stamps and the temperature of one inertial chip with a FIFO."""
+
+    def __init__(self, config: BoardConfig) -> None:
+        """Take settings; samples can be made once a chip has begun."""
+        self._config = config
+        self.stamps = FifoStamps(config.rate_hz)
+        self.zero = GyroZero()
+        self.temperature_c: float | None = None  # smoothed over about a second
+        self._gyro = _Watch("gyro", Health.GYRO_SATURATED)
+        self._accel = _Watch("accel", Health.ACCEL_SATURATED)
+        self._delay_ns = self._good_ns = 0
+        self._back = 0.0  # share of a period from the accelerometer's time to the gyro's
+        self._accel_before: Array | None = None
+        self._begin_maps(1.0, 1.0)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether the chip is warmer or colder than where its biases were taken, by more than is allowed."""
+        return self.zero.is_far(self.temperature_c, self._config.max_temperature_change_c)
+
+    def begin(self, imu: FifoImu, good_from_ns: int) -> None:
+        """Take the scale and rate of a chip that was just set up; its samples are good from a time on."""
+        self._begin_maps(imu.gyro_rad_s, imu.accel_m_s2)
+        self.stamps = FifoStamps(imu.rate_hz)
+        delay_s = imu.gyro_delay_s if self._config.delay_s is None else self._config.delay_s
+        self._delay_ns, self._good_ns = round(delay_s * 1e9), good_from_ns
+        self._back = (imu.gyro_delay_s - imu.accel_delay_s) * imu.rate_hz
+        self._accel_before = None
+        self._gyro.repeats = self._accel.repeats = 0
+
+    def restart(self) -> None:
+        """Samples were lost: the next ones are stamped without those before."""
+        self.stamps.restart()
+        self._accel_before = None
+
+    def take_temperature(self, found_c: float) -> None:
+        """Take what the chip says, about twice a second."""
+        self.temperature_c = found_c if self.temperature_c is None else 0.5 * (self.temperature_c + found_c)
+
+    def made(self, raw: RawSamples, asked_ns: int, answered_ns: int, tallies: Counter[str]) -> Made:
+        """Return samples of the body frame, at the times of what the gyro's filter lets through; counts faults.
+
+        `asked_ns` and `answered_ns` are around the question how many there are.
+        """
+        events = self._gyro.looked(raw.gyro, tallies) | self._accel.looked(raw.accel, tallies)
+        stuck = [watch.name for watch in (self._gyro, self._accel) if watch.repeats >= self._config.stuck_samples]
+        for name in stuck:
+            tallies[f"{name}_stuck"] += 1
+        drift = self.zero.drift_rad_s(self.temperature_c)
+        rates = raw.gyro @ self._gyro_map.matrix.T + self._gyro_map.offset - drift
+        forces = self._at_gyro(raw.accel) @ self._accel_map.matrix.T + self._accel_map.offset
+        stamps = self.stamps.of(len(raw), asked_ns, answered_ns)
+        samples = [
+            ImuSample(t_ns - self._delay_ns, rate, force)
+            for t_ns, rate, force in zip(stamps, rates, forces, strict=True)
+            if t_ns >= self._good_ns
+        ]
+        return Made(samples, events, bool(stuck))
+
+    def _at_gyro(self, accel: Array) -> Array:
+        """Return counts [N, 3] between those of the accelerometer, for the gyro's filter is late by more than its own.
+
+        Where it is late by less, by some 0.2 ms, they lie as far ahead on the line of the last two.
+        """
+        before = np.vstack([accel[:1] if self._accel_before is None else self._accel_before, accel[:-1]])
+        self._accel_before = accel[-1:]
+        return accel - self._back * (accel - before)
+
+    def _begin_maps(self, gyro_rad_s: float, accel_m_s2: float) -> None:
+        c = self._config.calibration
+        self._gyro_map = Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, gyro_rad_s)
+        self._accel_map = Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, accel_m_s2)
