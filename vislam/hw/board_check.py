@@ -1,4 +1,4 @@
-"""Whether a GY-85 that stands still measures what the world has: gravity, no rotation, the earth's field."""
+"""Whether a board that stands still measures what the world has: gravity, no rotation, the earth's field."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import numpy as np
 
 from vislam.core.findings import Finding, Severity
 from vislam.core.messages import ImuSample, MagSample
+from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 
 Add = Callable[..., None]
 
 _GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = 9.81, 0.5
-_MAX_RATE_DEG_S = 40.0  # zero-rate output of the data sheet
+_MAX_RATE_DEG_S = 40.0  # zero-rate output of an ITG3205 by the data sheet
 _MAX_GYRO_STD_DEG_S, _MAX_ACCEL_STD_M_S2 = 1.0, 0.3  # three times the noise of the chips
 _FIELD_UT = (22.0, 67.0)  # of the earth, anywhere
 _TEMPERATURE_C = (-40.0, 85.0)
@@ -24,12 +25,16 @@ _EXPLAINED = {
     "timeout": "a line was held low: look for a loose or shorted wire",
     "rounds_missed": "the machine was too busy to ask in time: free it, or use the serial bridge",
     "accel_overrun": "the accelerometer's FIFO ran over: the machine was busy for more than 80 ms",
+    "fifo_overrun": "the chip's FIFO ran over: the machine was busy for longer than it holds (docs/sensors.md)",
+    "imu_silent": "the chip gave no samples and was set up again: check its supply and the plug",
     "settings_lost": "a chip lost its power for a moment: check the plug",
     "reopened": "a chip went away and came back: check the plug",
 }
 
 
-def check_board(board: Gy85, inertial: list[ImuSample], magnetic: list[MagSample], where: str) -> list[Finding]:
+def check_board(
+    board: Gy85 | FifoBoard, inertial: list[ImuSample], magnetic: list[MagSample], where: str
+) -> list[Finding]:
     """Return what the self-tests, the fault counters and some seconds of samples at rest say."""
     findings: list[Finding] = []
 
@@ -53,7 +58,8 @@ def check_board(board: Gy85, inertial: list[ImuSample], magnetic: list[MagSample
     if word:
         add("warning", f"health: {word.name}", "docs/cart.md says what each bit means")
     if len(inertial) >= _MIN_SAMPLES:
-        _check_rest(inertial, add)
+        max_rate_deg_s = board.imu.max_zero_deg_s if isinstance(board, FifoBoard) and board.imu else _MAX_RATE_DEG_S
+        _check_rest(inertial, max_rate_deg_s, add)
     if board.temperature_c is not None:
         low, high = _TEMPERATURE_C
         is_possible = low < board.temperature_c < high
@@ -62,7 +68,7 @@ def check_board(board: Gy85, inertial: list[ImuSample], magnetic: list[MagSample
     return findings
 
 
-def _check_rest(inertial: list[ImuSample], add: Add) -> None:
+def _check_rest(inertial: list[ImuSample], max_rate_deg_s: float, add: Add) -> None:
     gyro = np.rad2deg([sample.gyro_rad_s for sample in inertial])
     accel = np.array([sample.accel_m_s2 for sample in inertial])
     gyro_std, accel_std = float(gyro.std(axis=0).max()), float(accel.std(axis=0).max())
@@ -77,13 +83,27 @@ def _check_rest(inertial: list[ImuSample], add: Add) -> None:
     else:
         add("ok", f"gravity is measured as {norm:.2f} m/s^2, along {np.round(force, 1).tolist()}")
     axes = " ".join(f"{value:.2f}" for value in rate)
-    if abs(rate).max() > _MAX_RATE_DEG_S:
-        add("warning", f"the gyro's zero is at {axes} deg/s, {_MAX_RATE_DEG_S:g} allowed", "replace the board")
+    if abs(rate).max() > max_rate_deg_s:
+        add("warning", f"the gyro's zero is at {axes} deg/s, {max_rate_deg_s:g} allowed", "replace the board")
     else:
         add("ok", f"the gyro's zero is at {axes} deg/s, noise {gyro_std:.2f} deg/s rms")
 
 
-def _check_field(board: Gy85, magnetic: list[MagSample], add: Add) -> None:
+def check_stamps(source: object, where: str) -> list[Finding]:
+    """Return where the stamps of an inertial source come from and, where that is known, how far they can be off."""
+    stamped_by = getattr(source, "stamped_by", None)
+    if stamped_by is None:
+        return []
+    bound_ms = getattr(source, "stamp_bound_ms", None)
+    bound = "" if bound_ms is None else f", known to about {bound_ms:.2f} ms"
+    findings = [Finding("ok", f"stamped by {stamped_by}{bound}", where, "")]
+    if isinstance(source, FifoBoard):
+        what = "this driver was tested against an emulator written from the data sheet and has not met a real chip"
+        findings.append(Finding("ok", what, where, "tell us what you see: docs/sensors.md"))
+    return findings
+
+
+def _check_field(board: Gy85 | FifoBoard, magnetic: list[MagSample], add: Add) -> None:
     name = board.magnetometer_name
     if name is None:
         add("warning", "there is no magnetometer", "nothing to do: it is optional")
@@ -91,7 +111,9 @@ def _check_field(board: Gy85, magnetic: list[MagSample], add: Add) -> None:
     if not magnetic:
         add("warning", f"the {name} gives no samples", "keep magnets away; docs/cart.md")
         return
-    if name != "HMC5883L":
+    if isinstance(board, FifoBoard):
+        add("ok", f"the magnetometer is a {name}: check its axes, docs/sensors.md")
+    elif name != "HMC5883L":
         add("ok", f"the magnetometer is a {name}, sold as HMC5883L: check its axes, docs/cart.md")
     norm = float(np.linalg.norm(np.mean([sample.field_ut for sample in magnetic], axis=0)))
     low, high = _FIELD_UT

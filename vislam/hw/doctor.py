@@ -11,15 +11,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from vislam.config import Gy85Config, SerialConfig, WebcamConfig
+from vislam.config import BoardConfig, Gy85Config, SensorsConfig, SerialConfig, WebcamConfig
 from vislam.core.errors import HardwareError
 from vislam.core.findings import Finding, Severity, worst
 from vislam.core.messages import ImuSample, MagSample
-from vislam.hw.board_check import check_board
+from vislam.hw.board_check import check_board, check_stamps
 from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.cameras.webcam import Capture, Webcam
-from vislam.hw.chips import I2cBus, identify, kernel_driver, unbind_command
+from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command
+from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
+from vislam.hw.sensors import open_inertial
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.hw.timing import Clock, HostClock
 
@@ -59,6 +61,7 @@ class Wanted:
     i2c: str | None = None
     serial: str | None = None
     camera: str | None = None
+    imu: str | None = None  # as a command line names it
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +103,15 @@ def examine(
 ) -> HardwareReport:
     """Look for buses, chips, ports and cameras, and measure what answers for so long each.
 
-    Only reads: chips at the addresses of a GY-85 are asked for their ids and set up if they are what they should be;
-    serial ports and cameras are opened when they are asked for by name. `root` is where /dev and /sys are.
+    Only reads: chips at known addresses are asked for their ids and set up if they are what they should be; serial
+    ports, cameras and an IMU are opened when they are asked for by name. `root` is where /dev and /sys are.
     """
     clock = HostClock() if clock is None else clock
     notes = _Notes()
-    _examine_buses(notes, wanted.i2c, seconds, clock, root)
+    if wanted.imu is None:
+        _examine_buses(notes, wanted.i2c, seconds, clock, root)
+    else:
+        _examine_named(notes, wanted.imu, seconds, clock)
     _examine_ports(notes, wanted.serial, seconds, clock, root)
     _examine_cameras(notes, wanted.camera, seconds, clock, root, open_capture)
     return HardwareReport(tuple(notes.devices), tuple(notes.timings), tuple(notes.findings))
@@ -128,18 +134,20 @@ def _examine_buses(notes: _Notes, wanted: str | None, seconds: float, clock: Clo
     for path in paths:
         try:
             with closing(I2cBus(path, Gy85Config().bus_timeout_s)) as bus:
-                has_board = _examine_chips(notes, bus, clock, root, severity)
+                make = _examine_chips(notes, bus, clock, root, severity)
         except HardwareError as error:
             notes.failed(error, path, severity)
             continue
-        if has_board:
-            _measure_board(notes, path, seconds, clock, severity)
+        if make is not None:
+            _measure_board(notes, path, make, seconds, clock, severity)
 
 
-def _examine_chips(notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severity: Severity) -> bool:
-    """Note the chips of a bus; return whether gyro and accelerometer of a GY-85 are there and free."""
+def _examine_chips(
+    notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severity: Severity
+) -> Callable[[str, Clock], Gy85 | FifoBoard] | None:
+    """Note the chips of a bus; return what opens the board that they make up, if they are free."""
     notes.devices.append(Device("bus", bus.path, "I2C" if bus.is_combined else "SMBus only"))
-    found: set[str] = set()
+    found: dict[str, int] = {}
     for chip in identify(bus):
         notes.devices.append(Device("chip", f"{bus.path} 0x{chip.address:02x}", chip.name))
         driver = kernel_driver(bus.path, chip.address, root / "sys")
@@ -151,13 +159,22 @@ def _examine_chips(notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severit
             next_step = "tie the chip's address pin (SDO or AD0) low, as on a GY-85"
             notes.add(severity, f"the {chip.name} is not at its usual address", where, next_step)
         else:
-            found.add(chip.name)
+            found[chip.name] = chip.address
+    imu = next((address for name, address in found.items() if name in IMU_NAMES), None)
+    if imu is not None:
+        _note_speed(notes, bus, imu, clock)
+        return lambda path, clock: FifoBoard(BoardConfig(bus=path), clock)
     missing = [name for name in ("ITG3205", "ADXL345") if name not in found]
     if missing:
         what = f"no {' and no '.join(missing)} free to use"
         notes.add(severity, what, bus.path, "check power (3.3 V), ground, SDA and SCL; a GY-85 has both")
-        return False
-    speed_hz = bus.measure_hz(0x53, 0x00, clock)
+        return None
+    _note_speed(notes, bus, 0x53, clock)
+    return lambda path, clock: Gy85(Gy85Config(bus=path), clock)
+
+
+def _note_speed(notes: _Notes, bus: I2cBus, address: int, clock: Clock) -> None:
+    speed_hz = bus.measure_hz(address, 0x00, clock)
     if speed_hz < _MIN_BUS_HZ:
         notes.add(
             "warning",
@@ -167,21 +184,47 @@ def _examine_chips(notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severit
         )
     else:
         notes.add("ok", f"the bus runs at {min(speed_hz, 1e6) / 1e3:.0f} kHz or more", bus.path)
-    return True
 
 
-def _measure_board(notes: _Notes, path: str, seconds: float, clock: Clock, severity: Severity) -> None:
+def _measure_board(
+    notes: _Notes,
+    path: str,
+    make: Callable[[str, Clock], Gy85 | FifoBoard],
+    seconds: float,
+    clock: Clock,
+    severity: Severity,
+) -> None:
     try:
-        board = Gy85(Gy85Config(bus=path), clock)
+        board = make(path, clock)
     except HardwareError as error:
         notes.failed(error, path, severity)
         return
     with closing(board):
         inertial, magnetic = _listen(board, seconds, clock)
-        notes.findings += check_board(board, inertial, magnetic, path)
+        notes.findings += check_board(board, inertial, magnetic, path) + check_stamps(board, path)
         _note_timing(notes, f"{path}: inertial", inertial, board.rate_hz, severity)
         if magnetic:
             notes.timings.append(_timing(f"{path}: magnetic", [sample.t_ns for sample in magnetic]))
+
+
+def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock) -> None:
+    """Open the IMU that a command line names and measure what comes."""
+    try:
+        source = open_inertial(name, SensorsConfig())
+    except HardwareError as error:
+        notes.failed(error, name, "error")
+        return
+    with closing(source):
+        inertial, magnetic = _listen(source, seconds, clock)
+        notes.findings += check_stamps(source, name)
+        if isinstance(source, Gy85 | FifoBoard):
+            notes.findings += check_board(source, inertial, magnetic, name)
+        _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, "error")
+        if magnetic:
+            notes.timings.append(_timing(f"{name}: magnetic", [sample.t_ns for sample in magnetic]))
+        word = source.health()
+        if word:
+            notes.add("warning", f"health: {word.name}; {_counted(source.counters())}", name, "see docs/sensors.md")
 
 
 def _listen(source: InertialSource, seconds: float, clock: Clock) -> tuple[list[ImuSample], list[MagSample]]:

@@ -47,6 +47,8 @@ class Gy85:
     One thread only. Transfers are bounded by `config.bus_timeout_s`, which is what a call may take longer than asked.
     """
 
+    stamped_by = "the host, in the middle of the transfer"
+
     def __init__(self, config: Gy85Config, clock: Clock | None = None, must_be_there: bool = True) -> None:
         """Open the bus, set the chips up, test them (`config.self_test`: about 2 s, standing still).
 

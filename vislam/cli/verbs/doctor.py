@@ -28,7 +28,9 @@ class DoctorOptions:
     source: Positional[str] = ""
     """Recording to examine, as for `run`; without one, the sensors of this machine are examined"""
     i2c: str | None = None
-    """A GY-85 must be on this bus, such as /dev/i2c-1; without, every bus is looked at"""
+    """A GY-85 or another known board must be on this bus, such as /dev/i2c-1; without, every bus is looked at"""
+    imu: str | None = None
+    """This IMU must give samples, as `vislam live` names it: board, lsm6dsox:/dev/i2c-1 ..."""
     serial: str | None = None
     """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that nobody names are not opened"""
     camera: str | None = None
@@ -49,7 +51,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _examine_recording(options: DoctorOptions) -> int:
-    if options.i2c or options.serial or options.camera:
+    if options.i2c or options.serial or options.camera or options.imu:
         raise UsageError(f"doctor examines {options.source} or the sensors of this machine, not both; leave one out")
     from vislam.datasets.inspect import inspect
 
@@ -64,7 +66,7 @@ def _examine_recording(options: DoctorOptions) -> int:
 def _examine_hardware(options: DoctorOptions) -> int:
     from vislam.hw.doctor import Wanted, examine
 
-    report = examine(Wanted(options.i2c, options.serial, options.camera), options.seconds)
+    report = examine(Wanted(options.i2c, options.serial, options.camera, options.imu), options.seconds)
     if options.json:
         print(json.dumps(asdict(report)))
     else:

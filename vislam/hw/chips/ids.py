@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
-from vislam.hw.chips import adxl345, hmc5883l, itg3205
-from vislam.hw.chips.bus import I2cBus
+from vislam.hw.chips import adxl345, akm, hmc5883l, itg3205, lis3mdl
+from vislam.hw.chips.bus import BusError, I2cBus
+from vislam.hw.chips.imus import KNOWN_IMUS
 from vislam.hw.chips.qmc5883 import QMC5883L, QMC5883P
 
 
@@ -20,29 +22,63 @@ class FoundChip:
 
 _ASKED_TIMES = 3  # a chip that does not answer may have been disturbed
 
-# name, address, id register, ids allowed, whether the address is not a GY-85's
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """What may sit at an address, and how it says so."""
+
+    address: int
+    register: int
+    names: dict[bytes, str]  # by what is in the register
+    is_elsewhere: bool = False
+
+
+_ITG3205 = {b"\x68": "ITG3205", b"\x69": "ITG3205"}
+_LIS3MDL = {bytes([lis3mdl.ID]): "LIS3MDL"}
 _KNOWN = (
-    ("ADXL345", adxl345.ADDRESS, 0x00, (b"\xe5",), False),
-    ("ADXL345", 0x1D, 0x00, (b"\xe5",), True),
-    ("ITG3205", itg3205.ADDRESS, 0x00, (b"\x68", b"\x69"), False),
-    ("ITG3205", 0x69, 0x00, (b"\x68", b"\x69"), True),
-    ("HMC5883L or DA5883", hmc5883l.ADDRESS, hmc5883l.ID_REGISTER, (hmc5883l.IDS,), False),
+    _Candidate(adxl345.ADDRESS, 0x00, {b"\xe5": "ADXL345"}),
+    _Candidate(0x1D, 0x00, {b"\xe5": "ADXL345"}, True),
+    _Candidate(itg3205.ADDRESS, 0x00, _ITG3205),
+    _Candidate(0x69, 0x00, _ITG3205, True),
+    _Candidate(hmc5883l.ADDRESS, hmc5883l.ID_REGISTER, {hmc5883l.IDS: "HMC5883L or DA5883"}),
+    *(_Candidate(v.address, v.id_register, {bytes([v.id_value]): v.name}) for v in (QMC5883L, QMC5883P)),
     *(
-        (variant.name, variant.address, variant.id_register, (bytes([variant.id_value]),), False)
-        for variant in (QMC5883L, QMC5883P)
+        _Candidate(address, known.id_register, {bytes([value]): name for value, name in known.ids.items()})
+        for known in KNOWN_IMUS
+        for address in known.addresses
     ),
+    *(_Candidate(address, lis3mdl.ID_REGISTER, _LIS3MDL) for address in lis3mdl.ADDRESSES),
+    *(_Candidate(akm.ADDRESS, v.id_register, {bytes([v.id_value]): v.name}) for v in (akm.AK09916, akm.AK8963)),
 )
+IMU_NAMES = frozenset(name for known in KNOWN_IMUS for name in known.ids.values())
 
 
 def identify(bus: I2cBus) -> list[FoundChip]:
     """Return the known chips of a bus and, as unknown, others at their addresses; only reads ids. Raises BusError."""
     found = []
-    for name, address, register, ids, is_elsewhere in _KNOWN:
-        if not bus.answers(address, register, _ASKED_TIMES):
-            continue
-        answer = bus.read(address, register, len(ids[0]))
-        if answer in ids:
-            found.append(FoundChip(name, address, is_elsewhere))
-        else:
-            found.append(FoundChip(f"unknown chip (id {answer.hex()}, not a {name})", address, False))
+    for address in dict.fromkeys(candidate.address for candidate in _KNOWN):
+        candidates = [candidate for candidate in _KNOWN if candidate.address == address]
+        if bus.answers(address, candidates[0].register, _ASKED_TIMES):
+            found.append(_named(bus, candidates))
     return found
+
+
+def _named(bus: I2cBus, candidates: list[_Candidate]) -> FoundChip:
+    """Return the first candidate that the chip at their address says it is; unknown: what it said to the first."""
+    first = b""
+    for candidate in candidates:
+        answer = _asked(bus, candidate)
+        first = first or answer
+        if answer in candidate.names:
+            return FoundChip(candidate.names[answer], candidate.address, candidate.is_elsewhere)
+    likely = next(iter(candidates[0].names.values()))
+    return FoundChip(f"unknown chip (id {first.hex()}, not a {likely})", candidates[0].address, False)
+
+
+def _asked(bus: I2cBus, candidate: _Candidate) -> bytes:
+    """Return what a chip has in a register of its id; a wire may be disturbed just then."""
+    length = len(next(iter(candidate.names)))
+    for _ in range(_ASKED_TIMES - 1):
+        with suppress(BusError):
+            return bus.read(candidate.address, candidate.register, length)
+    return bus.read(candidate.address, candidate.register, length)

@@ -1,0 +1,148 @@
+"""What the doctor says of boards with a FIFO, and how verbs name them."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vislam.cli import run_verb
+from vislam.config import BoardConfig, Config, SensorsConfig
+from vislam.core.errors import HardwareError, UsageError
+from vislam.hw.chips import I2cBus, identify
+from vislam.hw.chips.imus import KNOWN_IMUS
+from vislam.hw.doctor import HardwareReport, Wanted, examine
+from vislam.hw.emulator import SteppedClock, emulated_board, emulated_bus
+from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
+from vislam.live.sources import open_live
+from vislam.run.record import record
+from vislam.run.sources import recorded_path
+from worlds.gy85 import driving, still
+
+
+def examined(kind: Any, root: Path, truth: Any = still, **options: Any) -> HardwareReport:
+    clock = SteppedClock()
+    bus = emulated_board(kind, truth, clock.now_ns, stepped=clock, **{"seed": 2, **options})
+    with emulated_bus(bus):
+        return examine(Wanted(i2c=bus.path), 2.0, clock, root=root)
+
+
+def said(report: HardwareReport, severity: str) -> str:
+    return "\n".join(f"{f.what} -> {f.next_step}" for f in report.findings if f.severity == severity)
+
+
+@pytest.mark.parametrize("kind", ["LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-9250", "ICM-20948"])
+def test_a_good_board_is_approved_of_with_its_stamps_and_with_what_it_has_not_met(kind: str, tmp_path: Path) -> None:
+    report = examined(kind, tmp_path)
+    assert report.worst == "warning", "no port, no camera, no magnetometer"
+    assert kind in {d.name for d in report.devices}
+    good = said(report, "ok")
+    for words in (
+        "gravity is measured as 9.8", "400 kHz", "the gyro has 30.0", "from the counts of its FIFO, known to about 0.",
+        "has not met a real chip",
+    ):  # fmt: skip
+        assert words in good
+    timing = report.timings[0]
+    assert timing.rate_hz == pytest.approx(200.0, rel=0.15)
+    assert timing.jitter_ms is not None
+    assert timing.jitter_ms < 0.1
+    if kind in ("MPU-9250", "ICM-20948"):
+        assert "the magnetometer is a AK" in good
+        assert "the field is 4" in good
+
+
+def test_everything_on_the_bus_is_listed(tmp_path: Path) -> None:
+    report = examined("LSM6DSOX", tmp_path, magnetometer="LIS3MDL")
+    assert {d.name for d in report.devices} == {"I2C", "LSM6DSOX", "LIS3MDL"}
+    assert "the magnetometer is a LIS3MDL" in said(report, "ok")
+
+
+def test_ids_are_read_again_where_a_wire_was_disturbed() -> None:
+    clock = SteppedClock()
+    bus = emulated_board("ICM-20948", still, clock.now_ns)
+    with emulated_bus(bus):
+        for every in (3, 4, 5, 7, 11):
+            bus.nack_every = every
+            assert [chip.name for chip in identify(I2cBus(bus.path, 0.02))] == ["ICM-20948"]
+
+
+def test_a_board_that_moves_is_not_approved_of(tmp_path: Path) -> None:
+    assert "stand still and try again" in said(examined("LSM6DSOX", tmp_path, driving), "warning")
+
+    def turning(t_ns: int):  # type: ignore[no-untyped-def]
+        return (0.0, 0.0, 0.3), (0.0, 0.0, 9.8), (20.0, 0.0, -42.0), 30.0
+
+    assert "10 allowed" in said(examined("LSM6DSOX", tmp_path, turning), "warning")
+
+
+def test_a_chip_that_the_kernel_owns_is_left_alone(tmp_path: Path) -> None:
+    device, driver = tmp_path / "sys/bus/i2c/devices/7-006a", tmp_path / "sys/bus/i2c/drivers/st_lsm6dsx_i2c"
+    device.mkdir(parents=True)
+    driver.mkdir(parents=True)
+    (device / "driver").symlink_to(driver)
+    report = examined("LSM6DSOX", tmp_path, path="/dev/i2c-7")
+    assert "echo 7-006a | sudo tee /sys/bus/i2c/drivers/st_lsm6dsx_i2c/unbind" in said(report, "error")
+
+
+def test_names_of_a_command_line_are_families_that_there_are() -> None:
+    families = {known.chip for known in KNOWN_IMUS}
+    assert {family for family in CHIPS.values() if family} == families
+    for known in KNOWN_IMUS:
+        assert known.chip in CHIPS
+    assert set(INERTIAL_KINDS) > set(CHIPS)
+
+
+def test_a_board_is_opened_by_its_name_and_the_settings(tmp_path: Path) -> None:
+    config = SensorsConfig(board=BoardConfig(rate_hz=100.0))
+    with emulated_bus(emulated_board("LSM6DSOX", still, time.monotonic_ns, path="/dev/i2c-9")):
+        for name in ("board:/dev/i2c-9", "lsm6dsox:/dev/i2c-9", "ism330dhcx:/dev/i2c-9"):
+            source = open_inertial(name, config)
+            try:
+                assert source.rate_hz == pytest.approx(104.0, rel=0.01)
+                assert rate_of(name, config) == 100.0
+            finally:
+                source.close()
+            check_devices(name, "none", config)
+        with pytest.raises(HardwareError, match="no mpu6050 answers"):
+            open_inertial("mpu9250:/dev/i2c-9", config)
+    with pytest.raises(HardwareError, match="cannot be opened"):
+        check_devices("board:/dev/i2c-absent", "none", config)
+    with pytest.raises(UsageError, match=r"no IMU called 'bmi160'.*lsm6dsox"):
+        open_inertial("bmi160", config)
+    assert recorded_path("lsm6dsox:/dev/i2c-1+webcam") is None
+
+
+def test_live_takes_a_board_and_its_calibration() -> None:
+    biased = BoardConfig(calibration=SensorsConfig().board.calibration)
+    source, _ = open_live("mpu9250+none", Config(), SensorsConfig(board=biased))
+    assert not source.has_camera
+    assert source.imu_noise is not None
+    assert source.imu_noise.rate_hz == 200.0
+    assert with_raw_samples(SensorsConfig()).board.calibration == biased.calibration
+    with pytest.raises(UsageError, match=r"no live source.*lsm6dsox"):
+        open_live("bmi160+none", Config(), SensorsConfig())
+
+
+def test_a_board_is_recorded(tmp_path: Path) -> None:
+    from vislam.config import RecordConfig
+
+    with emulated_bus(emulated_board("ICM-20948", still, time.monotonic_ns)) as bus:
+        recorded = record(tmp_path / "r", f"board:{bus.path}", "none", SensorsConfig(), RecordConfig(), seconds=1.0)
+    assert sum(recorded.counts.values()) > 50
+    rows = np.loadtxt(tmp_path / "r/mav0/imu0/data.csv", delimiter=",", comments="#")
+    assert (np.diff(rows[:, 0]) > 0).all()
+    np.testing.assert_allclose(rows[:, 4:7].mean(axis=0), [0.0, 0.0, 9.8], atol=0.3)
+
+
+def test_the_verb_measures_an_imu_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with emulated_bus(emulated_board("MPU-6050", still, time.monotonic_ns, seed=2)) as bus:
+        assert run_verb(["doctor", "--imu", f"mpu6050:{bus.path}", "--seconds", "0.5", "--json"]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["timings"][0]["count"] > 20
+        assert any("FIFO" in finding["what"] for finding in answer["findings"])
+    assert run_verb(["doctor", "--imu", "mpu6050:/dev/absent"]) == 5
+    assert "cannot be opened" in capsys.readouterr().out
+    assert run_verb(["doctor", "--imu", "nothing"]) == 2
+    assert run_verb(["doctor", "sim:corridor-loop", "--imu", "board"]) == 2
