@@ -57,9 +57,8 @@ def check_board(
     word = board.health() & ~Health.MAG_FAULT
     if word:
         add("warning", f"health: {word.name}", "docs/cart.md says what each bit means")
-    if len(inertial) >= _MIN_SAMPLES:
-        max_rate_deg_s = board.imu.max_zero_deg_s if isinstance(board, FifoBoard) and board.imu else _MAX_RATE_DEG_S
-        _check_rest(inertial, max_rate_deg_s, add)
+    max_rate_deg_s = board.imu.max_zero_deg_s if isinstance(board, FifoBoard) and board.imu else _MAX_RATE_DEG_S
+    findings += check_rest(inertial, where, max_rate_deg_s)
     if board.temperature_c is not None:
         low, high = _TEMPERATURE_C
         is_possible = low < board.temperature_c < high
@@ -79,7 +78,9 @@ def _check_rest(inertial: list[ImuSample], max_rate_deg_s: float, add: Add) -> N
     rate, force = gyro.mean(axis=0), accel.mean(axis=0)
     norm = float(np.linalg.norm(force))
     if abs(norm - _GRAVITY_M_S2) > _GRAVITY_TOLERANCE_M_S2:
-        add("warning", f"gravity is measured as {norm:.2f} m/s^2", "vislam calibrate imu")
+        in_g = abs(norm - 1.0) < 0.1
+        next_step = "it seems to be in g: the driver must give m/s^2" if in_g else "vislam calibrate imu"
+        add("warning", f"gravity is measured as {norm:.2f} m/s^2", next_step)
     else:
         add("ok", f"gravity is measured as {norm:.2f} m/s^2, along {np.round(force, 1).tolist()}")
     axes = " ".join(f"{value:.2f}" for value in rate)
@@ -87,6 +88,18 @@ def _check_rest(inertial: list[ImuSample], max_rate_deg_s: float, add: Add) -> N
         add("warning", f"the gyro's zero is at {axes} deg/s, {max_rate_deg_s:g} allowed", "replace the board")
     else:
         add("ok", f"the gyro's zero is at {axes} deg/s, noise {gyro_std:.2f} deg/s rms")
+
+
+def check_rest(inertial: list[ImuSample], where: str, max_rate_deg_s: float = _MAX_RATE_DEG_S) -> list[Finding]:
+    """Return what samples at rest say: gravity, the gyro's zero; nothing of less than 50 samples."""
+    findings: list[Finding] = []
+
+    def add(severity: Severity, what: str, next_step: str = "") -> None:
+        findings.append(Finding(severity, what, where, next_step))
+
+    if len(inertial) >= _MIN_SAMPLES:
+        _check_rest(inertial, max_rate_deg_s, add)
+    return findings
 
 
 def check_stamps(source: object, where: str) -> list[Finding]:

@@ -15,7 +15,7 @@ from vislam.config import BoardConfig, Gy85Config, SensorsConfig, SerialConfig, 
 from vislam.core.errors import HardwareError
 from vislam.core.findings import Finding, Severity, worst
 from vislam.core.messages import ImuSample, MagSample
-from vislam.hw.board_check import check_board, check_stamps
+from vislam.hw.board_check import check_board, check_rest, check_stamps
 from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.cameras.webcam import Capture, Webcam
 from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command
@@ -154,7 +154,9 @@ def _examine_chips(
         where = f"{bus.path} 0x{chip.address:02x}"
         if driver is not None:
             what = f"the kernel's driver {driver} owns the {chip.name}"
-            notes.add(severity, what, where, unbind_command(bus.path, chip.address, driver))
+            release = unbind_command(bus.path, chip.address, driver)
+            other = "; or leave it and ask for the IMU iio" if chip.name in IMU_NAMES else ""
+            notes.add(severity, what, where, release + other)
         elif chip.is_elsewhere:
             next_step = "tie the chip's address pin (SDO or AD0) low, as on a GY-85"
             notes.add(severity, f"the {chip.name} is not at its usual address", where, next_step)
@@ -219,6 +221,8 @@ def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock) -> No
         notes.findings += check_stamps(source, name)
         if isinstance(source, Gy85 | FifoBoard):
             notes.findings += check_board(source, inertial, magnetic, name)
+        else:
+            notes.findings += check_rest(inertial, name)
         _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, "error")
         if magnetic:
             notes.timings.append(_timing(f"{name}: magnetic", [sample.t_ns for sample in magnetic]))

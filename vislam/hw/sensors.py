@@ -22,11 +22,14 @@ CHIPS: dict[str, ImuChip | None] = {
     "board": None, "lsm6dsox": "lsm6dsox", "lsm6dso": "lsm6dsox", "ism330dhcx": "lsm6dsox",
     "mpu6050": "mpu6050", "mpu6500": "mpu6050", "mpu9250": "mpu6050", "icm20948": "icm20948",
 }  # fmt: skip
-INERTIAL_KINDS = ("gy85", *CHIPS, "serial")
+INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial")
 
 
 def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) -> InertialSource:
-    """Open `gy85[:BUS]`, `board[:BUS]` or a chip in its place, or `serial[:PORT]`; the rest is in the settings.
+    """Open what a name says; the rest is in the settings.
+
+    `gy85[:BUS]`, `board[:BUS]` or a chip in its place, `bno085`, `adafruit:MODULE.CLASS`, `iio[:NAME]` for a chip that
+    the kernel drives, `serial[:PORT]`.
 
     Raises:
         UsageError: there is no such kind of sensor.
@@ -37,6 +40,14 @@ def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) 
         from vislam.hw.fifo_board import FifoBoard
 
         return FifoBoard(_board(kind, where, config), must_be_there=must_be_there)
+    if kind in ("bno085", "adafruit"):
+        from vislam.hw.adafruit import BNO085, open_adafruit
+
+        return open_adafruit(BNO085 if kind == "bno085" else where, config.board)
+    if kind == "iio":
+        from vislam.hw.iio_imu import IioImu
+
+        return IioImu(config.board, where, must_be_there)
     if kind == "gy85":
         from vislam.hw.gy85 import Gy85
 
@@ -48,8 +59,8 @@ def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) 
         bridge = replace(config.serial, port=where) if where else config.serial
         return SerialBridge(bridge, must_be_there)
     raise UsageError(
-        f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, each with a place such as gy85:/dev/i2c-1, "
-        "serial:/dev/ttyUSB0"
+        f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, with a place such as gy85:/dev/i2c-1, "
+        "serial:/dev/ttyUSB0, iio:lsm6dsox, adafruit:adafruit_lsm6ds.lsm6dsox.LSM6DSOX"
     )
 
 
@@ -62,7 +73,12 @@ def _board(kind: str, where: str, config: SensorsConfig) -> BoardConfig:
 
 def rate_of(name: str, config: SensorsConfig) -> float:
     """Return the samples per second that are asked of an inertial sensor."""
-    return config.board.rate_hz if name.partition(":")[0] in CHIPS else config.gy85.rate_hz
+    return config.board.rate_hz if _is_board(name) else config.gy85.rate_hz
+
+
+def _is_board(name: str) -> bool:
+    """Return whether a sensor's settings are those of `board`."""
+    return name.partition(":")[0] not in ("gy85", "serial")
 
 
 def open_camera(
@@ -96,6 +112,10 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
 
         board = config.gy85 if kind == "gy85" else config.board
         I2cBus(where or board.bus, board.bus_timeout_s).close()
+    elif kind == "iio":
+        from vislam.hw.iio_imu import find_devices
+
+        find_devices(Path("/"), where)
     elif kind == "serial":
         from vislam.hw.bridge.bridge import why_not_open
 
@@ -131,6 +151,6 @@ def with_raw_samples(config: SensorsConfig) -> SensorsConfig:
 
 def calibration_of(name: str, config: SensorsConfig) -> SensorCalibration:
     """Return the calibration in the settings of an inertial sensor."""
-    if name.partition(":")[0] in CHIPS:
-        return config.board.calibration
-    return config.serial.calibration if name.startswith("serial") else config.gy85.calibration
+    if name.startswith("serial"):
+        return config.serial.calibration
+    return config.board.calibration if _is_board(name) and name != "none" else config.gy85.calibration

@@ -1,0 +1,231 @@
+"""Any object of an `adafruit_*` driver that has `acceleration` and `gyro` as a source of inertial samples."""
+
+from __future__ import annotations
+
+import importlib
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from vislam.config import BoardConfig
+from vislam.core.errors import HardwareError, UsageError
+from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.hw.body_map import BodyMap, triple
+from vislam.hw.gyro_zero import GyroZero
+from vislam.hw.health import Health
+from vislam.hw.timing import Clock, HostClock
+
+MAX_RATE_HZ = 200.0  # each sample costs such a driver two or three transfers and some hundred lines of Python
+BNO085 = "adafruit_bno08x.i2c.BNO08X_I2C"
+_NS = 1_000_000_000
+_TEMPERATURE_S = 0.5  # between looks at the temperature
+_BNO_REPORTS = {"acceleration": 0x01, "gyro": 0x02, "magnetic": 0x03}  # calibrated ones, by the BNO08X data sheet
+
+
+class AdafruitImu:
+    """Satisfies `InertialSource` with a driver object's `acceleration` (m/s^2), `gyro` (rad/s) and `magnetic` (uT).
+
+    Stamps are the host's, in the middle between asking for the first value and having the second: such drivers tell
+    no time, and so the stamps jitter as the machine does. Values that are the last ones again are no new sample: chips
+    that report by themselves (BNO085) may be asked more often than they report. One thread only.
+    """
+
+    stamped_by = "the host, when the driver had read the chip: jitter is the machine's"
+
+    def __init__(
+        self,
+        device: Any,
+        config: BoardConfig | None = None,
+        clock: Clock | None = None,
+        open_again: Callable[[], Any] | None = None,
+    ) -> None:
+        """Take the driver's object and read it once.
+
+        Args:
+            device: has `acceleration` and `gyro`, and maybe `magnetic` and `temperature`.
+            config: rate (200 Hz at most), calibration, times; defaults if None.
+            clock: the host's if None.
+            open_again: makes a new object after the old one gave nothing for `config.silent_s`.
+
+        Raises:
+            UsageError: more than 200 Hz, or an object that has not both.
+            HardwareError: it cannot be read.
+        """
+        self._config = BoardConfig() if config is None else config
+        if self._config.rate_hz > MAX_RATE_HZ:
+            raise UsageError(f"board.rate_hz must be at most {MAX_RATE_HZ:g} for such a driver; use a chip's own name")
+        missing = [name for name in ("acceleration", "gyro") if not hasattr(type(device), name)]
+        if missing:
+            raise UsageError(f"{type(device).__name__} has no {' and no '.join(missing)}; it is no inertial sensor")
+        self._device, self._open_again = device, open_again
+        self._clock: Clock = HostClock() if clock is None else clock
+        self.rate_hz = self._config.rate_hz
+        self._map = BodyMap(self._config)
+        self._counts: Counter[str] = Counter()
+        self._events = Health(0)
+        self._last: Array = np.full(6, np.nan)
+        self._last_ns = self._next_mag_ns = self._next_temperature_ns = 0
+        self._has_mag = self._config.mag is not False and hasattr(type(device), "magnetic")
+        try:
+            triple(device.acceleration)
+            triple(device.gyro)
+        except Exception as error:  # a driver may raise anything
+            raise HardwareError(
+                f"{type(device).__name__} cannot be read: {error}; check power and wires, `vislam doctor` lists buses"
+            ) from error
+        if self._has_mag and self._config.mag is None:
+            self._has_mag = self._field() is not None
+        now = self._clock.now_ns()
+        self._next_ns = self._last_out_ns = self._retry_ns = now
+        self._counts.clear()
+        self._events = Health(0)
+
+    @property
+    def temperature_c(self) -> float | None:
+        """Temperature that the driver tells; None where it does not."""
+        return self._map.temperature_c
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """Take the drift from a temperature on off; see `InertialSource`."""
+        self._map.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
+
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
+        deadline = self._clock.now_ns() + round(timeout_s * _NS)
+        while True:
+            if self._next_ns > deadline:
+                self._clock.sleep_until(deadline)
+                return []
+            self._clock.sleep_until(self._next_ns)
+            samples = self._poll()
+            if samples:
+                return samples
+
+    def health(self) -> Health:
+        """Return the sensor bits that hold now and the events since the last call."""
+        word, self._events = self._events, Health(0)
+        if self._is_silent():
+            word |= Health.IMU_MISSING
+        return word | (Health.TEMPERATURE_DRIFT if self._map.is_far else Health(0))
+
+    def counters(self) -> dict[str, int]:
+        """Return how often each fault occurred since the start."""
+        return dict(self._counts)
+
+    def close(self) -> None:
+        """Let the object go; may be called twice."""
+        with suppress(Exception):  # most drivers have no such method, and some fail in it
+            self._device.deinit()
+
+    def _poll(self) -> list[ImuSample | MagSample]:
+        samples: list[ImuSample | MagSample] = []
+        asked = self._clock.now_ns()
+        try:
+            rate = triple(self._device.gyro)
+            force = triple(self._device.acceleration)
+        except Exception as error:  # a driver may raise anything
+            self._failed(error)
+        else:
+            t_ns = (asked + self._clock.now_ns()) // 2
+            values = np.concatenate([rate, force])
+            if (values == self._last).all() or not force.any():  # zeros: a BNO085 before its first report
+                self._counts["repeated"] += 1
+            elif t_ns > self._last_ns:
+                self._last, self._last_ns, self._last_out_ns = values, t_ns, self._clock.now_ns()
+                samples.append(self._map.inertial(t_ns, rate, force))
+        self._look(asked)
+        if self._has_mag and asked >= self._next_mag_ns:
+            self._next_mag_ns = asked + round(_NS / self._config.mag_rate_hz)
+            begin = self._clock.now_ns()
+            field_ut = self._field()
+            if field_ut is not None and field_ut.any():  # zeros as above
+                samples.append(self._map.magnetic((begin + self._clock.now_ns()) // 2, field_ut))
+        self._replace_silent()
+        period_ns = round(_NS / self.rate_hz)
+        late = max(self._clock.now_ns() - self._next_ns, 0) // period_ns
+        if late > 0:
+            self._counts["rounds_missed"] += late
+            self._events |= Health.IMU_GAP
+        self._next_ns += (late + 1) * period_ns
+        return samples
+
+    def _field(self) -> Array | None:
+        try:
+            return triple(self._device.magnetic)
+        except Exception as error:  # also of a report that is not switched on
+            self._failed(error)
+            self._events |= Health.MAG_FAULT
+            return None
+
+    def _look(self, now: int) -> None:
+        if now >= self._next_temperature_ns and hasattr(type(self._device), "temperature"):
+            self._next_temperature_ns = now + round(_TEMPERATURE_S * _NS)
+            with suppress(Exception):
+                self._map.temperature_c = float(self._device.temperature)
+
+    def _failed(self, error: Exception) -> None:
+        self._counts["bad_values" if isinstance(error, ValueError | TypeError) else "read_failed"] += 1
+        self._events |= Health.BUS_FAULT | Health.IMU_GAP
+
+    def _is_silent(self) -> bool:
+        return self._clock.now_ns() - self._last_out_ns > self._config.silent_s * _NS
+
+    def _replace_silent(self) -> None:
+        """Make a new object where the old one gives nothing, every `config.reopen_s`."""
+        now = self._clock.now_ns()
+        if self._open_again is None or not self._is_silent() or now < self._retry_ns:
+            return
+        self._retry_ns = now + round(self._config.reopen_s * _NS)
+        try:
+            self._device = self._open_again()
+        except Exception:  # as above
+            self._counts["open_failures"] += 1
+        else:
+            self._counts["reopened"] += 1
+
+
+def open_adafruit(name: str, config: BoardConfig) -> AdafruitImu:
+    """Open a driver by `MODULE.CLASS` on the board's own I2C bus, such as `adafruit_lsm6ds.lsm6dsox.LSM6DSOX`.
+
+    Raises:
+        UsageError: there is no such class, or it is no inertial sensor.
+        HardwareError: the driver or Blinka is not installed, or the chip does not answer.
+    """
+    make = _maker(name, config)
+    try:
+        device = make()
+    except (HardwareError, UsageError):
+        raise
+    except Exception as error:  # a driver may raise anything
+        raise HardwareError(f"{name} cannot be opened: {error}; check power and wires") from error
+    return AdafruitImu(device, config, open_again=make)
+
+
+def _maker(name: str, config: BoardConfig) -> Callable[[], Any]:
+    module_name, _, class_name = name.rpartition(".")
+    if not module_name:
+        raise UsageError(f"'{name}' names no driver; write adafruit:MODULE.CLASS, such as adafruit:{BNO085}")
+    try:
+        module, board = importlib.import_module(module_name), importlib.import_module("board")
+        i2c = board.I2C
+    except (ImportError, NotImplementedError, AttributeError) as error:  # the last two: a machine that Blinka knows not
+        package = f"adafruit-circuitpython-{module_name.split('.')[0].removeprefix('adafruit_')}"
+        raise HardwareError(
+            f"{name} needs its driver and Blinka ({error}); install them: pip install 'vislam[boards]' {package}"
+        ) from error
+    driver = getattr(module, class_name, None)
+    if driver is None:
+        raise UsageError(f"{module_name} has no class {class_name}; its documentation names it")
+
+    def make() -> Any:
+        device = driver(i2c())
+        if hasattr(device, "enable_feature"):  # BNO08x: reports are off until asked for
+            for attribute, report in _BNO_REPORTS.items():
+                if attribute != "magnetic" or config.mag is not False:
+                    device.enable_feature(report, round(1e6 / config.rate_hz))
+        return device
+
+    return make

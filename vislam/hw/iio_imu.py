@@ -1,0 +1,218 @@
+"""An inertial chip that the kernel drives, through its Industrial I/O buffers: stamped by the kernel."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from pathlib import Path
+
+import numpy as np
+
+from vislam.config import BoardConfig
+from vislam.core.errors import HardwareError
+from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.hw.body_map import BodyMap
+from vislam.hw.gyro_zero import GyroZero
+from vislam.hw.health import Health
+from vislam.hw.iio_device import KINDS, IioDevice, Scans, kinds_of
+
+_NS = 1_000_000_000
+_BUFFER_S = 1.0  # that the kernel keeps
+_KEPT = 2000  # samples of one sensor that wait for the other: ten seconds at 200 Hz
+_FAR_NS = 2 * _NS  # a stamp so far from now is of another clock
+
+
+class IioImu:
+    """Satisfies `InertialSource` with one device of gyro and accelerometer, or with one of each.
+
+    Stamps are the kernel's, taken at the chip's interrupt; `config.delay_s` is taken off (the kernel does not tell the
+    delay of a filter: None is none). Where gyro and accelerometer are devices of their own, the accelerometer is
+    interpolated to the gyro's stamps. One thread only.
+    """
+
+    stamped_by = "the kernel, at the chip's interrupt"
+
+    def __init__(self, config: BoardConfig, name: str = "", must_be_there: bool = True, root: Path = Path("/")) -> None:
+        """Find the devices, set them up and start them.
+
+        Args:
+            config: rate, calibration and times.
+            name: of the chip as the kernel has it, or a device such as `iio:device0`; empty: whichever is there.
+            must_be_there: otherwise it is looked for as after unplugging.
+            root: where /dev and /sys are.
+
+        Raises HardwareError: there is none, or it cannot be set up.
+        """
+        self._config, self._name, self._root = config, name, root
+        self.rate_hz = config.rate_hz
+        self._map = BodyMap(config)
+        self._counts: Counter[str] = Counter()
+        self._events = Health(0)
+        self._devices: list[IioDevice] = []
+        self._waiting: dict[str, deque[tuple[int, Array]]] = {kind: deque(maxlen=_KEPT) for kind in KINDS}
+        self._newest_ns: dict[str, int] = {}  # by device
+        self._last_ns = self._retry_ns = 0
+        self._last_out_ns = time.monotonic_ns()
+        self._is_reopening = False
+        try:
+            self._open()
+        except HardwareError:
+            if must_be_there:
+                raise
+
+    @property
+    def temperature_c(self) -> float | None:
+        """None: no device of the kernel streams it beside the samples."""
+        return self._map.temperature_c
+
+    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
+        """See `InertialSource`; without a temperature nothing is taken off."""
+        self._map.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
+
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
+        deadline = time.monotonic_ns() + round(timeout_s * _NS)
+        while True:
+            now = time.monotonic_ns()
+            if not self._devices:
+                self._reopen(now)
+            left_s = max(deadline - time.monotonic_ns(), 0) / _NS
+            if not self._devices:
+                time.sleep(min(left_s, max(self._retry_ns - time.monotonic_ns(), 0) / _NS))
+            else:
+                samples = self._received(left_s)
+                if samples:
+                    return samples
+            if time.monotonic_ns() >= deadline:
+                return []
+
+    def health(self) -> Health:
+        """Return the sensor bits that hold now and the events since the last call."""
+        word, self._events = self._events, Health(0)
+        if time.monotonic_ns() - self._last_out_ns > self._config.silent_s * _NS:
+            word |= Health.IMU_MISSING
+        if not self._devices:
+            word |= Health.GYRO_FAULT | Health.ACCEL_FAULT
+        return word | (Health.TEMPERATURE_DRIFT if self._map.is_far else Health(0))
+
+    def counters(self) -> dict[str, int]:
+        """Return how often each fault occurred since the start."""
+        return dict(self._counts)
+
+    def close(self) -> None:
+        """Stop the devices; may be called twice."""
+        for device in self._devices:
+            device.close()
+        self._devices = []
+
+    # ---- samples ----------------------------------------------------------------------------------------------
+
+    def _received(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        for k, device in enumerate(self._devices):
+            try:
+                # one is waited for: the other's samples lie in the kernel's buffer meanwhile
+                self._take(device, device.read(timeout_s if k == 0 else 0.0))
+            except OSError:
+                self._counts["gone"] += 1
+                self._events |= Health.BUS_FAULT | Health.IMU_GAP
+                self.close()
+                self._is_reopening = True
+                self._retry_ns = time.monotonic_ns() + round(self._config.reopen_s * _NS)
+                return []
+        merged = self._merged()
+        if merged:
+            self._last_out_ns = time.monotonic_ns()
+        return [*merged]
+
+    def _take(self, device: IioDevice, scans: Scans) -> None:
+        now = time.monotonic_ns()
+        shift_ns = 0 if device.clock == "monotonic" else time.time_ns() - now
+        newest_ns = self._newest_ns.get(device.name, 0)
+        for row, t_ns in enumerate((scans.t_ns - shift_ns).tolist()):
+            if abs(t_ns - now) > _FAR_NS:
+                self._counts["stamps_far"] += 1
+                self._events |= Health.CLOCK_STEP
+            elif t_ns <= newest_ns:
+                self._counts["stamps_backwards"] += 1
+            else:
+                newest_ns = t_ns
+                for kind, values in scans.values.items():
+                    self._waiting[kind].append((t_ns, values[row]))
+        self._newest_ns[device.name] = newest_ns
+
+    def _merged(self) -> list[ImuSample]:
+        """Return the gyro's samples around which the accelerometer has some, with those interpolated."""
+        gyro, accel = self._waiting["anglvel"], self._waiting["accel"]
+        delay_ns = round((self._config.delay_s or 0.0) * _NS)
+        merged = []
+        while gyro and accel and gyro[0][0] <= accel[-1][0]:
+            t_ns, rate = gyro.popleft()
+            while len(accel) > 1 and accel[1][0] <= t_ns:
+                accel.popleft()
+            if t_ns < accel[0][0] or t_ns <= self._last_ns:
+                continue  # before the accelerometer's first
+            force = accel[0][1]
+            if t_ns > accel[0][0]:
+                share = (t_ns - accel[0][0]) / (accel[1][0] - accel[0][0])
+                force = (1.0 - share) * force + share * accel[1][1]
+            self._last_ns = t_ns
+            merged.append(self._map.inertial(t_ns - delay_ns, rate, force))
+        return merged
+
+    # ---- coming and going -------------------------------------------------------------------------------------
+
+    def _reopen(self, now: int) -> None:
+        if now < self._retry_ns:
+            return
+        self._retry_ns = now + round(self._config.reopen_s * _NS)
+        try:
+            self._open()
+        except HardwareError:
+            self._counts["open_failures"] += 1
+        else:
+            self._counts["reopened"] += self._is_reopening
+
+    def _open(self) -> None:
+        devices: list[IioDevice] = []
+        length = max(round(_BUFFER_S * self._config.rate_hz), 2)
+        try:
+            for folder in find_devices(self._root, self._name):
+                devices.append(IioDevice(folder, self._root / "dev" / folder.name, self._config.rate_hz, length))
+        except HardwareError:
+            for device in devices:
+                device.close()
+            raise
+        self._devices = devices
+        gyro = next(device for device in devices if "anglvel" in device.kinds)
+        self.rate_hz = gyro.rate_hz or self._config.rate_hz
+        for queue in self._waiting.values():
+            queue.clear()
+
+
+def find_devices(root: Path, name: str = "") -> list[Path]:
+    """Return the folders of one device with gyro and accelerometer, or of one with each, in this order.
+
+    `name` is that of the chip or the beginning of it (`lsm6dsox` for `lsm6dsox_gyro` and `lsm6dsox_accel`), or of a
+    device. Raises HardwareError where there is none.
+    """
+    folders = sorted((root / "sys/bus/iio/devices").glob("iio:device*"))
+    found: dict[Path, tuple[str, ...]] = {}
+    for folder in folders:
+        try:
+            chip = (folder / "name").read_text(encoding="ascii", errors="replace").strip()
+        except OSError:
+            chip = ""
+        if not name or name == folder.name or chip.startswith(name):
+            found[folder] = kinds_of(folder)
+    both = next((folder for folder, kinds in found.items() if set(kinds) == set(KINDS)), None)
+    if both is not None:
+        return [both]
+    single = [next((folder for folder, kinds in found.items() if kinds == (kind,)), None) for kind in KINDS]
+    if None not in single:
+        return [folder for folder in single if folder is not None]
+    listed = ", ".join(folder.name for folder in folders) or "none"
+    raise HardwareError(
+        f"{root / 'sys/bus/iio/devices'}: no device{f' {name}' if name else ''} streams a gyro and an accelerometer "
+        f"(devices: {listed}); load the chip's driver (docs/sensors.md), or use the chip without it: a name such as "
+        "lsm6dsox"
+    )
