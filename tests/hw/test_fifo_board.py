@@ -11,7 +11,7 @@ from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.fifo_stamps import FifoStamps
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
-from worlds.fifo_boards import KINDS, fifo_board, gathered, inertial_chip, stamp_errors_ms
+from worlds.fifo_boards import FIRMWARE, KINDS, fifo_board, gathered, inertial_chip, stamp_errors_ms
 from worlds.gy85 import driving, errors, still
 
 GONE = Health.IMU_MISSING | Health.ACCEL_FAULT | Health.GYRO_FAULT
@@ -116,7 +116,7 @@ def test_started_before_it_is_plugged_in(kind: str) -> None:
     with fifo_board(kind) as (driver, virtual, clock):
         driver.close()
         virtual.unplug()
-        later = FifoBoard(BoardConfig(bus=virtual.path), clock, must_be_there=False)
+        later = FifoBoard(BoardConfig(bus=virtual.path, firmware=str(FIRMWARE)), clock, must_be_there=False)
         assert gathered(later, clock, 1.0)[0] == []
         assert later.health() & GONE == GONE
         virtual.replug()

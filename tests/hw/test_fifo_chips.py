@@ -2,6 +2,10 @@
 
 import struct
 from collections import Counter
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -9,9 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.core.errors import HardwareError
-from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, lsm6dsox, mpu6050
+from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, bmi270, icm20948, lsm6dsox, mpu6050
 from vislam.hw.chips.fifo_imu import divided, next_of
-from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualLsm6dsox, VirtualMpu6050, emulated_bus
+from vislam.hw.emulator import (
+    EmulatedBus,
+    SteppedClock,
+    VirtualBmi270,
+    VirtualIcm20948,
+    VirtualLsm6dsox,
+    VirtualMpu6050,
+    emulated_bus,
+)
+from worlds.fifo_boards import FIRMWARE
 from worlds.gy85 import still
 
 SETUP = ImuSetup(200.0, 500, 8)
@@ -201,3 +214,81 @@ def test_the_next_rate_and_range_that_a_chip_has() -> None:
     assert divided(300.0, 1000.0) == 3
     assert divided(1.0, 1000.0) == 256
     assert divided(5000.0, 1000.0) == 1
+
+
+def test_what_is_written_to_an_icm20948_is_in_the_right_bank() -> None:
+    clock = SteppedClock()
+    chip = VirtualIcm20948(still, clock.now_ns)
+    bus = EmulatedBus({0x69: chip}, clock=clock)
+    with emulated_bus(bus):
+        driver = icm20948.Icm20948(I2cBus(bus.path, 0.02), SETUP)
+        chip.registers[0x7F] = 0x20  # another program left it there
+        driver.configure(clock)
+        second = chip.banks[2]
+        assert (second[0x00], second[0x11], second[0x10]) == (4, 4, 0), "1125 Hz / 5"
+        assert (second[0x01], second[0x14], second[0x09]) == (0b010_01_1, 0b010_10_1, 1), "500 deg/s, 8 g, filters"
+        assert (chip.registers[0x7F], chip.registers[0x67], chip.registers[0x03]) == (0, 0x1E, 0x40)
+        assert (chip.registers[0x06], chip.registers[0x69]) == (0x01, 0x00), "awake, the oldest bytes are overwritten"
+        assert chip.lets_through
+        assert driver.rate_hz == 225.0
+        assert driver.temperature_c() == pytest.approx(30.0, abs=0.01)
+        clock.advance(200_000_000)
+        assert driver.waiting().is_overrun
+        clock.advance(50_000_000)
+        assert driver.waiting().units == 11
+        np.testing.assert_allclose(driver.take(11).accel[:, 2], 4096, atol=1)
+        chip.power_cycle()
+        with pytest.raises(SettingsLostError, match="401e"):
+            driver.temperature_c()
+
+
+@pytest.mark.parametrize("smbus_only", [False, True])
+def test_a_bmi270_is_sent_its_configuration_byte_for_byte(tmp_path: Path, smbus_only: bool) -> None:
+    file = tmp_path / "whole.bin"
+    file.write_bytes(bytes(k * 7 & 0xFF for k in range(8192)))
+    clock = SteppedClock()
+    chip = VirtualBmi270(still, clock.now_ns)
+    bus = EmulatedBus({0x68: chip}, clock=clock, smbus_only=smbus_only)
+    with emulated_bus(bus):
+        driver = bmi270.Bmi270(I2cBus(bus.path, 0.02), replace(SETUP, firmware=str(file)))
+        begin_ns = clock.now_ns()
+        driver.configure(clock)
+        assert chip.given == file.read_bytes()
+        assert clock.now_ns() - begin_ns < 300_000_000
+        assert bytes(chip.registers[0x40:0x44]) == bytes((0xA9, 2, 0xE9, 2)), "200 Hz, 8 g, 200 Hz, 500 deg/s"
+        assert (chip.registers[0x49], chip.registers[0x7C], chip.registers[0x7D]) == (0xC0, 0x00, 0x0E)
+        assert driver.temperature_c() == pytest.approx(30.0, abs=0.01)
+        chip.power_cycle()
+        with pytest.raises(SettingsLostError, match="a902e902"):
+            driver.temperature_c()
+        chip.takes = False
+        with pytest.raises(HardwareError, match=r"does not take its configuration \(status 2\); Bosch"):
+            driver.configure(clock)
+
+
+def test_the_configuration_of_a_bmi270_is_bytes_or_a_c_file(tmp_path: Path) -> None:
+    assert len(bmi270.configuration(str(FIRMWARE))) == 40
+    (tmp_path / "a.c").write_text("const uint8_t bmi270_config_file[] = {\n 0xc8, 0x2E,\n 0x00, 0x1 };\nint x = 0xff;")
+    assert bmi270.configuration(str(tmp_path / "a.c")) == bytes((0xC8, 0x2E, 0x00, 0x01))
+    (tmp_path / "empty.c").write_text("int x = 3;")
+    (tmp_path / "odd.bin").write_bytes(bytes(3))
+    (tmp_path / "long.bin").write_bytes(bytes(9000))
+    for name, size in (("empty.c", 0), ("odd.bin", 3), ("long.bin", 9000)):
+        with pytest.raises(HardwareError, match=f"holds {size} bytes of configuration, 2 to 8192 are needed"):
+            bmi270.configuration(str(tmp_path / name))
+    with pytest.raises(HardwareError, match="needs its configuration file; Bosch's driver"):
+        bmi270.configuration(None)
+    with pytest.raises(HardwareError, match="No such file"):
+        bmi270.configuration(str(tmp_path / "absent.bin"))
+    with pytest.raises(HardwareError, match="directory"):
+        bmi270.configuration(str(tmp_path))
+
+
+@given(st.binary(max_size=300))
+def test_any_file_of_configuration_is_taken_or_refused(data: bytes) -> None:
+    with TemporaryDirectory() as folder:
+        for name in ("any.c", "any.bin"):
+            path = Path(folder) / name
+            path.write_bytes(b"config_file[] = {" + data)
+            with suppress(HardwareError):
+                assert 0 < len(bmi270.configuration(str(path))) <= 8192

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from vislam.hw.emulator import EmulatedBus, FifoChip, SteppedClock, Truth, emula
 from vislam.hw.fifo_board import FifoBoard
 from worlds.gy85 import driving
 
-KINDS = ("LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-9250", "ICM-20948")
+FIRMWARE = Path(__file__).with_name("bmi270_stand_in.c")  # what any virtual BMI270 is content with
+KINDS = ("LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-9250", "ICM-20948", "BMI270")
 
 
 @contextmanager
@@ -29,6 +31,8 @@ def fifo_board(
     """Yield a driver on a virtual board; `options` go to `emulated_board`."""
     clock = SteppedClock()
     config = BoardConfig() if config is None else config
+    if kind == "BMI270":
+        config = replace(config, firmware=str(FIRMWARE))
     told = {"seed": 1, "magnetometer": "none", "axes": config.calibration, **options}
     bus = emulated_board(kind, truth, clock.now_ns, stepped=clock, **told)
     with emulated_bus(bus):

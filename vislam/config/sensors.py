@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from vislam.config.frontend import CalibrationConfig
 from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Share
 
-ImuChip = Literal["auto", "lsm6dsox", "mpu6050", "icm20948"]
+ImuChip = Literal["auto", "lsm6dsox", "mpu6050", "icm20948", "bmi270"]
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 Axes = tuple[Axis, Axis, Axis]
 Vector3 = tuple[Finite, Finite, Finite]
@@ -68,6 +68,7 @@ class BoardConfig:
     rate_hz: Positive = 200.0  # or the next higher rate that the chip has; 400 Hz need a bus of 400 kHz
     gyro_range_deg_s: Literal[250, 500, 1000, 2000] = 500  # a cart turns by 200 at most; in the hand ask for 2000
     accel_range_g: Literal[2, 4, 8, 16] = 8  # wheels on thresholds give 5
+    firmware: str | None = None  # configuration that a BMI270 needs at every start: Bosch's file, docs/sensors.md
     delay_s: NonNegative | None = None  # of the gyro's filter, taken off the stamps; None: the chip's own
     mag: bool | None = None  # a magnetometer must be there; None: it is used if there is one at the start
     mag_rate_hz: Positive = 50.0  # how often it is asked

@@ -48,7 +48,7 @@ class FifoBoard:
             raise UsageError(f"board.rate_hz must be at most 1000, got {config.rate_hz:g}")
         self._config = config
         self._clock: Clock = HostClock() if clock is None else clock
-        self._setup = ImuSetup(config.rate_hz, config.gyro_range_deg_s, config.accel_range_g)
+        self._setup = ImuSetup(config.rate_hz, config.gyro_range_deg_s, config.accel_range_g, config.firmware)
         self.rate_hz = config.rate_hz
         self.self_tests: tuple[SelfTest, ...] = ()
         c = config.calibration

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # chips with a FIFO as a command line names them, and the family of each as the settings do; board: whichever answers
 CHIPS: dict[str, ImuChip | None] = {
     "board": None, "lsm6dsox": "lsm6dsox", "lsm6dso": "lsm6dsox", "ism330dhcx": "lsm6dsox",
-    "mpu6050": "mpu6050", "mpu6500": "mpu6050", "mpu9250": "mpu6050", "icm20948": "icm20948",
+    "mpu6050": "mpu6050", "mpu6500": "mpu6050", "mpu9250": "mpu6050", "icm20948": "icm20948", "bmi270": "bmi270",
 }  # fmt: skip
 INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial")
 

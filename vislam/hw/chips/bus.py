@@ -114,6 +114,16 @@ class I2cBus:
         except OSError as error:
             raise self._failed(f"write of register 0x{register:02x} at 0x{address:02x}", error) from error
 
+    def write_block(self, address: int, register: int, data: bytes) -> None:
+        """Write registers from `register` on, or one that takes a row of bytes, 1 to 32; raises BusError."""
+        try:
+            if self.is_combined:
+                self._bus.i2c_rdwr(self._smbus2.i2c_msg.write(address, [register, *data]))
+            else:
+                self._bus.write_i2c_block_data(address, register, list(data))
+        except OSError as error:
+            raise self._failed(f"write of register 0x{register:02x} at 0x{address:02x}", error) from error
+
     def answers(self, address: int, register: int = 0, times: int = 1) -> bool:
         """Return whether a chip lets one register be read, asked up to `times`; a silent address is no fault.
 

@@ -23,6 +23,7 @@ class ImuSetup:
     rate_hz: float  # the next higher one
     gyro_range_deg_s: int
     accel_range_g: int
+    firmware: str | None = None  # file that the chip needs at every start
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from vislam.core.errors import HardwareError
-from vislam.hw.chips import icm20948, lsm6dsox, mpu6050
+from vislam.hw.chips import bmi270, icm20948, lsm6dsox, mpu6050
 from vislam.hw.chips.bus import I2cBus
 from vislam.hw.chips.fifo_imu import FifoImu, ImuSetup
 
@@ -27,6 +27,7 @@ class KnownImu:
 KNOWN_IMUS = (
     KnownImu("lsm6dsox", lsm6dsox.ADDRESSES, lsm6dsox.ID_REGISTER, lsm6dsox.IDS, lsm6dsox.Lsm6dsox),
     KnownImu("icm20948", icm20948.ADDRESSES, icm20948.ID_REGISTER, icm20948.IDS, icm20948.Icm20948),
+    KnownImu("bmi270", bmi270.ADDRESSES, bmi270.ID_REGISTER, bmi270.IDS, bmi270.Bmi270),
     KnownImu("mpu6050", mpu6050.ADDRESSES, mpu6050.ID_REGISTER, mpu6050.IDS, mpu6050.Mpu6050),
 )
 

@@ -1,5 +1,6 @@
 """Boards without hardware: virtual chips under the real smbus2, byte for byte, driven by a motion that is known."""
 
+from vislam.hw.emulator.bmi270 import VirtualBmi270
 from vislam.hw.emulator.board import emulated_gy85
 from vislam.hw.emulator.bus import EmulatedBus, emulated_bus
 from vislam.hw.emulator.chips import VirtualAdxl345, VirtualItg3205
@@ -20,6 +21,7 @@ __all__ = [
     "Truth",
     "VirtualAdxl345",
     "VirtualAkm",
+    "VirtualBmi270",
     "VirtualHmc5883l",
     "VirtualIcm20948",
     "VirtualItg3205",

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from vislam.config import SensorCalibration
+from vislam.hw.emulator.bmi270 import VirtualBmi270
 from vislam.hw.emulator.bus import EmulatedBus
 from vislam.hw.emulator.chips import Chip, NowNs
 from vislam.hw.emulator.icm20948 import VirtualIcm20948
@@ -17,17 +18,19 @@ from vislam.hw.emulator.mpu6050 import VirtualMpu6050
 from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
 from vislam.hw.emulator.stepped_clock import SteppedClock
 
-FifoKind = Literal["LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-6500", "MPU-9250", "ICM-20948"]
+FifoKind = Literal["LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-6500", "MPU-9250", "ICM-20948", "BMI270"]
 BoardMagnetometer = Literal["inside", "LIS3MDL", "QMC5883P", "none"]
 _DEG = np.pi / 180.0
 _ALIKE = SensorCalibration()
+_Kind = VirtualLsm6dsox | VirtualMpu6050 | VirtualIcm20948 | VirtualBmi270
 # kind -> class, id, address, and noise densities of the data sheets: deg/s/sqrt(Hz), 1e-6 g/sqrt(Hz)
-_KINDS: dict[str, tuple[type[VirtualLsm6dsox | VirtualMpu6050 | VirtualIcm20948], int, int, float, float]] = {
+_KINDS: dict[str, tuple[type[_Kind], int, int, float, float]] = {
     "LSM6DSOX": (VirtualLsm6dsox, 0x6C, 0x6A, 0.0038, 110.0),
     "ISM330DHCX": (VirtualLsm6dsox, 0x6B, 0x6A, 0.005, 80.0),
     "MPU-6050": (VirtualMpu6050, 0x68, 0x68, 0.005, 400.0),
     "MPU-6500": (VirtualMpu6050, 0x70, 0x68, 0.01, 300.0),
     "MPU-9250": (VirtualMpu6050, 0x71, 0x68, 0.01, 300.0),
+    "BMI270": (VirtualBmi270, 0x24, 0x68, 0.008, 160.0),
     "ICM-20948": (VirtualIcm20948, 0xEA, 0x69, 0.015, 230.0),
 }
 _INSIDE = {"MPU-9250": "AK8963", "ICM-20948": "AK09916"}
@@ -89,6 +92,6 @@ def emulated_board(
         chips[0x1C] = VirtualLis3mdl(truth, now_ns, mag, seed + 3)
     elif magnetometer == "QMC5883P":
         chips[0x2C] = VirtualQmc5883(truth, now_ns, mag, seed + 3, "P")
-    elif magnetometer == "inside" and not isinstance(chip, VirtualLsm6dsox) and kind in _INSIDE:
+    elif magnetometer == "inside" and isinstance(chip, VirtualMpu6050 | VirtualIcm20948) and kind in _INSIDE:
         chips[0x0C] = VirtualAkm(truth, now_ns, mag, seed + 3, _INSIDE[kind], chip)
     return EmulatedBus(chips, path, smbus_only, one_read, stepped)

@@ -1,0 +1,113 @@
+"""Virtual BMI270: does nothing before it was given its configuration; a FIFO of frames, by the data sheet."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from vislam.hw.emulator.chips import NowNs
+from vislam.hw.emulator.fifo_chip import FifoChip
+from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
+
+_G_M_S2 = 9.80665
+_INIT_DATA = 0x5E
+
+
+class VirtualBmi270(FifoChip):
+    """FIFO without headers; a frame that is read in part is read again; the oldest frames are overwritten.
+
+    Attributes:
+        given: the configuration that it was sent.
+        takes: whether it is content with that.
+    """
+
+    FIFO_REGISTER = 0x26
+    FIFO_BYTES = 2048 // 12 * 12
+
+    def __init__(
+        self,
+        truth: Truth,
+        now_ns: NowNs,
+        gyro: SensorError = IDEAL,
+        accel: SensorError = IDEAL,
+        seed: int = 0,
+        who_am_i: int = 0x24,
+    ) -> None:
+        """Take the motion, the host's clock and the errors."""
+        self._who_am_i = who_am_i
+        self.given = bytearray()
+        self.takes = True
+        super().__init__(truth, now_ns, gyro, accel, seed)
+
+    def power_cycle(self) -> None:
+        """Come up in advanced power save without a configuration."""
+        super().power_cycle()
+        self.registers[0x00], self.registers[0x40], self.registers[0x42] = self._who_am_i, 0xA8, 0xA9
+        self.registers[0x7C] = 0x03
+        self.given = bytearray()
+
+    def _rate_hz(self) -> float:
+        return 25.0 * 2 ** ((self.registers[0x42] & 0x0F) - 6)
+
+    def write(self, data: bytes) -> None:
+        """Take a message; the register of the configuration's data does not move on."""
+        if data and data[0] == _INIT_DATA:
+            place = 2 * (self.registers[0x5B] & 0x0F | self.registers[0x5C] << 4)
+            if len(self.given) < place + len(data) - 1:
+                self.given += bytes(place + len(data) - 1 - len(self.given))
+            self.given[place : place + len(data) - 1] = data[1:]
+            self._pointer = _INIT_DATA
+        else:
+            super().write(data)
+
+    def _write_register(self, register: int, value: int) -> None:
+        self._run()
+        if register in (0x00, 0x1D, 0x21, 0x24, 0x25):
+            return
+        if register == 0x7E:
+            if value == 0xB6:
+                self.power_cycle()
+            elif value == 0xB0:
+                self.fifo.clear()
+                self.registers[0x1D] = 0
+            return
+        self.registers[register] = value
+        if register == 0x59 and value == 1:
+            is_awake = not self.registers[0x7C] & 0x01
+            self.registers[0x21] = 0x01 if self.takes and is_awake and self.given else 0x02
+        runs = self.registers[0x21] == 0x01 and self.registers[0x7D] & 0x06 == 0x06 and self.registers[0x49] == 0xC0
+        if not runs:
+            self._next_ns = math.inf
+        elif register in (0x7D, 0x49, 0x42):
+            self._start()
+            self.gyro_delay_ns = self.accel_delay_ns = round(0.225e9 / (0.4 * self._rate_hz()))
+
+    def _packed(self, t_ns: int) -> bytes:
+        gyro_lsb = 32768.0 / (2000.0 / (1 << (self.registers[0x43] & 7))) * 180.0 / math.pi
+        accel_lsb = 16384.0 / (1 << (self.registers[0x41] & 3)) / _G_M_S2
+        gyro, accel = self._counts(t_ns, gyro_lsb, accel_lsb)
+        return struct.pack("<6h", *gyro, *accel)
+
+    def _overran(self) -> None:
+        self.registers[0x1D] |= 0x01
+
+    def _begin_read(self, first: int, count: int) -> None:
+        struct.pack_into("<H", self.registers, 0x24, len(self.fifo))
+        temperature_c = self._truth(self._now_ns())[3]
+        struct.pack_into("<h", self.registers, 0x22, round((temperature_c - 23.0) * 512.0))
+
+    def read(self, count: int) -> bytes:
+        """Answer a message that reads; what is read of a frame in part stays in the FIFO, and none is 0x8000."""
+        if self._pointer != self.FIFO_REGISTER:
+            return super().read(count)
+        self._run()
+        whole = count // 12 * 12
+        data = bytes(self.fifo[:count])
+        del self.fifo[:whole]
+        return data + (b"\x00\x80" * count)[: count - len(data)]
+
+    def _read_byte(self, register: int) -> int:
+        value = super()._read_byte(register)
+        if register == 0x1D:
+            self.registers[0x1D] = 0
+        return value
