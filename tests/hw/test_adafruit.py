@@ -13,7 +13,7 @@ from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.adafruit import AdafruitImu, open_adafruit
 from vislam.hw.emulator import SteppedClock
 from vislam.hw.health import Health
-from vislam.hw.sensors import open_inertial
+from vislam.hw.sensors import check_devices, open_inertial
 from vislam.hw.source import InertialSource
 from worlds.gy85 import FIELD_UT, driving
 
@@ -233,3 +233,7 @@ def test_a_driver_is_opened_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None
 def test_without_the_library_the_extra_is_named() -> None:
     with pytest.raises(HardwareError, match=r"pip install 'vislam\[boards\]' adafruit-circuitpython-absent_chip"):
         open_adafruit("adafruit_absent_chip.X", BoardConfig())
+    with pytest.raises(HardwareError, match=r"no module adafruit_absent_chip\); install.*vislam\[boards\]"):
+        check_devices("adafruit:adafruit_absent_chip.X", "none", SensorsConfig())
+    with pytest.raises(UsageError, match="names no driver"):
+        check_devices("adafruit:X", "none", SensorsConfig())

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from vislam.config import BoardConfig, SensorCalibration
+from vislam.config import BoardConfig, PowerUpConfig, SensorCalibration
 from vislam.core.errors import HardwareError, UsageError
-from vislam.core.messages import ImuSample
+from vislam.core.messages import ImuSample, ImuSpan
 from vislam.hw.emulator import SteppedClock, emulated_bus, emulated_gy85
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.fifo_stamps import FifoStamps
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
+from vislam.imu import PowerUp, power_up
 from worlds.fifo_boards import FIRMWARE, KINDS, fifo_board, gathered, inertial_chip, stamp_errors_ms
 from worlds.gy85 import driving, errors, still
 
@@ -252,6 +253,23 @@ def test_temperature_drift_is_told_and_its_known_part_taken_off() -> None:
         drift = np.mean([s.gyro_rad_s for s in last], axis=0) - np.mean([s.gyro_rad_s for s in first], axis=0)
         assert abs(18.0 * per_c).max() > 0.002, "the chip itself drifts"
         assert abs(drift).max() < 0.001
+
+
+def test_power_up_finds_bias_and_level_as_on_a_gy85() -> None:
+    def level(t_ns: int):  # type: ignore[no-untyped-def]
+        return (0.0, 0.0, 0.0), (0.17, -0.34, 9.80185), (20.0, 0.0, -42.0), 30.0
+
+    with fifo_board("LSM6DSOX", truth=level) as (driver, virtual, clock):
+        error = inertial_chip(virtual)._sense._error
+        bias = np.array(error.bias) + 5.0 * np.array(error.bias_per_c)
+        samples, _ = gathered(driver, clock, 3.0)
+        t_ns = np.array([s.t_ns for s in samples], dtype=np.int64)
+        rates, forces = np.array([s.gyro_rad_s for s in samples]), np.array([s.accel_m_s2 for s in samples])
+        found = power_up(ImuSpan(t_ns, rates, forces), PowerUpConfig(), 9.81, driver.temperature_c)
+        assert isinstance(found, PowerUp)
+        np.testing.assert_allclose(found.gyro_bias_rad_s, bias, atol=5e-4)
+        np.testing.assert_allclose(found.R_level_body @ [0.17, -0.34, 9.80185], [0.0, 0.0, 9.81], atol=0.1)
+        assert found.temperature_c == pytest.approx(30.0, abs=0.1)
 
 
 def test_what_is_in_the_place_of_a_chip_is_told() -> None:

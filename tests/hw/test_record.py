@@ -282,7 +282,7 @@ def test_what_cannot_be_recorded_is_refused(video: Path, sensors: SensorsConfig,
     with pytest.raises(UsageError, match="nothing to record"):
         record(tmp_path / "r", "none", "none", sensors, CONFIG)
     with pytest.raises(UsageError, match="no IMU called 'mpu6050'"):
-        record(tmp_path / "r", "mpu6050", "none", sensors, CONFIG)
+        record(tmp_path / "r", "bmi160", "none", sensors, CONFIG)
     with pytest.raises(HardwareError, match="there is no port"):
         record(tmp_path / "r", f"serial:{tmp_path / 'no'}", "none", sensors, CONFIG)
     with pytest.raises(StorageError, match="min-free-gb"):

@@ -6,6 +6,7 @@ import importlib
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -204,18 +205,33 @@ def open_adafruit(name: str, config: BoardConfig) -> AdafruitImu:
     return AdafruitImu(device, config, open_again=make)
 
 
-def _maker(name: str, config: BoardConfig) -> Callable[[], Any]:
-    module_name, _, class_name = name.rpartition(".")
+def check_driver(name: str) -> None:
+    """Raise HardwareError where the driver `MODULE.CLASS` or Blinka is not installed, UsageError for no such name."""
+    package = _module_of(name).partition(".")[0]
+    for needed in (package, "board"):
+        if find_spec(needed) is None:
+            raise HardwareError(_why_not(name, f"there is no module {needed}"))
+
+
+def _module_of(name: str) -> str:
+    module_name = name.rpartition(".")[0]
     if not module_name:
         raise UsageError(f"'{name}' names no driver; write adafruit:MODULE.CLASS, such as adafruit:{BNO085}")
+    return module_name
+
+
+def _why_not(name: str, problem: object) -> str:
+    package = f"adafruit-circuitpython-{name.split('.', maxsplit=1)[0].removeprefix('adafruit_')}"
+    return f"{name} needs its driver and Blinka ({problem}); install them: pip install 'vislam[boards]' {package}"
+
+
+def _maker(name: str, config: BoardConfig) -> Callable[[], Any]:
+    module_name, class_name = _module_of(name), name.rpartition(".")[2]
     try:
         module, board = importlib.import_module(module_name), importlib.import_module("board")
         i2c = board.I2C
     except (ImportError, NotImplementedError, AttributeError) as error:  # the last two: a machine that Blinka knows not
-        package = f"adafruit-circuitpython-{module_name.split('.')[0].removeprefix('adafruit_')}"
-        raise HardwareError(
-            f"{name} needs its driver and Blinka ({error}); install them: pip install 'vislam[boards]' {package}"
-        ) from error
+        raise HardwareError(_why_not(name, error)) from error
     driver = getattr(module, class_name, None)
     if driver is None:
         raise UsageError(f"{module_name} has no class {class_name}; its documentation names it")

@@ -112,6 +112,10 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
 
         board = config.gy85 if kind == "gy85" else config.board
         I2cBus(where or board.bus, board.bus_timeout_s).close()
+    elif kind in ("bno085", "adafruit"):
+        from vislam.hw.adafruit import BNO085, check_driver
+
+        check_driver(BNO085 if kind == "bno085" else where)
     elif kind == "iio":
         from vislam.hw.iio_imu import find_devices
 

@@ -1,7 +1,8 @@
 """MPU-6050, MPU-6500, MPU-9250 and MPU-9255 of InvenSense: one register map, a FIFO of bytes.
 
-Registers by RM-MPU-6000A-00 rev. 4.2 and RM-MPU-9250A-00 rev. 1.4 and 1.6 (sections 4.4 to 4.8, 4.34 to 4.38), compared with
-the kernel's driver (inv_mpu_iio.h). A MPU-9250 has an AK8963 magnetometer inside, which answers at 0x0C from then on.
+Registers by RM-MPU-6000A-00 rev. 4.2 and RM-MPU-9250A-00 rev. 1.4 and 1.6 (sections 4.4 to 4.8, 4.34 to 4.38),
+compared with the kernel's driver (inv_mpu_iio.h). A MPU-9250 has an AK8963 magnetometer inside, which answers at 0x0C
+from then on.
 """
 
 from __future__ import annotations
