@@ -281,7 +281,7 @@ def test_an_unplugged_imu_is_missed_and_comes_back(video: Path, sensors: Sensors
 def test_what_cannot_be_recorded_is_refused(video: Path, sensors: SensorsConfig, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="nothing to record"):
         record(tmp_path / "r", "none", "none", sensors, CONFIG)
-    with pytest.raises(UsageError, match="no IMU called 'mpu6050'"):
+    with pytest.raises(UsageError, match="no IMU called 'bmi160'"):
         record(tmp_path / "r", "bmi160", "none", sensors, CONFIG)
     with pytest.raises(HardwareError, match="there is no port"):
         record(tmp_path / "r", f"serial:{tmp_path / 'no'}", "none", sensors, CONFIG)
