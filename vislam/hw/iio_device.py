@@ -100,7 +100,7 @@ class IioDevice:
             self.close()
             raise HardwareError(
                 f"{node} ({self.name}): {error}; give yourself the right to write below {folder} and to read {node} "
-                "(a udev rule, docs/sensors.md), and see that no other program uses it"
+                "(a udev rule, docs/sensors.md), set its trigger if it has none, see that no other program uses it"
             ) from error
 
     def read(self, timeout_s: float) -> Scans:
