@@ -131,6 +131,7 @@ def test_a_board_is_recorded(tmp_path: Path) -> None:
     with emulated_bus(emulated_board("ICM-20948", still, time.monotonic_ns)) as bus:
         recorded = record(tmp_path / "r", f"board:{bus.path}", "none", SensorsConfig(), RecordConfig(), seconds=1.0)
     assert sum(recorded.counts.values()) > 50
+    assert any("stamped by the chip's clock" in note for note in recorded.notes)
     rows = np.loadtxt(tmp_path / "r/mav0/imu0/data.csv", delimiter=",", comments="#")
     assert (np.diff(rows[:, 0]) > 0).all()
     np.testing.assert_allclose(rows[:, 4:7].mean(axis=0), [0.0, 0.0, 9.8], atol=0.3)

@@ -115,7 +115,7 @@ def record(
             images = open_camera(camera, sensors, stamps_ns=_video_stamps(camera), in_real_time=in_real_time)
         first = None if images is None else _first_image(images, camera)
         rig, notes = (None, ()) if first is None else _rig(first, files, sensors.hfov_deg)
-        notes = (*notes, *_camera_notes(images))
+        notes = (*notes, *_camera_notes(images), *_stamp_notes(imu, inertial))
         noise = None if inertial is None else _noise(files, sensors, inertial.rate_hz)
         imu_calibration, mag_calibration = _calibrations(files, calibration_of(imu, sensors))
         with Recorder(
@@ -340,6 +340,14 @@ def _rig(first: CapturedImage, files: CalibrationConfig, hfov_deg: float) -> tup
         note = f"{files.camera} does not say where the camera sits: looking ahead, at the IMU, is written"
         return Rig((found.camera,), (_T_BODY_CAM,)), (note,)
     return Rig((found.camera,), (np.asarray(found.T_body_cam),)), ()
+
+
+def _stamp_notes(name: str, inertial: InertialSource | None) -> tuple[str, ...]:
+    """Return where the stamps of an inertial source come from; those of a GY-85 and a bridge are in the docs."""
+    stamped_by = getattr(inertial, "stamped_by", None)
+    if stamped_by is None or name.startswith("gy85"):
+        return ()
+    return (f"inertial samples of {name} are stamped by {stamped_by}",)
 
 
 def _camera_notes(images: Webcam | VideoCamera | None) -> tuple[str, ...]:
