@@ -1,6 +1,7 @@
 """Pose-graph optimisers side by side: every peer on the same file, one after the other, and cost against size.
 
     .venv/bin/python benchmarks/pose_graph.py FILE.g2o ...
+    .venv/bin/python benchmarks/pose_graph.py landmarks     # Victoria Park of the installed gtsam
     .venv/bin/python benchmarks/pose_graph.py growth --sizes 1000 10000 100000 --picture growth.png
 
 Each peer runs in a process of its own, reads the file, solves and writes a g2o file; times are its CPU seconds, the
@@ -39,11 +40,12 @@ sys.path[:0] = [str(ROOT)]
 from vislam.batch.posegraph.certificate import certify  # noqa: E402
 from vislam.batch.posegraph.files import read_pose_graph  # noqa: E402
 from vislam.batch.posegraph.g2o import write_g2o  # noqa: E402
+from vislam.batch.posegraph.optimize import optimize_pose_graph  # noqa: E402
 from vislam.batch.posegraph.problem import PoseGraphProblem  # noqa: E402
 from vislam.batch.posegraph.solver import levenberg_marquardt  # noqa: E402
 from vislam.batch.posegraph.structure import Structure  # noqa: E402
 from vislam.batch.posegraph.worlds import simulate_graph  # noqa: E402
-from vislam.config import GraphWorldConfig  # noqa: E402
+from vislam.config import GraphWorldConfig, PoseGraphConfig  # noqa: E402
 from vislam.core.errors import VislamError  # noqa: E402
 
 PEER = ROOT / "benchmarks" / "peers" / "pose_graph_peer.py"
@@ -143,6 +145,21 @@ def growth(
         draw(rows, picture)
 
 
+def landmarks() -> None:
+    """Print CPU seconds and chi2 of our start and descent, and of gtsam's Levenberg-Marquardt from the same start."""
+    import gtsam
+
+    source = Path(gtsam.__file__).parent / "Data" / "victoria_park.txt"
+    print("| file | start | method | solve s (CPU) | chi2 |\n|---|---|---|---:|---:|")
+    for _ in range(2):  # the first round loads compiled code
+        problem = read_pose_graph(source)
+        solved = [(m, optimize_pose_graph(problem, PoseGraphConfig(start="grown", method=m))) for m in ("lm", "gtsam")]
+    solved.append(("lm", optimize_pose_graph(problem, PoseGraphConfig(start="chordal"))))
+    for method, solution in solved:
+        numbers = f"{solution.solve_s:.2f} | {solution.costs[-1]:.9g}{'' if solution.converged else ', not converged'}"
+        print(f"| {source.stem} | {solution.start_name} | {method} | {numbers} |", flush=True)
+
+
 def draw(rows: list[dict[str, Any]], picture: Path) -> None:
     """Draw CPU time and memory over size, with a line of n log n."""
     import matplotlib as mpl
@@ -171,7 +188,7 @@ def draw(rows: list[dict[str, Any]], picture: Path) -> None:
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", help="g2o files, or the word growth")
+    parser.add_argument("files", nargs="+", help="g2o files, or one of the words growth, landmarks")
     parser.add_argument("--limit-s", type=float, default=600.0, help="of a peer on a file")
     parser.add_argument("--shapes", nargs="+", default=["manhattan", "torus", "sphere", "grid3d"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[1000, 3000, 10000, 30000, 100000])
@@ -185,6 +202,8 @@ def main() -> None:
         folder = Path(temporary)
         if args.files == ["growth"]:
             growth(args.shapes, args.sizes, args.loops_per_pose, args.limit_s, folder, args.picture)
+        elif args.files == ["landmarks"]:
+            landmarks()
         else:
             cpu_ms = compare([Path(file) for file in args.files], args.limit_s, folder, args.peers, args.rounds)
             if args.record:

@@ -163,13 +163,22 @@ def test_the_verb_tells_landmarks_and_writes_them_apart(tmp_path, capsys):
     assert "landmarks" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("options", [{"robust": "gnc"}, {"method": "gtsam"}, {"method": "isam2"}])
-def test_what_knows_poses_alone_refuses_landmarks(options, tmp_path):
+@pytest.mark.parametrize("options", [{"robust": "gnc"}, {"method": "gtsam"}, {"start": "grown"}])
+def test_every_way_ends_at_the_same_minimum(options, tmp_path):
     problem = read(tmp_path, *mixed(np.random.default_rng(1)))
-    with pytest.raises(UsageError, match="no landmarks and no priors"):
-        optimize_pose_graph(problem, PoseGraphConfig(**options))
-    with pytest.raises(UsageError, match="no lines for"):
-        write_pose_graph(problem, tmp_path / "a.toro")
+    expected = optimize_pose_graph(problem, PoseGraphConfig(start="file"))
+    found = optimize_pose_graph(problem, PoseGraphConfig(**options))
+    assert found.costs[-1] == pytest.approx(expected.costs[-1], rel=1e-7)
+    assert found.poses == pytest.approx(expected.poses, abs=1e-5)
+
+
+def test_what_a_way_or_a_format_does_not_know_is_refused(tmp_path):
+    problem = read(tmp_path, *mixed(np.random.default_rng(1)))
+    with pytest.raises(UsageError, match="with landmarks auto, gnc or cauchy"):
+        optimize_pose_graph(problem, PoseGraphConfig(robust="dcs"))
+    for ending in ("toro", "isam"):
+        with pytest.raises(UsageError, match="no lines for"):
+            write_pose_graph(problem, tmp_path / f"a.{ending}")
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,9 @@ class BatchConfig:
 class PoseGraphConfig:
     """Optimisation of a pose graph from a file."""
 
-    start: Literal["auto", "file", "odometry", "tree", "chordal", "angles"] = "auto"  # auto: the one of lowest cost
+    start: Literal["auto", "file", "odometry", "tree", "chordal", "angles", "grown"] = (
+        "auto"  # auto: the one of lowest cost
+    )
     method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
     equations: Literal["auto", "cholesky", "gradients"] = "auto"  # conjugate gradients where a factor would be large
     # which edges that do not join successive ids may be rejected, by what; auto tries several, judges, and says why
@@ -43,6 +45,8 @@ class PoseGraphConfig:
     inlier_probability: Probability = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
     certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
     covariances: bool = False  # write those of all poses: in space 300 bytes each
+    # what an iSAM file in the plane states: square roots of information, or covariances; auto tells and says so
+    isam_noise: Literal["auto", "root", "covariance"] = "auto"
     repair_information: bool = False  # take the nearest positive definite matrix for what is not; else it is refused
 
 

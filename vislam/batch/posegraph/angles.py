@@ -86,7 +86,7 @@ def refuse_other_tags(path: Path, found: TaggedLines, known: Mapping[str, tuple[
         raise DataError(f"{path}:{line}: '{text.split()[0][:40]}' is no tag that is known here: {', '.join(known)}")
 
 
-def refuse_what_is_lost(problem: PoseGraphProblem, path: Path, name: str) -> None:
+def refuse_what_is_lost(problem: PoseGraphProblem, path: Path, name: str, with_landmarks: bool = False) -> None:
     """Raise UsageError for a problem with fixed poses or landmarks, which the format has no lines for."""
-    if problem.fixed.any() or problem.passed_lines or not problem.of_poses:
+    if problem.fixed.any() or problem.passed_lines or not (problem.of_poses or with_landmarks):
         raise UsageError(f"{path}: {name} files have no lines for fixed poses, landmarks, priors; write a g2o file")

@@ -131,9 +131,9 @@ def read_extras(path: Path, rows: Mapping[str, Rows], d: int) -> Extras:
             _positions(rows["EDGE_SE3_XYZ_PRIOR"], False, False),  # g2o reads the id of an offset, and leaves it aside
             _positions(rows["EDGE_POINTXYZ_PRIOR"], False, True),
         ]
-    places = PoseLines(points.ids[:, 0], _placed(points.numbers), points.lines)
+    at = PoseLines(points.ids[:, 0], places(points.numbers), points.lines)
     fields = [np.concatenate([part[name] for part in parts]) for name in _FIELDS]
-    return Extras(places, *fields)
+    return Extras(at, *fields)
 
 
 def extra_vertices(problem: PoseGraphProblem, values: Array) -> Iterator[str]:
@@ -193,7 +193,7 @@ def _positions(rows: Rows, observed: bool, wants_point: bool) -> _Columns:
     information[:, k - d :, k - d :] = symmetric(rows.numbers[:, d:], tuple(range(d)))
     return {
         "to": rows.ids[:, 1 if observed else 0], "wants_point": np.full(count, wants_point),
-        "observer": rows.ids[:, 0] if observed else np.full(count, -1), "measurements": _placed(rows.numbers[:, :d]),
+        "observer": rows.ids[:, 0] if observed else np.full(count, -1), "measurements": places(rows.numbers[:, :d]),
         "information": information, "is_position": np.full(count, True), "lines": rows.lines,
     }  # fmt: skip
 
@@ -259,7 +259,7 @@ def _offsets_of(path: Path, offsets: dict[int, Array], ids: Ids, lines: Ids) -> 
     return np.array([offsets[i] for i in ids.tolist()]).reshape(-1, 4, 4)
 
 
-def _placed(positions: Array) -> Array:
+def places(positions: Array) -> Array:
     """Return transforms [M, d + 1, d + 1] without a rotation."""
     d = positions.shape[1]
     T = np.tile(np.eye(d + 1), (len(positions), 1, 1))

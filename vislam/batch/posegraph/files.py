@@ -8,6 +8,7 @@ from typing import Literal
 
 from vislam.batch.posegraph.g2o import read_g2o, write_g2o
 from vislam.batch.posegraph.isam import read_isam, write_isam
+from vislam.batch.posegraph.landmark_lines import Noise
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.toro import read_toro, write_toro
 from vislam.core.errors import DataError, UsageError
@@ -17,7 +18,7 @@ from vislam.core.reading import open_file
 GraphFormat = Literal["g2o", "toro", "isam"]
 
 _READERS: dict[GraphFormat, Callable[[Path, bool], PoseGraphProblem]] = {
-    "g2o": read_g2o, "toro": read_toro, "isam": read_isam,
+    "g2o": read_g2o, "toro": read_toro,
 }  # fmt: skip
 _WRITERS: dict[GraphFormat, Callable[[PoseGraphProblem, Path, Array | None], None]] = {
     "g2o": write_g2o, "toro": write_toro, "isam": write_isam,
@@ -26,6 +27,7 @@ _ENDINGS: dict[str, GraphFormat] = {".g2o": "g2o", ".toro": "toro", ".isam": "is
 _TAGS: dict[str, GraphFormat] = {
     "VERTEX_SE2": "g2o", "VERTEX_SE3:QUAT": "g2o", "EDGE_SE2": "g2o", "EDGE_SE3:QUAT": "g2o",
     "VERTEX2": "toro", "VERTEX3": "toro", "ODOMETRY": "isam", "Constraint2": "isam", "POSE3D_INIT": "isam",
+    "LANDMARK": "isam",
 }  # fmt: skip
 _LOOKED_AT_BYTES = 1 << 20
 
@@ -52,9 +54,13 @@ def graph_format(path: Path) -> GraphFormat:
     )
 
 
-def read_pose_graph(path: Path, repair: bool = False) -> PoseGraphProblem:
-    """Read a pose graph of any format; see `graph_format` and the readers. `repair`: make its information positive."""
-    return _READERS[graph_format(path)](path, repair)
+def read_pose_graph(path: Path, repair: bool = False, isam_noise: Noise | Literal["auto"] = "auto") -> PoseGraphProblem:
+    """Read a pose graph of any format; see `graph_format` and the readers. `repair`: make its information positive.
+
+    `isam_noise`: whether an iSAM file in the plane states square roots of information or covariances; "auto" tells.
+    """
+    name = graph_format(path)
+    return read_isam(path, repair, isam_noise) if name == "isam" else _READERS[name](path, repair)
 
 
 def write_pose_graph(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

@@ -35,7 +35,7 @@ _STEPS_MAX = 60
 _INNER = 2  # iterations of a step: the next one asks something else anyway
 _LEAST_INFORMATION = 1e-9  # of the trace: what makes a matrix with unknown directions invertible
 _NEAR = 25.0  # times the limit: rejected loops that graduated non-convexity looks at again
-_TAILS = 4.0  # times the limit at the end: errors of real loops have heavier tails than a Gaussian
+TAILS = 4.0  # times the limit at the end: errors of real loops have heavier tails than a Gaussian
 _SETTLED = 1e-3  # weights this close to 0 or 1 are decided
 
 
@@ -56,7 +56,7 @@ def reject_false_edges(structure: Structure, config: PoseGraphConfig, progress: 
     poses, candidates, scale = _gated(problem, trusted, limit, progress)
     weights = candidates.astype(np.float64)
     weights[candidates] = graduated_non_convexity(
-        Structure(problem.with_edges(candidates)), poses, trusted[candidates], _TAILS * limit * scale, progress
+        Structure(problem.with_edges(candidates)), poses, trusted[candidates], TAILS * limit * scale, progress
     )
     return weights
 
@@ -66,7 +66,7 @@ def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraph
 
     For a problem whose poses are good already, as those of sessions that several loops agreed to bring together.
     """
-    limit = _TAILS * chi_square_limit(config.inlier_probability, problem.tangent)
+    limit = TAILS * chi_square_limit(config.inlier_probability, problem.tangent)
     return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)
 
 
@@ -161,9 +161,11 @@ def _tested(
 
 
 def graduated_non_convexity(
-    structure: Structure, poses: Array, trusted: Mask, limit: float, progress: Progress | None = None
+    structure: Structure, poses: Array, trusted: Mask, limit: float | Array, progress: Progress | None = None
 ) -> Array:
     """Return the weights [E], 0 or 1, that minimise the least squares, truncated at `limit`, of what is not trusted.
+
+    `limit` is one for all edges or has one for each [E].
 
     Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, section IV.
     """
@@ -172,10 +174,10 @@ def graduated_non_convexity(
     if trusted.all():
         return weights
     errors = problem.edge_chi2(poses)
-    worst = float(errors[~trusted].max(initial=0.0))
-    control = limit / max(2.0 * worst - limit, limit)
+    limits = np.broadcast_to(np.asarray(limit, dtype=np.float64), errors.shape)[~trusted]
+    control = float(np.min(limits / np.maximum(2.0 * errors[~trusted] - limits, limits)))
     for _ in range(_STEPS_MAX):
-        weights[~trusted] = _weights(errors[~trusted], limit, control)
+        weights[~trusted] = _weights(errors[~trusted], limits, control)
         descent = levenberg_marquardt(structure, poses, weights, iterations=_INNER, tolerance=_INNER_TOLERANCE)
         poses, errors = descent.poses, problem.edge_chi2(descent.poses)
         if progress is not None:
@@ -183,11 +185,11 @@ def graduated_non_convexity(
         if control > 1.0 and np.all((weights < _SETTLED) | (weights > 1.0 - _SETTLED)):
             break
         control *= _GROWTH
-    weights[~trusted] = errors[~trusted] <= limit
+    weights[~trusted] = errors[~trusted] <= limits
     return weights
 
 
-def _weights(errors: Array, limit: float, control: float) -> Array:
+def _weights(errors: Array, limit: Array, control: float) -> Array:
     """Return the weights of truncated least squares at a control parameter (equation 14 of the paper)."""
     upper, lower = (control + 1.0) / control * limit, control / (control + 1.0) * limit
     between = np.sqrt(limit * control * (control + 1.0) / np.maximum(errors, 1e-300)) - control

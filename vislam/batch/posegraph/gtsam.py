@@ -1,4 +1,7 @@
-"""Pose graphs through gtsam: Levenberg-Marquardt as the route that always works, and iSAM2 fed edge by edge."""
+"""Pose graphs through gtsam: Levenberg-Marquardt as the route that always works, and iSAM2 fed edge by edge.
+
+Positions of landmarks are Python factors: gtsam's Python has none with the error of `PositionEdges`.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from vislam.batch.posegraph.points import turned_by
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import Descent, Progress
 from vislam.core.errors import DataError
@@ -31,11 +35,11 @@ def gtsam_levenberg_marquardt(
     """Lower the cost from `poses` by gtsam; edges of weight 0 are left out. Raises DataError when gtsam fails."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for i in range(len(problem.ids)):
-        values.insert(i, _pose(problem, poses[i]))
+        values.insert(i, _value(problem, i, poses[i]))
     for i in problem.anchors().tolist():
         graph.add(_anchor(problem, i, poses[i]))
     for e in np.flatnonzero(weights > 0.0).tolist():
-        graph.add(_between(problem, e, weights[e]))
+        graph.add(_factor(problem, e, weights[e]))
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(iterations)
     params.setRelativeErrorTol(tolerance)
@@ -86,47 +90,99 @@ def _replayed(
     isam = gtsam.ISAM2(params)
     anchors = set(problem.anchors().tolist())
     used = np.flatnonzero(weights > 0.0)
-    later = problem.edges[used].max(axis=1)
+    turn = np.arange(len(problem.ids))  # [N] when a pose comes; the world, of which priors are edges, comes first
+    if problem.world >= 0:
+        turn = (turn + 1) % len(turn)
+    later = turn[problem.edges[used]].max(axis=1)
     order = used[np.argsort(later, kind="stable")]
     begins = np.searchsorted(np.sort(later), np.arange(len(problem.ids) + 1))
     step_back = max(1, len(problem.ids) // 100)
-    for i in range(len(problem.ids)):
+    for k, i in enumerate(np.argsort(turn).tolist()):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        edges = order[begins[i] : begins[i + 1]].tolist()
-        start = _pose(problem, poses[i])
+        edges = order[begins[k] : begins[k + 1]].tolist()
+        start, known = poses[i], _from_edge(problem, isam, i, edges)
         if i in anchors:
             graph.add(_anchor(problem, i, poses[i]))
-        elif edges:
-            a, b = problem.edges[edges[0]].tolist()
-            Z = _pose(problem, problem.measurements[edges[0]])
-            other = _current(problem, isam, a if b == i else b)
-            start = other.compose(Z) if b == i else other.compose(Z.inverse())
+        elif known is not None:
+            start = known
         else:
             # its edges all lead to later poses: a loose prior until they come
             graph.add(_anchor(problem, i, poses[i], sigma=1e3))
         for e in edges:
-            graph.add(_between(problem, e, weights[e]))
-        values.insert(i, start)
+            graph.add(_factor(problem, e, weights[e]))
+        values.insert(i, _value(problem, i, start))
         isam.update(graph, values)
-        if progress is not None and i % step_back == 0:
-            progress(i, float("nan"))
+        if progress is not None and k % step_back == 0:
+            progress(k, float("nan"))
     for _ in range(_FINAL_STEPS):
         isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], None, None, None, True)
     return _read(problem, isam.calculateBestEstimate())
 
 
-def _current(problem: PoseGraphProblem, isam: gtsam.ISAM2, i: int) -> Any:
-    return isam.calculateEstimatePose2(i) if problem.dimension == 2 else isam.calculateEstimatePose3(i)
+def _from_edge(problem: PoseGraphProblem, isam: gtsam.ISAM2, i: int, edges: list[int]) -> Array | None:
+    """Return where the first of the edges that tells it puts a pose or landmark, None where none does."""
+    for e in edges:
+        a, b = problem.edges[e].tolist()
+        if problem.is_position[e] and not problem.is_point[i]:
+            continue
+        Z, other = problem.measurements[e], _current(problem, isam, a if b == i else b)
+        return np.asarray(other @ Z if b == i else other @ np.linalg.inv(Z))
+    return None
+
+
+def _current(problem: PoseGraphProblem, isam: gtsam.ISAM2, i: int) -> Array:
+    two = problem.dimension == 2
+    if not problem.is_point[i]:
+        return np.asarray((isam.calculateEstimatePose2(i) if two else isam.calculateEstimatePose3(i)).matrix())
+    out = np.eye(problem.dimension + 1)
+    out[:-1, -1] = isam.calculateEstimatePoint2(i) if two else isam.calculateEstimatePoint3(i)
+    return out
 
 
 def _pose(problem: PoseGraphProblem, T: Array) -> Any:
     return gtsam.Pose2(T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0])) if problem.dimension == 2 else gtsam.Pose3(T)
 
 
+def _value(problem: PoseGraphProblem, i: int, T: Array) -> Any:
+    """Return a pose, or the position of a landmark, as gtsam has it."""
+    return T[:-1, -1].copy() if problem.is_point[i] else _pose(problem, T)
+
+
 def _anchor(problem: PoseGraphProblem, i: int, T: Array, sigma: float = _ANCHOR_SIGMA) -> Any:
-    model = gtsam.noiseModel.Isotropic.Sigma(problem.tangent, sigma)
-    kind = gtsam.PriorFactorPose2 if problem.dimension == 2 else gtsam.PriorFactorPose3
-    return kind(i, _pose(problem, T), model)
+    two, point = problem.dimension == 2, bool(problem.is_point[i])
+    model = gtsam.noiseModel.Isotropic.Sigma(problem.dimension if point else problem.tangent, sigma)
+    of_points = gtsam.PriorFactorPoint2 if two else gtsam.PriorFactorPoint3
+    of_poses = gtsam.PriorFactorPose2 if two else gtsam.PriorFactorPose3
+    return (of_points if point else of_poses)(i, _value(problem, i, T), model)
+
+
+def _factor(problem: PoseGraphProblem, e: int, weight: float) -> Any:
+    return (_position if problem.is_position[e] else _between)(problem, e, weight)
+
+
+def _position(problem: PoseGraphProblem, e: int, weight: float) -> Any:
+    """Return an edge that measures a position alone, with the error of `PositionEdges`."""
+    d = problem.dimension
+    i, j = problem.edges[e].tolist()
+    Z, to_point = problem.measurements[e], bool(problem.is_point[j])
+    R_back = Z[:d, :d].T
+
+    def error(_factor: Any, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        Ti, Tj = _matrix(problem, i, values), _matrix(problem, j, values)
+        to_from = Ti[:d, :d].T
+        seen = to_from @ (Tj[:d, d] - Ti[:d, d])
+        if jacobians is not None:
+            turned = turned_by(seen[None])[0]
+            parts = (R_back @ turned, -R_back)
+            jacobians[0] = np.concatenate(parts[::-1] if d == 2 else parts, axis=1)  # in the plane the angle is last
+            moved = R_back @ to_from
+            still, moved_body = np.zeros((d, problem.tangent - d)), moved @ Tj[:d, :d]
+            whole = (moved_body, still) if d == 2 else (still, moved_body)
+            jacobians[1] = moved if to_point else np.concatenate(whole, axis=1)
+        return np.asarray(R_back @ (seen - Z[:d, d]))
+
+    information = weight * problem.information[e][-d:, -d:]
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Information(information), [i, j], error)
 
 
 def _between(problem: PoseGraphProblem, e: int, weight: float) -> Any:
@@ -139,6 +195,14 @@ def _between(problem: PoseGraphProblem, e: int, weight: float) -> Any:
     return kind(a, b, _pose(problem, problem.measurements[e]), model)
 
 
+def _matrix(problem: PoseGraphProblem, i: int, values: gtsam.Values) -> Array:
+    two = problem.dimension == 2
+    if not problem.is_point[i]:
+        return np.asarray((values.atPose2(i) if two else values.atPose3(i)).matrix())
+    out = np.eye(problem.dimension + 1)
+    out[:-1, -1] = values.atPoint2(i) if two else values.atPoint3(i)
+    return out
+
+
 def _read(problem: PoseGraphProblem, values: gtsam.Values) -> Array:
-    at = values.atPose2 if problem.dimension == 2 else values.atPose3
-    return np.ascontiguousarray([at(i).matrix() for i in range(len(problem.ids))])
+    return np.ascontiguousarray([_matrix(problem, i, values) for i in range(len(problem.ids))])

@@ -1,14 +1,19 @@
-"""iSAM's text files: edges with the square root of their information, poses only in space.
+"""iSAM's text files: edges with the square root of their information, poses only in space, landmarks in the plane.
 
 iSAM's residual is the difference of the numbers x y angle, or x y z yaw pitch roll, of the predicted and the measured
 motion (`Pose2d_Pose2d_Factor`, `Pose3d_Pose3d_Factor`): of translations in the first pose's frame, and of Euler angles.
 Information is carried into our tangent at the measurement and back, so that both costs agree to second order; at a
 pitch of 90 degrees Euler angles have no rates, and such an edge is refused.
+
+Files go about in this format whose numbers are covariances (Victoria Park as gtsam brings it). Taken for square roots,
+their headings would be off by more than half a turn, which says nothing: by that they are told.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -22,6 +27,15 @@ from vislam.batch.posegraph.angles import (
     refuse_other_tags,
     refuse_what_is_lost,
 )
+from vislam.batch.posegraph.landmark_lines import (
+    BEARING_RANGE_COLUMNS,
+    LANDMARK_COLUMNS,
+    Noise,
+    information_of,
+    landmark_lines,
+    read_sightings,
+    with_sightings,
+)
 from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_lines
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
 from vislam.batch.posegraph.tagged_lines import Rows, TaggedLines, read_tagged_lines
@@ -30,49 +44,88 @@ from vislam.core.files import write_text
 from vislam.core.messages import Array
 
 _EDGES_2D = ("ODOMETRY", "EDGE2", "Constraint2")
-_COLUMNS = dict.fromkeys(_EDGES_2D, (2, 9)) | {"EDGE3": (2, 27), "POSE3D_INIT": (1, 6)}
+_SEEN = LANDMARK_COLUMNS | BEARING_RANGE_COLUMNS
+_COLUMNS = dict.fromkeys(_EDGES_2D, (2, 9)) | {"EDGE3": (2, 27), "POSE3D_INIT": (1, 6)} | _SEEN
 _IGNORED = ("SOLVE", "EDGE3_INIT", "EDGE3_TRUE", "POSE3D_TRUE")  # orders to the program and yardsticks, no measurements
 _UPRIGHT = 1e-6  # cosine of the pitch
 
 
-def read_isam(path: Path, repair: bool = False) -> PoseGraphProblem:
-    """Read ODOMETRY, EDGE2 and Constraint2, or EDGE3 and POSE3D_INIT; there are no poses of the plane to start from.
+def read_isam(path: Path, repair: bool = False, noise: Noise | Literal["auto"] = "auto") -> PoseGraphProblem:
+    """Read ODOMETRY, EDGE2, Constraint2, LANDMARK and BR, or EDGE3 and POSE3D_INIT.
 
-    Edges are in the order of the file. Raises DataError with the line number on damage of any kind, on both dimensions
-    in one file, on landmarks and on other tags; see `problem_from_lines` for the rest.
+    There are no poses of the plane to start from. Edges are in the order of the file, landmarks behind them. `noise`
+    says what stands for it in the plane: the square root of information, as in iSAM, or covariances; "auto" tells.
+    Raises DataError with the line number on damage of any kind, on both dimensions in one file, on other tags and on an
+    id of a landmark that is a pose's too; see `problem_from_lines` for the rest.
     """
     found = read_tagged_lines(path, _COLUMNS)
     kept = [(line, text) for line, text in found.others if text.split()[0] not in _IGNORED]
     refuse_other_tags(path, TaggedLines(found.rows, kept), _COLUMNS)
     plane, space = _joined([found.rows[tag] for tag in _EDGES_2D]), (found.rows["POSE3D_INIT"], found.rows["EDGE3"])
+    seen = [found.rows[tag] for tag in _SEEN if len(found.rows[tag].lines)]
+    first_seen = min((int(rows.lines[0]) for rows in seen), default=0)
     vertices, edges, two = choose_dimension(path, (_joined([]), plane), space)
-    measured, k = poses_of(edges.numbers, two), 3 if two else 6
+    if first_seen and not two:
+        raise DataError(f"{path}:{first_seen}: landmarks are known in the plane alone here, beside edges of the plane")
+    measured = poses_of(edges.numbers, two)
+    form, notes = _form(edges, noise) if two else ("root", ())
+    J = _file_tangent(path, measured, edges.lines)
+    if form == "root":
+        information = _squared(path, edges, J)
+    else:
+        information = J.transpose(0, 2, 1) @ information_of(path, edges.numbers[:, 3:], edges.lines, form) @ J
+    information = 0.5 * (information + information.transpose(0, 2, 1))
+    poses = PoseLines(vertices.ids.reshape(-1), poses_of(vertices.numbers, two), vertices.lines)
+    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
+    if not first_seen:
+        problem = problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+    else:
+        problem = with_sightings(path, poses, found_edges, read_sightings(path, found.rows, form), repair)
+    return replace(problem, notes=problem.notes + notes)
+
+
+def _form(edges: Rows, noise: Noise | Literal["auto"]) -> tuple[Noise, tuple[str, ...]]:
+    """Return what the noise of edges of the plane is stated as, and a note where that was found out."""
+    if noise != "auto":
+        return noise, ()
+    root = float(np.median(edges.numbers[:, -1])) if len(edges.lines) else 0.0
+    if not 0.0 < root < 1.0 / np.pi:
+        return "root", ()
+    told = (
+        f"the noise was read as covariances (headings to {np.sqrt(root):.2g} rad): as square roots of information, "
+        f"headings would be off by {1.0 / root:.2g} rad, which says nothing; --isam-noise root reads them so"
+    )
+    return "covariance", (told,)
+
+
+def _squared(path: Path, edges: Rows, J: Array) -> Array:
+    """Return information [E, k, k] of square roots in the file's tangent."""
+    k = J.shape[1]
     R = np.zeros((len(edges.ids), k, k))
     a, b = np.triu_indices(k)
     R[:, a, b] = edges.numbers[:, k:]
-    J = _file_tangent(path, measured, edges.lines)
     with np.errstate(over="ignore", invalid="ignore"):
         information = (R @ J).transpose(0, 2, 1) @ (R @ J)
     if not np.isfinite(information).all():
         line = edges.lines[int(np.argmin(np.isfinite(information).all(axis=(1, 2))))]
         raise DataError(f"{path}:{line}: the square of the square root of the information is not finite")
-    information = 0.5 * (information + information.transpose(0, 2, 1))
-    poses = PoseLines(vertices.ids.reshape(-1), poses_of(vertices.numbers, two), vertices.lines)
-    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
-    return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+    return np.asarray(information)
 
 
 def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
     """Write a problem with 17 digits; in space with poses, `poses` [N, d + 1, d + 1] in the place of its own.
 
-    Raises UsageError for what the format cannot hold (fixed poses, landmarks, information without a square root, a
-    measured pitch of 90 degrees), StorageError.
+    Raises UsageError for what the format cannot hold (fixed poses, priors, landmarks in space, information without a
+    square root, a measured pitch of 90 degrees), StorageError.
     """
-    refuse_what_is_lost(problem, path, "iSAM")
+    seen = problem.is_position if problem.dimension == 2 and problem.world < 0 else np.zeros(0, dtype=np.bool_)
+    refuse_what_is_lost(problem, path, "iSAM", with_landmarks=bool(seen.any()))
+    whole, problem = problem, problem.with_edges(~seen) if seen.any() else problem
     J = _file_tangent(path, problem.measurements, np.arange(1, len(problem.edges) + 1), UsageError)
     inverse = np.linalg.inv(J)
     try:
         R = np.linalg.cholesky(inverse.transpose(0, 2, 1) @ problem.information @ inverse).transpose(0, 2, 1)
+        places = list(landmark_lines(whole)) if seen.any() else []
     except np.linalg.LinAlgError as error:
         raise UsageError(
             f"{path}: an edge's information is singular and has no square root; write a g2o file"
@@ -80,7 +133,8 @@ def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None
     a, b = np.triu_indices(problem.tangent)
     two = problem.dimension == 2
     lines = [] if two else list(pose_lines(problem, poses, "POSE3D_INIT"))
-    write_text(path, "\n".join([*lines, *edge_lines(problem, R[:, a, b], "EDGE2" if two else "EDGE3")]) + "\n")
+    lines += edge_lines(problem, R[:, a, b], "EDGE2" if two else "EDGE3")
+    write_text(path, "\n".join([*lines, *places]) + "\n")
 
 
 def _joined(parts: list[Rows]) -> Rows:

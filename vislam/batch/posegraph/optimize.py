@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.batch.posegraph.growing import grown_start
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
 from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
 from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
@@ -64,11 +65,6 @@ def optimize_pose_graph(
     """
     config = config or PoseGraphConfig()
     begun = time.process_time()
-    if not problem.of_poses and (config.robust != "none" or config.method not in ("lm", "dogleg")):
-        asked = f"--robust {config.robust}" if config.robust != "none" else f"--method {config.method}"
-        raise UsageError(
-            f"{asked} knows no landmarks and no priors, which this graph has; use --robust none, --method lm or dogleg"
-        )
     structure, decision = Structure(problem, config.equations), None
     weights = np.ones(len(problem.edges))
     if config.robust != "none":
@@ -82,7 +78,7 @@ def optimize_pose_graph(
         start_name, start, start_costs = _start(structure, config)
     descent = _descend(structure, start, config, progress)
     parts = structure.parts
-    notes = list(problem.notes)
+    notes = [*problem.notes, *_of_landmarks(problem, descent.poses, weights)]
     if decision is not None and decision.warning:
         notes.append(decision.warning)
     if parts > 1:
@@ -100,12 +96,25 @@ def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress 
     """Return what the route that was asked for says about the edges."""
     from vislam.batch.posegraph.auto import decide, decide_by_kernel
     from vislam.batch.posegraph.gnc import reject_false_edges
+    from vislam.batch.posegraph.sightings import reject_false_sightings
 
+    if not structure.problem.of_poses:
+        return reject_false_sightings(structure.problem, config, progress)
     if config.robust == "auto":
         return decide(structure.problem, config, progress)
     if config.robust in ("cauchy", "geman-mcclure", "dcs"):
         return decide_by_kernel(structure.problem, config.robust, progress)
     return Decision(None, reject_false_edges(structure, config, progress), "graduated non-convexity, as asked for")
+
+
+def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> list[str]:
+    """Return what is to be told of landmarks."""
+    if not problem.is_point.any():
+        return []
+    from vislam.batch.posegraph.sightings import told_undetermined, undetermined_landmarks
+
+    free = undetermined_landmarks(problem, poses, weights)
+    return [told_undetermined(free)] if len(free) else []
 
 
 def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, dict[str, float]]:
@@ -118,6 +127,7 @@ def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, d
         "tree": lambda: tree_start(problem, structure.anchors),
         "odometry": lambda: odometry_start(problem, structure.anchors),
         "file": lambda: file_start(problem),
+        "grown": lambda: grown_start(problem),
     }
     if problem.dimension == 3:
         del makers["angles"]
@@ -127,6 +137,8 @@ def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, d
         makers = {config.start: makers[config.start]}
     elif not problem.has_pose.any():
         del makers["file"]
+    if config.start == "auto" and not problem.is_point.any():
+        del makers["grown"]  # as dear as solving, and among poses alone the linear starts are good
     best: tuple[float, str, Array] | None = None
     costs: dict[str, float] = {}
     for name, make in makers.items():

@@ -36,7 +36,7 @@ class PositionEdges:
         R_back = p.measurements[self.at, :d, :d].transpose(0, 2, 1)
         to_from = Ti[:, :d, :d].transpose(0, 2, 1)
         seen = np.einsum("eab,eb->ea", to_from, Tj[:, :d, d] - Ti[:, :d, d])
-        J_i = np.concatenate([R_back @ _turned(seen), -R_back], axis=2)
+        J_i = np.concatenate([R_back @ turned_by(seen), -R_back], axis=2)
         J_j = np.concatenate([np.zeros((len(ends), d, turn)), R_back @ to_from @ Tj[:, :d, :d]], axis=2)
         i, j = self._index[ends].T
         for J, place in ((J_i, i), (J_j, j)):
@@ -52,7 +52,7 @@ class PositionEdges:
         return float(np.einsum("ea,eab,eb->", r, W, r))
 
 
-def _turned(points: Array) -> Array:
+def turned_by(points: Array) -> Array:
     """Return the derivatives [M, d, turn] of Exp(-w) @ points [M, d] by w at zero."""
     out = np.zeros((len(points), points.shape[1], 1 if points.shape[1] == 2 else 3))
     if points.shape[1] == 2:

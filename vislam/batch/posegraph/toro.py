@@ -20,19 +20,21 @@ from vislam.batch.posegraph.angles import (
     refuse_other_tags,
     refuse_what_is_lost,
 )
+from vislam.batch.posegraph.landmark_lines import BEARING_RANGE_COLUMNS, read_sightings, with_sightings
 from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_lines, symmetric
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.tagged_lines import read_tagged_lines
+from vislam.core.errors import DataError
 from vislam.core.files import write_text
 from vislam.core.messages import Array
 
-_COLUMNS = {"VERTEX2": (1, 3), "EDGE2": (2, 9), "VERTEX3": (1, 6), "EDGE3": (2, 27)}
+_COLUMNS = {"VERTEX2": (1, 3), "EDGE2": (2, 9), "VERTEX3": (1, 6), "EDGE3": (2, 27)} | BEARING_RANGE_COLUMNS
 _ROWS_OF_TORO = [0, 1, 4, 2, 5, 3]  # its ff fs ss rr fr sr as an upper triangle in rows
 _ORDER_3D = (3, 4, 5, 0, 1, 2)  # files have translation first
 
 
 def read_toro(path: Path, repair: bool = False) -> PoseGraphProblem:
-    """Read VERTEX2 and EDGE2 or VERTEX3 and EDGE3.
+    """Read VERTEX2, EDGE2 and BR (bearing and range of a landmark, as gtsam writes it), or VERTEX3 and EDGE3.
 
     Raises DataError with the line number on damage of any kind, on both dimensions in one file and on other tags (EQUIV
     among them: merge those poses first); see `problem_from_lines` for the rest.
@@ -49,7 +51,11 @@ def read_toro(path: Path, repair: bool = False) -> PoseGraphProblem:
         information = symmetric(edges.numbers[:, 6:], _ORDER_3D)
     poses = PoseLines(vertices.ids[:, 0], poses_of(vertices.numbers, two), vertices.lines)
     found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
-    return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+    if not len(rows["BR"].lines):
+        return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+    if not two:
+        raise DataError(f"{path}:{rows['BR'].lines[0]}: BR is of the plane, the poses are not; give one kind")
+    return with_sightings(path, poses, found_edges, read_sightings(path, {"BR": rows["BR"]}, "root"), repair)
 
 
 def write_toro(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

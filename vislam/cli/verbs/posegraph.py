@@ -63,9 +63,10 @@ def _optimize(options: PoseGraphOptions, out: Path) -> int:
     if options.json:
         print(json.dumps(summary))
     else:
+        landmarks = f"{summary['landmarks']} landmarks, " if summary["landmarks"] else ""
         print(
-            f"{summary['poses']} poses, {summary['edges']} edges ({len(summary['rejected'])} found false); chi2 "
-            f"{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
+            f"{summary['poses']} poses, {landmarks}{summary['edges']} edges ({len(summary['rejected'])} found false); "
+            f"chi2 {summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
             f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
         )
         if summary["robust"]:

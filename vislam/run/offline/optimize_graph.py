@@ -48,7 +48,7 @@ def optimize_graph_file(
     Everything is computed before anything is written. Raises DataError, UsageError, StorageError.
     """
     begun = time.perf_counter()
-    problem = read_pose_graph(path, config.repair_information)
+    problem = read_pose_graph(path, config.repair_information, config.isam_noise)
     solution = optimize_pose_graph(problem, config, progress)
     problem, solution, noise = _noise(problem, solution, config, progress)
     certificate = None

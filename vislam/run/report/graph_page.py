@@ -33,6 +33,7 @@ def write_graph_report(
     took = solution.solve_s * (1000.0 if unit == "ms" else 1.0)
     tiles = (
         tile(number(int(problem.is_pose.sum()), 0), "", f"poses, {problem.dimension}D"),
+        *([tile(number(int(problem.is_point.sum()), 0), "", "landmarks")] if problem.is_point.any() else []),
         tile(number(len(problem.edges), 0), "", "edges"),
         tile(f"{solution.costs[-1]:.6g}", "", f"chi², from {solution.costs[0]:.6g}"),
         tile(number(took, 1), unit, f"to solve, {len(solution.costs) - 1} iterations"),
@@ -101,7 +102,8 @@ def _picture(problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Arra
     first, second = _plane(solution.poses)
     points = poses[:, [first, second], d]
     shown = (problem.edges != problem.world).all(axis=1)
-    successive = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
+    rank = np.cumsum(problem.is_pose)  # landmarks may have ids between those of poses
+    successive = np.abs(rank[problem.edges[:, 1]] - rank[problem.edges[:, 0]]) == 1
     rejected = solution.weights == 0.0
     between = shown & ~rejected
     lines = [
@@ -109,6 +111,9 @@ def _picture(problem: PoseGraphProblem, solution: PoseGraphSolution, poses: Arra
         _edges(points, problem.edges[between & ~successive], "muted", 0.4, 0.5),
         _edges(points, problem.edges[shown & successive & ~problem.is_position], "graph", 1.2, 1.0),
     ]
+    landmarks = points[problem.is_point]
+    if len(landmarks):
+        lines.append(Lines(np.stack((landmarks, landmarks), axis=1), "ink", 3.0))
     if regions is not None:
         lines.append(Lines(regions, "ekf", 0.8))
     return drawing(lines, Axis(f"{'xyz'[first]} [m]"), Axis(f"{'xyz'[second]} [m]"), height_pt=338, same_scale=True)
