@@ -30,7 +30,6 @@ from vislam.core.messages import Array, Frame, ImuSample, Keyframe, KeyframePack
 from vislam.core.readings import Reading
 from vislam.ekf.filtering import Filtering
 from vislam.ekf.loose.kernels import ERRORS
-from vislam.factors.keys import X, own_key
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.graph import PoseGraph
 from vislam.imu import ImuBuffer, ImuNoise
@@ -167,16 +166,14 @@ class Drive:
 
     def of_graph(self, k: int) -> Array | None:
         """Return the covariance [2, 2] of a keyframe's place among the anchors; None where gtsam gives none."""
-        readings, estimator = self.graph.readings, self.graph._estimator  # nothing public tells of both together
-        keys = [X(k), *(own_key(n) for n in range(*self._suite.own("uwb").indices(self._suite.size))[:_FRAME])]
-        joint = estimator.joint_covariance(keys)
+        joint = self.graph.joint_covariance(k, "uwb")
         found, T = self.graph.own("uwb"), self.graph.poses()[k]
         if joint is None or found is None:
             return None
         turned = np.eye(6 + _FRAME)
         turned[3:6, 3:6] = T[:3, :3]  # from the body's axes
-        turned[6:, 6:] *= readings._units("uwb")[:_FRAME]
-        return in_anchors_covariance(found[0], T, turned @ joint @ turned.T)
+        framed = joint[: 6 + _FRAME, : 6 + _FRAME]
+        return in_anchors_covariance(found[0], T, turned @ framed @ turned.T)
 
     def _of_filter(self, T: Array) -> Array:
         at, P = self._suite.own("uwb").start, self.filter.ekf._state.P

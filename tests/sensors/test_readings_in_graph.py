@@ -114,6 +114,32 @@ def fake_window(monkeypatch: pytest.MonkeyPatch) -> Callable[[World], None]:
     return take
 
 
+def test_pose_and_own_variables_are_told_together() -> None:
+    errors = []
+    for seed in range(4):
+        truth, start = drawn_fix(np.random.default_rng(seed))
+        drive = Drive(a_world(seed), {"fixes": Fixes(0.05)}, {"fixes": truth}, True, LOOSE).run((start,))
+        graph, own = drive.graph, told(drive.graph, "fixes")
+        assert graph.joint_covariance(0, "nothing") is None
+        with pytest.raises(IndexError, match=f"the graph has {len(drive.packets)}"):
+            graph.joint_covariance(len(drive.packets), "fixes")
+        for k in range(10, drive.world.count, 20):
+            joint = graph.joint_covariance(k, "fixes")
+            assert joint is not None
+            assert joint.shape == (6 + len(truth), 6 + len(truth))
+            assert joint == pytest.approx(joint.T, abs=1e-12)
+            assert np.sqrt(np.diag(joint)[6:]) == pytest.approx(own[1], rel=1e-6)
+            pose = graph._estimator.joint_covariance([X(k)])
+            assert joint[:6, :6] == pytest.approx(pose, rel=1e-5, abs=1e-9)
+            # the frame of the fixes is the world's: pose and frame err together, and apart they are not as told
+            error = np.concatenate([pose_error(drive.world.truth[k], graph.poses()[k]), truth - own[0]])
+            error[3:6] = graph.poses()[k][:3, :3].T @ error[3:6]
+            errors.append(error @ np.linalg.solve(joint, error) / len(error))
+            assert np.abs(joint[:6, 6:]).max() > 0.1 * np.sqrt(np.diag(joint)[:6].max() * np.diag(joint)[6:].max())
+    print(f"NEES of pose and own variables together: {np.mean(errors):.2f}")
+    assert 0.3 < np.mean(errors) < 2.0
+
+
 @pytest.mark.parametrize("kind", ["loose", "no IMU", "tight"])
 def test_fixes_in_an_unknown_frame_bend_odometry_back_and_errors_are_as_told(kind: str, fake_window) -> None:
     poses, own, gain = [], [], []

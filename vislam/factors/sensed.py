@@ -222,16 +222,18 @@ class Readings:
         return total
 
     def own(self, name: str, values: gtsam.Values, covariance: Covariance) -> tuple[Array, Array] | None:
-        """Return a sensor's own variables [V] and their sigmas [V], NaN where there is no covariance.
-
-        `covariance` gives the joint one of keys. None while the sensor has no variables in the graph.
-        """
-        newest = self._newest.get(name)
-        if newest is None or not newest.keys:
+        """Return own variables [V] and sigmas [V], NaN where `covariance` of keys gives none; None: none there."""
+        keys, units = self.own_keys(name)
+        if not keys:
             return None
-        joint, units = covariance(newest.keys), self._units(name)
+        joint = covariance(keys)
         sigmas = np.full(len(units), np.nan) if joint is None else np.sqrt(np.diag(joint))
-        return np.array(self._guesses(newest, values)) * units, sigmas * units
+        return np.array(self._guesses(self._newest[name], values)) * units, sigmas * units
+
+    def own_keys(self, name: str) -> tuple[list[int], Array]:
+        """Return keys [V] of a sensor's own variables, none while they have no factor, and of each its unit [V]."""
+        newest = self._newest.get(name)
+        return ([], np.empty(0)) if newest is None or not newest.keys else (newest.keys, self._units(name))
 
     def all_own(self, values: gtsam.Values) -> tuple[OwnStart, ...]:
         """Return the own variables of all sensors as they are now, each with the unit of its key for a sigma."""

@@ -23,8 +23,9 @@ from vislam.factors.journal import (
     keyframe_record,
     start_record,
 )
+from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel
-from vislam.factors.sensed import Readings
+from vislam.factors.sensed import Covariance, Readings
 from vislam.graph.belief import LoopSet
 from vislam.graph.estimator import Estimator
 from vislam.graph.joining import Placement, Waiting, relinked, weak_link
@@ -189,7 +190,7 @@ class PoseGraph:
         if T_odom_body is not None and not np.all(np.isfinite(T_odom_body)):
             raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
         if previous is None:
-            self._check_start(record)
+            _check_start(record, self._start_t_ns)
         elif record.begins_submap:
             before, config = self._estimator.poses[-1], self._config
             record = weak_link(record, before, self._T_odom_last, T_odom_body, self._noise is not None, config)
@@ -204,9 +205,9 @@ class PoseGraph:
             notes = [self._estimator.begin()]
         else:
             step, note = self._estimator.extend()
-            self._travel.append(*_variances(record, step), self._motion(record.id))
+            self._travel.append(*_variances(record, step), _motion_to(record.id, self._estimator.poses))
             for older, variance_rad2, variance_m2 in self._source.amended(self._estimator.vo_scale):
-                self._travel.amend(older, variance_rad2, variance_m2, self._motion(older))
+                self._travel.amend(older, variance_rad2, variance_m2, _motion_to(older, self._estimator.poses))
             notes = [step.note, note]
         self._keyframes.append(record)
         if record.begins_submap:
@@ -247,6 +248,16 @@ class PoseGraph:
         """
         return self.readings.own(name, self._estimator.values, self._estimator.joint_covariance)
 
+    def joint_covariance(self, k: int, name: str) -> Array | None:
+        """Return the joint covariance [6 + V, 6 + V] of keyframe k's pose and a sensor's own variables, see `own`.
+
+        Of the pose rotation, then translation, in rad and m on the body side, without a shared error of scale. None
+        where gtsam gives none, and while no variable has a factor. Raises IndexError for another keyframe.
+        """
+        if not 0 <= k < len(self._keyframes):
+            raise IndexError(f"no keyframe {k}; the graph has {len(self._keyframes)}")
+        return _in_units(self._estimator.joint_covariance, X(k), *self.readings.own_keys(name))
+
     def sensed(self, name: str) -> dict[str, int]:
         """Return what became of a sensor's readings, at the estimate as it is; see `Readings.counts_of`."""
         return self.readings.counts_of(name, self._estimator.values)
@@ -258,17 +269,6 @@ class PoseGraph:
     def edge_reports(self) -> list[EdgeReport]:
         """Return what became of every offered loop, by loop id, with the weight it has now."""
         return self._loops.reports()
-
-    def _check_start(self, record: KeyframeRecord) -> None:
-        if self._start_t_ns is not None and abs(record.t_ns - self._start_t_ns) > _START_SLACK_NS:
-            raise DataError(
-                f"keyframe 0 at {record.t_ns} ns: the initial state is of {self._start_t_ns} ns; "
-                "give the state at the time of keyframe 0"
-            )
-
-    def _motion(self, k: int) -> Array:
-        """Return the motion [4, 4] to keyframe k from the one before."""
-        return invert(self._estimator.poses[k - 1]) @ self._estimator.poses[k]
 
     def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
         """Gate loops, accept them or keep them pending, and let the review work; return accepted and refused ids."""
@@ -384,3 +384,23 @@ class PoseGraph:
 def _variances(record: KeyframeRecord, step: Step) -> tuple[float, float]:
     """Return the variances in rad^2 and m^2 of the motion to a keyframe."""
     return _UNKNOWN if record.begins_submap else (step.variance_rad2, step.variance_m2)
+
+
+def _check_start(record: KeyframeRecord, start_t_ns: int | None) -> None:
+    if start_t_ns is not None and abs(record.t_ns - start_t_ns) > _START_SLACK_NS:
+        raise DataError(
+            f"keyframe 0 at {record.t_ns} ns: the initial state is of {start_t_ns} ns; "
+            "give the state at the time of keyframe 0"
+        )
+
+
+def _motion_to(k: int, poses: Array) -> Array:
+    """Return the motion [4, 4] to keyframe k from the one before."""
+    return invert(poses[k - 1]) @ poses[k]
+
+
+def _in_units(covariance: Covariance, key: int, own: list[int], units: Array) -> Array | None:
+    """Return the joint covariance of a pose and own variables, by their keys, in their units; None: there is none."""
+    joint = covariance([key, *own]) if own else None
+    scale = np.append(np.ones(6), units)
+    return None if joint is None else joint * np.outer(scale, scale)
