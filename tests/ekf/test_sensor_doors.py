@@ -330,7 +330,7 @@ def test_a_filter_without_sensors_is_as_it_was_byte_for_byte(kind: str) -> None:
     assert full.counters.keys() - without.counters.keys() == {
         f"{name}_{end}"
         for name in every_sensor()
-        for end in ("accepted", "gated", "failed", "refused", "waiting", "begun")
+        for end in ("accepted", "gated", "failed", "refused", "waiting", "begun", "regained")
     }
     with_sensors, bare = full.state(), without.state()
     np.testing.assert_allclose(with_sensors.T_world_body, bare.T_world_body, atol=1e-12)

@@ -54,6 +54,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"is_started": False, "start_reason": "gravity norm 1.00"}, "gravity was not found"),
         ({"start_failures": 5}, "contradicted each other in 5 attempts"),
         ({"soft_resets": 2}, "gave up its certainty 2 times"),
+        ({"regained": {"gnss": 3}}, "refused readings of gnss until so many agreed that it moved to them, 3 times"),
         ({"refused": 900}, "refused 900 of 4000"),
         ({"innovations": {"vo": (300, 2700.0, 1800)}}, "innovations of vo are 1.5 times"),
         ({"sigma_m": 3.0}, "uncertain by 3.0 m"),

@@ -37,7 +37,7 @@ class SensedTimeline(Timeline[S, M]):
         """Correct the state at the time of a reading.
 
         One that cannot be used, comes twice, is of a sensor that has not begun or that fails, or does not pass the gate
-        is counted and changes nothing. The gate may say no for ever: nothing is inflated for a sensor's sake.
+        is counted and changes nothing. A sensor of places whose refused readings agree is believed again: see `regain`.
         """
         name = reading.sensor
         if name not in self._core.sensing.suite.names:

@@ -13,6 +13,7 @@ from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.history import Outcome
 from vislam.ekf.loose.kernels import pose
+from vislam.ekf.regain import Refused, Regain, Watch
 from vislam.sensors import BodyState, SensorError, Suite, linearised
 
 _ENDS = (
@@ -22,6 +23,7 @@ _ENDS = (
     "refused",  # not a reading that could ever be used
     "waiting",  # its sensor had not begun
     "begun",  # own variables set
+    "regained",  # refused readings that agreed were believed, see `regain`
 )
 
 
@@ -146,6 +148,24 @@ class Sensing:
         out.count(f"{name}_gated")
         out.reason = f"innovation {nis:.1f} of at most {limit:.1f}"
         return False
+
+    def refuse(
+        self, watch: Watch, reading: Reading, rows: Rows, body: BodyState, out: Outcome
+    ) -> tuple[Watch, Regain | None]:
+        """Remember a reading that the gate refused; return also how to believe its sensor again, if that is time."""
+        name = reading.sensor
+        if not rows.H[:, 3:6].any():
+            return watch, None  # it says nothing of places
+        watch = watch.refused(name, Refused(reading.t_ns, rows.H[:, 3:6], rows.residual))
+        speed_m_s = float(np.linalg.norm(body.velocity_m_s))
+        return watch, watch.regain(name, reading.t_ns, speed_m_s, self.suite[name].regain_m)
+
+    def regained(self, name: str, regain: Regain, out: Outcome) -> None:
+        """Write down that a sensor is believed again."""
+        out.counts.pop(f"{name}_gated")
+        out.accept(f"{name}_accepted")
+        out.count(f"{name}_regained")
+        out.reason = f"{name} {regain.told}"
 
 
 def body_of(t_ns: int, x: Array, gyro_rad_s: Array) -> BodyState:

@@ -59,6 +59,9 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         refused=sum(refused for _, refused in offered),
         offered=sum(taken + refused for taken, refused in offered),
         soft_resets=ekf.get("soft_resets", 0),
+        regained={
+            name: count for key, count in ekf.items() if (name := key.removesuffix("_regained")) != key and count
+        },
         uniform_s=report.uniform_s,
         gravity_m_s2=imu.gravity_m_s2,
         max_gap_s=imu.max_gap_s,

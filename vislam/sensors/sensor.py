@@ -41,6 +41,7 @@ class Sensor(ABC):
             elsewhere gives the same reading. Then the sliding window takes it, too, where the camera is blind.
         variables: own ones, estimated with the body's state by every estimator; each has its own values.
         gate_probability: that a good reading passes the test of its innovation.
+        regain_m: how far readings that the gate refused, but that agree, may move a filter at most; 0: never.
         from_magnetometer: its readings are the samples of the machine's own magnetometer, as they come with the IMU's.
     """
 
@@ -49,6 +50,7 @@ class Sensor(ABC):
     sees_motion_only: ClassVar[bool] = False
     variables: tuple[Variable, ...] = ()
     gate_probability: float = 0.999
+    regain_m: float = 1000.0
     from_magnetometer: bool = False
 
     @abstractmethod

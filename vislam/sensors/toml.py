@@ -43,6 +43,7 @@ class _Common:
     baud: Count = 9600  # of that port
     delay_s: NonNegative = 0.05  # from a fix's time to the first byte that tells of it at that port
     gate_probability: Probability = 0.999
+    regain_m: NonNegative = 1000.0  # that refused readings which agree may move the filter by at most; 0: never
     known: dict[str, tuple[Finite, Positive]] | None = None  # own variables that are known: value and sigma
     ticks: TicksSettings | None = None
     gnss: GnssSettings | None = None
@@ -145,6 +146,7 @@ def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
     sensor.gate_probability = common.gate_probability
+    sensor.regain_m = common.regain_m
     sensor.variables = _with_known(sensor.variables, common.known or {}, where)
     return sensor, common
 

@@ -27,6 +27,7 @@ from vislam.ekf.loose.measurements import (
 )
 from vislam.ekf.loose.own_variables import begin, correct_by_reading
 from vislam.ekf.loose.state import Ledger, LooseState
+from vislam.ekf.regain import Watch
 from vislam.ekf.sensor_rows import Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.imu import ImuNoise
@@ -105,7 +106,9 @@ class LooseCore:
         kernels.clone(state.x, state.P)
         if self._config.vision == "accumulated":
             state.P[15:] = state.P[:, 15:] = 0.0  # no clone, and no sensor has begun: the 16 numbers of the paper
-        state.ledger = Ledger(last_vo_t_ns=start.t_ns, floor_z_m=float(state.x[2]), noise=noise)
+        state.ledger = Ledger(
+            last_vo_t_ns=start.t_ns, floor_z_m=float(state.x[2]), noise=noise, watch=Watch(start.t_ns, start.t_ns)
+        )
         state.sigmas = scaled(self._told_sigmas, noise)
         if vo is not None:
             self._place_keyframe(state, vo)
@@ -222,7 +225,7 @@ class LooseCore:
         self._correct(state, at_rest, self._all, "zero_velocity", out)
         if not out.accepted:
             return replace(ledger, clone_rests=False, rested_t_ns=None)
-        return replace(ledger, clone_rests=holds, rested_t_ns=t_ns)
+        return replace(ledger, clone_rests=holds, rested_t_ns=t_ns, watch=ledger.watch.seen(t_ns))
 
     def _apply_vo(self, state: LooseState, vo: VoMeasurement, out: Outcome) -> Ledger:
         ledger = state.ledger
@@ -263,7 +266,7 @@ class LooseCore:
         """Count rejections in a row; too many for too long widen the covariance. `shared`: if it was accepted."""
         config, ledger = self._config, state.ledger
         if out.accepted:
-            return replace(ledger, rejects=0, last_vo_t_ns=t_ns, shared=shared)
+            return replace(ledger, rejects=0, last_vo_t_ns=t_ns, shared=shared, watch=ledger.watch.seen(t_ns))
         since = t_ns if ledger.rejects == 0 else ledger.rejects_since_ns
         rejects = ledger.rejects + 1
         if rejects >= config.reset_rejects and t_ns - since >= config.reset_s * 1e9:

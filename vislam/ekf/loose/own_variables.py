@@ -11,6 +11,7 @@ from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.history import Outcome
 from vislam.ekf.loose import kernels
 from vislam.ekf.loose.state import LooseState
+from vislam.ekf.regain import grown
 from vislam.ekf.sensor_rows import Sensing, body_of
 
 
@@ -19,6 +20,7 @@ def begin(sensing: Sensing, state: LooseState, start: OwnStart, t_ns: int, out: 
     out.accept(f"{start.sensor}_begun")
     sensing.begin(start, state.x[kernels.NOMINAL :], state.P)
     _note(state, start.sensor, t_ns)
+    state.ledger = replace(state.ledger, watch=state.ledger.watch.begun(start.sensor, t_ns))
 
 
 def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gyro_rad_s: Array, out: Outcome) -> None:
@@ -37,9 +39,21 @@ def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gy
     H[:, :15], H[:, kernels.ERRORS :][:, sensing.suite.own(name)] = rows.H, rows.H_own
     everything = np.eye(len(P))
     nis = kernels.update(state.x, P, H, np.eye(m), rows.residual, sensing.limit(name, m), everything)
-    if sensing.judge(name, nis, m, out):
-        state.P = P
-        _note(state, name, reading.t_ns)
+    watch = state.ledger.watch
+    if not sensing.judge(name, nis, m, out):
+        body = body_of(reading.t_ns, state.x, gyro_rad_s)
+        watch, regain = sensing.refuse(watch, reading, rows, body, out)
+        if regain is None:
+            state.ledger = replace(state.ledger, watch=watch)
+            return
+        sensing.regained(name, regain, out)
+        P = grown(P, regain, np.eye(15), (3, 18), body.R_world_body[2])
+        state.x[0:3] += regain.place_m
+        state.x[3:6] += regain.velocity_m_s
+        state.x[16:19] += regain.place_m  # the clone
+    state.P = P
+    _note(state, name, reading.t_ns)
+    state.ledger = replace(state.ledger, watch=watch.accepted(name, reading.t_ns, rows.H))
 
 
 def _note(state: LooseState, name: str, t_ns: int) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from vislam.core.messages import AS_MODELLED, Array, NoiseScale
 from vislam.ekf.loose.kernels import ERRORS, NOMINAL
+from vislam.ekf.regain import Watch
 from vislam.ekf.sensor_rows import OwnVariables
 
 
@@ -30,6 +31,7 @@ class Ledger:
     noise: NoiseScale = AS_MODELLED  # white noise of the IMU over that of the model
     floor_z_m: float = 0.0  # height of the body in `odom` at the start, where a floor keeps it
     own_since_ns: Mapping[str, int] = field(default_factory=dict)  # see `OwnVariables`
+    watch: Watch = field(default_factory=Watch)  # which sensors it believes
 
 
 @dataclass(slots=True, eq=False)

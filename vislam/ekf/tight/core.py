@@ -14,6 +14,7 @@ from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.filter_core import imu_sigmas, nominal, scaled
 from vislam.ekf.history import AtRest, Event, KnownBias, Outcome
 from vislam.ekf.loose.kernels import Step
+from vislam.ekf.regain import Watch
 from vislam.ekf.sensor_rows import OwnVariables, Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.ekf.tight import kernels
@@ -136,7 +137,18 @@ class TightCore:
             P[TIME, TIME] = camera.time_offset_sigma_s**2
             P[MOUNT, MOUNT] = np.diag(camera.rotation_sigma_rad**2)
             time_offset_s, R_body_cam = camera.time_offset_s, R_body_cam @ so3_exp(camera.rotation_rad)
-        return self._at(x, Window(P, time_offset_s, R_body_cam, last_vision_t_ns=start.t_ns, noise=noise, own=own))
+        return self._at(
+            x,
+            Window(
+                P,
+                time_offset_s,
+                R_body_cam,
+                last_vision_t_ns=start.t_ns,
+                noise=noise,
+                own=own,
+                watch=Watch(start.t_ns, start.t_ns),
+            ),
+        )
 
     def _at(self, x: Array, window: Window) -> TightState:
         return TightState(_since_now(x), window, scaled(self._told_sigmas, window.noise))

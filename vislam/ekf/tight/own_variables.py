@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from vislam.core.geometry import so3_exp, so3_right_jacobian
+from vislam.core.geometry import skew, so3_exp, so3_right_jacobian
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.history import Outcome
+from vislam.ekf.regain import Regain, grown
 from vislam.ekf.sensor_rows import OwnVariables, Sensing, body_of
-from vislam.ekf.tight.kernels import INERTIAL, to_nav_error
-from vislam.ekf.tight.state import Window, corrected
+from vislam.ekf.tight.kernels import INERTIAL, from_nav_error, to_nav_error
+from vislam.ekf.tight.state import CLONES, Window, corrected
 from vislam.sensors import BodyState
 
 
@@ -21,7 +22,8 @@ def begun(sensing: Sensing, window: Window, start: OwnStart, t_ns: int) -> tuple
     out, own, P = Outcome(), window.own.copy(), window.P.copy()
     out.accept(f"{start.sensor}_begun")
     sensing.begin(start, own, P)
-    return replace(window, own=own, P=P, own_since_ns={**window.own_since_ns, start.sensor: t_ns}), out
+    since_ns, watch = {**window.own_since_ns, start.sensor: t_ns}, window.watch.begun(start.sensor, t_ns)
+    return replace(window, own=own, P=P, own_since_ns=since_ns, watch=watch), out
 
 
 def corrected_by_reading(
@@ -39,16 +41,44 @@ def corrected_by_reading(
         return window, out
     P, at = window.P.copy(), sensing.suite.own(name)
     sensing.grow(name, reading.t_ns, window.own_since_ns, P)
-    grown = replace(window, P=P)
+    free = replace(window, P=P)
     H = np.zeros((len(rows.residual), len(P)))
     H[:, :INERTIAL] = rows.H @ by_now(body, ago_s) @ to_nav_error(x)
     H[:, window.first_own :][:, at] = rows.H_own
     S = H @ P @ H.T + np.eye(len(H))
     nis = float(rows.residual @ np.linalg.solve(S, rows.residual))
-    if not sensing.judge(name, nis, len(H), out):
-        return window, out
     since_ns = {**window.own_since_ns, name: reading.t_ns}
-    return replace(corrected(grown, x, H, rows.residual), own_since_ns=since_ns), out
+    if sensing.judge(name, nis, len(H), out):
+        window = corrected(free, x, H, rows.residual)
+        return replace(window, own_since_ns=since_ns, watch=window.watch.accepted(name, reading.t_ns, rows.H)), out
+    watch, regain = sensing.refuse(window.watch, reading, rows, body, out)
+    if regain is None:
+        return replace(window, watch=watch), out
+    sensing.regained(name, regain, out)
+    window = _regained(free, x, body, regain)
+    return replace(window, own_since_ns=since_ns, watch=watch.accepted(name, reading.t_ns, rows.H)), out
+
+
+def _regained(window: Window, x: Array, body: BodyState, regain: Regain) -> Window:
+    """Return a window moved by what its body, clones and points are off by; x [16] moves in place.
+
+    As an invariant error has the place turned by the error of rotation in it, the covariance of that moves, too.
+    """
+    clones, points = range(CLONES, window.first_point, 6), range(window.first_point, window.first_own, 3)
+    T, by_turn = np.eye(len(window.P)), skew(regain.place_m)
+    T[3:6, 0:3], T[6:9, 0:3] = by_turn, skew(regain.velocity_m_s)
+    for at in clones:
+        T[at + 3 : at + 6, at : at + 3] = by_turn
+    for at in points:
+        T[at : at + 3, 0:3] = by_turn
+    places = (3, *(at + 3 for at in clones), *points)
+    P = T @ grown(window.P, regain, from_nav_error(x), places, body.R_world_body[2]) @ T.T
+    x[0:3] += regain.place_m
+    x[3:6] += regain.velocity_m_s
+    return replace(
+        window, P=0.5 * (P + P.T), p=window.p + regain.place_m, velocity=window.velocity + regain.velocity_m_s,
+        points=window.points + regain.place_m,
+    )  # fmt: skip
 
 
 def by_now(body: BodyState, ago_s: float) -> Array:

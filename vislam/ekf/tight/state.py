@@ -19,6 +19,7 @@ from vislam.core.geometry import skew, so3_exp, so3_left_jacobian
 from vislam.core.jit import njit
 from vislam.core.messages import AS_MODELLED, Array, NoiseScale
 from vislam.ekf.loose.kernels import turn
+from vislam.ekf.regain import Watch
 from vislam.ekf.tight.tracks import FrameTracks
 
 TIME = 15
@@ -68,6 +69,7 @@ class Window:
     noise: NoiseScale = AS_MODELLED  # white noise of the IMU from here on
     own: Array = field(default_factory=lambda: _none(0))  # [K] of sensors, as `Suite` orders them
     own_since_ns: Mapping[str, int] = field(default_factory=dict)  # see `OwnVariables`
+    watch: Watch = field(default_factory=Watch)  # which sensors it believes
 
     @property
     def to_first(self) -> Array:

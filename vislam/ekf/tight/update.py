@@ -128,7 +128,7 @@ class Updater:
                 break
         window = replace(window, P=P, misses=rows.misses, frames=marked(prior.frames, rows.at, rows.row))
         if out.accepted:
-            window = replace(window, last_vision_t_ns=frame.t_ns)
+            window = replace(window, last_vision_t_ns=frame.t_ns, watch=window.watch.seen(frame.t_ns))
             window = self._keep_points(window, rows, out)
         if leaving is not None:
             window = without_clone(window, leaving)
@@ -292,7 +292,7 @@ class Updater:
         r = np.concatenate((-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / rate_sigma))
         if not self._passes("zero_velocity", window, H, r, out):
             return replace(window, rest=None), out
-        window = replace(corrected(window, x, H, r), rested_t_ns=t_ns)
+        window = replace(corrected(window, x, H, r), rested_t_ns=t_ns, watch=window.watch.seen(t_ns))
         stamps = [frame.t_ns for frame in window.frames]
         if window.rest is not None and window.rest.t_ns in stamps:
             window = self._hold(window, x, stamps.index(window.rest.t_ns), out)

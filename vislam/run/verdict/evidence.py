@@ -76,6 +76,7 @@ class Evidence:
     refused: int = 0  # visual measurements
     offered: int = 0
     soft_resets: int = 0
+    regained: dict[str, int] = field(default_factory=dict)  # sensors that it believed again after it refused them
     sigma_m: float = 0.0  # of its position at its worst
     uniform_s: float = 0.0  # longest stretch of one camera without motion that shows scale
     # filter, graph, loops

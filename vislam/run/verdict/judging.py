@@ -128,6 +128,11 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             f"vision contradicted the filter for so long that it gave up its certainty {e.soft_resets} times: look for "
             "something that moves through the image, and check calibration and time offset"
         )
+    for name, count in e.regained.items():
+        yield (
+            f"the filter refused readings of {name} until so many agreed that it moved to them, {count} times: it was "
+            "surer than it was right; look for stretches without sight, and for an IMU that is worse than told"
+        )
     if e.offered >= _MIN_FRAMES and e.refused > c.refused_share * e.offered:
         yield f"the filter refused {e.refused} of {e.offered} visual measurements as impossible"
     for kind, (count, nis, degrees) in e.innovations.items():
