@@ -124,7 +124,7 @@ def test_what_is_no_recording_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is empty"):
         inspect(str(tmp_path))
     with pytest.raises(UsageError, match="no format"):
-        inspect("bag:x")
+        inspect("rosbag:x")
 
 
 @pytest.mark.parametrize(

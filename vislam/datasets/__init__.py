@@ -11,6 +11,7 @@ from typing import Protocol
 from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.recording import Recording
+from vislam.datasets import bags
 from vislam.datasets.calibrated import calibrated
 from vislam.datasets.formats import asl, kitti, tum, video
 from vislam.datasets.stream import FileRecording, Survey
@@ -32,7 +33,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: dict[str, Reader] = {"euroc": asl, "tum": tum, "kitti": kitti, "video": video}
+READERS: dict[str, Reader] = {"euroc": asl, "tum": tum, "kitti": kitti, "video": video, "bag": bags}
 
 
 def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Recording:
@@ -47,10 +48,18 @@ def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Reco
 
 
 def survey(uri: str) -> Survey:
-    """Return what `FORMAT:PATH` or a bare path holds, for `open_dataset` and `vislam doctor`; raises as it does."""
-    name, path = _split(uri)
+    """Return what `FORMAT:PATH` or a bare path holds, for `open_dataset` and `vislam doctor`; raises as it does.
+
+    A bag's topics may be told behind it: `bag:PATH,cam0=/left/image_raw,imu=/imu`.
+    """
+    name, path, options = _split(uri)
     try:
-        return _reader(name, path).survey(path)
+        reader = _reader(name, path)
+        if not options:
+            return reader.survey(path)
+        if reader is not bags:
+            raise UsageError(f"'{options}' in {uri}: only a bag takes options, and {path} is none")
+        return bags.survey_with(path, _told(uri, options))
     except OSError as error:  # a folder that may not be entered, a disk that fails
         raise DataError(f"{error.filename or path} cannot be read: {error.strerror or error}") from error
 
@@ -70,14 +79,33 @@ def _reader(name: str, path: Path) -> Reader:
     return READERS[name or fitting[0]]
 
 
-def _split(uri: str) -> tuple[str, Path]:
-    """Return format (empty: to be recognised) and path; a path that exists may contain a colon itself."""
+def _split(uri: str) -> tuple[str, Path, str]:
+    """Return format (empty: to be recognised), path and options; a path that exists may contain colon and comma."""
     name, colon, rest = uri.partition(":")
-    if not colon or (name not in READERS and Path(uri).exists()):
-        return "", Path(uri)
+    if not colon or (name not in READERS and _exists(uri)):
+        return "", *_path_and_options(uri)
     if name not in READERS:
         raise UsageError(f"no format '{name}' in '{uri}'; known formats: {', '.join(READERS)}")
-    return name, Path(rest)
+    return name, *_path_and_options(rest)
+
+
+def _exists(text: str) -> bool:
+    return _path_and_options(text)[0].exists()
+
+
+def _path_and_options(text: str) -> tuple[Path, str]:
+    """Return path and options, `,name=value` behind a path that exists."""
+    whole, (first, _, options) = Path(text), text.partition(",")
+    if not options or whole.exists() or "=" not in options or not Path(first).exists():
+        return whole, ""
+    return Path(first), options
+
+
+def _told(uri: str, options: str) -> dict[str, str]:
+    parts = options.split(",")
+    if wrong := [part for part in parts if "=" not in part]:
+        raise UsageError(f"'{wrong[0]}' in {uri} is no option; write bag:PATH,cam0=/topic,imu=/topic")
+    return dict(part.split("=", 1) for part in parts)
 
 
 def _wanted(name: str) -> str:

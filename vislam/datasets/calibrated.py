@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
-from vislam.datasets.stream import Survey
+from vislam.datasets.stream import KnownCamera, Survey
 
 _OFFSET_WIDER = 3.0  # sigmas of a calibrated time offset that a later day may be off
 _LEAST_OFFSET_SIGMA_S = 0.001
@@ -25,14 +26,27 @@ def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
     """
     if files.camera is not None and found.rig is not None:
         found = replace(found, rig=_rig(found.rig, Path(files.camera)))
+    elif files.camera is not None and found.known_cameras:
+        found = replace(found, rig=_completed_rig(found, Path(files.camera)), lacking=_without(found, "camera"))
     if files.imu is not None:
         found = replace(found, imu_calibration=read_imu_calibration(Path(files.imu)))
     if files.imu_noise is not None and found.imu_noise is not None:
         noise = read_noise(Path(files.imu_noise))
         found = replace(found, imu_noise=replace(noise, rate_hz=found.imu_noise.rate_hz or noise.rate_hz))
+    elif files.imu_noise is not None and "imu_noise" in found.lacking:
+        noise = read_noise(Path(files.imu_noise))
+        found = replace(found, imu_noise=noise, lacking=_without(found, "imu_noise"))
     if files.mag is not None:
         found = replace(found, mag_calibration=read_mag_calibration(Path(files.mag)))
     return found
+
+
+def joined_rig(known: Sequence[KnownCamera], has_depth: bool) -> Rig | None:
+    """Return the rig of cameras of which all is known, None where something is not."""
+    whole = [(one.camera, one.T_body_cam) for one in known if one.camera is not None and one.T_body_cam is not None]
+    if not known or len(whole) != len(known):
+        return None
+    return Rig(tuple(camera for camera, _ in whole), tuple(T for _, T in whole), has_depth)
 
 
 def with_clock(config: Config) -> Config:
@@ -47,6 +61,27 @@ def with_clock(config: Config) -> Config:
         sigma_s = max(_OFFSET_WIDER * first.time_offset_sigma_s, _LEAST_OFFSET_SIGMA_S)
         init = replace(init, time_offset_sigma_s=min(sigma_s, init.time_offset_sigma_s))
     return replace(config, init=init)
+
+
+def _without(found: Survey, name: str) -> dict[str, DataError]:
+    return {key: error for key, error in found.lacking.items() if key != name}
+
+
+def _completed_rig(found: Survey, path: Path) -> Rig:
+    """Return the rig of a recording that does not know all of its cameras; the file goes before what it knows."""
+    cameras = read_cameras(path)
+    if len(cameras) < len(found.known_cameras):
+        raise DataError(
+            f"{path} has {len(cameras)} camera, the recording has {len(found.known_cameras)}; calibrate both"
+        )
+    pairs = list(zip(cameras, found.known_cameras, strict=False))
+    T_ins = [old.T_body_cam if new.T_body_cam is None else np.asarray(new.T_body_cam) for new, old in pairs]
+    joined = [KnownCamera(new.camera, T) for (new, _), T in zip(pairs, T_ins, strict=True)]
+    rig = joined_rig(joined, found.depth is not None)
+    if rig is None:
+        missing = next(k for k, one in enumerate(joined) if one.T_body_cam is None)
+        raise DataError(f"{path} does not tell where cam{missing} sits, nor does the recording: it needs T_cam_imu")
+    return rig
 
 
 def _rig(recorded: Rig, path: Path) -> Rig:

@@ -121,20 +121,32 @@ def _ros_camera(data: Mapping[str, Any], path: Path) -> Camera:
     width, height = (int(numbers_in(sizes, key, path, 1)[0]) for key in sizes)
     name = str(data.get("distortion_model", "plumb_bob"))
     coefficients = _ros_numbers(data, "distortion_coefficients", path)
-    if name == "equidistant":
+    return ros_camera((width, height), K, name, coefficients, str(path))
+
+
+def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list[float], where: str) -> Camera:
+    """Return the camera that ROS describes by K [3, 3], its distortion's name and coefficients.
+
+    Raises DataError for a lens that vislam does not have.
+    """
+    width, height = size_px
+    if name in ("equidistant", "fisheye") and len(coefficients) >= 4 and not any(coefficients[4:]):
         model: Distortion = "equidistant"
+        coefficients = coefficients[:4]
+    elif name in ("plumb_bob", "rational_polynomial", "none", "") and not any(coefficients):
+        model = "none"
     elif name in ("plumb_bob", "rational_polynomial") and not any(coefficients[5:]):
-        model = "radtan" if any(coefficients) else "none"
+        model = "radtan"
         coefficients = coefficients[: 5 if len(coefficients) > 4 and coefficients[4] != 0.0 else 4]
     else:
-        raise DataError(f"{path}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob")
+        raise DataError(f"{where}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob")
     try:
         return Camera(
             width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model,
             () if model == "none" else tuple(coefficients),
         )  # fmt: skip
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{where}: {error}") from error
 
 
 def _ros_numbers(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:

@@ -136,6 +136,14 @@ def _decode(path: Path, camera: Camera, flags: int) -> NDArray[np.generic]:
         raise UnreadableImageError("missing image", path) from error
     except OSError as error:
         raise UnreadableImageError("unreadable image", path) from error
+    return decode_image(data, camera, flags, path)
+
+
+def decode_image(data: bytes, camera: Camera, flags: int, path: Path) -> NDArray[np.generic]:
+    """Return the image in the bytes of a PNG or JPEG file as OpenCV's flags ask for it; `path` stands in errors.
+
+    Raises UnreadableImageError when it is damaged, DataError when it is not of the camera's size.
+    """
     # compared before decoding, so that a forged header cannot ask for gigabytes
     check_size_px(_checked_size(data[:_HEAD_BYTES], data[-_TAIL_BYTES:], path), camera, path)
     try:

@@ -21,13 +21,16 @@ from vislam.datasets.plausibility import (
     ImuFacts,
     camera_tilt_rad,
     epipolar_facts,
+    force_seems_in_g,
     gyro_turns,
     imu_facts,
+    mean_force,
+    rates_seem_in_degrees,
     turn_disagreement,
     turning_pairs,
 )
-from vislam.datasets.stream import Survey, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
-from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
+from vislam.datasets.stream import Survey, TopicSummary, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
+from vislam.datasets.tables import Problems, Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
 from vislam.trajectory.truth_fit import fit_truth
@@ -70,6 +73,7 @@ class Inspection:
     size_bytes: int
     streams: tuple[StreamSummary, ...]
     findings: tuple[Finding, ...]
+    topics: tuple[TopicSummary, ...] = ()  # of a bag
 
     @property
     def worst(self) -> Severity:
@@ -100,8 +104,9 @@ class _Inspector:
         self._found = found
         self._problems = problems
         self._findings: list[Finding] = [Finding("error", str(error), str(found.root)) for error in found.errors]
+        self._findings += [Finding("warning", str(error), str(found.root)) for error in found.lacking.values()]
         self._streams: list[StreamSummary] = []
-        self._size_bytes = 0
+        self._size_bytes = found.streams.size_bytes if found.streams is not None else 0
 
     def run(self, uri: str) -> Inspection:
         found = self._found
@@ -123,6 +128,7 @@ class _Inspector:
             size_bytes=self._size_bytes,
             streams=tuple(self._streams),
             findings=tuple(sorted(self._findings, key=lambda f: ("error", "warning", "ok").index(f.severity))),
+            topics=found.topics,
         )
 
     def _add(self, severity: Severity, what: str, where: str, next_step: str = "") -> None:
@@ -163,11 +169,13 @@ class _Inspector:
         streams = [*found.cameras, *([found.depth] if found.depth is not None else [])]
         for index, images in enumerate(streams):
             self._check_stream(images.name, images.t_ns, gap_limit_s(images.t_ns), images.rate_hz)
-            if found.video is None:
+            if found.video is None and found.streams is None:
                 is_depth = images is found.depth
                 self._check_images(images, _camera_of(found.rig, 0 if is_depth else index), is_depth)
         if found.video is not None:
             self._size_bytes += found.video.stat().st_size
+        if found.streams is not None and frames is not None:
+            self._findings += _message_findings(found, frames)
         if frames is not None and not len(frames.t_ns):
             self._add("error", "no frame: the cameras share no stamps", str(found.root), "synchronise the cameras")
 
@@ -200,20 +208,20 @@ class _Inspector:
             self._add("ok", f"{images.name}: all images are there, {decoded} of them decoded", images.name)
 
     def _rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
-        assert self._found.imu_file is not None
         calibration = self._found.imu_calibration
-        for t_ns, values in in_time_order(read_numbers(self._found.imu_file, 6, problems), problems, "imu"):
+        for t_ns, values in in_time_order(self._found.imu_rows(problems), problems, "imu"):
             yield t_ns, values if calibration is None else calibration.apply_to(np.array([values]))[0].tolist()
 
     def _check_imu(self) -> ImuFacts | None:
-        if self._found.imu_file is None:
+        if not self._found.has_imu:
             self._add("ok", "no IMU: vision alone gives the motion", str(self._found.root))
             return None
-        self._size_bytes += self._found.imu_file.stat().st_size
+        if self._found.imu_file is not None:
+            self._size_bytes += self._found.imu_file.stat().st_size
         try:
             facts = imu_facts(self._rows(self._problems))
         except DataError as error:
-            self._add("error", str(error), str(self._found.imu_file))
+            self._add("error", str(error), str(self._found.imu_file or self._found.root))
             return None
         noise = self._found.imu_noise
         declared_hz = noise.rate_hz if noise is not None else 0.0
@@ -225,13 +233,11 @@ class _Inspector:
         return facts
 
     def _check_gravity(self, facts: ImuFacts) -> None:
-        rest = bool(facts.at_rest.any())
-        force = facts.accel_mean[facts.at_rest] if rest else facts.accel_mean
-        norm = float(np.linalg.norm(force.mean(axis=0))) if not rest else float(np.linalg.norm(force, axis=1).mean())
+        norm, rest = mean_force(facts)
         state = f"over {int(facts.at_rest.sum()) * 0.5:.1f} s at rest" if rest else "on average (never at rest)"
         what = f"specific force {norm:.2f} m/s^2 {state}"
         off = abs(norm - _GRAVITY_M_S2)
-        if abs(norm - 1.0) < 0.1:
+        if force_seems_in_g(norm):
             self._add("error", f"{what}: the unit seems to be g", "imu0", f"multiply by {_GRAVITY_M_S2}")
         elif norm < 0.5 * _GRAVITY_M_S2:
             self._add("error", f"{what}: gravity is missing", "imu0", "record raw data, with gravity, in m/s^2")
@@ -242,14 +248,14 @@ class _Inspector:
 
     def _check_gyro(self, facts: ImuFacts, noise: ImuNoise | None) -> None:
         rate = np.linalg.norm(facts.gyro_mean, axis=1)
-        if float(np.median(rate)) > 10.0 or float(rate.max()) > 40.0:
+        if rates_seem_in_degrees(facts):
             self._add(
                 "error", f"gyro of up to {rate.max():.0f} rad/s: the unit seems to be deg/s", "imu0", "convert it"
             )
         period_ns = float(np.median(np.diff(facts.t_ns))) if len(facts.t_ns) > 1 else 0.0
         if period_ns > 1e9 / _MIN_IMU_RATE_HZ:
             self._add("warning", f"only {1e9 / period_ns:.0f} Hz of IMU", "imu0", "100 Hz or more serve better")
-        if noise is None and not self._found.errors:
+        if noise is None and not self._found.errors and not self._found.lacking:
             self._add("error", "the IMU has no noise model", "imu0", "write its sensor.yaml, see docs/formats.md")
 
     def _check_overlap(self, frame_t_ns: Stamps, t_ns: Stamps, what: str) -> None:
@@ -332,7 +338,7 @@ class _Inspector:
 
     def _check_truth_fit(self, truth: Trajectory) -> None:
         """Tell what the truth's body is turned, displaced and late against the IMU."""
-        if self._found.imu_file is None:
+        if not self._found.has_imu:
             return
         try:
             rows = list(self._rows(Problems()))
@@ -359,3 +365,35 @@ class _Inspector:
         self._check_truth_fit(truth)
         if frames is not None:
             self._check_overlap(frames.t_ns, truth.t_ns, "truth")
+
+
+def _message_findings(found: Survey, frames: FrameTable) -> list[Finding]:
+    """Decode some frames of a bag, evenly spread, and tell which cannot be used."""
+    rig = found.rig or _rig_of_first_sizes(found)
+    if rig is None or not len(frames.t_ns):
+        return []
+    bad: dict[str, list[str]] = {}
+    chosen = np.unique(np.linspace(0, len(frames.t_ns) - 1, _DECODED_PER_CAMERA).astype(int))
+    try:
+        with closing(open_loader(found, rig, frames)) as loader:
+            for i in chosen:
+                trouble = loader.load(int(i)).trouble
+                if trouble is not None:
+                    bad.setdefault(trouble.kind, []).append(str(trouble.path))
+    except DataError as error:
+        return [Finding("error", str(error), str(found.root), "leave the topic out, or record with one size")]
+    if not bad:
+        return [Finding("ok", f"{len(chosen)} of {len(frames.t_ns)} frames decoded", str(found.root))]
+    step = "the run skips what it cannot read"
+    return [
+        Finding("error" if len(where) > len(chosen) // 2 else "warning", f"{kind}: {len(where)} of {len(chosen)} "
+        "frames decoded", where[0], step)
+        for kind, where in bad.items()
+    ]  # fmt: skip
+
+
+def _rig_of_first_sizes(found: Survey) -> Rig | None:
+    """Return a rig that only says the sizes of the images, where there is no calibration yet; None without lenses."""
+    lenses = [known.camera for known in found.known_cameras if known.camera is not None]
+    whole = len(lenses) == len(found.cameras) > 0
+    return Rig(tuple(lenses), tuple(np.eye(4) for _ in lenses), found.depth is not None) if whole else None

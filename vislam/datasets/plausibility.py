@@ -79,6 +79,40 @@ def imu_facts(rows: Iterable[Row[list[float]]]) -> ImuFacts:
     )
 
 
+def mean_force(facts: ImuFacts) -> tuple[float, bool]:
+    """Return the mean specific force in whatever unit it is told, and whether that is at rest, not on average."""
+    rest = bool(facts.at_rest.any())
+    if rest:
+        return float(np.linalg.norm(facts.accel_mean[facts.at_rest], axis=1).mean()), True
+    return float(np.linalg.norm(facts.accel_mean.mean(axis=0))), False
+
+
+def force_seems_in_g(force: float) -> bool:
+    """Return whether a mean force is that of the earth in g, not in m/s^2."""
+    return abs(force - 1.0) < 0.1
+
+
+def rates_seem_in_degrees(facts: ImuFacts) -> bool:
+    """Return whether rates are beyond what anything that carries a camera turns at, were they in rad/s."""
+    rate = np.linalg.norm(facts.gyro_mean, axis=1)
+    return bool(float(np.median(rate)) > 10.0 or float(rate.max()) > 40.0)
+
+
+def unit_doubt(facts: ImuFacts) -> tuple[str, str] | None:
+    """Return what speaks against the units of inertial data and what to do about it; None when nothing does."""
+    if not len(facts.window_t_ns):
+        return None
+    force, rest = mean_force(facts)
+    if force_seems_in_g(force):
+        return f"specific force {force:.2f} m/s^2 {'at rest' if rest else 'on average'}, the unit seems to be g", (
+            "convert it to m/s^2"
+        )
+    if rates_seem_in_degrees(facts):
+        fastest = float(np.linalg.norm(facts.gyro_mean, axis=1).max())
+        return f"gyro of up to {fastest:.0f} rad/s, the unit seems to be deg/s", "convert it to rad/s"
+    return None
+
+
 def camera_tilt_rad(facts: ImuFacts, rig: Rig) -> float:
     """Return the angle between up, as the accelerometer feels it, and the top of cam0's image, through `T_BS`."""
     chosen = facts.accel_mean[facts.at_rest] if facts.at_rest.any() else facts.accel_mean

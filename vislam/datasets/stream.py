@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import ImuConfig
-from vislam.core.camera import Rig
+from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.datasets.formats.truth import Truth
@@ -27,6 +28,51 @@ DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
 _FRAME_GAP_S = 0.5  # a hole in the images that is worth telling, unless frames are rarer anyway
 _USUAL_PERIODS = 3.5  # a hole is longer than this many usual periods
 _NAMED_GAPS = 5  # so many gaps are told one by one
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """One topic of a bag and what it was taken for."""
+
+    name: str
+    type: str
+    count: int
+    rate_hz: float  # NaN when there are fewer than two
+    taken_for: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownCamera:
+    """What a recording says of one camera, None where it does not."""
+
+    camera: Camera | None = None
+    T_body_cam: Array | None = None  # [4, 4]
+
+
+class Streams(Protocol):
+    """The values of a recording that are messages of one file, not files of their own."""
+
+    @property
+    def size_bytes(self) -> int:
+        """How large it is."""
+        ...
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether there are inertial samples."""
+        ...
+
+    def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        """Yield stamp, rates (rad/s) and forces (m/s^2); raises DataError when most cannot be used."""
+        ...
+
+    def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        """Yield stamp and field (µT); raises DataError when most cannot be used."""
+        ...
+
+    def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> Loader:
+        """Return what loads the images of frames, of the first `cameras` only if told."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,8 +93,29 @@ class Survey:
     mag_calibration: MagCalibration | None = None  # as for the IMU, in the magnetometer's own axes
     R_body_mag: Array = field(default_factory=lambda: np.eye(3))
     truth: Truth | None = None
+    streams: Streams | None = None  # images and samples come from here; the files of a camera are names for messages
+    topics: tuple[TopicSummary, ...] = ()
+    known_cameras: tuple[KnownCamera, ...] = ()  # what is known where there is no rig yet
+    lacking: Mapping[str, DataError] = field(default_factory=dict)  # why it cannot be replayed without that option
     problems: Problems = field(default_factory=Problems)  # met while listing
     errors: tuple[DataError, ...] = ()
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether there are inertial samples."""
+        return self.imu_file is not None or (self.streams is not None and self.streams.has_imu)
+
+    def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        """Yield stamp, rates and forces as recorded, without calibration; raises DataError when most are unusable."""
+        if self.streams is not None:
+            return self.streams.imu_rows(problems)
+        return iter(()) if self.imu_file is None else read_numbers(self.imu_file, 6, problems)
+
+    def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        """Yield stamp and field as recorded, as `imu_rows` does."""
+        if self.streams is not None:
+            return self.streams.mag_rows(problems)
+        return iter(()) if self.mag_file is None else read_numbers(self.mag_file, 3, problems)
 
 
 def image_list(
@@ -87,6 +154,8 @@ def open_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | Non
 
     Raises DataError when a video cannot be opened.
     """
+    if survey.streams is not None:
+        return survey.streams.open_loader(rig, frames, cameras)
     if survey.video is not None:
         return VideoLoader(survey.video, survey.cameras[0].files, rig.cameras[0])
     return FolderLoader(frames, survey.cameras[:cameras], survey.depth, rig, survey.depth_units_per_m)
@@ -100,8 +169,8 @@ class FileRecording:
 
     def __init__(self, survey: Survey) -> None:
         """Open what a survey found; raises DataError when it cannot be replayed, or images and calibration differ."""
-        if survey.errors:
-            raise survey.errors[0]
+        for error in (*survey.errors, *survey.lacking.values()):
+            raise error
         if survey.rig is None or not survey.cameras:
             raise DataError(f"{survey.root} holds no camera images; `vislam doctor` shows what it holds")
         self.name = survey.root.resolve().name
@@ -147,6 +216,10 @@ class FileRecording:
         if self._survey.video is not None:
             open_loader(self._survey, self.rig, self._frames).close()
             return
+        if self._survey.streams is not None:
+            with closing(open_loader(self._survey, self.rig, self._frames)) as loader:
+                next((i for i in range(min(100, self.frame_count)) if loader.load(i).images), None)
+            return
         for column, (camera, stream) in enumerate(zip(self.rig.cameras, self._survey.cameras, strict=True)):
             for row in self._frames.camera_rows[:100, column]:
                 try:
@@ -169,12 +242,12 @@ class FileRecording:
                         index += 1
 
     def _read_imu(self) -> Generator[ImuSample, None, None]:
-        if self._survey.imu_file is None:
+        if not self._survey.has_imu:
             return
         rate_hz = self.imu_noise.rate_hz if self.imu_noise is not None else 0.0
         gaps = _GapWatch("imu", imu_gap_limit_s(rate_hz), self._counter)
         calibration = self._survey.imu_calibration
-        rows = read_numbers(self._survey.imu_file, 6, self._counter)
+        rows = self._survey.imu_rows(self._counter)
         for t_ns, values in in_time_order(rows, self._counter, "imu"):
             gaps.see(t_ns)
             both = np.array(values)
@@ -182,10 +255,8 @@ class FileRecording:
             yield sample if calibration is None else calibration.apply(sample)
 
     def _read_mag(self) -> Generator[MagSample, None, None]:
-        if self._survey.mag_file is None:
-            return
         calibration = self._survey.mag_calibration
-        rows = read_numbers(self._survey.mag_file, 3, self._counter)
+        rows = self._survey.mag_rows(self._counter)
         for t_ns, values in in_time_order(rows, self._counter, "mag"):
             raw = MagSample(t_ns, np.array(values))
             field_ut = raw.field_ut if calibration is None else calibration.apply(raw).field_ut

@@ -102,8 +102,8 @@ def measured_inertial(uri: str) -> MeasuredInertial:
         raise found.errors[0]
     problems = Problems()
     truth = None if found.truth is None else found.truth(problems)
-    if found.imu_file is None or found.imu_noise is None or truth is None:
-        lacks = "an IMU" if found.imu_file is None or found.imu_noise is None else "truth"
+    if not found.has_imu or found.imu_noise is None or truth is None:
+        lacks = "an IMU" if not found.has_imu or found.imu_noise is None else "truth"
         raise DataError(f"{uri} lacks {lacks}; simulated vision on a real IMU needs inertial data and true poses")
     t_ns, values = _samples(found)
     name, gyro, accel = found.root.resolve().name, values[:, :3], values[:, 3:]
@@ -134,7 +134,7 @@ def shaken(recording: Recording, vibration: VibrationConfig) -> Recording:
     if recording.imu_noise is None:
         raise UsageError(f"{recording.name} has no IMU that could vibrate; leave --imu.vibration.recording away")
     found = survey(vibration.recording)
-    if found.imu_file is None:
+    if not found.has_imu:
         raise DataError(f"{vibration.recording} has no inertial data to take vibration from")
     t_ns, values = _samples(found)
     shaking = Vibration(t_ns, values, vibration.begin_s, vibration.length_s, vibration.above_hz)
@@ -143,11 +143,10 @@ def shaken(recording: Recording, vibration: VibrationConfig) -> Recording:
 
 def _samples(found: Survey) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return stamps [N] and calibrated samples [N, 6] of a recording with inertial data."""
-    from vislam.datasets.tables import Problems, in_time_order, read_numbers
+    from vislam.datasets.tables import Problems, in_time_order
 
-    assert found.imu_file is not None
     problems = Problems()
-    rows = list(in_time_order(read_numbers(found.imu_file, 6, problems), problems, "imu"))
+    rows = list(in_time_order(found.imu_rows(problems), problems, "imu"))
     values = np.array([row[1] for row in rows]).reshape(-1, 6)
     if found.imu_calibration is not None:
         values = found.imu_calibration.apply_to(values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -57,7 +58,10 @@ def _examine_recording(options: DoctorOptions) -> int:
 
     inspection = inspect(options.source)
     if options.json:
-        print(json.dumps(asdict(inspection)))
+        told = asdict(inspection)
+        if not inspection.topics:
+            del told["topics"]  # only bags have any
+        print(json.dumps(told))
     else:
         _print_inspection(inspection)
     return DataError.exit_code if inspection.worst == "error" else 0
@@ -91,9 +95,19 @@ def _print_hardware(report: HardwareReport) -> None:
 def _print_inspection(inspection: Inspection) -> None:
     size = f"{inspection.duration_s:.1f} s, {inspection.size_bytes / 1e6:.1f} MB"
     Console().print(f"{printable(inspection.source)}: {inspection.format}, {size}", soft_wrap=True)
+    topics = [
+        (t.name, t.type.replace("/msg/", "/"), str(t.count), _rate(t.rate_hz), t.taken_for) for t in inspection.topics
+    ]
+    if topics:
+        words = ("topic", "type", "taken for")
+        print_table(("topic", "type", "count", "rate [Hz]", "taken for"), topics, "topics", words=words)
     rows = [(s.name, str(s.count), f"{s.rate_hz:.1f}", f"{s.longest_gap_s:.3f}") for s in inspection.streams]
     print_table(("stream", "count", "rate [Hz]", "longest gap [s]"), rows)
     _print_findings(inspection.findings)
+
+
+def _rate(rate_hz: float) -> str:
+    return "" if math.isnan(rate_hz) else number(rate_hz, 1)
 
 
 def _print_findings(findings: Sequence[Finding]) -> None:

@@ -34,7 +34,7 @@ def asl_truth(path: Path, T_sensor_body: Array) -> Truth:
     def read(problems: Problems) -> Trajectory | None:
         check_size(path, MAX_FILE_BYTES)
         rows = ((t, [*v[:3], *v[4:7], v[3]]) for t, v in read_numbers(path, 7, problems))
-        return _trajectory(rows, problems, T_sensor_body)
+        return trajectory_of(rows, problems, T_sensor_body)
 
     return read
 
@@ -44,7 +44,7 @@ def tum_truth(path: Path) -> Truth:
 
     def read(problems: Problems) -> Trajectory | None:
         check_size(path, MAX_FILE_BYTES)
-        return _trajectory(read_numbers(path, 7, problems, parse_seconds, None), problems, np.eye(4))
+        return trajectory_of(read_numbers(path, 7, problems, parse_seconds, None), problems, np.eye(4))
 
     return read
 
@@ -54,8 +54,8 @@ def kitti_truth(path: Path, t_ns: Stamps) -> Truth:
     return lambda _problems: read_kitti(path, t_ns)
 
 
-def _trajectory(rows: Iterable[Row[list[float]]], problems: Problems, T_sensor_body: Array) -> Trajectory | None:
-    """Return the body's trajectory of rows t, x, y, z, qx, qy, qz, qw; None when there are no usable rows."""
+def trajectory_of(rows: Iterable[Row[list[float]]], problems: Problems, T_sensor_body: Array) -> Trajectory | None:
+    """Return the body's trajectory of rows t, x, y, z, qx, qy, qz, qw of a sensor; None without usable rows."""
     kept = list(in_time_order(rows, problems, "truth"))
     values = np.array([row[1] for row in kept]).reshape(-1, 7)
     t_ns = np.array([row[0] for row in kept], dtype=np.int64)

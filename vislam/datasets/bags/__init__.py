@@ -1,0 +1,30 @@
+"""Bags: rosbag 1, rosbag 2 and MCAP as recordings, with topics guessed or told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from vislam.config import validated
+from vislam.datasets.bags.bag import SUFFIXES, is_bag
+from vislam.datasets.bags.choice import BagOptions
+from vislam.datasets.bags.surveying import survey_bag
+from vislam.datasets.stream import Survey
+
+__all__ = ["LOOKS_FOR", "SUFFIXES", "recognises", "survey", "survey_with"]
+
+LOOKS_FOR = f"a bag ({', '.join(SUFFIXES)}, or a folder with such files)"
+recognises = is_bag
+
+
+def survey(path: Path) -> Survey:
+    """Return what a bag holds, with its topics guessed; what is wrong with it is in `errors`.
+
+    Raises DataError when the extra `bags` is not installed.
+    """
+    return survey_with(path, {})
+
+
+def survey_with(path: Path, options: Mapping[str, str]) -> Survey:
+    """Return what a bag holds, with topics as they are told; raises UsageError for an option that is none."""
+    return survey_bag(path, validated(BagOptions, options, f"bag:{path}"))

@@ -1,0 +1,104 @@
+"""Messages decoded through `rosbags`, by its own definitions of the standard types.
+
+The definitions that a bag brings are never parsed: what is read here is standard, and a definition from outside could
+be anything. Where ROS 1's checksum of it differs from the standard's, the topic is refused.
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Any
+
+from vislam.core.errors import DataError
+from vislam.datasets.bags.stored import DamagedError, Topic
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO, IMU, MAGNETIC = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
+FIX, RANGE, PRESSURE = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Range", "sensor_msgs/msg/FluidPressure"
+ODOMETRY, TWIST, JOINTS = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/JointState"
+TWIST_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+POSE, POSE_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM, TRANSFORMS, OLD_TRANSFORMS = (
+    "geometry_msgs/msg/TransformStamped",
+    "tf2_msgs/msg/TFMessage",
+    "tf/msg/tfMessage",
+)
+KNOWN = (
+    IMAGE, COMPRESSED, CAMERA_INFO, IMU, MAGNETIC, FIX, RANGE, PRESSURE, ODOMETRY, TWIST, TWIST_COVARIANCE, JOINTS,
+    POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, OLD_TRANSFORMS,
+)  # fmt: skip
+_TRANSFORMS_SUM = "94810edda583a504dfda3829e70d7eec"
+_STAMP = {"<": struct.Struct("<iI"), ">": struct.Struct(">iI")}
+_ROS1_STAMP = struct.Struct("<III")
+
+
+def need_rosbags() -> None:
+    """Raise DataError naming the extra where the package is not installed."""
+    try:
+        _stores()
+    except ImportError as error:
+        raise DataError(f"bags need {error.name or 'rosbags'}; install it: pip install 'vislam[bags]'") from error
+
+
+def why_unreadable(topic: Topic) -> str:
+    """Return why messages of a topic cannot be decoded, empty when they can."""
+    if topic.type not in KNOWN:
+        return "a type that vislam does not read"
+    if topic.encoding not in ("ros1", "cdr"):
+        return f"encoded as '{topic.encoding}'; ros1 and cdr are read"
+    if topic.encoding == "ros1" and topic.digest not in ("", "*", _standard_sum(topic.type)):
+        return f"its definition of {topic.type} is not the standard one"
+    return ""
+
+
+def decoded(topic: Topic, data: bytes) -> Any:
+    """Return a message with the fields of its type; raises DamagedError when the bytes are none."""
+    ros1, *ros2 = _stores()
+    type_ = TRANSFORMS if topic.type == OLD_TRANSFORMS else topic.type
+    try:
+        if topic.encoding == "ros1":
+            return ros1.deserialize_ros1(data, type_)
+        if data[:2] not in (b"\x00\x00", b"\x00\x01"):  # neither order of bytes; others are not plain CDR
+            raise DamagedError("message in another representation than plain CDR")
+        try:
+            return ros2[0].deserialize_cdr(data, type_)
+        except (AssertionError, ValueError):
+            return ros2[1].deserialize_cdr(data, type_)  # later ones have further fields
+    except (AssertionError, ValueError, KeyError, IndexError, OverflowError, MemoryError, struct.error) as error:
+        raise DamagedError(f"message that cannot be read as {topic.type}") from error
+
+
+def stamp_ns(topic: Topic, head: bytes) -> int | None:
+    """Return the stamp in a message's header; None when it has none or its seconds are impossible."""
+    try:
+        if topic.encoding == "ros1":
+            _sequence, seconds, rest_ns = _ROS1_STAMP.unpack_from(head)
+        else:
+            seconds, rest_ns = _STAMP["<" if head[1:2] == b"\x01" else ">"].unpack_from(head, 4)
+    except struct.error:
+        return None
+    return None if rest_ns >= 10**9 or seconds < 0 or (seconds == 0 and rest_ns == 0) else seconds * 10**9 + rest_ns
+
+
+def header_ns(header: Any) -> int | None:
+    """Return the stamp in a decoded header, as `stamp_ns`."""
+    seconds, rest_ns = int(header.stamp.sec), int(header.stamp.nanosec)
+    return None if rest_ns >= 10**9 or seconds < 0 or (seconds == 0 and rest_ns == 0) else seconds * 10**9 + rest_ns
+
+
+@cache
+def _stores() -> tuple[Any, Any, Any]:
+    """Return definitions of ROS 1 and of two ages of ROS 2. Raises ImportError."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    return ros1, get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)
+
+
+@cache
+def _standard_sum(type_: str) -> str:
+    if type_ in (TRANSFORMS, OLD_TRANSFORMS):
+        return _TRANSFORMS_SUM
+    return str(_stores()[0].generate_msgdef(type_, ros_version=1)[1])

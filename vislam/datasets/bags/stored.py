@@ -1,0 +1,70 @@
+"""Messages of a bag before they are decoded: whose topic they are on, when they were logged, and where they lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from vislam.datasets.tables import Problems
+
+HEAD_BYTES = 512  # of a message: all of an inertial one, and the header of every other
+MOST_MESSAGE_BYTES = 2**28  # as of an image file
+MOST_TOPICS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a bag."""
+
+    name: str
+    type: str  # "sensor_msgs/msg/Image", for ROS 1 too
+    encoding: str  # "ros1" or "cdr"; others are listed and never decoded
+    digest: str = ""  # ROS 1: the sum over the definition
+
+
+class Place(NamedTuple):
+    """Where the bytes of a message lie."""
+
+    file: int  # number of the bag's file
+    chunk: int  # where the packed chunk begins that holds it; -1: it lies open
+    at: int  # in the file or in the unpacked chunk; in a database, its row
+    length: int
+
+
+class Found(NamedTuple):
+    """One message, met while a bag is read front to back."""
+
+    topic: Topic
+    log_ns: int
+    place: Place
+    head: bytes  # its first bytes, `HEAD_BYTES` at most
+
+
+class Container(Protocol):
+    """One file of a bag."""
+
+    def scan(self, problems: Problems) -> Iterator[Found]:
+        """Yield the messages in the order in which they were stored; what is damaged is counted and passed over.
+
+        Raises DataError when it is no file of its kind.
+        """
+        ...
+
+    def read(self, place: Place) -> bytes:
+        """Return the bytes of a message; raises DamagedError when they cannot be had."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the file."""
+        ...
+
+
+class DamagedError(Exception):
+    """Bytes that are not what their container says; met and counted in this package, never seen by its users."""
+
+
+def message_type(name: str) -> str:
+    """Return the ROS 2 name of a message's type, "sensor_msgs/msg/Image" for "sensor_msgs/Image"."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name

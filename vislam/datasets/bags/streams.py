@@ -1,0 +1,187 @@
+"""The streams of a bag while it is run: inertial rows, the field, and the images of each frame."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import ImageF32, ImageU8
+from vislam.datasets.bags import pictures
+from vislam.datasets.bags.bag import Bag
+from vislam.datasets.bags.decoding import decoded
+from vislam.datasets.bags.listing import fitting, stamp
+from vislam.datasets.bags.stored import HEAD_BYTES, DamagedError, Found, Place, Topic
+from vislam.datasets.images import UnreadableImageError
+from vislam.datasets.loaders import FrameTable, LoadedImages
+from vislam.datasets.tables import Problems, Row
+
+_ENOUGH = 20  # so many messages, and most of them unusable, settle it
+_UT_PER_TESLA = 1e6
+Values = Callable[[Any], list[float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageTopic:
+    """The images of one topic, as its camera's list has them."""
+
+    topic: Topic
+    compressed: bool
+    t_ns: NDArray[np.int64]  # [N]
+    places: NDArray[np.int64]  # [N, 4]
+
+
+class BagStreams:
+    """What a run reads of a bag; implements `vislam.datasets.stream.Streams`."""
+
+    def __init__(
+        self,
+        bag: Bag,
+        cameras: Sequence[ImageTopic],
+        depth: ImageTopic | None,
+        samples: tuple[Topic | None, Topic | None],
+        by_log_time: bool,
+    ) -> None:
+        """Take the topics of images, of inertial samples and of the field."""
+        self._bag = bag
+        self._cameras, self._depth = tuple(cameras), depth
+        self._imu, self._mag = samples
+        self._by_log_time = by_log_time
+        weakref.finalize(self, bag.close)
+
+    @property
+    def size_bytes(self) -> int:
+        """How large the bag is."""
+        return self._bag.size_bytes
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether there are inertial samples."""
+        return self._imu is not None
+
+    def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        """Yield stamp, rates and forces as they were stored; raises DataError when most cannot be used."""
+        return (
+            iter(()) if self._imu is None else topic_rows(self._bag, self._imu, _inertial, self._by_log_time, problems)
+        )
+
+    def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
+        """Yield stamp and field in µT; as `imu_rows`."""
+        return iter(()) if self._mag is None else topic_rows(self._bag, self._mag, _field, self._by_log_time, problems)
+
+    def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> BagLoader:
+        """Return what loads the images of frames, of the first `cameras` only if told."""
+        return BagLoader(self._bag, frames, self._cameras[:cameras], self._depth, rig)
+
+
+class BagLoader:
+    """Loads frames from the messages of a bag."""
+
+    workers = 2
+
+    def __init__(
+        self, bag: Bag, frames: FrameTable, cameras: tuple[ImageTopic, ...], depth: ImageTopic | None, rig: Rig
+    ) -> None:
+        self._bag, self._frames, self._cameras, self._depth, self._rig = bag, frames, cameras, depth, rig
+
+    def load(self, i: int) -> LoadedImages:
+        """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
+        images: list[ImageU8] = []
+        color = None
+        try:
+            for index, (camera, topic) in enumerate(zip(self._rig.cameras, self._cameras, strict=False)):
+                grey, bgr = self._grey_or_color(topic, int(self._frames.camera_rows[i, index]), camera)
+                images.append(grey)
+                color = bgr if index == 0 else color
+        except UnreadableImageError as error:
+            return LoadedImages((), trouble=error)
+        row = int(self._frames.depth_rows[i])
+        if self._depth is None or row < 0:
+            return LoadedImages(tuple(images), color)
+        try:
+            return LoadedImages(tuple(images), color, self._depth_m(self._depth, row))
+        except UnreadableImageError as error:
+            return LoadedImages(tuple(images), color, trouble=error)
+
+    def close(self) -> None:
+        """Nothing is held that the recording does not hold."""
+
+    def _grey_or_color(self, topic: ImageTopic, row: int, camera: Camera) -> tuple[ImageU8, ImageU8 | None]:
+        message, path = self._message(topic, row)
+        if topic.compressed:
+            return pictures.unpacked_grey_or_color(message, camera, path)
+        return pictures.grey_or_color(message, camera, path)
+
+    def _depth_m(self, topic: ImageTopic, row: int) -> ImageF32:
+        message, path = self._message(topic, row)
+        camera = self._rig.cameras[0]
+        return (pictures.unpacked_depth_m if topic.compressed else pictures.depth_m)(message, camera, path)
+
+    def _message(self, topic: ImageTopic, row: int) -> tuple[Any, Path]:
+        path = self._bag.path / topic.topic.name.strip("/") / str(int(topic.t_ns[row]))
+        try:
+            return decoded(topic.topic, self._bag.read(Place(*topic.places[row].tolist()))), path
+        except (DamagedError, OSError) as error:
+            raise UnreadableImageError("image message that cannot be read", path) from error
+
+
+def messages_of(bag: Bag, topic: Topic, problems: Problems) -> Iterator[tuple[Found, Any]]:
+    """Yield the messages of one topic, decoded; those that cannot be are counted.
+
+    Raises DataError when most cannot be used.
+    """
+    good = bad = 0
+    for found in bag.scan(Problems()):  # damage of the file was counted when it was listed
+        if found.topic.name != topic.name or found.topic.type != topic.type:
+            continue
+        try:
+            whole = found.place.length == len(found.head) < HEAD_BYTES  # else it may be packed, or go on
+            yield found, decoded(topic, found.head if whole else bag.read(found.place))
+            good += 1
+        except (DamagedError, OSError) as error:
+            bad += 1
+            problems.count(f"{topic.name}: {error}", f"logged at {found.log_ns} ns")
+    if bad > good and good + bad >= _ENOUGH:
+        raise DataError(f"{bag.path}: {bad} of {good + bad} messages on {topic.name} cannot be read as {topic.type}")
+
+
+def topic_rows(
+    bag: Bag, topic: Topic, values: Values, by_log_time: bool, problems: Problems
+) -> Iterator[Row[list[float]]]:
+    """Yield stamp and numbers of each message of a topic; what is not finite is left out and counted.
+
+    Raises DataError when most cannot be used.
+    """
+    good = bad = 0
+    for found, message in messages_of(bag, topic, problems):
+        t_ns = stamp(found, by_log_time)
+        if t_ns is None:
+            problems.count(f"{topic.name}: without a stamp, the recorder's time is taken")
+            t_ns = fitting(found.log_ns)
+        numbers = values(message)
+        if all(map(math.isfinite, numbers)):
+            good += 1
+            yield t_ns, numbers
+        else:
+            bad += 1
+            problems.count(f"{topic.name}: messages with NaN or infinity", f"{t_ns} ns")
+    if bad > good and (good + bad >= _ENOUGH or good == 0):
+        raise DataError(f"{bag.path}: {bad} of {good + bad} messages on {topic.name} hold NaN or infinity")
+
+
+def _inertial(message: Any) -> list[float]:
+    w, a = message.angular_velocity, message.linear_acceleration
+    return [w.x, w.y, w.z, a.x, a.y, a.z]
+
+
+def _field(message: Any) -> list[float]:
+    field = message.magnetic_field
+    return [field.x * _UT_PER_TESLA, field.y * _UT_PER_TESLA, field.z * _UT_PER_TESLA]
