@@ -113,7 +113,8 @@ class Rosbag1:
                 head = block[max(0, match.start() - 100) : match.start()]
                 for back in range(len(head), 3, -1):  # its header begins with its own length
                     begin = at + match.start() - back
-                    if head[-back + 1 : -back + 4] == b"\0\0\0" and self._is_chunk(begin):
+                    length = head[len(head) - back : len(head) - back + 4]
+                    if length.endswith(b"\0\0\0") and self._is_chunk(begin):
                         return begin
             at += len(block) - 200 if len(block) == _BLOCK_BYTES else len(block)
         return self._bytes.size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from vislam.core.errors import DataError
-from vislam.core.reading import check_file
+from vislam.core.reading import check_file, open_file
 from vislam.datasets.bags.stored import (
     HEAD_BYTES,
     MOST_MESSAGE_BYTES,
@@ -41,6 +42,8 @@ class Database:
             self._base = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True, check_same_thread=False)
             self._base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_MESSAGE_BYTES)
             self._base.execute("PRAGMA trusted_schema=OFF")
+            if _is_cut_off(path):  # else sqlite refuses it altogether
+                self._base.execute("PRAGMA writable_schema=ON")
             self._base.execute("PRAGMA cache_size=-8192")
             self._base.text_factory = lambda data: data.decode("utf-8", "replace")
         except sqlite3.Error as error:
@@ -64,6 +67,7 @@ class Database:
     def scan(self, problems: Problems) -> Iterator[Found]:
         """Yield the messages in the order of their rows; raises DataError when it is no database of rosbag 2."""
         topics = self._topics()
+        problems.count(f"{self._path.name}: cut off", times=int(_is_cut_off(self._path)))
         last = -(2**63)
         while rows := self._rows(last, problems):
             for row, topic_id, log_ns, length, data in rows:
@@ -108,3 +112,12 @@ class Database:
         except (sqlite3.Error, MemoryError) as error:
             raise DataError(f"{self._path} cannot be read as a database of rosbag 2: {error}") from error
         return {row[0]: Topic(str(row[1]), message_type(str(row[2])), str(row[3])) for row in rows}
+
+
+def _is_cut_off(path: Path) -> bool:
+    """Return whether a database is shorter than its first page says."""
+    with open_file(path) as file:
+        head = file.read(32)
+        size = os.fstat(file.fileno()).st_size
+    page = int.from_bytes(head[16:18], "big")
+    return size < (2**16 if page == 1 else page) * int.from_bytes(head[28:32], "big")
