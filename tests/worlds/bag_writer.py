@@ -42,8 +42,8 @@ class Types:
         self.ros1 = ros1
         self.store = ROS1 if ros1 else ROS2
 
-    def make(self, name: str, **values: Any) -> Any:
-        return self.store.types[name](**values)
+    def make(self, type_: str, /, **values: Any) -> Any:
+        return self.store.types[type_](**values)
 
     def header(self, t_ns: int, frame: str) -> Any:
         stamp = self.make("builtin_interfaces/msg/Time", sec=t_ns // 10**9, nanosec=t_ns % 10**9)

@@ -42,7 +42,11 @@ def sensor_readings(name: str, sensor: Configured, file: SensorFile, problems: P
     Raises:
         DataError: the file cannot be read, lacks a column, or most of its rows are unusable.
     """
-    if file.format == "csv":
+    if file.format == "bag":
+        from vislam.datasets.bags import readings_of_topic
+
+        readings = readings_of_topic(name, sensor, file, problems)
+    elif file.format == "csv":
         readings = _counts(name, file, problems) if file.ticks else _table(name, sensor, file, problems)
     else:
         readings = {"nmea": _nmea, "ubx": _ubx}[file.format](FixReadings(name, file.gnss), file, problems)
@@ -58,6 +62,10 @@ def local_frame(file: SensorFile) -> LocalFrame:
     Its datum is the one that was told, or the first fix that is good enough. Raises DataError where there is none.
     """
     made, readers = FixReadings("", file.gnss), {"nmea": _nmea, "ubx": _ubx}
+    if made.frame is None and file.format == "bag":
+        from vislam.datasets.bags import first_fix
+
+        first_fix(made, file)
     if made.frame is None and file.format in readers:
         next(readers[file.format](made, file, Problems()), None)
     if made.frame is None:

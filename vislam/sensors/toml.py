@@ -25,9 +25,20 @@ from vislam.sensors.ticks import TicksSettings
 MOST_SENSORS = 64
 _MOST_BYTES = 2**20
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
-FileFormat = Literal["csv", "nmea", "ubx"]
+FileFormat = Literal["csv", "nmea", "ubx", "bag"]
 _FIX_COLUMNS = ("east_m", "north_m", "up_m")
-_FORMATS: dict[str, FileFormat] = {".nmea": "nmea", ".ubx": "ubx"}  # all else is a table
+_FORMATS: dict[str, FileFormat] = {  # all else is a table
+    ".nmea": "nmea", ".ubx": "ubx", ".bag": "bag", ".mcap": "bag", ".db3": "bag",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class JointsSettings:
+    """Which joints of a robot's joint states are its wheels."""
+
+    left: str
+    right: str
+    radius_m: Positive
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +47,9 @@ class _Common:
 
     kind: str
     file: str = ""  # beside the TOML file; empty: readings come from elsewhere
-    format: FileFormat | None = None  # None: by the file's ending
+    format: FileFormat | None = None  # None: by the file's ending; a bag where a topic is told
+    topic: str = ""  # of a bag
+    joints: JointsSettings | None = None  # of a bag's joint states
     simulated_hz: NonNegative = 0.0  # above 0, and without a file, readings are drawn on the truth of a recording
     offset_s: Finite = 0.0  # is added to the file's stamps, to have them by the IMU's clock
     port: str = ""  # live: of a satellite receiver
@@ -58,6 +71,8 @@ class SensorFile:
     offset_s: float
     ticks: TicksSettings | None  # None: the file has speeds
     gnss: GnssSettings
+    topic: str = ""  # of a bag
+    joints: JointsSettings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,12 +181,16 @@ def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> Sens
     if not common.file or "\0" in common.file:
         return None
     path = folder / common.file
-    format_ = common.format or _FORMATS.get(path.suffix.lower(), "csv")
-    if format_ != "csv" and sensor.columns != _FIX_COLUMNS:
+    format_ = common.format or ("bag" if common.topic else _FORMATS.get(path.suffix.lower(), "csv"))
+    if (format_ == "bag") != bool(common.topic):
+        raise UsageError(f"{where}: option topic: one is asked of a bag and of nothing else; vislam doctor lists them")
+    if (format_ == "bag" and common.ticks) or (format_ != "bag" and common.joints):
+        raise UsageError(f"{where}: ticks are those of a table, joints those of a bag; this is {format_}")
+    if format_ in ("nmea", "ubx") and sensor.columns != _FIX_COLUMNS:
         raise UsageError(f"{where}: option format: {format_} holds fixes, for a kind that has east, north, up")
     if common.ticks and sensor.columns != ("left_m_s", "right_m_s"):
         raise UsageError(f"{where}: option ticks: counts are those of kind wheels, this is {common.kind}")
-    return SensorFile(path, format_, common.offset_s, common.ticks, _gnss(common, where))
+    return SensorFile(path, format_, common.offset_s, common.ticks, _gnss(common, where), common.topic, common.joints)
 
 
 def _port(common: _Common, sensor: Configured, where: str) -> SensorPort | None:
@@ -179,8 +198,8 @@ def _port(common: _Common, sensor: Configured, where: str) -> SensorPort | None:
         return None
     if sensor.columns != _FIX_COLUMNS:
         raise UsageError(f"{where}: option port: fixes are read there, for a kind that has east, north, up")
-    if common.format == "csv":
-        raise UsageError(f"{where}: option format: nmea or ubx is read at a port, got csv")
+    if common.format not in (None, "nmea", "ubx"):
+        raise UsageError(f"{where}: option format: nmea or ubx is read at a port, got {common.format}")
     return SensorPort(common.port, common.baud, common.format or "nmea", common.delay_s, _gnss(common, where))
 
 

@@ -9,9 +9,10 @@ from vislam.config import validated
 from vislam.datasets.bags.bag import SUFFIXES, is_bag
 from vislam.datasets.bags.choice import BagOptions
 from vislam.datasets.bags.surveying import survey_bag
+from vislam.datasets.bags.topic_readings import first_fix, readings_of_topic
 from vislam.datasets.stream import Survey
 
-__all__ = ["LOOKS_FOR", "SUFFIXES", "recognises", "survey", "survey_with"]
+__all__ = ["LOOKS_FOR", "SUFFIXES", "first_fix", "readings_of_topic", "recognises", "survey", "survey_with"]
 
 LOOKS_FOR = f"a bag ({', '.join(SUFFIXES)}, or a folder with such files)"
 recognises = is_bag
