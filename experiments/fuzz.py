@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -271,6 +271,7 @@ def small_targets() -> list[Target]:
         Target("graph", _graphs(), _optimize),
         Target("trajectory", _trajectories(), _read_trajectories),
         Target("recording", [_asl(), _tum(), _kitti()], _survey),
+        Target("bag", _bags(), _read_bags),
         Target("calibration", _calibrations(), _read_calibrations),
         Target("settings", _settings(), _read_settings),
         Target("tracks", [{"tracks.csv": _TRACKS}], _read_tracks),
@@ -391,6 +392,83 @@ def _kitti() -> dict[str, bytes]:
         "calib.txt": b"P0: 5 0 4 0 0 5 3 0 0 0 1 0\nP1: 5 0 4 -2 0 5 3 0 0 0 1 0\n",
         "times.txt": b"0\n1e-1\n2e-1\n3e-1\n",
     }
+
+
+def _bags() -> list[dict[str, bytes]]:
+    """Return one bag of each storage and packing, with a camera, its calibration and an IMU."""
+    from rosbags.rosbag1 import Writer as Rosbag1
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+    from rosbags.rosbag2 import Writer as Rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    out: list[dict[str, bytes]] = []
+    with tempfile.TemporaryDirectory() as name:
+        for packing in (None, *Rosbag1.CompressionFormat):
+            one = Rosbag1(Path(name) / f"{packing}.bag")
+            if packing is not None:
+                one.set_compression(packing)
+            _write_bag(one, get_typestore(Stores.ROS1_NOETIC))
+            out.append({"drive.bag": one.path.read_bytes()})
+        for storage, ending in ((StoragePlugin.MCAP, ".mcap"), (StoragePlugin.SQLITE3, ".db3")):
+            for mode in (CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.STORAGE):
+                if (storage, mode) == (StoragePlugin.SQLITE3, CompressionMode.STORAGE):
+                    continue
+                two = Rosbag2(Path(name) / f"{storage}{mode}", version=9, storage_plugin=storage)
+                two.set_compression(mode, CompressionFormat.ZSTD)
+                _write_bag(two, get_typestore(Stores.ROS2_HUMBLE))
+                out.append({"drive" + ending: next(two.path.glob(f"*{ending}")).read_bytes()})
+    return out
+
+
+def _write_bag(writer: Any, store: Any) -> None:
+    types, ros1 = store.types, "seq" in str(store.fielddefs["std_msgs/msg/Header"])
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+
+    def header(t_ns: int) -> Any:
+        time_ = types["builtin_interfaces/msg/Time"](sec=t_ns // 10**9, nanosec=t_ns % 10**9)
+        return types["std_msgs/msg/Header"](**({"seq": 0} if ros1 else {}), stamp=time_, frame_id="cam")
+
+    def vector(z: float) -> Any:
+        return types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=z)
+
+    begin, name = 14 * 10**17, str.upper if ros1 else str
+    lens = {"d": np.zeros(5), "k": np.array([5.0, 0, 4, 0, 5, 3, 0, 0, 1]), "r": np.eye(3).ravel(), "p": np.zeros(12)}
+    roi = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    nine = {f"{what}_covariance": np.zeros(9) for what in ("orientation", "angular_velocity", "linear_acceleration")}
+    rows = [(begin, "/cam/camera_info", types["sensor_msgs/msg/CameraInfo"](
+        header=header(begin), height=6, width=8, distortion_model="plumb_bob", binning_x=0, binning_y=0, roi=roi,
+        **{name(key): value for key, value in lens.items()}))]  # fmt: skip
+    for i in range(4):
+        t_ns = begin + i * 50_000_000
+        rows.append((t_ns, "/cam/image_raw", types["sensor_msgs/msg/Image"](
+            header=header(t_ns), height=6, width=8, encoding="mono8", is_bigendian=0, step=8,
+            data=np.arange(48, dtype=np.uint8))))  # fmt: skip
+        rows.append((t_ns, "/imu", types["sensor_msgs/msg/Imu"](
+            header=header(t_ns), orientation=turn, angular_velocity=vector(0.0), linear_acceleration=vector(9.81),
+            **nine)))  # fmt: skip
+    with writer:
+        connections: dict[str, Any] = {}
+        for t_ns, topic, message in rows:
+            type_ = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_, typestore=store)
+            writer.write(connections[topic], t_ns, serialize(message, type_))
+
+
+def _read_bags(folder: Path) -> None:
+    from vislam.config import CalibrationConfig
+    from vislam.datasets import open_dataset
+    from vislam.datasets.inspect import inspect
+
+    noise = folder.parent / f"{folder.name}.yaml"
+    noise.write_bytes(_IMU)
+    path = next(path for path in folder.iterdir())
+    inspect(f"bag:{path}")
+    for _ in zip(
+        range(50), open_dataset(f"bag:{path}", CalibrationConfig(imu_noise=str(noise))).events(), strict=False
+    ):
+        pass
 
 
 def _survey(folder: Path) -> None:

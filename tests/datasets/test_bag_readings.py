@@ -42,11 +42,6 @@ def fix(types: Types, t_ns: int, latitude: float, status: int = 0, variance: flo
 
 
 def distance(types: Types, t_ns: int, range_m: float, frame: str) -> Any:
-    later = (
-        {}
-        if types.ros1 or "variance" not in types.store.types["sensor_msgs/msg/Range"].__annotations__
-        else {"variance": 0.0}
-    )
     return types.make(
         "sensor_msgs/msg/Range", header=types.header(t_ns, frame), radiation_type=0, field_of_view=0.1, min_range=0.1,
         max_range=50.0, range=range_m,

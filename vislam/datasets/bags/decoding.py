@@ -63,9 +63,11 @@ def decoded(topic: Topic, data: bytes) -> Any:
             raise DamagedError("message in another representation than plain CDR")
         try:
             return ros2[0].deserialize_cdr(data, type_)
-        except (AssertionError, ValueError):
+        except Exception:
             return ros2[1].deserialize_cdr(data, type_)  # later ones have further fields
-    except (AssertionError, ValueError, KeyError, IndexError, OverflowError, MemoryError, struct.error) as error:
+    except DamagedError:
+        raise
+    except Exception as error:  # of whatever kind: these bytes may be anything, and that code is another's
         raise DamagedError(f"message that cannot be read as {topic.type}") from error
 
 

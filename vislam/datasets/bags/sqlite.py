@@ -24,6 +24,7 @@ from vislam.datasets.bags.stored import (
 from vislam.datasets.tables import Problems
 
 MAGIC = b"SQLite format 3\0"
+_ERRORS = (sqlite3.Error, ValueError, OverflowError, MemoryError)  # ValueError: of its own message that is no text
 _STEP_ROWS = 1000  # of one question; a row that cannot be read costs no more than those behind it
 
 
@@ -46,7 +47,7 @@ class Database:
                 self._base.execute("PRAGMA writable_schema=ON")
             self._base.execute("PRAGMA cache_size=-8192")
             self._base.text_factory = lambda data: data.decode("utf-8", "replace")
-        except sqlite3.Error as error:
+        except _ERRORS as error:
             raise DataError(f"{path} cannot be read as a database: {error}") from error
 
     def close(self) -> None:
@@ -58,7 +59,7 @@ class Database:
         try:
             with self._lock:
                 row = self._base.execute("SELECT data FROM messages WHERE rowid = ?", (place.at,)).fetchone()
-        except (sqlite3.Error, OverflowError, MemoryError) as error:
+        except _ERRORS as error:
             raise DamagedError(f"message that cannot be read: {error}") from error
         if row is None or not isinstance(row[0], bytes):
             raise DamagedError("message that is gone")
@@ -95,7 +96,7 @@ class Database:
             with self._lock:
                 for row in self._base.execute(asked, (HEAD_BYTES, last, _STEP_ROWS)):
                     found.append(row)  # those before a row that cannot be read stay
-        except (sqlite3.Error, MemoryError) as error:
+        except _ERRORS as error:
             if not found:
                 problems.count(f"{self._path.name}: cut off or damaged: {error}", f"behind row {last}")
         return found
@@ -109,7 +110,7 @@ class Database:
                         raise DataError(f"{self._path} is no database of rosbag 2: no table {table}")
                 asked = f"SELECT id, name, type, serialization_format FROM topics LIMIT {MOST_TOPICS}"
                 rows = self._base.execute(asked).fetchall()
-        except (sqlite3.Error, MemoryError) as error:
+        except _ERRORS as error:
             raise DataError(f"{self._path} cannot be read as a database of rosbag 2: {error}") from error
         return {row[0]: Topic(str(row[1]), message_type(str(row[2])), str(row[3])) for row in rows}
 
