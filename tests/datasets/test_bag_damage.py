@@ -85,7 +85,7 @@ def test_an_mcap_without_footer_is_whole_and_says_that_it_was_not_closed(tmp_pat
     assert open_dataset(str(path)).problems == {"mcap.mcap: not closed by its recorder": 1}
 
 
-@pytest.mark.parametrize("kind", ["bag", "bag-lz4", "mcap-zstd"])
+@pytest.mark.parametrize("kind", ["bag", "bag-lz4", "mcap", "mcap-zstd"])
 def test_what_lies_behind_damage_in_the_middle_is_found_again(kind: str, tmp_path: Path) -> None:
     path = bag_of(tmp_path, kind, frames=1500)
     whole = len(frames_of(path))

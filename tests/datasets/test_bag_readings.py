@@ -168,3 +168,17 @@ JOINTS = {"left": "a", "right": "b", "radius_m": 1.0}
 def test_settings_that_do_not_fit_a_bag_are_refused(table: dict[str, Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=words):
         sensor_setup({"sensors": {"it": table}}, "cart.toml", tmp_path)
+
+
+def test_inertial_samples_of_a_bag_can_be_calibrated_with(tmp_path: Path) -> None:
+    from vislam.calibration.inertial.tables import read_field, read_inertial
+
+    types = types_of("mcap")
+    out = [Message(T0 + i, "/imu", types.imu(T0 + i, [i, 0, 0, 0, 0, 9.8])) for i in range(200)]
+    out += [Message(T0 + i, "/mag", types.field(T0 + i, [i * 1e-6, 0, 0])) for i in range(150)]
+    bag = write_bag(tmp_path, "mcap", out)
+    for source in (bag, next(bag.glob("*.mcap"))):
+        assert read_inertial(source).values[:, 0].tolist() == list(range(200))
+        assert np.allclose(read_field(source).values[:, 0], np.arange(150))
+    with pytest.raises(DataError, match="0 usable rows"):
+        read_field(write_bag(tmp_path, "mcap", out[:200], name="without"))

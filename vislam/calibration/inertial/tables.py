@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.datasets import survey
-from vislam.datasets.tables import MAX_FILE_BYTES, Problems, check_size, in_time_order, read_numbers
+from vislam.datasets.bags import is_bag
+from vislam.datasets.tables import MAX_FILE_BYTES, Problems, Row, check_size, in_time_order, read_numbers
 
 _NS = 1e-9
 _MIN_ROWS = 100  # fewer are no recording
@@ -69,16 +71,22 @@ def read_field(source: Path) -> Table:
 
 
 def _read(source: Path, kind: str, usual: str, columns: int) -> Table:
-    path = source
-    if not source.is_file():
-        found = getattr(survey(str(source)), kind)
-        if found is None:
-            raise DataError(f"{source} has no {usual}; record one with `vislam record`, see docs/formats.md")
-        path = found
-    check_size(path, MAX_FILE_BYTES)
-    problems = Problems()
+    path, problems = source, Problems()
+    rows: Iterator[Row[list[float]]] | None = None
+    if not source.is_file() or is_bag(source):
+        recording = survey(str(source))
+        if recording.streams is not None:
+            rows = recording.imu_rows(problems) if kind == "imu_file" else recording.mag_rows(problems)
+        else:
+            found = getattr(recording, kind)
+            if found is None:
+                raise DataError(f"{source} has no {usual}; record one with `vislam record`, see docs/formats.md")
+            path = found
+    if rows is None:
+        check_size(path, MAX_FILE_BYTES)
+        rows = read_numbers(path, columns, problems)
     stamps, numbers = array("q"), array("d")  # a list of lists would take ten times the memory
-    for t_ns, row in in_time_order(read_numbers(path, columns, problems), problems, path.parent.name):
+    for t_ns, row in in_time_order(rows, problems, path.parent.name):
         stamps.append(t_ns)
         numbers.extend(row)
     if len(stamps) < _MIN_ROWS:

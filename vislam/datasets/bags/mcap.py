@@ -1,4 +1,7 @@
-"""MCAP files, read front to back: as with rosbag 1 the index is not asked, so a file without one is read alike."""
+"""MCAP files, read front to back: as with rosbag 1 the index is not asked, so a file without one is read alike.
+
+Only behind damage the index says where to go on, if it is there and what it says is true.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,9 @@ from vislam.datasets.bags.stored import (
 from vislam.datasets.tables import Problems
 
 MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _DATA_END = 2, 3, 4, 5, 6, 8, 15
+_FOOTER_BYTES = 37  # with the mark at the file's end
+_MOST_INDEXED = 1_000_000
 _MOST_RECORD_BYTES = 2**22  # of a schema or channel
 _RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -119,7 +124,13 @@ class Mcap:
         return out, whole and len(data) == chunk.length
 
     def _next_chunk(self, at: int) -> int:
-        """Return where the next packed chunk begins; the file's end when there is none."""
+        """Return where the next chunk begins, by the index if there is one; the file's end when there is none.
+
+        Without an index only packed chunks are found.
+        """
+        indexed = [begin for begin in self._indexed_chunks() if begin >= at and self._is_chunk(begin)]
+        if indexed:
+            return min(indexed)
         before = _RECORD.size + _CHUNK_HEAD.size - 4  # in front of the name of its method
         while at < self._bytes.size:
             block = self._bytes.fetch(at, _BLOCK_BYTES)
@@ -130,13 +141,31 @@ class Mcap:
             at += len(block) - before - 8 if len(block) == _BLOCK_BYTES else len(block)
         return self._bytes.size
 
+    def _indexed_chunks(self) -> Iterator[int]:
+        """Yield where chunks begin as the index at the file's end says, as far as it can be read."""
+        footer = self._bytes.fetch(self._bytes.size - _FOOTER_BYTES, _FOOTER_BYTES)
+        if len(footer) < _FOOTER_BYTES or footer[0] != _FOOTER:
+            return
+        at = int(_U64.unpack_from(footer, _RECORD.size)[0])
+        for _ in range(_MOST_INDEXED):
+            try:
+                op, data_at, length = _record(self._bytes, at)
+            except DamagedError:
+                return
+            if op == _FOOTER:
+                return
+            if op == _CHUNK_INDEX and len(place := self._bytes.read(data_at + 16, 8)) == 8:
+                yield int(_U64.unpack(place)[0])
+            at = data_at + length
+
     def _is_chunk(self, at: int) -> bool:
         try:
             op, data_at, length = _record(self._bytes, at)
             chunk = _chunk_head(self._bytes.read(data_at, _MOST_HEAD_BYTES), data_at)
         except DamagedError:
             return False
-        return op == _CHUNK and chunk.length <= length and chunk.unpacked_length <= MOST_CHUNK_BYTES
+        known = chunk.method in ("", "zstd", "lz4")
+        return op == _CHUNK and known and chunk.length <= length and chunk.unpacked_length <= MOST_CHUNK_BYTES
 
 
 def _walk(reader: Bytes | FileBytes, at: int, end: int, origin: tuple[int, int], known: _Known) -> Iterator[Found]:
