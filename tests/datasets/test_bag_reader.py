@@ -158,6 +158,18 @@ def test_what_a_bag_lacks_is_named_with_the_option_that_gives_it(tmp_path: Path,
     assert sum(f.severity == "warning" and "--calibration" in f.what for f in findings) == 2
 
 
+def test_the_noise_may_stand_beside_the_bag(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", from_asl(write_asl(tmp_path / "asl"), types_of("mcap")))
+    (tmp_path / "drive.imu.yaml").write_text(IMU_YAML)
+    noise = open_dataset(str(path)).imu_noise
+    assert noise is not None
+    assert noise.rate_hz == 200.0
+    file = next(path.glob("*.mcap"))
+    (path / f"{file.stem}.imu.yaml").write_text("rate_hz: 200\n")
+    with pytest.raises(DataError, match=r"imu.yaml: no 'gyroscope_noise_density'"):
+        open_dataset(str(file))
+
+
 def test_the_extra_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vislam.datasets.bags import surveying
 
@@ -200,6 +212,9 @@ def bayer(pattern: str) -> np.ndarray:
         ("rgb8", COLOR, COLOR[..., ::-1]),
         ("bgra8", FOUR, FOUR[..., :3]),
         ("rgba8", FOUR, FOUR[..., 2::-1]),
+        ("bgr16", COLOR.astype(np.uint16) * 256 + 77, COLOR),
+        ("rgb16", COLOR.astype(np.uint16) * 256 + 77, COLOR[..., ::-1]),
+        ("bayer_rggb16", bayer("rggb").astype(np.uint16) * 256 + 9, np.full((HEIGHT, WIDTH, 3), (50, 100, 200))),
         *(
             (f"bayer_{p}8", bayer(p), np.full((HEIGHT, WIDTH, 3), (50, 100, 200)))
             for p in ("rggb", "bggr", "gbrg", "grbg")
@@ -226,6 +241,18 @@ def test_images_of_every_encoding(
             inner = (slice(2, -2), slice(2, -2))  # a pattern has no neighbours at the edge
             assert np.array_equal(frame.color[inner], np.asarray(bgr, np.uint8)[inner])
             assert np.array_equal(frame.images[0], cv2.cvtColor(frame.color, cv2.COLOR_BGR2GRAY))
+
+
+@pytest.mark.parametrize(("encoding", "grey_at"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
+def test_images_of_webcams(encoding: str, grey_at: int, tmp_path: Path) -> None:
+    types = types_of("mcap")
+    pixels = np.full((HEIGHT, WIDTH, 2), 128, np.uint8)
+    ramp = np.linspace(16, 235, WIDTH)
+    pixels[..., grey_at] = ramp
+    messages = images_of(types, count=1)
+    messages[1] = Message(BEGIN_NS, "/cam0/image_raw", types.image(BEGIN_NS, pixels, encoding))
+    (frame,) = open_dataset(str(write_bag(tmp_path, "mcap", messages))).events()
+    assert np.allclose(frame.images[0], (ramp.astype(np.uint8) - 16.0) * 255.0 / 219.0, atol=1.5)
 
 
 @pytest.mark.parametrize("format_", ["jpeg", "png"])

@@ -33,9 +33,11 @@ from vislam.datasets.calibrated import joined_rig
 from vislam.datasets.camera_files import ros_camera
 from vislam.datasets.formats.truth import Truth, trajectory_of
 from vislam.datasets.images import ImageList
+from vislam.datasets.imu_files import read_noise
 from vislam.datasets.plausibility import imu_facts, unit_doubt
 from vislam.datasets.stream import KnownCamera, Survey, TopicSummary
 from vislam.datasets.tables import Problems, Row, in_time_order
+from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
 
 _LOOKED_AT_NS = 20_000_000_000  # of the inertial samples, to see whether their units can be
@@ -82,10 +84,9 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
     )
     if not images:
         found.errors.append(DataError(f"{path} has no camera images that can be read; {topics_there(listing)}"))
+    noise = None
     if choice.imu is not None:
-        found.lacking["imu_noise"] = DataError(
-            f"{path}: no bag tells how noisy its IMU ({choice.imu.topic.name}) is; give {_NOISE}, see docs/formats.md"
-        )
+        noise = _noise(path, choice.imu, found)
         _check_imu(streams, [listed for listed, _ in images], path, found)
     body = _frame_id(listing, choice.imu) or (choice.cameras[0].frame if choice.cameras else "")
     known = _known_cameras(listing, choice, frames, body, found)
@@ -101,6 +102,7 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         depth=None if depth is None else depth[0],
         rig=rig,
         streams=streams,
+        imu_noise=noise,
         R_body_mag=np.eye(3) if T_body_mag is None else T_body_mag[:3, :3],
         truth=None if choice.truth is None else _truth(bag, choice.truth, frames, body),
         topics=_topics(listing, choice.told() | _places(listing)),
@@ -109,6 +111,22 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         problems=found.problems,
         errors=tuple(found.errors),
     )
+
+
+def _noise(path: Path, imu: Entry, found: _Found) -> ImuNoise | None:
+    """Return the noise model in the file beside a bag; without one it is lacking."""
+    beside = path.with_name(f"{path.name if path.is_dir() else path.stem}.imu.yaml")
+    if beside.is_file():
+        try:
+            return read_noise(beside)
+        except DataError as error:
+            found.lacking["imu_noise"] = error
+            return None
+    found.lacking["imu_noise"] = DataError(
+        f"{path}: no bag tells how noisy its IMU ({imu.topic.name}) is; give {_NOISE}, or write {beside}; "
+        "see docs/formats.md"
+    )
+    return None
 
 
 def _topics(listing: Listing, told: dict[str, str]) -> tuple[TopicSummary, ...]:
