@@ -96,6 +96,7 @@ def _writers(run_out: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     yield "posegraph", "posegraph {data}/graph.g2o --out {place}/graph", ()
     yield "map", "map {place}/run", ("run",)
     yield "report", "report {place}/run", ("run",)
+    yield "export", "export {data}/run --mcap {place}/run.mcap", ()
     yield "vocabulary", "vocabulary {data}/world --features 200 --out {place}/words.npz", ()
     yield "board", "calibrate board --out {place}/board", ()
     yield "record", "record --imu serial:{data}/tty --camera none --seconds 1 --min-free-gb 0 --out {place}/ride", ()
@@ -172,7 +173,8 @@ def _bad_files() -> Iterator[Case]:
         yield Case(f"settings are {what}: run", f"run {_WORLD} --config {path} {here}", (2, 3), is_short=True)
         yield Case(f"sensors are {what}: live", f"live --sensors {path} --source gy85+none {here}", (2, 3))
         for verb in ("run {} {here}", "doctor {}", "eval {}", "optimize {}", "posegraph {}", "map {}", "loops {}",
-                     "report {}", "compare {}", "vocabulary {} --out {place}/w.npz", "run --resume {}",
+                     "report {}", "export {} --mcap {place}/run.mcap", "compare {}",
+                     "vocabulary {} --out {place}/w.npz", "run --resume {}",
                      "live --resume {}", "calibrate noise {} --out {place}/c"):  # fmt: skip
             command = verb.replace("{here}", here).replace("{}", path)
             yield Case(f"input is {what}: {verb.split(' {')[0]}", command, (2, 3))

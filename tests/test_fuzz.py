@@ -16,6 +16,7 @@ from vislam.config import load
 from vislam.core.errors import DataError, UsageError, VislamError, printable
 from vislam.core.reading import parse_json, read_bytes
 from vislam.datasets.calibration import load_yaml
+from vislam.datasets.telemetry.mp4 import read_tracks
 from vislam.experiment.plan import load_plan
 from vislam.loop.table import read_loops
 from vislam.loop.words.orbslam import read_orbslam
@@ -94,7 +95,7 @@ def test_what_is_quoted_never_reaches_the_terminal_as_it_is():
 
 READERS = (
     read_trajectory, load_yaml, load, load_plan, read_orbslam, Vocabulary.load, read_octree, read_pcd, read_ply,
-    read_loops, Session,
+    read_loops, Session, read_tracks,
 )  # fmt: skip
 
 

@@ -91,7 +91,7 @@ WRONG = {
     "[sensors.a]\nkind='height'\ngate_probability=1.0": "gate_probability is 1",
     "[sensors.a]\nkind='height'\nfile='x.nmea'": "option format: nmea holds fixes",
     "[sensors.a]\nkind='height'\nfile='x'\nformat='xml'": (
-        "option format: Input should be 'csv', 'nmea', 'ubx' or 'bag'"
+        "option format: Input should be 'csv', 'nmea', 'ubx', 'bag' or 'gpmf'"
     ),
     "[sensors.a]\nkind='twist'\nfile='x'\nticks={ticks_per_turn=1,radius_m=1}": "option ticks: counts are those of",
     "[sensors.a]\nkind='wheels'\nfile='x'\nticks={radius_m=1}": "option ticks.ticks_per_turn: Field required",

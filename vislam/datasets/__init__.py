@@ -13,7 +13,7 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.recording import Recording
 from vislam.datasets import bags
 from vislam.datasets.calibrated import calibrated
-from vislam.datasets.formats import asl, kitti, tum, video
+from vislam.datasets.formats import asl, kitti, phone, tum, video
 from vislam.datasets.stream import FileRecording, Survey
 
 __all__ = ["READERS", "Reader", "open_dataset", "survey"]
@@ -33,7 +33,9 @@ class Reader(Protocol):
         ...
 
 
-READERS: dict[str, Reader] = {"euroc": asl, "tum": tum, "kitti": kitti, "video": video, "bag": bags}
+READERS: dict[str, Reader] = {
+    "euroc": asl, "tum": tum, "kitti": kitti, "video": video, "phone": phone, "bag": bags,
+}  # fmt: skip
 
 
 def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Recording:

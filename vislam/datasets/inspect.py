@@ -110,6 +110,7 @@ class _Inspector:
 
     def run(self, uri: str) -> Inspection:
         found = self._found
+        self._findings += found.findings
         frames = frame_table(found, self._problems) if found.cameras else None
         self._check_cameras(frames)
         facts = self._check_imu()

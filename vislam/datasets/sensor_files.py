@@ -22,6 +22,7 @@ from vislam.datasets.tables import (
     parse_seconds,
     read_rows,
 )
+from vislam.datasets.telemetry import open_telemetry
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import LocalFrame
 from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
@@ -49,7 +50,7 @@ def sensor_readings(name: str, sensor: Configured, file: SensorFile, problems: P
     elif file.format == "csv":
         readings = _counts(name, file, problems) if file.ticks else _table(name, sensor, file, problems)
     else:
-        readings = {"nmea": _nmea, "ubx": _ubx}[file.format](FixReadings(name, file.gnss), file, problems)
+        readings = _FIXES[file.format](FixReadings(name, file.gnss), file, problems)
     rows = ((reading.t_ns, reading) for reading in readings)
     shift_ns = round(file.offset_s * 1e9)
     for t_ns, reading in in_time_order(rows, problems, f"{file.path.parent.name}/{file.path.name}", keep_equal=True):
@@ -61,13 +62,13 @@ def local_frame(file: SensorFile) -> LocalFrame:
 
     Its datum is the one that was told, or the first fix that is good enough. Raises DataError where there is none.
     """
-    made, readers = FixReadings("", file.gnss), {"nmea": _nmea, "ubx": _ubx}
+    made = FixReadings("", file.gnss)
     if made.frame is None and file.format == "bag":
         from vislam.datasets.bags import first_fix
 
         first_fix(made, file)
-    if made.frame is None and file.format in readers:
-        next(readers[file.format](made, file, Problems()), None)
+    if made.frame is None and file.format in _FIXES:
+        next(_FIXES[file.format](made, file, Problems()), None)
     if made.frame is None:
         raise DataError(f"{file.path}: no datum is told and no fix is good enough to be one")
     return made.frame
@@ -168,6 +169,17 @@ def _ubx(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Re
     place = f"{file.path.parent.name}/{file.path.name}"
     problems.count(f"{place}: damaged messages", times=fixes.damaged)
     problems.count(f"{place}: fixes before any date", times=fixes.undated)
+
+
+def _gpmf(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    telemetry = open_telemetry(file.path)
+    if telemetry is None or not telemetry.fix_count:
+        raise DataError(f"{file.path}: no GNSS in it; switch the camera's GPS on, or name a .nmea, .ubx or .csv file")
+    for fix in telemetry.fixes(problems):
+        yield from _made(fix, made, file, problems)
+
+
+_FIXES = {"nmea": _nmea, "ubx": _ubx, "gpmf": _gpmf}
 
 
 def _made(fix: Fix | None, made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from vislam.config import ImuConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
+from vislam.core.findings import Finding
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.datasets.formats.truth import Truth
 from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, decode_ahead, match_by_time, probe
+from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoader
 from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -87,6 +89,8 @@ class Survey:
     video: Path | None = None  # the frames come from here; the files of cam0 are frame numbers
     rig: Rig | None = None
     imu_file: Path | None = None
+    samples: ImuRows | None = None  # inertial ones, where there is no table of them
+    findings: tuple[Finding, ...] = ()  # what doctor tells of its parts
     imu_noise: ImuNoise | None = None
     imu_calibration: ImuCalibration | None = None  # of raw samples; None: they are calibrated
     mag_file: Path | None = None
@@ -103,12 +107,15 @@ class Survey:
     @property
     def has_imu(self) -> bool:
         """Whether there are inertial samples."""
-        return self.imu_file is not None or (self.streams is not None and self.streams.has_imu)
+        has = self.streams is not None and self.streams.has_imu
+        return has or self.imu_file is not None or self.samples is not None
 
     def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         """Yield stamp, rates and forces as recorded, without calibration; raises DataError when most are unusable."""
         if self.streams is not None:
             return self.streams.imu_rows(problems)
+        if self.samples is not None:
+            return self.samples.imu_rows(problems)
         return iter(()) if self.imu_file is None else read_numbers(self.imu_file, 6, problems)
 
     def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:

@@ -155,7 +155,9 @@ def read_names(
     return read_rows(path, parse, problems, separator, needs_line_end=False)
 
 
-def read_frame_stamps(path: Path, problems: Problems) -> Iterator[Row[str]]:
+def read_frame_stamps(
+    path: Path, problems: Problems, parse_stamp: Callable[[str], int] = parse_ns
+) -> Iterator[Row[str]]:
     """Yield stamp and frame number of each row of a video's stamp file: the nth row belongs to the nth frame.
 
     Rows that cannot be used are skipped but keep their frame. Raises DataError as `read_names` does.
@@ -166,7 +168,7 @@ def read_frame_stamps(path: Path, problems: Problems) -> Iterator[Row[str]]:
         nonlocal frame
         if any(map(str.isdigit, fields[0])):  # else it is a header
             frame += 1
-        return parse_ns(fields[0]), str(frame)
+        return parse_stamp(fields[0]), str(frame)
 
     check_size(path, MAX_FILE_BYTES)
     return read_rows(path, parse, problems, ",", needs_line_end=True)

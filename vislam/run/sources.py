@@ -29,7 +29,8 @@ _SENSORS = re.compile(rf"virtual-cart(,|$)|({'|'.join(INERTIAL_KINDS)})(:[^+]*)?
 def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None = None) -> Recording:
     """Open a recording on disk or a simulated one.
 
-    On disk: `euroc:PATH`, `tum:PATH`, `kitti:PATH`, `video:PATH`, `bag:PATH`, or a bare path. Rendered: `sim:WORLD`.
+    On disk: `euroc:PATH`, `tum:PATH`, `kitti:PATH`, `video:PATH`, `phone:PATH`, `bag:PATH`, or a bare path. Rendered:
+    `sim:WORLD`.
     Vision simulated as points, on a world's motion or on the real IMU of a recording with truth: `points:WORLD` or
     `points:PATH`. Real tracks without images: `eqvio:FILE`, or `eqvio:gtsam` for the table that GTSAM's package brings.
     To bags and to all that are not on disk options are appended as `,option=value`. Calibration files that are named

@@ -25,10 +25,11 @@ from vislam.sensors.ticks import TicksSettings
 MOST_SENSORS = 64
 _MOST_BYTES = 2**20
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
-FileFormat = Literal["csv", "nmea", "ubx", "bag"]
+FileFormat = Literal["csv", "nmea", "ubx", "bag", "gpmf"]
 _FIX_COLUMNS = ("east_m", "north_m", "up_m")
 _FORMATS: dict[str, FileFormat] = {  # all else is a table
     ".nmea": "nmea", ".ubx": "ubx", ".bag": "bag", ".mcap": "bag", ".db3": "bag",
+    ".mp4": "gpmf", ".lrv": "gpmf", ".360": "gpmf",
 }  # fmt: skip
 
 

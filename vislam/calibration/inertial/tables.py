@@ -15,6 +15,7 @@ from vislam.core.messages import Array
 from vislam.datasets import survey
 from vislam.datasets.bags import is_bag
 from vislam.datasets.tables import MAX_FILE_BYTES, Problems, Row, check_size, in_time_order, read_numbers
+from vislam.datasets.telemetry import open_telemetry
 
 _NS = 1e-9
 _MIN_ROWS = 100  # fewer are no recording
@@ -57,7 +58,7 @@ class Table:
 
 
 def read_inertial(source: Path) -> Table:
-    """Return rates (rad/s) and forces (m/s^2) [N, 6] of a recording, or of a csv file like `imu0/data.csv`.
+    """Return rates (rad/s) and forces (m/s^2) [N, 6] of a recording, a GoPro's film or a csv file as `imu0/data.csv`.
 
     What the recording's own calibration says is not applied. Raises DataError when there is no such table or it is
     too short.
@@ -72,17 +73,13 @@ def read_field(source: Path) -> Table:
 
 def _read(source: Path, kind: str, usual: str, columns: int) -> Table:
     path, problems = source, Problems()
-    rows: Iterator[Row[list[float]]] | None = None
-    if not source.is_file() or is_bag(source):
-        recording = survey(str(source))
-        if recording.streams is not None:
-            rows = recording.imu_rows(problems) if kind == "imu_file" else recording.mag_rows(problems)
-        else:
-            found = getattr(recording, kind)
+    rows = _rows(source, kind, problems)
+    if rows is None:
+        if not source.is_file():
+            found = getattr(survey(str(source)), kind)
             if found is None:
                 raise DataError(f"{source} has no {usual}; record one with `vislam record`, see docs/formats.md")
             path = found
-    if rows is None:
         check_size(path, MAX_FILE_BYTES)
         rows = read_numbers(path, columns, problems)
     stamps, numbers = array("q"), array("d")  # a list of lists would take ten times the memory
@@ -93,3 +90,14 @@ def _read(source: Path, kind: str, usual: str, columns: int) -> Table:
         raise DataError(f"{path} has {len(stamps)} usable rows, {_MIN_ROWS} are the least that can be used")
     t = np.array(stamps, dtype=np.int64)
     return Table(path, t, np.array(numbers, dtype=np.float64).reshape(-1, columns), dict(problems))
+
+
+def _rows(source: Path, kind: str, problems: Problems) -> Iterator[Row[list[float]]] | None:
+    """Return the rows of a bag, a film or a phone's folder, which have no table of their own; None of others."""
+    if source.is_file() and not is_bag(source):
+        telemetry = open_telemetry(source) if kind == "imu_file" else None
+        return telemetry.imu_rows(problems) if telemetry is not None and telemetry.has_imu else None
+    found = survey(str(source))
+    if found.streams is not None:
+        return found.imu_rows(problems) if kind == "imu_file" else found.mag_rows(problems)
+    return found.imu_rows(problems) if kind == "imu_file" and found.samples is not None else None

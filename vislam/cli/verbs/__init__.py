@@ -56,5 +56,9 @@ VERBS = {
         "vislam live --source virtual-cart --out runs/cart",
     ),
     "report": Verb("write report.html of a run again", "vislam report runs/desk"),
+    "export": Verb(
+        "write the results of a run as MCAP, for ROS 2, Foxglove and rosbags",
+        "vislam export runs/desk --mcap desk.mcap",
+    ),
     "completion": Verb("print what makes bash or zsh complete all this", "vislam completion bash >> ~/.bashrc", 0),
 }

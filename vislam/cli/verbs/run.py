@@ -23,8 +23,9 @@ class RunOptions:
     """Options of `vislam run`."""
 
     source: Positional[str]
-    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, bag:PATH[,cam0=/topic,imu=/topic], sim:WORLD[,option=value],
-    points:WORLD or points:PATH[,option=value], eqvio:FILE[,option=value], or a path, recognised by its contents"""
+    """euroc:PATH, tum:PATH, kitti:PATH, video:PATH, phone:PATH, bag:PATH[,cam0=/topic,imu=/topic],
+    sim:WORLD[,option=value], points:WORLD or points:PATH[,option=value], eqvio:FILE[,option=value], or a path,
+    recognised by its contents"""
     out: Path
     """Folder to make for everything that the run leaves"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)

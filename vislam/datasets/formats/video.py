@@ -2,10 +2,14 @@
 
 For `ride.mp4`: `ride.csv` (one row a frame, stamp in ns), `ride.yaml` (a camera's sensor file), and, if there is an
 IMU, `ride.imu.csv` and `ride.imu.yaml` in the ASL layout. Every stamp must be from the clock that stamps the IMU.
+
+An MP4 without `ride.csv` has its frames stamped by its own table of times. Of a GoPro's, the IMU in its telemetry is
+by that clock, too, and is read where `ride.imu.yaml` says its noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +17,14 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.core.findings import Finding
 from vislam.core.geometry import invert
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList, check_size_px
 from vislam.datasets.loaders import video_facts
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import Problems, read_frame_stamps
+from vislam.datasets.tables import Problems, Row, read_frame_stamps
+from vislam.datasets.telemetry import Telemetry, frame_times_ns, is_mp4, open_telemetry
 from vislam.imu import ImuNoise
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
@@ -36,10 +42,15 @@ def survey(path: Path) -> Survey:
     errors: list[DataError] = []
     imu_file, imu_noise, T_body_imu = None, None, np.eye(4)
     cameras: tuple[ImageList, ...] = ()
-    rig = None
+    rig, telemetry = None, _telemetry(path)
+    findings = [] if telemetry is None else telemetry.findings()
+    if (why := _why_unused(path)) and telemetry is not None and telemetry.has_imu:
+        findings.append(Finding("warning", f"the IMU of the telemetry is not used: {why}", path.name, ""))
+    samples = telemetry if telemetry is not None and telemetry.has_imu and not why else None
     try:
         if path.with_suffix(".imu.csv").is_file():
             imu_file = path.with_suffix(".imu.csv")
+        if imu_file is not None or samples is not None:
             imu_noise, T_body_imu = _imu(path)
         if not path.with_suffix(".yaml").is_file():
             raise DataError(f"{path.with_suffix('.yaml')} is missing; write the calibration into it: {CAMERA_EXAMPLE}")
@@ -64,7 +75,9 @@ def survey(path: Path) -> Survey:
         video=path,
         rig=rig,
         imu_file=imu_file,
+        samples=samples,
         imu_noise=imu_noise,
+        findings=tuple(findings),
         problems=problems,
         errors=tuple(errors),
     )
@@ -79,6 +92,31 @@ def _imu(path: Path) -> tuple[ImuNoise, NDArray[np.float64]]:
 
 def _frames(path: Path, problems: Problems) -> ImageList:
     stamps = path.with_suffix(".csv")
-    if not stamps.is_file():
-        raise DataError(f"{stamps} is missing; write one row a frame into it: the time of its exposure in ns")
-    return image_list("cam0", path.parent, read_frame_stamps(stamps, problems), problems)
+    if stamps.is_file():
+        return image_list("cam0", path.parent, read_frame_stamps(stamps, problems), problems)
+    if is_mp4(path) and not path.with_suffix(".imu.csv").is_file():  # that IMU would have another clock
+        return image_list("cam0", path.parent, _own_times(path), problems)
+    raise DataError(f"{stamps} is missing; write one row a frame into it: the time of its exposure in ns")
+
+
+def _own_times(path: Path) -> Iterator[Row[str]]:
+    return ((t_ns, str(frame)) for frame, t_ns in enumerate(frame_times_ns(path).tolist()))
+
+
+def _telemetry(path: Path) -> Telemetry | None:
+    """Return a GoPro's telemetry; what is wrong with the file is told where its frames are looked for."""
+    try:
+        return open_telemetry(path)
+    except DataError:
+        return None
+
+
+def _why_unused(path: Path) -> str:
+    """Return why the IMU of a telemetry is left aside, empty where it is not."""
+    if path.with_suffix(".imu.csv").is_file():
+        return f"{path.with_suffix('.imu.csv').name} takes its place"
+    if path.with_suffix(".csv").is_file():
+        return f"its clock is the video's, and {path.with_suffix('.csv').name} stamps the frames by another"
+    if not path.with_suffix(".imu.yaml").is_file():
+        return f"write its noise into {path.with_suffix('.imu.yaml').name}, see docs/formats.md"
+    return ""

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.files import replacing
 from vislam.core.jit import njit
+from vislam.core.reading import read_bytes, read_text
 from vislam.mapping.octree import Octree
 
 _OCCUPIED_SHADE, _FREE_SHADE, _UNKNOWN_SHADE = 0, 254, 205  # map_saver's
 _MAX_CELLS = 1 << 28
+_MAX_DESCRIPTION_BYTES = 1 << 16
 _LARGE_SHARE = 0.5  # of the largest horizontal surface: from there on a level may be the floor
 
 
@@ -92,3 +95,44 @@ def write_grid(folder: Path, grid: Grid, name: str = "grid") -> tuple[Path, Path
     with replacing(description) as file:
         file.write(text.encode())
     return image, description
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridImage:
+    """What the files of a grid say: cells as in `Grid`; they know no floor."""
+
+    cells: NDArray[np.int8]  # [rows, columns]
+    resolution_m: float
+    origin_m: tuple[float, float]
+
+
+def read_grid(folder: Path, name: str = "grid") -> GridImage:
+    """Return what `write_grid` wrote as `NAME.pgm` and `NAME.yaml`; raises DataError when they are something else."""
+    image, description = folder / f"{name}.pgm", folder / f"{name}.yaml"
+    try:
+        told = yaml.safe_load(read_text(description, _MAX_DESCRIPTION_BYTES))
+        resolution, origin = float(told["resolution"]), [float(value) for value in told["origin"]]
+        if not (np.isfinite([resolution, *origin]).all() and resolution > 0.0 and len(origin) == 3):
+            raise ValueError("resolution or origin cannot be")
+    except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"{description} cannot be used: {reason}; `vislam map RUN` writes it again") from error
+    try:
+        shades = _read_pgm(read_bytes(image, _MAX_CELLS + _MAX_DESCRIPTION_BYTES))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{image} cannot be used: {error}; `vislam map RUN` writes it again") from error
+    cells = np.full(shades.shape, -1, np.int8)
+    cells[shades == _FREE_SHADE] = 0
+    cells[shades == _OCCUPIED_SHADE] = 1
+    return GridImage(cells[::-1], resolution, (origin[0], origin[1]))
+
+
+def _read_pgm(content: bytes) -> NDArray[np.uint8]:
+    """Return the shades [rows, columns] of a binary PGM with one comment, as `write_grid` makes it."""
+    magic, comment, size, depth, *rest = content.split(b"\n", 4)
+    columns, rows = map(int, size.split())
+    if magic != b"P5" or not comment.startswith(b"#") or depth != b"255" or min(columns, rows) < 1:
+        raise ValueError("no binary PGM with shades to 255 and one comment")
+    if not rest or len(rest[0]) != columns * rows:
+        raise ValueError(f"{columns} x {rows} shades are promised, {len(rest[0]) if rest else 0} bytes follow")
+    return np.frombuffer(rest[0], np.uint8).reshape(rows, columns)

@@ -1,0 +1,333 @@
+"""What apps on phones write: rates, forces and frames as tables beside a film.
+
+Three descriptions are read, each recognised by the names of its files and columns:
+
+- Sensor Logger (tszheichoi.com): `Gyroscope.csv`, `TotalAcceleration.csv` or `Accelerometer.csv` with `Gravity.csv`;
+- the Mobile AR Sensor (MARS) logger: `gyro_accel.csv`, `frame_timestamps.txt` or `movie_metadata.csv`, `movie.mp4`;
+- ADVIO (Cortés et al., ECCV 2018): `gyro.csv`, `accelerometer.csv`, `frames.csv`, `frames.mov`.
+
+The camera's calibration is `camera.yaml` in the folder, the IMU's noise `imu.yaml`.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.findings import Finding
+from vislam.core.geometry import invert
+from vislam.core.reading import open_file, read_text
+from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
+from vislam.datasets.images import ImageList, check_size_px
+from vislam.datasets.imu_pairs import ImuRows, Rows, paired
+from vislam.datasets.loaders import video_facts
+from vislam.datasets.stream import Survey, image_list
+from vislam.datasets.tables import (
+    MAX_LINE_BYTES,
+    Problems,
+    Row,
+    in_time_order,
+    parse_ns,
+    parse_seconds,
+    read_frame_stamps,
+    read_rows,
+)
+
+LOOKS_FOR = (
+    "Gyroscope.csv of Sensor Logger, gyro_accel.csv of the MARS logger, or gyro.csv, accelerometer.csv and frames.mov"
+)
+_STANDARD_GRAVITY_M_S2 = 9.80665
+_HEADER_LINES = 5
+_MOST_METADATA_BYTES = 2**16
+_LOOKED_AT = 500  # forces, to tell g from m/s^2
+_AXES = ("x", "y", "z")
+_RATES = ("gx[rad/s]", "gy[rad/s]", "gz[rad/s]")
+_FORCES = ("ax[m/s^2]", "ay[m/s^2]", "az[m/s^2]")
+Logger = Literal["Sensor Logger", "MARS logger", "ADVIO"]
+
+
+def recognises(path: Path) -> bool:
+    """Return whether a folder holds the tables of a logger that is known."""
+    return path.is_dir() and _logger(path) is not None
+
+
+def survey(path: Path) -> Survey:
+    """Return what a folder of a phone's recording holds; what is wrong with it is in `errors`."""
+    problems, errors = Problems(), list[DataError]()
+    samples: ImuRows | None = None
+    findings: list[Finding] = []
+    imu_noise, T_body_imu, rig, video = None, np.eye(4), None, None
+    cameras: tuple[ImageList, ...] = ()
+    logger = _logger(path)
+    try:
+        samples, findings = _samples(path, logger)
+        imu_noise, T_body_imu = read_imu(_asked(path / "imu.yaml", "write the noise of the IMU into it"))
+    except DataError as error:
+        errors.append(error)
+    try:
+        file = read_camera(_asked(path / "camera.yaml", f"write the calibration into it: {CAMERA_EXAMPLE}"))
+        rig = Rig((file.camera,), (invert(T_body_imu) @ file.T_body_cam,))
+    except DataError as error:
+        errors.append(error)
+    try:
+        images, video = _frames(path, logger, problems)
+        cameras = (images,)
+        if video is not None:
+            size, frames = video_facts(video)
+            last = int(images.files[-1]) + 1 if images.files else 0
+            problems.count("video frame without a stamp", times=max(0, frames - last) if frames > 0 else 0)
+            if rig is not None:
+                check_size_px(size, rig.cameras[0], video)
+    except DataError as error:
+        errors.append(error)
+    return Survey(
+        format="phone", root=path, cameras=cameras, video=video, rig=rig, samples=samples, imu_noise=imu_noise,
+        findings=tuple(findings), problems=problems, errors=tuple(errors),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """Columns of a table: stamps and three numbers."""
+
+    path: Path
+    columns: tuple[int, ...]
+    stamp_column: int = 0
+    parse_stamp: Callable[[str], int] = parse_ns
+    factor: float = 1.0
+
+    def rows(self, problems: Problems) -> Rows:
+        def parse(fields: list[str]) -> Row[list[float]]:
+            if len(fields) <= max(self.stamp_column, *self.columns):
+                raise ValueError
+            numbers = [self.factor * float(fields[k]) for k in self.columns]
+            if not all(map(math.isfinite, numbers)):
+                raise ArithmeticError
+            return self.parse_stamp(fields[self.stamp_column].strip()), numbers
+
+        found = read_rows(self.path, parse, problems, ",", needs_line_end=True)
+        return in_time_order(found, problems, self.path.name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Rates and forces that were sampled apart; `gravity` is to be added to forces that are without it."""
+
+    rates: _Table
+    forces: _Table
+    gravity: _Table | None = None
+
+    def imu_rows(self, problems: Problems) -> Rows:
+        """Yield stamp, rates and forces, forces interpolated at the stamps of the rates."""
+        forces = self.forces.rows(problems)
+        if self.gravity is not None:
+            both = paired(forces, self.gravity.rows(problems), problems, f"{self.forces.path.name} with gravity")
+            forces = ((t_ns, [a + g for a, g in zip(row[:3], row[3:], strict=True)]) for t_ns, row in both)
+        return paired(self.rates.rows(problems), forces, problems, self.rates.path.parent.name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Whole:
+    """Rates and forces in one table."""
+
+    table: _Table
+
+    def imu_rows(self, problems: Problems) -> Rows:
+        """Yield stamp, rates and forces."""
+        return self.table.rows(problems)
+
+
+def _logger(path: Path) -> Logger | None:
+    """Return which logger wrote a folder."""
+    if {"time", "seconds_elapsed", *_AXES} <= {*_header(path / "Gyroscope.csv")}:
+        return "Sensor Logger"
+    if {*_RATES, *_FORCES} <= {*_header(path / "gyro_accel.csv")}:
+        return "MARS logger"
+    if all((path / name).is_file() for name in ("frames.mov", "frames.csv", "accelerometer.csv")) and _advio_rates(
+        path
+    ):
+        return "ADVIO"
+    return None
+
+
+def _advio_rates(path: Path) -> Path | None:
+    """Return the table of rates: `gyro.csv` in the archives, `gyroscope.csv` in their description."""
+    return next((path / name for name in ("gyro.csv", "gyroscope.csv") if (path / name).is_file()), None)
+
+
+def _header(path: Path) -> tuple[str, ...]:
+    """Return the names of a table's columns; empty where there is no such table, or none in its first lines."""
+    if not path.is_file():
+        return ()
+    try:
+        with open_file(path) as file:
+            for _ in range(_HEADER_LINES):
+                line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").strip(" #\r\n")
+                names = tuple(name.strip(' "') for name in line.split(","))
+                if len(names) >= 4 and not any(map(_is_number, names)):
+                    return names
+    except OSError:
+        return ()
+    return ()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _asked(path: Path, what: str) -> Path:
+    if not path.is_file():
+        raise DataError(f"{path} is missing; {what}, see docs/formats.md")
+    return path
+
+
+def _samples(path: Path, logger: Logger | None) -> tuple[ImuRows, list[Finding]]:
+    """Return the inertial samples and what doctor tells of them; raises DataError where a table is missing."""
+    if logger == "Sensor Logger":
+        return _of_sensor_logger(path)
+    if logger == "MARS logger":
+        table = path / "gyro_accel.csv"
+        names = _header(table)
+        columns = tuple(names.index(name) for name in (*_RATES, *_FORCES))
+        parse = _stamp_parser(names[0], table)
+        found = Finding("ok", "MARS logger: forces were interpolated at the stamps of the rates by the app", path.name)
+        return _Whole(_Table(table, columns, 0, parse)), [found]
+    return _of_advio(path)
+
+
+def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
+    platform, standardised = _platform(path)
+    told = f"Sensor Logger on {platform or 'a phone that it does not name'}"
+    # Apple tells forces of inertia: at rest gravity points down. Android, and the app where it standardises, the other
+    factor = -1.0 if platform == "ios" and not standardised else 1.0
+    rates = _of_axes(path / "Gyroscope.csv", 1.0)
+    if (path / "TotalAcceleration.csv").is_file():
+        forces = _of_axes(path / "TotalAcceleration.csv", factor)
+        what = f"{told}: TotalAcceleration.csv is interpolated at the stamps of Gyroscope.csv"
+        return _Pair(rates, forces), [Finding("ok", what, path.name)]
+    if not (path / "Accelerometer.csv").is_file():
+        raise DataError(
+            f"{path} holds neither TotalAcceleration.csv nor Accelerometer.csv; record the accelerometer, too"
+        )
+    if not (path / "Gravity.csv").is_file():
+        raise DataError(
+            f"{path / 'Accelerometer.csv'} is without gravity, and there is no Gravity.csv to add; record the sensor "
+            "Gravity, too"
+        )
+    if not platform:
+        raise DataError(
+            f"{path / 'Metadata.csv'} does not say the platform, on which the sign of Accelerometer.csv depends; copy "
+            "it from the recording"
+        )
+    forces, gravity = (_of_axes(path / name, factor) for name in ("Accelerometer.csv", "Gravity.csv"))
+    sign = ", negated as it is Apple's" if factor < 0.0 else ""
+    what = f"{told}: Accelerometer.csv and Gravity.csv are added{sign} and interpolated at the stamps of Gyroscope.csv"
+    return _Pair(rates, forces, gravity), [Finding("ok", what, path.name)]
+
+
+def _of_axes(path: Path, factor: float) -> _Table:
+    names = _header(path)
+    if not {"time", *_AXES} <= {*names}:
+        raise DataError(f"{path} lacks the columns time, x, y, z; it has {', '.join(names) or 'no header'}")
+    return _Table(path, tuple(names.index(axis) for axis in _AXES), names.index("time"), parse_ns, factor)
+
+
+def _platform(path: Path) -> tuple[str, bool]:
+    """Return the platform in Metadata.csv, empty where it is not told, and whether the app standardised its frames."""
+    file = path / "Metadata.csv"
+    if not file.is_file():
+        return "", False
+    try:
+        row = next(csv.DictReader(read_text(file, _MOST_METADATA_BYTES).splitlines()), {})
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{file} cannot be read: {error}; copy it again") from error
+    platform = (row.get("platform") or "").strip().lower()
+    return platform if platform in ("ios", "android") else "", (row.get("standardisation") or "").strip() == "true"
+
+
+def _of_advio(path: Path) -> tuple[ImuRows, list[Finding]]:
+    rates = _advio_rates(path)
+    assert rates is not None
+    forces = _Table(path / "accelerometer.csv", (1, 2, 3), 0, parse_seconds)
+    rows = forces.rows(Problems())
+    norms = [math.hypot(*row[1]) for row, _ in zip(rows, range(_LOOKED_AT), strict=False)]
+    usual = float(np.median(norms)) if norms else math.nan
+    in_g = usual < 0.5 * _STANDARD_GRAVITY_M_S2
+    unit = "g, as its description says" if in_g else "m/s^2, though its description says g"
+    what = (
+        f"ADVIO: accelerometer.csv of usually {usual:.2f} is taken as {unit}; interpolated at the stamps of the rates"
+    )
+    factor = _STANDARD_GRAVITY_M_S2 if in_g else 1.0
+    forces = _Table(forces.path, forces.columns, 0, parse_seconds, factor)
+    return _Pair(_Table(rates, (1, 2, 3), 0, parse_seconds), forces), [Finding("ok", what, path.name)]
+
+
+def _stamp_parser(name: str, path: Path) -> Callable[[str], int]:
+    """Return what reads stamps by the unit in the name of their column."""
+    if "[nanosec]" in name:
+        return parse_ns
+    if "[sec]" in name:
+        return parse_seconds
+    raise DataError(f"{path}: the unit of the stamps is not told in '{name[:40]}'; [nanosec] or [sec] is read")
+
+
+def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[ImageList, Path | None]:
+    """Return the frames and the film that they are in, None where they are images."""
+    if logger == "Sensor Logger":
+        return _sensor_logger_frames(path, problems)
+    parse: Callable[[str], int] = parse_seconds
+    video, stamps = path / "frames.mov", path / "frames.csv"
+    if logger == "MARS logger":
+        video = next(
+            (v for v in sorted(path.glob("movie.*")) if v.suffix.lower() in (".mp4", ".mov")), path / "movie.mp4"
+        )
+        named = [path / name for name in ("frame_timestamps.txt", "movie_metadata.csv")]
+        stamps = next((file for file in named if file.is_file()), named[0])
+        first = _first_name(_asked(stamps, "copy it from the phone"))
+        parse = _stamp_parser(first, stamps) if first else parse_ns
+    _asked(video, "copy it from the phone")
+    return image_list("cam0", path, read_frame_stamps(_asked(stamps, "copy it"), problems, parse), problems), video
+
+
+def _first_name(path: Path) -> str:
+    """Return the name of the first column of a table, empty where it has no header."""
+    try:
+        with open_file(path) as file:
+            first = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").split(",")[0].strip(" #\r\n")
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    return "" if _is_number(first) else first
+
+
+def _sensor_logger_frames(path: Path, problems: Problems) -> tuple[ImageList, Path | None]:
+    """Return the frames in `Camera/`: images that are named by their time, or a film with its stamps beside it."""
+    folder = path / "Camera"
+    films = sorted(folder.glob("*.mp4")) if folder.is_dir() else []
+    if len(films) == 1:
+        stamps = films[0].with_suffix(".csv")
+        what = "write one row a frame into it, its time in ns since 1970 as in Gyroscope.csv"
+        return image_list("cam0", path, read_frame_stamps(_asked(stamps, what), problems), problems), films[0]
+    if films:
+        raise DataError(f"{folder} holds {len(films)} films; keep one, or name one as video:FILE")
+    return image_list("cam0", folder, _named_by_time(folder), problems), None
+
+
+def _named_by_time(folder: Path) -> Iterator[Row[str]]:
+    """Yield the stamps and names of images that are named by milliseconds since 1970."""
+    files = [file for file in folder.glob("*.jpg") if file.stem.isdecimal() and len(file.stem) < 16]
+    if not files:
+        raise DataError(f"{folder} holds no film and no image named by its time; record with the camera switched on")
+    for file in sorted(files, key=lambda file: int(file.stem)):
+        yield int(file.stem) * 1_000_000, file.name
