@@ -90,6 +90,19 @@ def _told_shift(a: Array, b: Array, at: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _told_cost(X: Array, links: Links) -> float:
+    """Return what all that further sensors told costs, up to a constant."""
+    total = 0.0
+    for k in np.flatnonzero(links.told):
+        d = _told_shift(X[k], X[k + 1], links.told_at[k])
+        for i in range(12):
+            total += links.told_b[k, i] * d[i]
+            for j in range(12):
+                total += 0.5 * d[i] * links.told_H[k, i, j] * d[j]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_told(d: Array, links: Links, where: Ints, k: int, A: Array, g: Array) -> None:
     """Add what further sensors told of link k, at a shift d [12], to the normal equations."""
     for i in range(12):
@@ -160,13 +173,7 @@ def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
                 total += (links.guess_weight[k, i // 3] * r[i]) ** 2
         for i in range(12, 15):
             total += (links.velocity_weight[k] * (X[k + 1, i] - X[k, i])) ** 2
-        if links.told[k]:
-            d = _told_shift(X[k], X[k + 1], links.told_at[k])
-            for i in range(12):
-                total += 2.0 * links.told_b[k, i] * d[i]
-                for j in range(12):
-                    total += d[i] * links.told_H[k, i, j] * d[j]
-    return 0.5 * total
+    return 0.5 * total + _told_cost(X, links)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
