@@ -1,15 +1,21 @@
 """Every example runs as a reader would run it, prints something, and its own assertions hold."""
 
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from vislam.sensors import registry
+from vislam.sensors.toml import sensor_setup
+
 ROOT = Path(__file__).resolve().parent.parent
+TOLD = {"11_further_sensors": ("wheels", "range")}  # all eleven kinds take a minute and a half of CPU
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
 
@@ -18,7 +24,12 @@ EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 def test_an_example_runs(script, tmp_path):
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     answer = subprocess.run(
-        [sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, script, *TOLD.get(script.stem, ())],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.strip()
@@ -27,13 +38,25 @@ def test_an_example_runs(script, tmp_path):
 
 def test_every_example_is_in_the_readme():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(EXAMPLES) == 10
+    assert len(EXAMPLES) == 11
     assert [path.name for path in EXAMPLES if f"](examples/{path.name})" not in readme] == []
 
 
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_stays_a_page(script):
     assert len(script.read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_every_kind_of_sensor_has_its_example_and_its_page_names_it():
+    spec = importlib.util.spec_from_file_location("further_sensors", ROOT / "examples" / "11_further_sensors.py")
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    assert set(example.KINDS) == registry._BUILT_IN
+    for kind, (lines, rate_hz) in example.KINDS.items():
+        table = tomllib.loads(f'[sensors.it]\nkind = "{kind}"\nsimulated_hz = {rate_hz}\n{lines}\n')
+        assert sensor_setup(table, kind, ROOT).simulated_hz == {"it": rate_hz}
+        page = (ROOT / "docs" / "sensors" / f"{kind}.md").read_text(encoding="utf-8")
+        assert f"examples/11_further_sensors.py {kind}`" in page
 
 
 @pytest.mark.slow

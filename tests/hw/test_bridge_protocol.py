@@ -7,7 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.hw.bridge import protocol
-from vislam.hw.bridge.protocol import Chips, FrameDecoder, Hello, OtherVersion, RawSample, Status, encode
+from vislam.hw.bridge.protocol import (
+    Chips,
+    Counts,
+    FrameDecoder,
+    Hello,
+    OtherVersion,
+    Passed,
+    RawSample,
+    Status,
+    encode,
+)
 
 int16 = st.integers(-(2**15), 2**15 - 1)
 triples = st.tuples(int16, int16, int16)
@@ -40,6 +50,9 @@ hellos = st.builds(
     gyro_limit=counts16,
     mag_limit=counts16,
 )
+int32, sequences, times = st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
+counts = st.builds(Counts, sequence=sequences, t_us=times, left=int32, right=int32)
+passed = st.builds(Passed, sequence=sequences, t_us=times, data=st.binary(min_size=1, max_size=protocol.MOST_PASSED))
 
 
 @given(st.binary(max_size=1000))
@@ -64,7 +77,7 @@ def test_stuffing_is_that_of_cobs(data: str, stuffed: str) -> None:
     assert protocol.stuff(bytes.fromhex(data)) == bytes.fromhex(stuffed)
 
 
-@given(st.lists(st.one_of(samples, hellos), max_size=20), st.randoms(use_true_random=False))
+@given(st.lists(st.one_of(samples, hellos, counts, passed), max_size=20), st.randoms(use_true_random=False))
 def test_messages_come_back_however_they_are_cut(sent: list, rng: random.Random) -> None:
     stream = b"".join(encode(message) for message in sent)
     decoder, got, at = FrameDecoder(), [], 0
@@ -92,7 +105,9 @@ def spoil(stream: bytes, rng: random.Random, rate: float) -> bytes:
 
 
 @settings(max_examples=60)
-@given(st.lists(samples, min_size=1, max_size=8), st.integers(0, 2**32), st.floats(0.0001, 0.02))
+@given(
+    st.lists(st.one_of(samples, counts, passed), min_size=1, max_size=8), st.integers(0, 2**32), st.floats(0.0001, 0.02)
+)
 def test_no_wrong_frame_passes(few: list, seed: int, rate: float) -> None:
     decoder, rng = FrameDecoder(), random.Random(seed)
     sent = few * 50

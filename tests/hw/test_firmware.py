@@ -9,7 +9,18 @@ from pathlib import Path
 import pytest
 
 from needs import missing
-from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Chips, FrameDecoder, Hello, RawSample, Status, encode
+from vislam.hw.bridge.protocol import (
+    MOST_PASSED,
+    SAMPLE_WIRE_BYTES,
+    Chips,
+    Counts,
+    FrameDecoder,
+    Hello,
+    Passed,
+    RawSample,
+    Status,
+    encode,
+)
 
 SKETCH = Path(str(files("vislam.hw"))) / "firmware" / "vislam_bridge"
 FAKE = Path(__file__).parent / "fake_arduino"
@@ -17,15 +28,29 @@ NOBODY = ("0", "0", "0")
 GYRO, MAG = str(0x68), str(0x1E)
 
 
+PINS = ("-DLEFT_A=2", "-DLEFT_B=3", "-DRIGHT_A=4", "-DRIGHT_B=5", "-DGNSS_PORT=Serial1")
+SENTENCE = "$GNGGA,120000.00,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+
+
 @pytest.fixture(scope="module")
 def bridge(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled(tmp_path_factory.mktemp("sketch"))
+
+
+@pytest.fixture(scope="module")
+def full_bridge(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sketch that was told of encoders and of a receiver."""
+    return compiled(tmp_path_factory.mktemp("full_sketch"), *PINS)
+
+
+def compiled(folder: Path, *told: str) -> Path:
     compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         missing("no C++ compiler for the sketch")
-    program = tmp_path_factory.mktemp("sketch") / "bridge"
+    program = folder / "bridge"
     sources = ["-I", FAKE, "-I", SKETCH, FAKE / "main.cpp", "-o", program]
     strict = ["-std=c++11", "-Wall", "-Wextra", "-Wconversion", "-Wno-psabi", "-Werror=return-type", "-O1"]
-    result = subprocess.run([compiler, *strict, *sources], capture_output=True, text=True, check=False)
+    result = subprocess.run([compiler, *strict, *told, *sources], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "vislam_bridge.ino" not in result.stderr, result.stderr  # no warnings
     return program
@@ -38,9 +63,10 @@ def run(
     silent: tuple = NOBODY,
     blocked: tuple = ("0", "0"),
     forgets_at: int = -1,
+    further: tuple = (),
 ) -> tuple[list, bytes, str]:
     """Return messages, the bytes they came in, and the registers that the sketch set."""
-    command = [str(bridge), str(seconds), str(begin_us), *silent, *blocked, str(forgets_at)]
+    command = [str(bridge), str(seconds), str(begin_us), *silent, *blocked, str(forgets_at), *further]
     done = subprocess.run(command, capture_output=True, check=True, timeout=60)
     decoder = FrameDecoder()
     messages = decoder.feed(done.stdout)
@@ -124,6 +150,43 @@ def test_a_line_that_takes_nothing_leaves_holes_and_stops_nothing(bridge: Path) 
     assert sorted(gaps)[-2] == 1
     samples, _ = parts(messages)
     assert samples[-1].t_us - samples[-2].t_us < 2600
+
+
+@pytest.mark.parametrize("begin_us", [0, 2**32 - 1_500_000])
+def test_encoders_and_a_receiver_travel_beside_the_samples(full_bridge: Path, begin_us: int) -> None:
+    messages, wire, told = run(full_bridge, 4.0, begin_us, further=("4800", "-1200", SENTENCE))
+    assert b"".join(encode(message) for message in messages) == wire
+    samples, hellos = parts(messages)
+    assert all(Chips.ENCODERS | Chips.GNSS in hello.chips for hello in hellos)
+    counts = [m for m in messages if isinstance(m, Counts)]
+    passed = [m for m in messages if isinstance(m, Passed)]
+    *_, left_quarters, right_quarters, lost = told.split()
+    for wheel, quarters in (("left", left_quarters), ("right", right_quarters)):  # both edges of A: a half of them
+        assert getattr(counts[-1], wheel) == pytest.approx(int(quarters) / 2, abs=0.02 * abs(int(quarters) / 8) + 2)
+    for before, after in pairwise(counts):
+        since_s = (after.t_us - before.t_us) % 2**32 * 1e-6
+        assert 0.019 < since_s < 0.025
+        assert after.left - before.left == pytest.approx(2400 * since_s, abs=2)
+        assert after.right - before.right == pytest.approx(-600 * since_s, abs=2)
+    said = b"".join(message.data for message in passed).decode()
+    assert len(said) > 3500
+    begun = int(lost)  # while the chips started; nothing later
+    assert begun < 100
+    assert said == (SENTENCE * 60)[begun : begun + len(said)]
+    assert max(len(message.data) for message in passed) == MOST_PASSED
+    for kind in (counts, passed):
+        assert [message.sequence for message in kind] == list(range(len(kind)))
+    shared = [m.sequence for m in messages if isinstance(m, RawSample | Hello)]
+    assert shared == list(range(len(shared)))  # no sample was lost for their sake, to an old host neither
+    assert all(Status.MISSED not in sample.status for sample in samples)
+
+
+def test_a_line_that_takes_nothing_costs_no_count(full_bridge: Path) -> None:
+    messages = run(full_bridge, 2.0, blocked=("1000", "1100"), further=("4800", "4800", SENTENCE))[0]
+    counts = [m for m in messages if isinstance(m, Counts)]
+    gaps_s = [(b.t_us - a.t_us) * 1e-6 for a, b in pairwise(counts)]
+    assert max(gaps_s) > 0.09
+    assert counts[-1].left == pytest.approx(2400 * counts[-1].t_us * 1e-6, abs=5)
 
 
 def test_a_sample_fits_the_smallest_buffer() -> None:

@@ -18,9 +18,9 @@ import pytest
 
 from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
-from vislam.hw import gnss_port
-from vislam.hw.gnss_port import GnssPort, check_port
+from vislam.hw import reading_port, talks
 from vislam.hw.gnss_stream import NmeaStream, UbxStream
+from vislam.hw.reading_port import ReadingPort, check_port
 from vislam.live.port_readings import PortReadings
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.toml import SensorPort
@@ -91,8 +91,8 @@ def config(tmp_path: Path) -> SensorPort:
 def test_a_receiver_that_is_unplugged_goes_on_in_the_frame_it_had(
     config: SensorPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gnss_port, "_REOPEN_S", 0.02)
-    monkeypatch.setattr(gnss_port, "_OLD_NS", round(LONG_S * 1e9))
+    monkeypatch.setattr(reading_port, "_REOPEN_S", 0.02)
+    monkeypatch.setattr(talks, "_OLD_NS", round(LONG_S * 1e9))
     receiver = Receiver(Path(config.port))
     sensors = PortReadings({"gnss": config})
     found: list[Reading] = []
@@ -140,7 +140,7 @@ def test_a_receiver_that_is_unplugged_goes_on_in_the_frame_it_had(
 def test_a_fix_that_is_not_good_enough_is_told(config: SensorPort) -> None:
     receiver = Receiver(Path(config.port))
     settings = SensorPort(config.port, config.baud, "nmea", 0.0, GnssSettings(least_fix="rtk"))
-    port = GnssPort("gnss", settings)
+    port = ReadingPort("gnss", settings)
     try:
         until(lambda: port.counters()["opened"] == 1, port.status)
         receiver.say(burst(0))
@@ -152,9 +152,9 @@ def test_a_fix_that_is_not_good_enough_is_told(config: SensorPort) -> None:
 
 
 def test_a_mute_port_is_told_and_opened_anew(config: SensorPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gnss_port, "_SILENT_NS", 0)
+    monkeypatch.setattr(reading_port, "_SILENT_NS", 0)
     receiver = Receiver(Path(config.port))
-    port = GnssPort("gnss", config)
+    port = ReadingPort("gnss", config)
     try:
         until(lambda: port.counters()["opened"] > 1, port.status)
         assert "is silent" in port.status()

@@ -118,12 +118,13 @@ def test_a_sensor_that_nobody_could_read_is_refused_before_anything_starts(tmp_p
 @pytest.mark.parametrize(
     ("table", "why"),
     [
-        ('kind = "height"\nport = "/dev/tty0"', "option port"),
-        ('kind = "position"\nport = "/dev/tty0"\nformat = "csv"', "nmea or ubx"),
+        ('kind = "height"\nport = "/dev/tty0"\nformat = "ubx"', "ubx holds fixes"),
+        ('kind = "height"\nport = "/dev/tty0"\nticks = {ticks_per_turn = 1, radius_m = 1}', "counts are those of kind"),
+        ('kind = "height"\nport = "/dev/a"\n[sensors.other]\nkind = "height"\nport = "/dev/a"', "sensor it has /dev/a"),
         ('kind = "position"\nport = "/dev/tty0"\ngnss = {datum = [100.0, 0.0, 0.0]}', "datum"),
     ],
 )
-def test_a_port_that_gives_no_fixes_is_refused(tmp_path: Path, table: str, why: str) -> None:
+def test_a_port_that_cannot_be_is_refused(tmp_path: Path, table: str, why: str) -> None:
     (tmp_path / "cart.toml").write_text(f"[sensors.it]\n{table}\n")
     with pytest.raises(UsageError, match=why):
         load_sensor_setup(tmp_path / "cart.toml")

@@ -36,6 +36,7 @@ from vislam.sensors.kinds import (
     WheelsSettings,
 )
 from vislam.sensors.linear import derived
+from vislam.sensors.measuring_frame import about_up
 from vislam.sensors.simulated import Faults, drawn_readings
 
 ANCHORS = {"1": (4.0, 1.0, 2.0), "2": (-3.0, 5.0, 2.5), "0x10": (0.5, -6.0, 0.2)}
@@ -231,3 +232,22 @@ def test_outliers_and_backward_stamps_come_as_often_as_asked() -> None:
     off = [np.abs(r.values - b.position_m).max() > 15.0 for r, b in zip(drawn, bodies, strict=True)]
     assert 0.07 < np.mean(off) < 0.13
     assert 0.03 < np.mean([r.t_ns < b.t_ns for r, b in zip(drawn, bodies, strict=True)]) < 0.07
+
+
+@pytest.mark.parametrize("told", [(0.0, 1e4), (0.7, 0.1)])
+def test_simulated_anchors_stand_about_the_path(told: tuple[float, float]) -> None:
+    settings = AnchorRangeSettings(ANCHORS, anchor_sigma_m=0.1, frame_z_m=told[0], frame_z_sigma_m=told[1])
+    suite, rng = Suite({"uwb": AnchorRange(settings)}), np.random.default_rng(7)
+    path = np.array([100.0, -50.0, 3.0]) + rng.uniform(-4.0, 4.0, (50, 3))
+    drawn = suite.drawn_own("uwb", rng)
+    sensor = suite["uwb"]
+    assert isinstance(sensor, AnchorRange)
+    own = sensor.about(path, drawn)
+    anchors = own[4:].reshape(-1, 3)
+    assert own[0] == drawn[0]
+    assert (own[4:] == drawn[4:]).all()
+    middle, there = (0.5 * (places.min(axis=0) + places.max(axis=0)) for places in (path, anchors))
+    assert (about_up(own[0]) @ middle + own[1:4])[:2] == pytest.approx(there[:2])
+    assert own[3] == (drawn[3] if told[1] < 1e4 else told[0])
+    known = AnchorRange(AnchorRangeSettings(ANCHORS, frame="known"))
+    assert known.about(path, np.zeros(0)).shape == (0,)

@@ -13,10 +13,20 @@ from hypothesis import strategies as st
 
 from vislam.cli import run_verb
 from vislam.core.geometry import so3_exp
-from vislam.core.messages import Array
-from vislam.run.geodetic_outputs import LINES, TABLES, GeodeticOutputs, lines_on_a_map, places_of
+from vislam.core.messages import Array, NavState
+from vislam.run.geodetic_outputs import (
+    COLUMNS,
+    LINES,
+    SIGMA_COLUMNS,
+    TABLES,
+    GeodeticOutputs,
+    lines_on_a_map,
+    most_sigmas,
+    places_of,
+)
 from vislam.run.session import Session
 from vislam.sensors.geodetic import Geodetic, LocalFrame
+from vislam.sensors.measuring_frame import about_up
 from vislam.sensors.toml import load_sensor_setup
 from vislam.trajectory import Trajectory, read_tum
 
@@ -45,9 +55,14 @@ def with_fixes(tmp_path_factory) -> Path:
 def table_of(path: Path) -> tuple[Array, list[Geodetic]]:
     with path.open() as file:
         rows = list(csv.reader(file))
-    assert rows[0] == ["t_ns", "latitude_deg", "longitude_deg", "height_m"]
+    assert rows[0] in ([*COLUMNS], [*COLUMNS, *SIGMA_COLUMNS])
     stamps = np.array([int(row[0]) for row in rows[1:]])
-    return stamps, [Geodetic(*map(float, row[1:])) for row in rows[1:]]
+    return stamps, [Geodetic(*map(float, row[1:4])) for row in rows[1:]]
+
+
+def sigmas_of(path: Path) -> Array:
+    with path.open() as file:
+        return np.array([[float(row[name]) for name in SIGMA_COLUMNS] for row in csv.DictReader(file)])
 
 
 def true_enu(out: Path) -> tuple[Array, Array]:
@@ -71,6 +86,30 @@ def test_latitude_and_longitude_are_those_of_the_truth(with_fixes: Path, by: str
     error = np.linalg.norm(enu - wanted, axis=1)[settled]
     assert len(error) > 60
     assert np.sqrt(np.mean(error**2)) < 0.05
+    most = sigmas_of(with_fixes / TABLES[by])[settled]
+    share = np.abs(enu - wanted)[settled] / most
+    print(by, "rms of error over most sigma", np.sqrt(np.mean(share**2, axis=0)), "sigmas", np.median(most, axis=0))
+    assert np.sqrt(np.mean(share**2)) < 1.0  # they are the most that a sigma can be
+    assert share.max() < 4.0
+    assert most.max() < 0.5
+
+
+def test_no_sigma_is_larger_however_body_and_frame_hang_together() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        root = rng.normal(size=(7, 7)) * rng.uniform(0.1, 2.0, 7)[:, None]
+        joint, p, frame = root @ root.T, rng.uniform(-50.0, 50.0, 3), rng.normal(size=4)
+        covariance = np.zeros((15, 15))
+        covariance[3:6, 3:6] = joint[:3, :3]
+        state = NavState(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), covariance)
+        R = about_up(float(frame[0]))
+        J = np.hstack([R, np.cross([0.0, 0.0, 1.0], R @ p)[:, None], np.eye(3)])
+        sigmas = np.sqrt(np.diag(J @ joint @ J.T))
+        most = most_sigmas([state], np.array([0, 1]), np.array([p, p]), frame, np.sqrt(np.diag(joint))[3:])
+        assert (sigmas <= most[0] * (1.0 + 1e-12)).all()
+        assert (most[0] == most[1]).all()
+        alone = most_sigmas([state], np.array([0]), p[None], np.zeros(0), np.zeros(0))
+        assert alone[0] == pytest.approx(np.sqrt(np.diag(joint))[:3])
 
 
 def test_the_datum_and_the_line_are_in_the_folder(with_fixes: Path) -> None:

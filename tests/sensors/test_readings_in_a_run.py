@@ -301,7 +301,7 @@ def jumping_back(readings):
     [
         (leap, ("ekf", "gnss_gated"), 1),
         (leap_for_long, ("ekf", "gnss_gated"), 15),
-        (backwards, ("ekf", "wheels_gated"), 50),
+        (backwards, ("sensor wheels", "slipped"), 50),
         (stopped, None, 0),
         (twice, ("ekf", "wheels_refused"), 200),
         (jumping_back, ("ekf", "gnss_gated"), 5),

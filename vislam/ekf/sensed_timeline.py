@@ -47,6 +47,13 @@ class SensedTimeline(Timeline[S, M]):
             reason = f"sensor {name!r} has a reading of {reading.t_ns} ns already"
         return self._refuse(f"{name}_refused", reason) if reason else self._insert(Event(reading.t_ns, reading))
 
+    def agrees(self, reading: Reading) -> bool:
+        """Return whether a reading would pass the gate, which changes nothing; False outside of the history."""
+        state = self._state_then(reading.t_ns)
+        if state is None or self._core.sensing.why_unusable(reading):
+            return False
+        return self._core.apply(state, Event(reading.t_ns, reading), self._rate_at(reading.t_ns), 0.0).accepted
+
     def own(self, name: str) -> tuple[Array, Array]:
         """Return values [V] and sigmas [V] of a sensor's own variables now; before it begins, what it says of them.
 

@@ -13,6 +13,8 @@ from vislam.config import BoardConfig, ImuChip, SensorCalibration, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 
 if TYPE_CHECKING:
+    import socket
+
     from vislam.hw.cameras.video import VideoCamera
     from vislam.hw.cameras.webcam import Webcam
     from vislam.hw.source import InertialSource
@@ -25,11 +27,15 @@ CHIPS: dict[str, ImuChip | None] = {
 INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial")
 
 
-def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) -> InertialSource:
+def open_inertial(
+    name: str, config: SensorsConfig, must_be_there: bool = True, further: socket.socket | None = None
+) -> InertialSource:
     """Open what a name says; the rest is in the settings.
 
     `gy85[:BUS]`, `board[:BUS]` or a chip in its place, `bno085`, `adafruit:MODULE.CLASS`, `iio[:NAME]` for a chip that
     the kernel drives, `serial[:PORT]`.
+
+    What a serial bridge says of further sensors goes to `further`.
 
     Raises:
         UsageError: there is no such kind of sensor.
@@ -57,7 +63,7 @@ def open_inertial(name: str, config: SensorsConfig, must_be_there: bool = True) 
         from vislam.hw.bridge.bridge import SerialBridge
 
         bridge = replace(config.serial, port=where) if where else config.serial
-        return SerialBridge(bridge, must_be_there)
+        return SerialBridge(bridge, must_be_there, further)
     raise UsageError(
         f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, with a place such as gy85:/dev/i2c-1, "
         "serial:/dev/ttyUSB0, iio:lsm6dsox, adafruit:adafruit_lsm6ds.lsm6dsox.LSM6DSOX"

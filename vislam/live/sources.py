@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -15,7 +16,7 @@ from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
-from vislam.hw.gnss_port import check_port
+from vislam.hw.reading_port import check_port
 from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
@@ -119,14 +120,20 @@ class CartSensors:
         self.frame_count, self.problems = 0, dict[str, int]()
         self.duration_s: float | None = None
         self._inertial, self._camera, self._sensors = inertial, camera, sensors
+        self._passed: tuple[socket.socket, socket.socket] | None = None  # from the bridge to who reads further sensors
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return what travels to other processes: each end of the bridge's wire goes with what opens it, and alone."""
+        return {**self.__dict__, "_passed": None}
 
     def check(self) -> None:
         """Raise HardwareError where a device is missing or may not be opened."""
         check_devices(self._inertial, self._camera, self._sensors)
 
     def inertial(self) -> Callable[[], InertialSource]:
-        """Return what opens the IMU."""
-        return partial(open_inertial, self._inertial, self._sensors)
+        """Return what opens the IMU; call `readings` before, for a bridge passes on what further sensors say."""
+        passed = None if self._passed is None else self._passed[0]
+        return partial(open_inertial, self._inertial, self._sensors, further=passed)
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens the camera."""
@@ -135,21 +142,31 @@ class CartSensors:
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
         """Return what reads further sensors at their ports.
 
-        Raises UsageError for a sensor without a port, HardwareError for a port that is not there.
+        Raises UsageError for a sensor without a port, or at a bridge where there is none, HardwareError for a port that
+        is not there.
         """
-        refuse_unread(
-            setup, setup.ports, "on a cart it needs a port (satellite receivers have one); a replay plays files"
-        )
+        refuse_unread(setup, setup.ports, "on a cart it needs a port; a replay plays files")
+        at_bridge = [name for name, port in setup.ports.items() if port.at_bridge]
+        if at_bridge and self._inertial.partition(":")[0] != "serial":
+            raise UsageError(
+                f'[sensors.{at_bridge[0]}]: port = "bridge" is the serial bridge, and --source {self._inertial} has '
+                "none; take --source serial:PORT+..., or give the sensor a port of its own"
+            )
         for port in setup.ports.values():
-            check_port(port)
-        return partial(PortReadings, setup.ports)
+            if not port.at_bridge:
+                check_port(port)
+        self.close()
+        self._passed = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) if at_bridge else None
+        return partial(PortReadings, setup.ports, None if self._passed is None else self._passed[1])
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
         """Return nothing: real sensors need no processes."""
         return {}
 
     def close(self) -> None:
-        """Do nothing: no memory is shared."""
+        """Close our ends of the bridge's wire; no memory is shared."""
+        for end in self._passed or ():
+            end.close()
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
         """Raise DataError: live sensors cannot be read twice."""

@@ -104,18 +104,15 @@ class Front:
             self.ekf_coupling = self._filter.coupling
         self._readings: ReadingIntake | None = None
         if suite is not None and len(suite):
-            buffer = None if noise is None else self._buffer
-            self._readings = ReadingIntake(
-                suite, self._filter, buffer, config.imu.gravity_m_s2,
-                0.0 if noise is None else noise.accel_noise_density, config.graph.coupling == "tight",
-            )  # fmt: skip
+            buffer, density = (None, 0.0) if noise is None else (self._buffer, noise.accel_noise_density)
+            has_window = config.graph.coupling == "tight"
+            self._readings = ReadingIntake(suite, self._filter, buffer, config.imu.gravity_m_s2, density, has_window)
         self._waypoints = Waypoints()
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
         self._graph_state: NavState | None = None  # at the newest keyframe that the graph has told of
         self._last_frame_t_ns: int | None = None
-        self._keyframe_t_ns = 0
-        self._keyframe_id = -1
+        self._keyframe_t_ns, self._keyframe_id = 0, -1
         self._keyframe_variance_m2 = 0.0  # of the filter's position there
         self._rested_since_keyframe = True
         self._mag: MagSample | None = None
@@ -199,6 +196,10 @@ class Front:
     def take_told_readings(self) -> list[ToldReading]:
         """Return what the filter was told by further sensors since this was asked last."""
         return [] if self._filter is None else self._filter.take_told_readings()
+
+    def sensor_doubts(self) -> dict[str, str]:
+        """Return, of further sensors that contradict the rest now, a word on how."""
+        return {} if self._readings is None else self._readings.doubts()
 
     def add_hint(self, hint: Hint) -> None:
         """Tell the filter what holds a body while the camera sees nothing."""

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState, Tracking
-from vislam.core.readings import MotionReadings, OwnNow, OwnStart, PlacedReading, Reading, Station
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState
+from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, preintegrate
+from vislam.pipeline.blind_motion import with_motions
+from vislam.pipeline.slip_watch import SlipWatch
 from vislam.sensors import BodyState, Suite
 from vislam.sensors.body import between_keyframes
 
@@ -47,7 +49,8 @@ class ReadingIntake:
             the filter; `dropped` had to wait for it for too long; with those of `beginning` a sensor looked for its own
             variables; `told` are those that the filter was given. And of these the graph never saw those that are
             `late`, as it had their keyframe already; `unplaced`, where it has no inertial data; `crowded` out, as too
-            many waited for a keyframe.
+            many waited for a keyframe. Of wheels that slip neither was told those that `slipped`, and the graph not
+            those by which a `slip_began`.
         notes: by sensor, why its first unusable reading was that, or why the sensor is left out.
     """
 
@@ -75,6 +78,7 @@ class ReadingIntake:
         self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}
         self._starts: list[OwnStart] = []  # for the next keyframe
         self._since: deque[Reading] = deque()  # the newest keyframe
+        self._slips = {name: SlipWatch() for name in suite.names if suite[name].slips}
         self._left_out: set[str] = set()  # sensors whose code failed
         self._path: deque[tuple[int, Array]] = deque(maxlen=2)  # times and poses of frames, where there is no filter
 
@@ -89,12 +93,18 @@ class ReadingIntake:
             if self._filter is not None and self._filter.ekf.initialised and entry["begun"] and names:
                 values, sigmas = self._filter.ekf.own(name)
                 entry["filter"] = {"values": values.tolist(), "sigmas": sigmas.tolist()}
+            if name in self._slips and (slip := self._slips[name].summary()):
+                entry["slip"] = slip
             if name in self.notes:
                 entry["note"] = self.notes[name]
             elif not self.counters[name]["readings"]:
                 entry["note"] = "no reading came"
             out[name] = entry
         return out
+
+    def doubts(self) -> dict[str, str]:
+        """Return, of wheels that slip now, a word on it."""
+        return {name: word for name, slip in self._slips.items() if (word := slip.status())}
 
     def add(self, reading: Reading) -> None:
         """Take a reading; the filter hears of it with the next `hand_on`."""
@@ -136,10 +146,7 @@ class ReadingIntake:
                 self.counters[reading.sensor]["unusable"] += 1
             elif reading.sensor in self._beginning:
                 self._compare(reading)
-            else:
-                if self._filter is not None:
-                    self._filter.add_reading(reading)
-                    self.counters[reading.sensor]["told"] += 1
+            elif self._tell_filter(reading):
                 self._queue(self._since, reading, _MAX_SINCE, "crowded")
 
     def pack(self, packet: KeyframePacket, before_t_ns: int, state: NavState | None) -> KeyframePacket:
@@ -161,23 +168,37 @@ class ReadingIntake:
                 self.counters[reading.sensor]["unplaced"] += 1
         self._since = later
         starts, self._starts = tuple(self._starts), []
-        motions = self._of_motion(packet, placed)
-        used = {motion.sensor for motion in motions}
-        rest = tuple(one for one in placed if one.reading.sensor not in used)
-        return replace(packet, readings=rest, own_starts=starts, motions=motions)
+        packet = replace(packet, readings=tuple(placed), own_starts=starts)
+        if not self._has_window or self._filter is None:
+            return packet
+        return with_motions(packet, self._suite, self._filter.ekf.own)
 
-    def _of_motion(self, packet: KeyframePacket, placed: list[PlacedReading]) -> tuple[MotionReadings, ...]:
-        """Return what is for the window to know: without sight it has inertial data alone, and is soon lost."""
-        if not self._has_window or self._filter is None or packet.begins_submap:
-            return ()
-        if packet.vo.tracking is not Tracking.LOST:
-            return ()
-        by_sensor: dict[str, list[PlacedReading]] = {}
-        for one in placed:
-            if self._suite[one.reading.sensor].sees_motion_only:
-                by_sensor.setdefault(one.reading.sensor, []).append(one)
-        own = self._filter.ekf.own
-        return tuple(MotionReadings(name, tuple(ones), OwnNow(*own(name))) for name, ones in by_sensor.items())
+    def _tell_filter(self, reading: Reading) -> bool:
+        """Give the filter a reading unless its wheels slip; return whether the graph shall have it as well."""
+        if self._filter is None:
+            return True
+        slip, counts = self._slips.get(reading.sensor), self.counters[reading.sensor]
+        if slip is not None and slip.slips:
+            slip.judge(reading.t_ns, self._filter.ekf.agrees(reading))
+            counts["slipped"] = counts.get("slipped", 0) + 1
+            return False
+        answer = self._filter.add_reading(reading)
+        counts["told"] += 1
+        if slip is None or not np.isfinite(answer.nis):
+            return True
+        slip.judge(reading.t_ns, answer.accepted)
+        if slip.slips:
+            self._take_back(reading.sensor, slip.begin_ns)
+        return not slip.slips
+
+    def _take_back(self, name: str, from_ns: int) -> None:
+        """Keep from the graph the readings by which a slip began, this one among them."""
+        counts, kept = self.counters[name], deque[Reading]()
+        for reading in self._since:
+            if reading.sensor != name or reading.t_ns < from_ns:
+                kept.append(reading)
+        counts["slip_began"] = counts.get("slip_began", 0) + len(self._since) - len(kept) + 1
+        self._since = kept
 
     def _why_unusable(self, reading: Reading) -> str:
         if reading.sensor in self._left_out:

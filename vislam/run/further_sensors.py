@@ -72,9 +72,9 @@ class FurtherReadings:
 
 
 def drawn(recording: Recording, setup: SensorSetup, seed: int) -> list[list[Reading]]:
-    """Return the readings of simulated sensors on the truth of a recording; own variables are drawn by their sigmas.
+    """Return the readings of simulated sensors on the truth of a recording.
 
-    Raises DataError without a truth.
+    Own variables are drawn by their sigmas, but anchors stand about the path. Raises DataError without a truth.
     """
     if not setup.simulated_hz:
         return []
@@ -86,5 +86,7 @@ def drawn(recording: Recording, setup: SensorSetup, seed: int) -> list[list[Read
         begin_ns, end_ns = int(truth.t_ns[0]) + _EDGE_NS, int(truth.t_ns[-1]) - _EDGE_NS
         t_ns = np.arange(begin_ns, end_ns, round(1e9 / rate_hz), dtype=np.int64)
         own = setup.suite.drawn_own(name, np.random.default_rng([seed, number]))
-        out.append(drawn_readings(name, setup.sensors[name], bodies_on(truth, t_ns), own, seed))
+        own = setup.sensors[name].about(truth.positions_m, own)
+        faults = setup.simulated_faults[name]
+        out.append(drawn_readings(name, setup.sensors[name], bodies_on(truth, t_ns), own, seed, faults))
     return out

@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.config import FurtherSensorsConfig
 from vislam.core.errors import DataError
 from vislam.core.files import write_text
-from vislam.core.messages import Array
+from vislam.core.messages import Array, NavState
 from vislam.datasets.sensor_files import local_frame
 from vislam.loop.table import csv_text
 from vislam.sensors.geodetic import Geodetic, LocalFrame
-from vislam.sensors.measuring_frame import frame_pose, frame_variables
+from vislam.sensors.measuring_frame import UP, frame_pose, frame_variables
 from vislam.sensors.toml import load_sensor_setup
-from vislam.trajectory import Trajectory
+from vislam.trajectory import Trajectory, read_states_csv
 
 COLUMNS = ("t_ns", "latitude_deg", "longitude_deg", "height_m")
+SIGMA_COLUMNS = ("most_sigma_east_m", "most_sigma_north_m", "most_sigma_up_m")
 LINES = "trajectory.geojson"
 TABLES = {"filter": "trajectory_ekf_geodetic.csv", "graph": "trajectory_graph_geodetic.csv"}
+_STATES = {"filter": "states_ekf.csv", "graph": "states_graph.csv"}
 _FRAME = [variable.name for variable in frame_variables("own")]
 _DIGITS, _HEIGHT_DIGITS = 9, 4  # of degrees, 0.1 mm, and of metres
 
@@ -59,7 +62,7 @@ class GeodeticOutputs:
         """Write tables and lines of a run, if a sensor has a datum; return the sensor's name and its datum.
 
         Args:
-            out: the folder of the run.
+            out: the folder of the run; where it has states with covariances, the tables have sigmas.
             sensors: what `metrics.json` has of further sensors; their datum is added. A receiver at a port has told
                 its own there.
             trajectories: of the filter in `odom` and of the graph in `map`, by "filter" and "graph".
@@ -77,7 +80,8 @@ class GeodeticOutputs:
             }
             if used is None and places:
                 used = {"sensor": name, **asdict(datum)}
-                _write(out, {by: trajectories[by] for by in places}, places)
+                sigmas = {by: _sigmas(out / _STATES[by], trajectories[by], entry, by) for by in places}
+                _write(out, {by: trajectories[by] for by in places}, places, sigmas)
         return used
 
 
@@ -85,6 +89,31 @@ def places_of(trajectory: Trajectory, frame: Array, datum: Geodetic) -> list[Geo
     """Return where the body was: by `T_frame_world` as yaw, x, y, z [4], or [0] of a world that is the frame."""
     local, (R, t) = LocalFrame(datum), frame_pose(frame)
     return [local.geodetic(place) for place in trajectory.positions_m @ R.T + t]
+
+
+def most_sigmas(
+    states: Sequence[NavState], t_ns: NDArray[np.int64], positions_m: Array, frame: Array, frame_sigmas: Array
+) -> Array:
+    """Return what sigmas east, north, up [N, 3] of placed positions are at most, however body and frame hang together.
+
+    The sigma of a sum is at most the sum of the sigmas: of the body in the run's world, between `states` interpolated;
+    of the frame's heading by how far the body is from where the world begins; and of the frame's origin.
+
+    Args:
+        states: with covariances, ascending; before the first and after the last they count as they are there.
+        t_ns: [N] of the positions.
+        positions_m: [N, 3] in the run's world.
+        frame: yaw, x, y, z [4] of the frame, or [0] of a world that is the frame.
+        frame_sigmas: theirs.
+    """
+    R, _ = frame_pose(frame)
+    of_body = np.array([np.sqrt(np.diag(R @ state.covariance[3:6, 3:6] @ R.T)) for state in states])
+    stamps = np.array([state.t_ns for state in states])
+    sigmas = np.column_stack([np.interp(t_ns, stamps, of_body[:, axis]) for axis in range(3)])
+    if len(frame):
+        lever = np.abs(np.cross(UP, positions_m @ R.T))
+        sigmas += frame_sigmas[0] * lever + frame_sigmas[1:4]
+    return np.asarray(sigmas)
 
 
 def lines_on_a_map(places: Mapping[str, list[Geodetic]]) -> dict[str, Any]:
@@ -101,16 +130,40 @@ def lines_on_a_map(places: Mapping[str, list[Geodetic]]) -> dict[str, Any]:
 
 def _frame(entry: Mapping[str, Any], by: str) -> Array | None:
     """Return the frame's variables by an estimator [4], [0] of a known frame; None where they are not found yet."""
+    return _of_frame(entry, by, "values")
+
+
+def _of_frame(entry: Mapping[str, Any], by: str, what: str) -> Array | None:
+    """Return "values" or "sigmas" of the frame's variables; see `_frame`."""
     names, found = entry["variables"], entry.get(by)
     if not set(_FRAME) <= set(names):
         return np.zeros(0) if entry["begun"] else None
-    return None if found is None else np.array([found["values"][names.index(name)] for name in _FRAME])
+    return None if found is None else np.array([found[what][names.index(name)] for name in _FRAME])
 
 
-def _write(out: Path, trajectories: Mapping[str, Trajectory], places: Mapping[str, list[Geodetic]]) -> None:
+def _sigmas(states: Path, trajectory: Trajectory, entry: Mapping[str, Any], by: str) -> Array | None:
+    """Return the sigmas [N, 3] of a table; None where the run has no covariances."""
+    frame, frame_sigmas = _of_frame(entry, by, "values"), _of_frame(entry, by, "sigmas")
+    found = read_states_csv(states)[1] if states.is_file() else []
+    if not found or frame is None or frame_sigmas is None:
+        return None
+    return most_sigmas(found, trajectory.t_ns, trajectory.positions_m, frame, frame_sigmas)
+
+
+def _write(
+    out: Path,
+    trajectories: Mapping[str, Trajectory],
+    places: Mapping[str, list[Geodetic]],
+    sigmas: Mapping[str, Array | None],
+) -> None:
     for by, trajectory in trajectories.items():
         rows = [(t_ns, *_told(place)) for t_ns, place in zip(trajectory.t_ns.tolist(), places[by], strict=True)]
-        write_text(out / TABLES[by], csv_text(COLUMNS, rows))
+        if (most := sigmas[by]) is None:
+            table = csv_text(COLUMNS, rows)
+        else:
+            told = [[f"{sigma:.{_HEIGHT_DIGITS}f}" for sigma in row] for row in most.tolist()]
+            table = csv_text(COLUMNS + SIGMA_COLUMNS, [(*row, *of) for row, of in zip(rows, told, strict=True)])
+        write_text(out / TABLES[by], table)
     write_text(out / LINES, json.dumps(lines_on_a_map(places)) + "\n")
 
 

@@ -94,10 +94,11 @@ def sensors_entry(
         queued, since = int(entry.get("queued", 0)), int(entry.get("since_keyframe", 0))
         came = counters.get(f"sensor {name}", {})
         both = {end: came.get(end, 0) for end in _BEFORE} | {"queued": queued}
+        both |= {"slipped": came["slipped"]} if "slipped" in came else {}
         readings = {
             "came": came.get("readings", 0),
             "filter": both | _in_filter(name, came, counters.get("ekf", {})),
-            "graph": both | _in_graph(came, {} if graph is None else graph.sensed(name), since),
+            "graph": both | _slipped(came) | _in_graph(came, {} if graph is None else graph.sensed(name), since),
         }
         told_here = {key: value for key, value in entry.items() if key not in {"queued", "since_keyframe"}}
         out[name] = {**told_here, "readings": readings}
@@ -119,6 +120,12 @@ def _in_filter(name: str, came: dict[str, int], ekf: dict[str, int]) -> dict[str
     """Return what the filter did with readings; `outside` are older than its history, or not its time yet."""
     did = {end: ekf.get(f"{name}_{end}", 0) for end in _BY_FILTER}
     return did | {"outside": max(came.get("told", 0) - sum(did.values()), 0)}
+
+
+def _slipped(came: dict[str, int]) -> dict[str, int]:
+    """Return how many readings of wheels that slip the graph was not told; empty where none did."""
+    slipped = came.get("slipped", 0) + came.get("slip_began", 0)
+    return {"slipped": slipped} if slipped else {}
 
 
 def _in_graph(came: dict[str, int], did: dict[str, int], since: int) -> dict[str, int]:

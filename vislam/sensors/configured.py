@@ -19,12 +19,10 @@ class Configured(Sensor):
         Settings: that dataclass; ranges of its numbers stand in their types (`vislam.config.ranges`).
         sigma_columns: of a file, one name for each number of the residual; a name may come several times. Where a file
             has them all, its rows bring their own covariance. Empty: a file cannot.
-        slips: the columns that a simulated slip makes larger.
     """
 
     Settings: ClassVar[type[Any]]
     sigma_columns: ClassVar[tuple[str, ...]] = ()
-    slips: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: Any = None) -> None:
         """Take settings; the defaults without any."""
@@ -32,6 +30,13 @@ class Configured(Sensor):
     def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
         """Return the values [C] of a reading of a true body at true own variables [V], with the noise of `noise`."""
         raise UsageError(f"{type(self).__name__} cannot draw readings; give it a method `draw(body, own, rng)`")
+
+    def about(self, path_m: Array, own: Array) -> Array:
+        """Return own variables [V], drawn by their sigmas, as they can be where a true path [N, 3] is measured.
+
+        Override it where that is not anywhere: a radio hears its anchors only among them.
+        """
+        return own
 
 
 def noisy(exact: Array, covariance: Array, rng: np.random.Generator) -> Array:

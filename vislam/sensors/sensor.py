@@ -42,12 +42,14 @@ class Sensor(ABC):
         variables: own ones, estimated with the body's state by every estimator; each has its own values.
         gate_probability: that a good reading passes the test of its innovation.
         regain_m: how far readings that the gate refused, but that agree, may move a filter at most; 0: never.
+        slips: the columns that a slip of wheels makes larger; a sensor that has some is watched for slips.
         from_magnetometer: its readings are the samples of the machine's own magnetometer, as they come with the IMU's.
     """
 
     columns: ClassVar[tuple[str, ...]] = ()
     touches: ClassVar[tuple[str, ...]] = ("rotation", "position", "velocity")
     sees_motion_only: ClassVar[bool] = False
+    slips: ClassVar[tuple[str, ...]] = ()
     variables: tuple[Variable, ...] = ()
     gate_probability: float = 0.999
     regain_m: float = 1000.0

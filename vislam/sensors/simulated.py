@@ -24,6 +24,7 @@ class Faults:
     stuck: Spans = ()  # the last values again and again
     slips: Spans = ()  # wheels turn faster than they roll
     slip_share: float = 0.5  # by so much
+    slip_columns: tuple[str, ...] = ()  # of one wheel; empty: of all that the sensor says can slip
     outliers: float = 0.0  # probability of a reading of a body that is elsewhere and moves otherwise
     outlier_m: float = 10.0  # sigma per axis of how far off; 0.1 of it in m/s, and 0.1 of it in rad about each axis
     backward: float = 0.0  # probability of a stamp before that of the last reading
@@ -58,21 +59,27 @@ def _drawn(
         since_s = (body.t_ns - bodies[0].t_ns) * 1e-9
         seen = _elsewhere(body, faults.outlier_m, rng) if rng.random() < faults.outliers else body
         values = sensor.draw(seen, np.array(true_own), rng)
-        if _within(since_s, faults.slips):
-            slipping = np.array([column in sensor.slips for column in sensor.columns])
-            values = np.where(slipping, (1.0 + faults.slip_share) * values, values)
+        if within(since_s, faults.slips):
+            values = slipping(sensor, values, faults)
         t_ns = body.t_ns
         if rng.random() < faults.backward:
             t_ns -= int(rng.uniform(0.0, faults.backward_s) * 1e9)
-        if _within(since_s, faults.outages):
+        if within(since_s, faults.outages):
             continue
-        if last is not None and _within(since_s, faults.stuck):
+        if last is not None and within(since_s, faults.stuck):
             values = last
         last = values
         yield Reading(name, t_ns, values)
 
 
-def _within(since_s: float, spans: Spans) -> bool:
+def slipping(sensor: Configured, values: Array, faults: Faults) -> Array:
+    """Return the values [C] that wheels give which turn faster than they roll."""
+    slips = np.array([column in (faults.slip_columns or sensor.slips) for column in sensor.columns])
+    return np.where(slips, (1.0 + faults.slip_share) * values, values)
+
+
+def within(since_s: float, spans: Spans) -> bool:
+    """Return whether a time is in one of the spans."""
     return any(begin <= since_s < end for begin, end in spans)
 
 

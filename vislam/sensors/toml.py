@@ -19,6 +19,7 @@ from vislam.sensors.geodetic import Geodetic, why_nowhere
 from vislam.sensors.gnss.fixes import GnssSettings
 from vislam.sensors.registry import kind_class
 from vislam.sensors.sensor import Variable
+from vislam.sensors.simulated import Faults
 from vislam.sensors.suite import Suite
 from vislam.sensors.ticks import TicksSettings
 
@@ -26,6 +27,8 @@ MOST_SENSORS = 64
 _MOST_BYTES = 2**20
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 FileFormat = Literal["csv", "nmea", "ubx", "bag", "gpmf"]
+BRIDGE = "bridge"  # in place of a port: the board that has the IMU
+_FIX_DELAY_S = 0.05  # from a fix's time to a receiver's first byte, unless it is told
 _FIX_COLUMNS = ("east_m", "north_m", "up_m")
 _FORMATS: dict[str, FileFormat] = {  # all else is a table
     ".nmea": "nmea", ".ubx": "ubx", ".bag": "bag", ".mcap": "bag", ".db3": "bag",
@@ -52,10 +55,11 @@ class _Common:
     topic: str = ""  # of a bag
     joints: JointsSettings | None = None  # of a bag's joint states
     simulated_hz: NonNegative = 0.0  # above 0, and without a file, readings are drawn on the truth of a recording
+    simulated_slips: tuple[tuple[NonNegative, NonNegative], ...] = ()  # from and to, in seconds: the wheels spin
     offset_s: Finite = 0.0  # is added to the file's stamps, to have them by the IMU's clock
-    port: str = ""  # live: of a satellite receiver
-    baud: Count = 9600  # of that port
-    delay_s: NonNegative = 0.05  # from a fix's time to the first byte that tells of it at that port
+    port: str = ""  # live: where the device is plugged in; "bridge": at the board that has the IMU
+    baud: Count | None = None  # of that port; None: 9600 of a satellite receiver, 115200 of another device
+    delay_s: NonNegative | None = None  # from a reading's time to its first byte there; None: 0.05 of a receiver, or 0
     gate_probability: Probability = 0.999
     regain_m: NonNegative = 1000.0  # that refused readings which agree may move the filter by at most; 0: never
     known: dict[str, tuple[Finite, Positive]] | None = None  # own variables that are known: value and sigma
@@ -78,13 +82,20 @@ class SensorFile:
 
 @dataclass(frozen=True, slots=True)
 class SensorPort:
-    """Where a satellite receiver is plugged in, and how it is read."""
+    """Where a device is plugged in, and how it is read."""
 
     port: str
     baud: int
-    format: Literal["nmea", "ubx"]
+    format: FileFormat  # "csv": lines of numbers
     delay_s: float
     gnss: GnssSettings
+    columns: tuple[str, ...] = ()  # of its kind
+    ticks: TicksSettings | None = None  # its lines are counts
+
+    @property
+    def at_bridge(self) -> bool:
+        """Whether it is plugged into the serial bridge, which passes on what it says."""
+        return self.port == BRIDGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +106,7 @@ class SensorSetup:
     sensors: Mapping[str, Configured]
     files: Mapping[str, SensorFile]
     simulated_hz: Mapping[str, float]  # of those whose readings are drawn
+    simulated_faults: Mapping[str, Faults]  # of the same
     ports: Mapping[str, SensorPort]  # of those that are read live
     datums: Mapping[str, Geodetic]  # of those that are told where on the earth their frame begins
 
@@ -122,6 +134,7 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
     sensors: dict[str, Configured] = {}
     files: dict[str, SensorFile] = {}
     simulated: dict[str, float] = {}
+    faults: dict[str, Faults] = {}
     ports: dict[str, SensorPort] = {}
     datums: dict[str, Geodetic] = {}
     for name, table in tables.items():
@@ -134,13 +147,13 @@ def sensor_setup(data: Mapping[str, Any], source: str, folder: Path) -> SensorSe
         if (file := _file(common, sensors[name], where, folder)) is not None:
             files[name] = file
         elif common.simulated_hz > 0.0:
-            simulated[name] = common.simulated_hz
+            simulated[name], faults[name] = common.simulated_hz, _faults(common, sensors[name], where)
         sensors[name].from_magnetometer &= name not in files and name not in simulated
         if (port := _port(common, sensors[name], where)) is not None:
-            ports[name] = port
+            ports[name] = _not_taken(port, ports, where)
         if (datum := _gnss(common, where).datum) is not None:
             datums[name] = Geodetic(*datum)
-    return SensorSetup(Suite(sensors), sensors, files, simulated, ports, datums)
+    return SensorSetup(Suite(sensors), sensors, files, simulated, faults, ports, datums)
 
 
 def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:
@@ -189,19 +202,52 @@ def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> Sens
         raise UsageError(f"{where}: ticks are those of a table, joints those of a bag; this is {format_}")
     if format_ in ("nmea", "ubx") and sensor.columns != _FIX_COLUMNS:
         raise UsageError(f"{where}: option format: {format_} holds fixes, for a kind that has east, north, up")
-    if common.ticks and sensor.columns != ("left_m_s", "right_m_s"):
-        raise UsageError(f"{where}: option ticks: counts are those of kind wheels, this is {common.kind}")
+    _check_ticks(common, sensor, where)
     return SensorFile(path, format_, common.offset_s, common.ticks, _gnss(common, where), common.topic, common.joints)
+
+
+def _faults(common: _Common, sensor: Configured, where: str) -> Faults:
+    if common.simulated_slips and not sensor.slips:
+        raise UsageError(f"{where}: option simulated_slips: kind {common.kind} has no wheels that could slip")
+    if any(begin >= end for begin, end in common.simulated_slips):
+        raise UsageError(f"{where}: option simulated_slips: each begins before it ends, got {common.simulated_slips}")
+    return Faults(slips=common.simulated_slips)
 
 
 def _port(common: _Common, sensor: Configured, where: str) -> SensorPort | None:
     if not common.port:
         return None
-    if sensor.columns != _FIX_COLUMNS:
-        raise UsageError(f"{where}: option port: fixes are read there, for a kind that has east, north, up")
-    if common.format not in (None, "nmea", "ubx"):
-        raise UsageError(f"{where}: option format: nmea or ubx is read at a port, got {common.format}")
-    return SensorPort(common.port, common.baud, common.format or "nmea", common.delay_s, _gnss(common, where))
+    fixes = sensor.columns == _FIX_COLUMNS
+    format_ = common.format or ("nmea" if fixes else "csv")
+    if format_ != "csv" and not fixes:
+        raise UsageError(f"{where}: option format: {format_} holds fixes, for a kind that has east, north, up")
+    _check_ticks(common, sensor, where)
+    if common.port == BRIDGE:
+        if format_ == "csv" and common.ticks is None:
+            raise UsageError(
+                f"{where}: option port: the bridge counts encoders, for kind wheels with ticks, and passes a satellite "
+                f"receiver on (format nmea or ubx); kind {common.kind} wants a port of its own"
+            )
+        if common.baud is not None:
+            raise UsageError(f"{where}: option baud: at the bridge it is told in the sketch, as GNSS_BAUD")
+    baud = common.baud or (115_200 if format_ == "csv" else 9600)
+    told_s = common.delay_s
+    delay_s = told_s if told_s is not None else 0.0 if format_ == "csv" else _FIX_DELAY_S
+    gnss = _gnss(common, where)
+    return SensorPort(common.port, baud, format_, delay_s, gnss, sensor.columns, common.ticks)
+
+
+def _not_taken(port: SensorPort, others: Mapping[str, SensorPort], where: str) -> SensorPort:
+    """Return the port; two programs on one would each get half of the bytes, and so would two sensors."""
+    for name, other in others.items():
+        if other.port == port.port and not port.at_bridge:
+            raise UsageError(f"{where}: option port: sensor {name} has {port.port}; each wants a port of its own")
+    return port
+
+
+def _check_ticks(common: _Common, sensor: Configured, where: str) -> None:
+    if common.ticks and sensor.columns != ("left_m_s", "right_m_s"):
+        raise UsageError(f"{where}: option ticks: counts are those of kind wheels, this is {common.kind}")
 
 
 def _gnss(common: _Common, where: str) -> GnssSettings:

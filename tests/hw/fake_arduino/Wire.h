@@ -19,7 +19,7 @@ struct FakeWire {
   void setClock(uint32_t) {}
   void setWireTimeout(uint32_t, bool) {}
   bool present() {
-    fake_us += 100;
+    fake_pass(100);
     int n = transfers[address]++;
     if (n == forgets_at && address == silent_address) memset(registers[address], 0, 128);
     bool there = address == 0x53 || address == 0x68 || address == 0x1E;

@@ -16,13 +16,17 @@ from vislam.core.errors import HardwareError
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.affine import Affine
 from vislam.hw.bridge.clock import DeviceClock
+from vislam.hw.bridge.passer import Passer
 from vislam.hw.bridge.protocol import (
     PROTOCOL_VERSION,
     SAMPLE_WIRE_BYTES,
     Chips,
+    Counts,
     FrameDecoder,
     Hello,
+    Message,
     OtherVersion,
+    Passed,
     RawSample,
     Status,
 )
@@ -30,6 +34,8 @@ from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 
 if TYPE_CHECKING:
+    import socket
+
     import serial
 
 _NS = 1_000_000_000
@@ -52,10 +58,11 @@ class SerialBridge:
     starts an Arduino anew. Nothing is ever written to it. One thread only.
     """
 
-    def __init__(self, config: SerialConfig, must_be_there: bool = True) -> None:
+    def __init__(self, config: SerialConfig, must_be_there: bool = True, further: socket.socket | None = None) -> None:
         """Open the port and wait for the first sample, `config.start_s` and a second at most.
 
-        With `must_be_there` False nothing is waited for and nothing that is missing is an error.
+        With `must_be_there` False nothing is waited for and nothing that is missing is an error. What the board says
+        of encoders and a satellite receiver goes to `further`, see `Passer`.
 
         Raises:
             HardwareError: no sample came, and why; pyserial is not installed.
@@ -70,6 +77,7 @@ class SerialBridge:
         self._mag_delay_ns = round((wire_s + config.chips_s + config.mag_delay_s) * _NS)
         self._decoder = FrameDecoder()
         self._clock = DeviceClock(config.clock)
+        self._passer = Passer(self._clock, round((wire_s + config.chips_s) * _NS), further)
         self._port: serial.Serial | None = None
         self._retry_ns = 0  # when to open the port
         self._patience_ns = 0  # until when a frame must have come
@@ -137,8 +145,10 @@ class SerialBridge:
 
     def counters(self) -> dict[str, int]:
         """Return how often each fault occurred since the start."""
-        found = self._counts + Counter(
-            bad_frames=self._decoder.bad, clock_steps=self._clock.steps, stamps_doubted=self._clock.doubted
+        found = (
+            self._counts
+            + self._passer.counts
+            + Counter(bad_frames=self._decoder.bad, clock_steps=self._clock.steps, stamps_doubted=self._clock.doubted)
         )
         return dict(found)
 
@@ -163,6 +173,7 @@ class SerialBridge:
         except PORT_ERRORS as error:
             self._counts["open_failures"] += 1
             self.problem = why_not_open(config, error)
+            self._passer.lose(self.problem)
             return
         self._counts["opened"] += 1
         self._patience_ns = now + round(config.start_s * _NS)
@@ -186,6 +197,7 @@ class SerialBridge:
     def _lose(self, what: str, problem: str) -> None:
         self._counts[what] += 1
         self.problem = problem
+        self._passer.lose(problem)
         self.close()
 
     def _diagnosis(self) -> tuple[str, str]:
@@ -233,7 +245,10 @@ class SerialBridge:
 
     # ---- messages ---------------------------------------------------------------------------------------------
 
-    def _taken(self, message: RawSample | Hello | OtherVersion, arrival_ns: int) -> list[ImuSample | MagSample]:
+    def _taken(self, message: Message, arrival_ns: int) -> list[ImuSample | MagSample]:
+        if isinstance(message, Counts | Passed):
+            self._passer.take(message)
+            return []
         if isinstance(message, OtherVersion):
             self._other_version = message.version
             self._hello = None
@@ -263,6 +278,7 @@ class SerialBridge:
                 Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, hello.mag_pt * 1e-6),
             )
         self._hello = hello
+        self._passer.greet(hello)
         self.rate_hz = float(hello.rate_hz)
 
     def _follow(self, sequence: int) -> None:
@@ -325,17 +341,12 @@ class SerialBridge:
             if self._gyro_watch.repeats((*raw.gyro, raw.temperature)) >= stuck:
                 counts["gyro_stuck"] += 1
                 faults |= Health.GYRO_FAULT
-            self._take_temperature(raw.temperature * hello.temperature_nk * 1e-9 + hello.temperature_mc * 1e-3)
+            told_c = raw.temperature * hello.temperature_nk * 1e-9 + hello.temperature_mc * 1e-3
+            self._temperature_c = _smoothed(told_c, self._temperature_c, self.rate_hz)
         if Status.MAG_NEW in raw.status and max(map(abs, raw.mag)) >= hello.mag_limit:
             counts["mag_overflow"] += 1
             self._events |= Health.MAG_FAULT
         self._faults = faults
-
-    def _take_temperature(self, temperature_c: float) -> None:
-        if self._temperature_c is None:
-            self._temperature_c = temperature_c
-        gain = min(1.0 / (_TEMPERATURE_TAU_S * self.rate_hz), 1.0)
-        self._temperature_c += gain * (temperature_c - self._temperature_c)
 
 
 class _Watch:
@@ -349,6 +360,14 @@ class _Watch:
         self._repeats = self._repeats + 1 if values == self._last else 0
         self._last = values
         return self._repeats
+
+
+def _smoothed(told_c: float, before_c: float | None, rate_hz: float) -> float:
+    """Return a temperature, smoothed over `_TEMPERATURE_TAU_S`."""
+    if before_c is None:
+        before_c = told_c
+    gain = min(1.0 / (_TEMPERATURE_TAU_S * rate_hz), 1.0)
+    return before_c + gain * (told_c - before_c)
 
 
 def load_pyserial() -> Any:

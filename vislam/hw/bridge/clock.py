@@ -61,6 +61,18 @@ class DeviceClock:
         self._add(point)
         return self._stamped(point) if self._rate_known else None
 
+    def host_ns(self, device_us: int) -> int | None:
+        """Return the host time of a device stamp near the newest one, which changes nothing; None where none is known.
+
+        For what the device stamped besides, before or after it: within `step_s` of the newest stamp.
+        """
+        if self._last is None or not self._rate_known:
+            return None
+        since_us = (device_us - self._last.device_ns // 1000 + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
+        if abs(since_us) > self._config.step_s * 1e6:
+            return None
+        return round(self._line_ns(self._last.device_ns + since_us * 1000))
+
     def _begin(self) -> None:
         self._last: _Point | None = None
         self._suspect = None

@@ -1,7 +1,9 @@
 """What the serial bridge says: frames of a microcontroller that reads the chips, and a decoder that trusts nothing.
 
 A frame is `type, sequence, device time, body, CRC-16`, stuffed by COBS (Cheshire and Baker, 1999) and ended by a zero
-byte, all little-endian. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`). docs/cart.md has the table;
+byte, all little-endian. Samples and hellos share one sequence; counts and passed bytes, which a sketch sends only where
+it is told of encoders or a receiver, have one each, so that a host which does not know them misses nothing. The CRC is
+CCITT's with initial value 0xFFFF (`binascii.crc_hqx`). docs/sensors.md has the table;
 firmware/vislam_bridge/vislam_bridge.ino is the other end.
 """
 
@@ -13,12 +15,15 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 PROTOCOL_VERSION = 1
-SAMPLE_TYPE, HELLO_TYPE = 1, 2
+SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE = 1, 2, 3, 4
 # longest stuffed frame, without its zero; a longer stretch without a zero is noise, and nothing of it is kept
 MAX_STUFFED_BYTES = 64
 
 _SAMPLE = struct.Struct("<BHIB9hh")  # type, sequence, microseconds, status, accel, gyro, mag, temperature
 _HELLO = struct.Struct("<BHIBBBB3sHIIIIiHHH")
+_COUNTS = struct.Struct("<BHIii")
+_PASSED = struct.Struct("<BHI")  # then the bytes
+MOST_PASSED = 20  # bytes in a frame: so that behind it an AVR's buffer still has room for a sample
 _VERSION_AT = 7  # the same in every version: type, sequence, microseconds, version
 _CRC = struct.Struct("<H")
 _CRC_BEGIN = 0xFFFF
@@ -41,6 +46,8 @@ class Chips(IntFlag):
     ACCEL = 1 << 0
     GYRO = 1 << 1
     MAG = 1 << 2
+    ENCODERS = 1 << 3  # the sketch was told of encoders, and counts them
+    GNSS = 1 << 4  # ... of a satellite receiver, whose bytes it passes on
     STARTED = 1 << 7  # the first hello since the device started
 
 
@@ -85,14 +92,37 @@ class OtherVersion:
     version: int
 
 
-Message = RawSample | Hello | OtherVersion
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Where the encoders of two wheels stand; both edges of channel A count, 0 when the device started."""
+
+    sequence: int  # 16 bits, of these frames alone
+    t_us: int
+    left: int  # 32 bits, signed
+    right: int
 
 
-def encode(message: RawSample | Hello) -> bytes:
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """Bytes that a satellite receiver sent to the device, 1 to `MOST_PASSED`."""
+
+    sequence: int  # 16 bits, of these frames alone
+    t_us: int  # when the first one was taken
+    data: bytes
+
+
+Message = RawSample | Hello | OtherVersion | Counts | Passed
+
+
+def encode(message: RawSample | Hello | Counts | Passed) -> bytes:
     """Return a frame with its zero at the end, byte for byte what the firmware sends."""
     if isinstance(message, RawSample):
         m = message
         body = _SAMPLE.pack(SAMPLE_TYPE, m.sequence, m.t_us, m.status, *m.accel, *m.gyro, *m.mag, m.temperature)
+    elif isinstance(message, Counts):
+        body = _COUNTS.pack(COUNTS_TYPE, message.sequence, message.t_us, message.left, message.right)
+    elif isinstance(message, Passed):
+        body = _PASSED.pack(PASSED_TYPE, message.sequence, message.t_us) + message.data
     else:
         h = message
         body = _HELLO.pack(
@@ -143,17 +173,12 @@ def parse(stuffed: bytes) -> Message | None:
     body = data[: -_CRC.size]
     if binascii.crc_hqx(body, _CRC_BEGIN) != _CRC.unpack(data[-_CRC.size :])[0]:
         return None
-    if body[0] == SAMPLE_TYPE and len(body) == _SAMPLE.size:
-        return _sample(body)
-    if body[0] == HELLO_TYPE:
-        if body[_VERSION_AT] != PROTOCOL_VERSION:
-            return OtherVersion(body[_VERSION_AT])
-        if len(body) == _HELLO.size:
-            return _hello(body)
-    return None
+    return _READERS[body[0]](body) if body[0] in _READERS else None
 
 
 def _sample(body: bytes) -> RawSample | None:
+    if len(body) != _SAMPLE.size:
+        return None
     _, sequence, t_us, status, *values = _SAMPLE.unpack(body)
     if status & ~_ALL_STATUS:
         return None
@@ -161,14 +186,29 @@ def _sample(body: bytes) -> RawSample | None:
     return RawSample(sequence, t_us, Status(status), (ax, ay, az), (wx, wy, wz), (mx, my, mz), temperature)
 
 
-def _hello(body: bytes) -> Hello | None:
+def _hello(body: bytes) -> Hello | OtherVersion | None:
+    if body[_VERSION_AT] != PROTOCOL_VERSION:
+        return OtherVersion(body[_VERSION_AT])
+    if len(body) != _HELLO.size:
+        return None
     _, sequence, t_us, _, chips, *rest = _HELLO.unpack(body)
     hello = Hello(sequence, t_us, Chips(chips), *rest)
     scales = (hello.rate_hz, hello.accel_nm_s2, hello.gyro_nrad_s, hello.mag_pt, hello.accel_limit, hello.gyro_limit)
     return hello if all(scales) else None
 
 
+def _counts(body: bytes) -> Counts | None:
+    return Counts(*_COUNTS.unpack(body)[1:]) if len(body) == _COUNTS.size else None
+
+
+def _passed(body: bytes) -> Passed | None:
+    _, sequence, t_us = _PASSED.unpack_from(body)
+    data = body[_PASSED.size :]
+    return Passed(sequence, t_us, data) if len(data) <= MOST_PASSED else None
+
+
 _ALL_STATUS = sum(Status)
+_READERS = {SAMPLE_TYPE: _sample, HELLO_TYPE: _hello, COUNTS_TYPE: _counts, PASSED_TYPE: _passed}
 
 
 class FrameDecoder:

@@ -19,12 +19,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Chips, Hello, RawSample, Status, encode
+from vislam.hw.bridge.protocol import (
+    MOST_PASSED,
+    SAMPLE_WIRE_BYTES,
+    Chips,
+    Counts,
+    Hello,
+    Passed,
+    RawSample,
+    Status,
+    encode,
+)
 from vislam.hw.emulator.sensing import Sensing, SensorError, Truth, quantised
 
 _NS = 1_000_000_000
 _PERIOD_NS = 2_500_000
 _MAG_EVERY = 8
+_COUNTS_EVERY = 8  # samples: 50 a second
+_LATE_NS = 20_000_000
 _HELLO_EVERY_NS = _NS
 _READ_NS = 500_000  # from a sample's time to its first byte
 _FILTER_NS = 3_300_000  # what the gyro shows is so old
@@ -69,6 +81,8 @@ class BridgeEmulator:
         errors: tuple[SensorError, SensorError, SensorError] = NOISE,
         baud: int = 500_000,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        turned: Callable[[int], tuple[float, float]] | None = None,
+        has_receiver: bool = False,
     ) -> None:
         """Start the board and plug it in.
 
@@ -80,6 +94,8 @@ class BridgeEmulator:
             errors: of gyro, accelerometer and magnetometer; the noise of the data sheets unless told otherwise.
             baud: sets how long a frame is on its way; the terminal itself has no rate.
             now_ns: the clock that truth and bytes follow.
+            turned: by how many counts left and right wheel have turned at a time; None: a sketch without encoders.
+            has_receiver: the sketch passes on what `say` tells.
         """
         self.path = path
         self.faults = LineFaults()
@@ -87,6 +103,9 @@ class BridgeEmulator:
         self._drift = drift
         self._wire_ns = SAMPLE_WIRE_BYTES * 10 * _NS // baud
         self._now_ns = now_ns
+        self._turned = turned
+        self._chips = Chips(7) | (Chips.ENCODERS if turned else 0) | (Chips.GNSS if has_receiver else 0)
+        self._said = b""  # by the receiver
         self._rng = random.Random(seed)
         self._sensing = [Sensing(error, seed + i) for i, error in enumerate(errors)]
         self._lock = threading.Lock()
@@ -128,6 +147,12 @@ class BridgeEmulator:
         """Press the board's reset button."""
         self._restart_asked.set()
 
+    def say(self, data: bytes) -> None:
+        """Let the satellite receiver at the board say something; without one nobody hears it."""
+        if Chips.GNSS in self._chips:
+            with self._lock:
+                self._said += data
+
     def close(self) -> None:
         """Stop the board; may be called twice."""
         self._is_stopping.set()
@@ -143,19 +168,25 @@ class BridgeEmulator:
     def _run_from(self, begin_ns: int) -> None:
         """Sample and send as the sketch does, until the board is to start anew."""
         sequence = ticks = 0
-        hello_ns, chips = begin_ns, Chips(7) | Chips.STARTED
+        hello_ns, chips = begin_ns, self._chips | Chips.STARTED
+        further = _Further(self._turned, begin_ns)
         due_ns = begin_ns
         while True:
             frames = b""
             if due_ns >= hello_ns:
                 hello_ns += _HELLO_EVERY_NS
                 hello = self._hello(sequence, self._device_us(due_ns - begin_ns), chips)
-                frames, sequence, chips = encode(hello), (sequence + 1) % _SEQUENCES, Chips(7)
+                frames, sequence, chips = encode(hello), (sequence + 1) % _SEQUENCES, self._chips
             sample = self._sample(sequence, self._device_us(due_ns - begin_ns), due_ns, ticks)
             sequence, ticks = (sequence + 1) % _SEQUENCES, ticks + 1
             if not self._waited_until(due_ns + _READ_NS + self._wire_ns):
                 return
-            self._send(frames + encode(sample))
+            frames += encode(sample)
+            with self._lock:
+                said, self._said = self._said[:MOST_PASSED], self._said[MOST_PASSED:]
+            frames += further.counts(due_ns, self._device_us(due_ns - begin_ns), ticks)
+            taken_ns = min(self._now_ns(), due_ns + _LATE_NS)  # of a thread that was put aside: near its samples
+            self._send(frames + further.passed(self._device_us(taken_ns - begin_ns), said))
             due_ns += _PERIOD_NS
             if self._now_ns() - due_ns > _NS:  # this thread was put aside: the board would have gone on sampling
                 due_ns = self._now_ns()
@@ -227,6 +258,32 @@ class BridgeEmulator:
         return bytes(
             byte ^ 1 << self._rng.randrange(8) if self._rng.random() < faults.flipped else byte for byte in kept
         )
+
+
+class _Further:
+    """What a board says besides, since it started."""
+
+    def __init__(self, turned: Callable[[int], tuple[float, float]] | None, begin_ns: int) -> None:
+        self._turned = turned
+        self._begun = (0.0, 0.0) if turned is None else turned(begin_ns)
+        self._counted = self._passed = 0
+
+    def counts(self, t_ns: int, t_us: int, tick: int) -> bytes:
+        if self._turned is None or tick % _COUNTS_EVERY:
+            return b""
+        left, right = (round(now - then) for now, then in zip(self._turned(t_ns), self._begun, strict=True))
+        self._counted += 1
+        return encode(Counts((self._counted - 1) % _SEQUENCES, t_us, _signed(left), _signed(right)))
+
+    def passed(self, t_us: int, said: bytes) -> bytes:
+        if not said:
+            return b""
+        self._passed += 1
+        return encode(Passed((self._passed - 1) % _SEQUENCES, t_us, said))
+
+
+def _signed(count: int) -> int:
+    return (count + 2**31) % 2**32 - 2**31
 
 
 def at_rest(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:

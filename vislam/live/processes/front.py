@@ -219,11 +219,12 @@ class FrontProcess:
                 self._send(told)
 
     def _follow_sensors(self, readings: ReadingSource) -> None:
-        """Note once a second how the further sensors are."""
+        """Note once a second how the further sensors are, and which of them slip."""
         now_s = time.monotonic()
         if now_s - self._sensors_noted_s >= _SENSORS_S and (status := readings.status()):
             self._sensors_noted_s = now_s
-            self._life.note(sensors=status)
+            doubts = {name: word for name, word in self.front.sensor_doubts().items() if status.get(name) == "well"}
+            self._life.note(sensors=status | doubts)
 
     def _judge(self, t_ns: int) -> None:
         """Tell the pose whether the run so far is to be doubted, and people why; nothing while it begins."""

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.live.epoch import Epoch
 from vislam.live.reading_source import Heard
@@ -14,6 +15,7 @@ from vislam.live.virtual.motion import Follower, Segment
 from vislam.live.virtual.place import BODY_HEIGHT_M
 from vislam.sensors import BodyState, SensorSetup
 from vislam.sensors.geodetic import Geodetic
+from vislam.sensors.simulated import slipping, within
 
 _NS = 1_000_000_000
 _KNOWN_S = 5.0  # of the motion; whoever asks later missed what was before
@@ -25,7 +27,8 @@ class VirtualReadings:
     def __init__(self, cart: str, epoch: Epoch, setup: SensorSetup, seed: int) -> None:
         """Put the simulated sensors of a setup on the cart whose segments are published under a name."""
         self._follower, self._epoch, self._setup = Follower.waiting(cart), epoch, setup
-        self._rngs, self._own = {}, {}
+        self._rngs, self._own = {}, dict[str, Array]()
+        self._is_placed = dict.fromkeys(setup.simulated_hz, False)
         for number, name in enumerate(setup.simulated_hz):
             self._rngs[name] = np.random.default_rng([seed, number])
             self._own[name] = setup.suite.drawn_own(name, self._rngs[name])
@@ -45,7 +48,13 @@ class VirtualReadings:
                     self._missed[name] += 1
                     continue
                 body = body_at(self._follower.at(t_s), begin_ns + round(t_s * _NS))
-                values = self._setup.sensors[name].draw(body, self._own[name].copy(), self._rngs[name])
+                sensor, faults = self._setup.sensors[name], self._setup.simulated_faults[name]
+                if not self._is_placed[name]:  # about where it begins: nobody knows yet where it will drive
+                    self._own[name] = sensor.about(body.position_m[None], self._own[name])
+                    self._is_placed[name] = True
+                values = sensor.draw(body, self._own[name].copy(), self._rngs[name])
+                if within(t_s, faults.slips):
+                    values = slipping(sensor, values, faults)
                 out.append(Reading(name, body.t_ns, values))
         self._heard.hear(out)
         return out

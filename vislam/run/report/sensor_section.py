@@ -47,11 +47,22 @@ def _readings(run: RunFiles, name: str) -> list[str | Cell]:
     by_filter = [number(filtered.get(f"{name}_{what}"), 0) for what in ("accepted", "gated", "refused")]
     entry = as_dict(run.metrics, "sensors", name)
     said = str(entry.get("note", "" if entry.get("begun") else "has not begun"))
+    said = "; ".join(filter(None, (said, _slipped(as_dict(entry, "slip")))))
     nis = number(_nis_per_degree(as_list(as_dict(run.metrics, "nis").get(name))), 2)
     return [
         name, number(counted.get("readings"), 0), *by_filter, number(counted.get("unusable"), 0), nis,
         Cell(said, kind="text long"),
     ]  # fmt: skip
+
+
+def _slipped(slip: dict[str, object]) -> str:
+    """Return in words how often wheels slipped; empty: never."""
+    times, seconds = slip.get("times"), slip.get("seconds")
+    if not isinstance(times, int) or not isinstance(seconds, int | float):
+        return ""
+    still = ", at the end as well" if slip.get("slips") else ""
+    doubt = "; contradicted the other sensors for longer than a slip lasts" if slip.get("contradicts") else ""
+    return f"slipped {times} time{'s' if times != 1 else ''}, {seconds:.1f} s{still}; not used meanwhile{doubt}"
 
 
 def _in_graph(name: str, counted: dict[str, object]) -> list[str | Cell]:

@@ -19,6 +19,7 @@ from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import (
     ANYWHERE_M,
     FrameKind,
+    about_up,
     frame_variables,
     placed,
     thinned_pairs,
@@ -145,6 +146,22 @@ class AnchorRange(Configured):
         number = int(rng.choice(list(self._anchors)))
         exact = self._predicted(number, body, own)
         return np.array([number, *noisy(exact, self.noise(exact), rng)])
+
+    def about(self, path_m: Array, own: Array) -> Array:
+        """Return own variables with a frame in which the middle of the path is at the middle of the anchors.
+
+        By their sigmas alone the path would be ten kilometres off, where all ranges are alike and tell no heading. Its
+        height is kept where it is told, and else the world's origin is at that of the frame.
+        """
+        if not self._frame:
+            return own
+        anchors = np.array([self._anchor(number, own) for number in self._anchors])
+        middle, there = (0.5 * (places.min(axis=0) + places.max(axis=0)) for places in (path_m, anchors))
+        out = own.copy()
+        out[1:3] = (there - about_up(float(own[0])) @ middle)[:2]
+        if self.settings.frame_z_sigma_m >= ANYWHERE_M:
+            out[3] = self.settings.frame_z_m
+        return out
 
     def _predicted(self, number: int, body: BodyState, own: Array) -> Array:
         antenna = placed(body, own[: self._frame], self._lever_of(own)).point_m

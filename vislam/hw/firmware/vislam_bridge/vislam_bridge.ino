@@ -3,6 +3,8 @@
 // For AVR (Nano, Uno, Mega, Leonardo) and ESP32 with their Arduino cores; no library but Wire. Connect 5 V or 3.3 V as
 // your GY-85 is made for, GND, SDA and SCL (Nano and Uno: A4 and A5; ESP32: 21 and 22). docs/cart.md of vislam has the
 // protocol, which vislam/hw/bridge/protocol.py reads. Any change of a frame's layout needs a new PROTOCOL_VERSION.
+// It also counts the encoders of two wheels and passes on what a satellite receiver says, where it is told their pins:
+// docs/sensors/wheels.md and docs/sensors/gnss.md of vislam.
 
 #include <Arduino.h>
 #include <Wire.h>
@@ -15,11 +17,25 @@ static const uint32_t I2C_HZ = 400000;    // at 100000 reduce RATE_HZ to 100
 static const uint32_t RETRY_MS = 100;     // between attempts to set up a chip that does not answer
 static const uint16_t I2C_TIMEOUT_MS = 3; // a stuck bus must not stop the clock
 
+// Pins of the encoders' channels A and B; -1: there are none. A has to be a pin with interrupts: 2 and 3 of a Nano or Uno,
+// any of an ESP32 (but 34 to 39, which have no pull-up). Both edges of A count, up while the machine goes forward.
+#ifndef LEFT_A
+#define LEFT_A -1
+#define LEFT_B -1
+#define RIGHT_A -1
+#define RIGHT_B -1
+#endif
+static const uint16_t COUNTS_HZ = 50;
+// A satellite receiver on another serial port: Serial1 of a Mega or Leonardo, Serial2 of an ESP32; a Nano has none.
+// #define GNSS_PORT Serial1
+static const uint32_t GNSS_BAUD = 9600;
+
 static const uint8_t PROTOCOL_VERSION = 1;
-static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2;
+static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2, COUNTS_TYPE = 3, PASSED_TYPE = 4;
 static const uint8_t STATUS_MAG_NEW = 1, STATUS_ACCEL_ERROR = 2, STATUS_GYRO_ERROR = 4, STATUS_MAG_ERROR = 8,
                      STATUS_MISSED = 16;
-static const uint8_t CHIPS_ACCEL = 1, CHIPS_GYRO = 2, CHIPS_MAG = 4, CHIPS_STARTED = 128;
+static const uint8_t CHIPS_ACCEL = 1, CHIPS_GYRO = 2, CHIPS_MAG = 4, CHIPS_ENCODERS = 8, CHIPS_GNSS = 16,
+                     CHIPS_STARTED = 128;
 
 static const uint32_t ACCEL_NM_S2 = 38307227;    // 256 counts a g in full resolution, whatever the range
 static const uint32_t GYRO_NRAD_S = 1214142;     // 14.375 counts a degree per second
@@ -37,6 +53,8 @@ static const uint8_t ACCEL_FORMAT = 0x0B;          // full resolution, 16 g
 static const uint8_t GYRO_FILTER = (3 << 3) | 2;   // 2000 degrees per second, filter at 98 Hz
 static const uint8_t MAG_SETTLING = 2;  // its first readings still have the gain before
 static const uint8_t MAX_BODY = 48;     // the hello is 42 bytes
+static const uint8_t SAMPLE_WIRE = 32;  // bytes that a sample takes; for anything but a hello this much stays free
+static const uint8_t MOST_PASSED = 20;  // bytes of a receiver in a frame: with a sample they fill an AVR's buffer
 
 struct Chip {
   uint8_t address;
@@ -44,6 +62,17 @@ struct Chip {
   bool ready;
   uint32_t tried_ms;
 };
+
+#if LEFT_A >= 0
+static const bool HAS_ENCODERS = true;
+#else
+static const bool HAS_ENCODERS = false;
+#endif
+#if defined(GNSS_PORT)
+static const bool HAS_GNSS = true;
+#else
+static const bool HAS_GNSS = false;
+#endif
 
 static Chip accelChip, gyroChip, magChip;
 static int16_t accel[3], gyro[3], mag[3], temperature;
@@ -193,10 +222,10 @@ static void put32(uint32_t value) {
   put16((uint16_t)(value >> 16));
 }
 
-static void beginFrame(uint8_t type, uint32_t timeUs) {
+static void beginFrame(uint8_t type, uint16_t number, uint32_t timeUs) {
   bodyLength = 0;
   put8(type);
-  put16(sequence++);
+  put16(number);
   put32(timeUs);
 }
 
@@ -236,7 +265,7 @@ static bool sendFrame() {
 }
 
 static void sendSample(uint32_t timeUs, uint8_t status) {
-  beginFrame(SAMPLE_TYPE, timeUs);
+  beginFrame(SAMPLE_TYPE, sequence++, timeUs);
   put8(status);
   for (uint8_t i = 0; i < 3; i++) put16((uint16_t)accel[i]);
   for (uint8_t i = 0; i < 3; i++) put16((uint16_t)gyro[i]);
@@ -246,10 +275,10 @@ static void sendSample(uint32_t timeUs, uint8_t status) {
 }
 
 static bool sendHello(uint32_t timeUs) {
-  beginFrame(HELLO_TYPE, timeUs);
+  beginFrame(HELLO_TYPE, sequence++, timeUs);
   put8(PROTOCOL_VERSION);
   put8((accelChip.ready ? CHIPS_ACCEL : 0) | (gyroChip.ready ? CHIPS_GYRO : 0) | (magChip.ready ? CHIPS_MAG : 0) |
-       (started ? CHIPS_STARTED : 0));
+       (HAS_ENCODERS ? CHIPS_ENCODERS : 0) | (HAS_GNSS ? CHIPS_GNSS : 0) | (started ? CHIPS_STARTED : 0));
   put8(accelChip.id[0]);
   put8(gyroChip.id[0]);
   for (uint8_t i = 0; i < 3; i++) put8(magChip.id[i]);
@@ -264,6 +293,76 @@ static bool sendHello(uint32_t timeUs) {
   put16(MAG_LIMIT);
   return sendFrame();
 }
+
+// ---- encoders: an interrupt at each edge of channel A
+
+#if LEFT_A >= 0
+#if !defined(IRAM_ATTR)
+#define IRAM_ATTR
+#endif
+
+static const uint32_t COUNTS_EVERY_US = 1000000UL / COUNTS_HZ;
+static const uint8_t COUNTS_WIRE = 19;
+static volatile int32_t leftCount, rightCount;
+static uint32_t countsDueUs;
+static uint16_t countsSent;
+
+// Going forward, A is a quarter ahead of B, so that right after an edge of A both differ.
+static void IRAM_ATTR leftTurned() { leftCount = leftCount + (digitalRead(LEFT_A) != digitalRead(LEFT_B) ? 1 : -1); }
+static void IRAM_ATTR rightTurned() { rightCount = rightCount + (digitalRead(RIGHT_A) != digitalRead(RIGHT_B) ? 1 : -1); }
+
+static void beginEncoders() {
+  const uint8_t pins[] = {LEFT_A, LEFT_B, RIGHT_A, RIGHT_B};
+  for (uint8_t i = 0; i < 4; i++) pinMode(pins[i], INPUT_PULLUP);
+  attachInterrupt(digitalPinToInterrupt(LEFT_A), leftTurned, CHANGE);
+  attachInterrupt(digitalPinToInterrupt(RIGHT_A), rightTurned, CHANGE);
+  countsDueUs = micros();
+}
+
+static void sendCounts(uint32_t timeUs) {
+  if (timeUs - countsDueUs >= 0x80000000UL || Serial.availableForWrite() < SAMPLE_WIRE + COUNTS_WIRE) return;
+  countsDueUs = timeUs + COUNTS_EVERY_US;
+  noInterrupts();  // an AVR reads 32 bits in four steps
+  const int32_t left = leftCount, right = rightCount;
+  interrupts();
+  beginFrame(COUNTS_TYPE, countsSent++, timeUs);
+  put32((uint32_t)left);
+  put32((uint32_t)right);
+  sendFrame();
+}
+#else
+static void beginEncoders() {}
+static void sendCounts(uint32_t) {}
+#endif
+
+// ---- a satellite receiver: its bytes as they come, with the time of the first one
+
+#if defined(GNSS_PORT)
+static const uint32_t GNSS_QUIET_US = 5000;  // without another byte for so long, what there is is sent
+static const uint8_t PASSED_WIRE = 11;       // and the bytes
+static uint8_t passed[MOST_PASSED], passedLength;
+static uint32_t passedUs, passedLastUs;
+static uint16_t passedSent;
+
+static void beginGnss() { GNSS_PORT.begin(GNSS_BAUD); }
+
+static void passOn(uint32_t timeUs) {
+  while (passedLength < MOST_PASSED && GNSS_PORT.available() > 0) {
+    if (passedLength == 0) passedUs = timeUs;
+    passed[passedLength++] = (uint8_t)GNSS_PORT.read();
+    passedLastUs = timeUs;
+  }
+  if (passedLength == 0 || (passedLength < MOST_PASSED && timeUs - passedLastUs < GNSS_QUIET_US)) return;
+  if (Serial.availableForWrite() < SAMPLE_WIRE + PASSED_WIRE + passedLength) return;
+  beginFrame(PASSED_TYPE, passedSent++, passedUs);
+  for (uint8_t i = 0; i < passedLength; i++) put8(passed[i]);
+  passedLength = 0;
+  sendFrame();
+}
+#else
+static void beginGnss() {}
+static void passOn(uint32_t) {}
+#endif
 
 // ---- the loop
 
@@ -291,6 +390,8 @@ void setup() {
   Serial.setTxBufferSize(512);
 #endif
   Serial.begin(BAUD);
+  beginEncoders();
+  beginGnss();
   freeBus();
   writeRegister(0x68, 0x3E, 0x80);  // reset the gyro, at either address
   writeRegister(0x69, 0x3E, 0x80);
@@ -318,5 +419,8 @@ void loop() {
   } else if (now - helloUs >= HELLO_EVERY_US) {
     helloUs = now;
     helloPending = true;
+  } else {
+    sendCounts(now);
+    passOn(now);
   }
 }

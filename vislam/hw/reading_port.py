@@ -1,4 +1,4 @@
-"""A satellite receiver on a serial port: a thread of its own reads it, for those who ask must not wait."""
+"""A sensor on a serial port: a thread of its own reads it, for those who ask must not wait."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import select
 import threading
 import time
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,9 +15,8 @@ from vislam.config import SerialConfig
 from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
 from vislam.hw.bridge.bridge import PORT_ERRORS, load_pyserial, why_not_open
-from vislam.hw.gnss_stream import FixStream, NmeaStream, UbxStream
+from vislam.hw.talks import talk_of
 from vislam.sensors.geodetic import Geodetic
-from vislam.sensors.gnss import Fix, FixReadings
 from vislam.sensors.toml import SensorPort
 
 if TYPE_CHECKING:
@@ -29,23 +27,22 @@ _READ_BYTES = 4096
 _GAP_S = 0.05  # without a byte for so long, a burst is over
 _REOPEN_S = 0.5  # between attempts to open a port that is not there
 _SILENT_NS = 5 * _NS  # without a byte for so long, the port is opened anew
-_OLD_NS = 3 * _NS  # without a fix for so long, the receiver is said to have none
 _MOST_WAITING = 256  # readings that nobody took
 _CLOSING_S = 2.0
 
 
 def check_port(config: SensorPort) -> None:
-    """Raise HardwareError where a receiver's port is missing or may not be opened, or pyserial is not installed."""
+    """Raise HardwareError where a sensor's port is missing or may not be opened, or pyserial is not installed."""
     load_pyserial()
     if not os.access(config.port, os.R_OK | os.W_OK):
         code = errno.EACCES if Path(config.port).exists() else errno.ENOENT
         raise HardwareError(_why_not(config, OSError(code, os.strerror(code))))
 
 
-class GnssPort:
-    """Reads a receiver until it is closed; a port that goes away is looked for again. Nothing is written to it.
+class ReadingPort:
+    """Reads a sensor until it is closed; a port that goes away is looked for again. Nothing is written to it.
 
-    A reading is stamped by CLOCK_MONOTONIC when the first byte of its burst came, less the delay of the settings.
+    Readings are stamped by CLOCK_MONOTONIC, less the delay of the settings; `Talk` says how.
     """
 
     def __init__(self, name: str, config: SensorPort) -> None:
@@ -53,18 +50,16 @@ class GnssPort:
 
         Args:
             name: of the sensor.
-            config: of port and receiver.
+            config: of port and device.
         """
         self._serial = load_pyserial()
         self._config = config
-        self._readings = FixReadings(name, config.gnss)  # its datum outlives a plug that was pulled
-        self._counts = dict.fromkeys(("fixes", "refused", "damaged", "opened", "open_failures", "port_lost", "mute"), 0)
+        self._talk = talk_of(name, config)
+        self._counts = dict.fromkeys(("opened", "open_failures", "port_lost", "mute"), 0)
         self._problem = f"{config.port} has not been opened"
-        self._refusal = ""
-        self._newest_ns: int | None = None  # when the last good fix came
         self._waiting: deque[Reading] = deque(maxlen=_MOST_WAITING)
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"gnss {name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"sensor {name}", daemon=True)
         self._thread.start()
 
     def take(self) -> list[Reading]:
@@ -75,25 +70,17 @@ class GnssPort:
         return found
 
     def status(self) -> str:
-        """Return "well", or what ails port or receiver."""
-        if self._problem:
-            return self._problem
-        newest_ns = self._newest_ns
-        silent_ns = 0 if newest_ns is None else time.monotonic_ns() - newest_ns
-        if newest_ns is not None and silent_ns <= _OLD_NS:
-            return "well"
-        since = "no fix yet" if newest_ns is None else f"no fix for {silent_ns / _NS:.0f} s"
-        return f"{since}: {self._refusal}" if self._refusal else since
+        """Return "well", or what ails port or device."""
+        return self._problem or self._talk.status()
 
     def counters(self) -> dict[str, int]:
-        """Return how many fixes were good, and how often each fault occurred."""
-        return dict(self._counts)
+        """Return how many readings were good, and how often each fault occurred."""
+        return {**self._talk.counters(), **self._counts}
 
     @property
     def datum(self) -> Geodetic | None:
-        """Where the frame of the readings begins: as told, or the first good fix; None before that."""
-        frame = self._readings.frame
-        return None if frame is None else frame.datum
+        """Where the frame of the readings begins: as told, or the first good fix; None before that, or without one."""
+        return self._talk.datum
 
     def close(self) -> None:
         """Stop reading; may be called twice."""
@@ -128,34 +115,19 @@ class GnssPort:
 
     def _listen(self, port: serial.Serial) -> None:
         """Read an open port until it is to be closed, goes away, or has been mute for long."""
-        stream: FixStream = UbxStream() if self._config.format == "ubx" else NmeaStream()
-        damaged_before, heard_ns = self._counts["damaged"], time.monotonic_ns()
+        self._talk.begin()
+        heard_ns = time.monotonic_ns()
         while not self._stop.is_set():
             ready, _, _ = select.select([port.fileno()], [], [], _GAP_S)
             data = port.read(_READ_BYTES) if ready else b""
             now_ns = time.monotonic_ns()
-            for fix in stream.feed(data, now_ns) if data else stream.end_burst():
-                self._take(fix)
-            self._counts["damaged"] = damaged_before + stream.damaged
+            self._waiting.extend(self._talk.feed(data, now_ns) if data else self._talk.end_burst())
             if data:
                 heard_ns, self._problem = now_ns, ""
             elif now_ns - heard_ns > _SILENT_NS:
                 self._counts["mute"] += 1
-                self._problem = f"{self._config.port} is silent; has the receiver power, and is the baud rate right?"
+                self._problem = f"{self._config.port} is silent; has the device power, and is the baud rate right?"
                 return
-
-    def _take(self, fix: Fix) -> None:
-        try:
-            reading = self._readings.reading(fix)
-        except ValueError as error:
-            self._counts["refused"] += 1
-            self._refusal = str(error)
-            return
-        if reading is None:
-            return
-        self._counts["fixes"] += 1
-        self._refusal, self._newest_ns = "", time.monotonic_ns()
-        self._waiting.append(replace(reading, t_ns=reading.t_ns - round(self._config.delay_s * _NS)))
 
 
 def _why_not(config: SensorPort, error: Exception) -> str:

@@ -1,0 +1,81 @@
+"""Readings of the further sensors that travel over the serial bridge, in the process that asks for them."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+
+from vislam.core.readings import Reading
+from vislam.hw.bridge.passer import BridgeState, BytesAt, CountsAt, passed_on
+from vislam.hw.bridge.protocol import Chips
+from vislam.hw.talks import CountTalk, FixTalk
+from vislam.sensors.geodetic import Geodetic
+from vislam.sensors.toml import SensorPort
+
+_GAP_NS = 50_000_000  # without a byte for so long, a receiver's burst is over
+_LACKS = {
+    Chips.ENCODERS: "the sketch on the board counts no encoders; set LEFT_A, LEFT_B, RIGHT_A and RIGHT_B in "
+    "vislam_bridge.ino of this vislam and put it on the board",
+    Chips.GNSS: "the sketch on the board passes no receiver on; set GNSS_PORT in vislam_bridge.ino of this vislam and "
+    "put it on the board",
+}
+
+
+class PassedReadings:
+    """Encoders and satellite receivers at the board whose inertial data another process reads."""
+
+    def __init__(self, source: socket.socket, sensors: Mapping[str, SensorPort]) -> None:
+        """Take the end of the bridge's `Passer`, and the sensors that are at the bridge."""
+        self._source = source
+        ticks = {name: port.ticks for name, port in sensors.items() if port.ticks}
+        self._counts = {name: CountTalk(name, replace(made, bits=32)) for name, made in ticks.items()}
+        self._fixes = {name: FixTalk(name, port) for name, port in sensors.items() if name not in ticks}
+        self._state = BridgeState(Chips(0), "the serial bridge has not said anything yet")
+        self._heard_ns: int | None = None  # when the receiver's last bytes came, while its burst lasts
+
+    def take(self) -> list[Reading]:
+        """Return the readings that came since the last call, at once."""
+        found: list[Reading] = []
+        for news in passed_on(self._source):
+            if isinstance(news, CountsAt):
+                found += [r for talk in self._counts.values() for r in talk.counted(news.t_ns, news.left, news.right)]
+            elif isinstance(news, BytesAt):
+                self._heard_ns = time.monotonic_ns()
+                found += [r for talk in self._fixes.values() for r in talk.feed(news.data, news.t_ns)]
+            else:
+                self._state = news
+                self._begin()
+        if self._heard_ns is not None and time.monotonic_ns() - self._heard_ns > _GAP_NS:
+            self._heard_ns = None
+            found += [reading for talk in self._fixes.values() for reading in talk.end_burst()]
+        return found
+
+    def status(self) -> dict[str, str]:
+        """Return by sensor "well", or what ails the bridge, its sketch or the device at it."""
+        asked = dict.fromkeys(self._counts, Chips.ENCODERS) | dict.fromkeys(self._fixes, Chips.GNSS)
+        talks: dict[str, CountTalk | FixTalk] = {**self._counts, **self._fixes}
+        return {
+            name: self._state.problem or ("" if chip in self._state.chips else _LACKS[chip]) or talks[name].status()
+            for name, chip in asked.items()
+        }
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return by sensor how many readings came, and how often each fault occurred."""
+        talks: dict[str, CountTalk | FixTalk] = {**self._counts, **self._fixes}
+        return {name: talk.counters() for name, talk in talks.items()}
+
+    def datums(self) -> dict[str, Geodetic]:
+        """Return by receiver where its frame begins, as far as it has told."""
+        return {name: datum for name, talk in self._fixes.items() if (datum := talk.datum) is not None}
+
+    def close(self) -> None:
+        """Stop listening; may be called twice."""
+        self._source.close()
+
+    def _begin(self) -> None:
+        for talk in self._counts.values():
+            talk.begin()
+        for receiver in self._fixes.values():
+            receiver.begin()
