@@ -14,7 +14,7 @@ from vislam.config import GraphConfig, WindowConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_log
 from vislam.core.memory import KeyframeEntry, WindowRecord
-from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision
+from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision, NavState
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.loop import LoopModel
 from vislam.factors.window import WindowOdometry
@@ -58,6 +58,38 @@ def feed(graph: PoseGraph, world: World, begin: int, end: int, loop_every: int =
         edges = [world.loop(k, k - 100, k)] if loop_every and k > 102 and k % loop_every == 0 else []
         updates.append(graph.add(world.packet(k), edges))
     return updates
+
+
+def faster(state: NavState, by_m_s: float, sigma: float = 1.0) -> NavState:
+    """Return a state of another speed, its velocity so many times as uncertain."""
+    covariance = state.covariance.copy()
+    covariance[6:9, 6:9] *= sigma**2
+    forward = state.T_world_body[:3, 0]
+    return replace(state, velocity_world_m_s=state.velocity_world_m_s + by_m_s * forward, covariance=covariance)
+
+
+@pytest.mark.parametrize(
+    ("field", "by_m_s", "sigma", "anew"),
+    [
+        ("filter_state", 0.02, 1.0, False),
+        ("filter_state", 0.5, 1.0, True),
+        ("filter_state", 0.5, 100.0, False),
+        ("state_at_sight", 0.0, 1.0, False),
+        ("state_at_sight", 0.0, 0.3, True),
+    ],
+)
+def test_a_window_begins_anew_where_the_filter_knows_its_speed_better(make, field, by_m_s, sigma, anew) -> None:
+    world = World(40)
+    graph, window = make(world)
+    feed(graph, world, 0, 20)
+    begun_at = window.begun_at
+    known = faster(window.state(20), by_m_s, sigma)
+    update = graph.add(replace(world.packet(20), **{field: known}), [])
+    assert (window.begun_at is known, window.begun_at is begun_at) == (anew, not anew)
+    assert ("begins anew" in update.note) == anew
+    later = feed(graph, world, 21, 40)
+    assert "begins anew" not in "".join(one.note for one in later)
+    assert np.abs(graph.poses()[:, :3, 3] - world.truth[:40, :3, 3]).max() < 1.0
 
 
 def chain(window: FakeWindow, count: int, keyframes: int) -> np.ndarray:
@@ -406,7 +438,7 @@ def test_a_packet_that_the_window_refuses_changes_nothing(world: World, make, mo
     before, journal = graph.poses(), len(graph.journal)
     good, add = world.packet(20), window.add
 
-    def refuse(packet: KeyframePacket, _: object = None) -> WindowUpdate:
+    def refuse(packet: KeyframePacket, *_: object) -> WindowUpdate:
         raise DataError("keyframe 20: its observations hold NaN")
 
     monkeypatch.setattr(window, "add", refuse)
@@ -436,7 +468,7 @@ def test_a_window_that_gives_nonsense_is_bridged(world: World, make, monkeypatch
     graph, window = make(world)
     feed(graph, world, 0, 40)
     add = window.add
-    monkeypatch.setattr(window, "add", lambda packet, T=None: SPOILED[name](add(packet, T)))
+    monkeypatch.setattr(window, "add", lambda packet, *rest: SPOILED[name](add(packet, *rest)))
     update = feed(graph, world, 40, 42)[-1]
     assert ("tilts" in name) or "no usable edge" in update.note
     monkeypatch.setattr(window, "add", add)

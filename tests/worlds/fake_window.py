@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.geometry import invert, se3_exp, so3_exp, tangent_basis, transform
 from vislam.core.messages import KeyframePacket, NavState
+from vislam.core.readings import Motion
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
 from worlds.lap import World
 
@@ -28,9 +31,10 @@ class FakeWindow:
         self.first: Array = np.eye(4)
         self.count = 0
         self.begin: int | None = None  # the first keyframe after `initialise`
+        self.begun_at: NavState | None = None
 
     def initialise(self, state: NavState | None, T_local_body: Array | None = None) -> None:
-        self.begin = None
+        self.begin, self.begun_at = None, state
         self.first = (
             state.T_world_body if state is not None else T_local_body if T_local_body is not None else np.eye(4)
         )
@@ -43,7 +47,9 @@ class FakeWindow:
         T = invert(self.world.truth[k - 1]) @ self.world.truth[k] @ se3_exp(xi)
         return WindowEdge(k - 1, k, T, np.diag((self.sigma * scale) ** 2), settled)
 
-    def add(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> WindowUpdate:
+    def add(
+        self, packet: KeyframePacket, T_odom_body: Array | None = None, motions: Sequence[Motion] = ()
+    ) -> WindowUpdate:
         k = packet.keyframe.id
         self.count = k + 1
         self.begin = k if self.begin is None else self.begin

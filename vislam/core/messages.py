@@ -158,6 +158,7 @@ class KeyframePacket:
     readings: tuple[PlacedReading, ...] = ()  # of other sensors since the previous keyframe
     own_starts: tuple[OwnStart, ...] = ()  # of sensors that have begun since then
     motions: tuple[MotionReadings, ...] = ()  # the same where vision was lost: for a window, and not in `readings`
+    filter_state: NavState | None = None  # where a further sensor sees motion: a window that contradicts it is wrong
     state_at_sight: NavState | None = None  # the filter's, at the first keyframe with sight after some without
 
 

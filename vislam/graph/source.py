@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from vislam.config import GraphConfig
+from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError
+from vislam.core.geometry import skew
 from vislam.core.memory import EdgeRecord, GraphMemory, GravityRecord, WindowRecord, at_pose
 from vislam.core.messages import Array, KeyframePacket, NavState
 from vislam.core.readings import Motion
@@ -25,6 +28,7 @@ from vislam.window.messages import WindowEdge, WindowUpdate
 
 _RATIO_MAX = 1e12  # eigenvalues of a covariance that is solved with
 _FAR_SURER = 4.0  # times, of the variance of velocity
+_CONTRADICTION = chi_square_limit(1.0 - 1e-9, 3)  # both see the same images: what is apart by chance is far less
 
 
 class Window(Protocol):
@@ -198,10 +202,11 @@ class WindowSource:
     ) -> list[WindowRecord]:
         """See Source."""
         update = self._window.add(packet, T_odom_body, motions)
-        if packet.state_at_sight is not None and _is_far_surer(packet.state_at_sight, update.newest):
-            # by inertial data alone the window's speed is metres per second off, too far to be linearised there
-            self._window.initialise(packet.state_at_sight)
+        better, why = _better_state(packet, update.newest)
+        if better is not None:
+            self._window.initialise(better)
             self._window.add(packet, T_odom_body)
+            update = replace(update, note="; ".join(note for note in (update.note, why) if note))
         said = self._record(update, record)
         self._odometry.append(said)
         self._local.append(update.newest)
@@ -345,8 +350,35 @@ def _is_direction(v: Array) -> bool:
     return bool(abs(float(np.linalg.norm(v)) - 1.0) < 1e-6)
 
 
-def _is_far_surer(state: NavState, other: NavState | None) -> bool:
-    """Return whether a state knows its velocity far better than another does."""
-    if other is None:
-        return False
-    return float(np.trace(other.covariance[6:9, 6:9])) > _FAR_SURER * float(np.trace(state.covariance[6:9, 6:9]))
+def _better_state(packet: KeyframePacket, newest: NavState | None) -> tuple[NavState | None, str]:
+    """Return the filter's state and why, where the window has to begin anew at it; None: the window may go on.
+
+    After a blind stretch by inertial data alone its speed is metres per second off, too far to be linearised there.
+    And from steady motion into a turn a window of one camera may take a tilt for an acceleration, and be sure of it.
+    """
+    if newest is None:
+        return None, ""
+    known, at_sight = packet.filter_state, packet.state_at_sight
+    if at_sight is not None:
+        window_m2_s2, filter_m2_s2 = (float(np.trace(s.covariance[6:9, 6:9])) for s in (newest, at_sight))
+        if window_m2_s2 > _FAR_SURER * filter_m2_s2:
+            return at_sight, "the window begins anew, for the filter knew the way in the dark"
+    if known is not None and known.t_ns == newest.t_ns:
+        (ours, P), (theirs, Q) = _body_velocity(newest), _body_velocity(known)
+        apart = ours - theirs
+        if float(apart @ np.linalg.solve(P + Q, apart)) > _CONTRADICTION:
+            told = f"off by {float(np.linalg.norm(apart)):.2f} m/s"
+            return (
+                known,
+                f"the window begins anew: its speed is {told} from the filter's, which a sensor of motion tells",
+            )
+    return None, ""
+
+
+def _body_velocity(state: NavState) -> tuple[Array, Array]:
+    """Return the velocity [3] in the body's axes and its covariance [3, 3]."""
+    R = state.T_world_body[:3, :3]
+    velocity = R.T @ state.velocity_world_m_s
+    J = np.hstack([skew(velocity), R.T])
+    index = np.r_[0:3, 6:9]
+    return velocity, J @ state.covariance[np.ix_(index, index)] @ J.T

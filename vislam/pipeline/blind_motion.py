@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from vislam.core.messages import Array, KeyframePacket, Tracking
+from vislam.core.messages import Array, KeyframePacket, NavState, Tracking
 from vislam.core.readings import MotionReadings, OwnNow, PlacedReading
 from vislam.sensors import Suite
 
 
-def with_motions(packet: KeyframePacket, suite: Suite, own: Callable[[str], tuple[Array, Array]]) -> KeyframePacket:
+def with_motions(
+    packet: KeyframePacket,
+    suite: Suite,
+    begun: Iterable[str],
+    state: NavState | None,
+    own: Callable[[str], tuple[Array, Array]],
+) -> KeyframePacket:
     """Return a keyframe's packet, its readings of motion set apart where vision does not tie it to the one before.
 
-    By inertial data alone a window is soon lost. `own` gives values and sigmas [V] of a sensor's own variables, as the
-    filter has them.
+    By inertial data alone a window is soon lost. With any sensor of motion among those that have `begun`, the filter's
+    `state` goes along. `own` gives values and sigmas [V] of a sensor's own variables, as the filter has them.
     """
+    if any(suite[name].sees_motion_only for name in begun):
+        packet = replace(packet, filter_state=state)
     if packet.begins_submap or packet.vo.tracking is not Tracking.LOST:
         return packet
     by_sensor: dict[str, list[PlacedReading]] = {}

@@ -171,7 +171,8 @@ class ReadingIntake:
         packet = replace(packet, readings=tuple(placed), own_starts=starts)
         if not self._has_window or self._filter is None:
             return packet
-        return with_motions(packet, self._suite, self._filter.ekf.own)
+        begun = [name for name in self._suite.names if name not in self._beginning]
+        return with_motions(packet, self._suite, begun, state, self._filter.ekf.own)
 
     def _tell_filter(self, reading: Reading) -> bool:
         """Give the filter a reading unless its wheels slip; return whether the graph shall have it as well."""
