@@ -139,6 +139,32 @@ class WebcamConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LibraryCameraConfig:
+    """What cameras behind their makers' libraries have in common; docs/sensors.md."""
+
+    device: str = ""  # a serial number, an id; empty: the first that is found
+    width_px: Count = 640  # or the nearest size that the camera has: it is told
+    height_px: Count = 480
+    rate_hz: Positive = 30.0
+    # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera
+    exposure_s: NonNegative | None = 0.01
+    gain: NonNegative | None = None  # in units of the camera; None: its own
+    max_age_s: NonNegative = 1.0  # of a stamp at arrival; older, it is from another clock
+    missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
+    start_s: NonNegative = 10.0  # until the first image; a device that loads its firmware takes some seconds
+    reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there
+
+
+@dataclass(frozen=True, slots=True)
+class PicamConfig(LibraryCameraConfig):
+    """The Raspberry Pi's own camera, by picamera2."""
+
+    device: str = "0"  # its number, as rpicam-hello counts
+    focus: NonNegative | None = 0.0  # dioptres, 0 is infinity; None leaves autofocus on, which moves the centre
+    buffers: Count = 4  # one is read, one waits, two are with the camera
+
+
+@dataclass(frozen=True, slots=True)
 class SensorsConfig:
     """The sensors of a cart, for `vislam record`; a TOML file with these sections describes one cart."""
 
@@ -146,6 +172,7 @@ class SensorsConfig:
     board: BoardConfig = field(default_factory=BoardConfig)
     serial: SerialConfig = field(default_factory=SerialConfig)
     webcam: WebcamConfig = field(default_factory=WebcamConfig)
+    picam: PicamConfig = field(default_factory=PicamConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     gyro_noise_density: NonNegative = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
     accel_noise_density: NonNegative = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis

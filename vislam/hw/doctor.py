@@ -17,10 +17,12 @@ from vislam.core.findings import Finding, Severity, worst
 from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.board_check import check_board, check_rest, check_stamps
 from vislam.hw.bridge.bridge import SerialBridge
+from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.webcam import Capture, Webcam
 from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
+from vislam.hw.library_cameras import is_library_camera, open_library_camera
 from vislam.hw.sensors import open_inertial
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.hw.timing import Clock, HostClock
@@ -326,15 +328,18 @@ def _examine_cameras(
         _check_permission(notes, path, "error" if path == wanted else "warning")
     if wanted is None:
         return
-    config = WebcamConfig(device=wanted)
+    camera: Webcam | LibraryCamera[CapturedImage]
     try:
-        camera = Webcam(config, open_capture=open_capture)
+        if is_library_camera(wanted):
+            camera = open_library_camera(wanted, SensorsConfig())
+        else:
+            camera = Webcam(WebcamConfig(device=wanted), open_capture=open_capture)
     except HardwareError as error:
         notes.failed(error, wanted, "error")
         return
     with closing(camera):
         images = list(_captured(camera, seconds, clock))
-        _note_timing(notes, f"{camera.path}: images", images, config.rate_hz, "error")
+        _note_timing(notes, f"{camera.path}: images", images, camera.rate_hz, "error")
         for setting in camera.settings:
             if setting.differs:
                 got = "does not offer it" if setting.got is None else f"does {setting.got}"
@@ -343,9 +348,14 @@ def _examine_cameras(
         if camera.stamped_by == "arrival":
             what = "images carry no time of capture: stamps are those of arrival"
             notes.add("warning", what, camera.path, "let the time offset be estimated, or use another camera")
+        elif images:
+            notes.add("ok", f"stamped by {camera.stamped_by}", camera.path)
+        if isinstance(camera, LibraryCamera):
+            what = "this driver was tested against a stand-in for its library and has not met a real camera"
+            notes.add("ok", what, camera.path, "tell us what you see: docs/sensors.md")
 
 
-def _captured(camera: Webcam, seconds: float, clock: Clock) -> Iterator[CapturedImage]:
+def _captured(camera: Webcam | LibraryCamera[CapturedImage], seconds: float, clock: Clock) -> Iterator[CapturedImage]:
     end_ns = clock.now_ns() + round(seconds * _NS)
     while clock.now_ns() < end_ns:
         image = camera.read(0.1)

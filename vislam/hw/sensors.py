@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING
 
 from vislam.config import BoardConfig, ImuChip, SensorCalibration, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
+from vislam.hw.library_cameras import check_library_camera, is_library_camera, open_library_camera
 
 if TYPE_CHECKING:
     import socket
 
+    from vislam.hw.cameras.library_camera import LibraryCamera
     from vislam.hw.cameras.video import VideoCamera
     from vislam.hw.cameras.webcam import Webcam
-    from vislam.hw.source import InertialSource
+    from vislam.hw.source import CapturedImage, InertialSource
 
 # chips with a FIFO as a command line names them, and the family of each as the settings do; board: whichever answers
 CHIPS: dict[str, ImuChip | None] = {
@@ -93,11 +95,13 @@ def open_camera(
     must_be_there: bool = True,
     stamps_ns: Sequence[int] | None = None,
     in_real_time: bool = True,
-) -> Webcam | VideoCamera:
-    """Open a camera by its index or device file, `webcam` as in the settings, or a video in its place (`VideoCamera`).
+) -> Webcam | VideoCamera | LibraryCamera[CapturedImage]:
+    """Open a camera by its index or device file, `webcam` as in the settings, `picam`, or a video in its place.
 
     Raises HardwareError when it is missing and must be there.
     """
+    if is_library_camera(name):
+        return open_library_camera(name, config, must_be_there)
     if is_video(name):
         from vislam.hw.cameras.video import VideoCamera
 
@@ -133,7 +137,9 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
         if not os.access(bridge.port, os.R_OK | os.W_OK):  # opening it would reset the board
             code = errno.EACCES if Path(bridge.port).exists() else errno.ENOENT
             raise HardwareError(why_not_open(bridge, OSError(code, os.strerror(code))))
-    if camera != "none" and not is_video(camera):
+    if is_library_camera(camera):
+        check_library_camera(camera, config)
+    elif camera != "none" and not is_video(camera):
         from vislam.hw.cameras.webcam import device_path, why_not_there
 
         problem = why_not_there(device_path(config.webcam.device if camera == "webcam" else camera))
@@ -143,7 +149,7 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
 
 def is_video(name: str) -> bool:
     """Return whether a camera's name is that of a video file."""
-    return not name.startswith("/dev/") and Path(name).suffix != ""
+    return not name.startswith("/dev/") and not is_library_camera(name) and Path(name).suffix != ""
 
 
 def with_raw_samples(config: SensorsConfig) -> SensorsConfig:

@@ -54,8 +54,8 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
     if not camera or inertial.partition(":")[0] not in INERTIAL_KINDS:
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
-            f"(an IMU of {', '.join(INERTIAL_KINDS)}; a camera's index or path in place of webcam, or none: attitude "
-            "by the IMU alone)"
+            f"(an IMU of {', '.join(INERTIAL_KINDS)}; a camera's index or path or picam in place of webcam, or none: "
+            "attitude by the IMU alone)"
         )
     return CartSensors(inertial, camera, config, sensors), with_clock(config)
 

@@ -30,6 +30,7 @@ from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.recorder import Recorder
 from vislam.datasets.tables import Problems, read_frame_stamps
+from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.video import VideoCamera
 from vislam.hw.cameras.webcam import Webcam
 from vislam.hw.health import Health
@@ -43,6 +44,7 @@ _WRITE_S = 0.05  # inertial samples wait at most so long for an image that does 
 _TOLD_S = 1.0  # between looks at the free space, and lines of progress
 _JOIN_S = 2.0
 _FIRST_IMAGE_S = 5.0
+Images = Webcam | VideoCamera | LibraryCamera[CapturedImage]
 # x forward, y left, z up of the body, for a camera that looks ahead: x right, y down, z forward
 _T_BODY_CAM = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -86,7 +88,7 @@ def record(
     Args:
         out: folder to make.
         imu: `gy85[:BUS]`, `board[:BUS]` or a chip's name, `serial[:PORT]`, or `none`.
-        camera: index, device file, `webcam`, video file or `none`.
+        camera: index, device file, `webcam`, `picam`, video file or `none`.
         sensors: settings of both.
         config: budget and queues.
         seconds: length, None: until stopped.
@@ -107,7 +109,7 @@ def record(
     _check_space(out, config)
     files = sensors.calibration
     inertial: InertialSource | None = None
-    images: Webcam | VideoCamera | None = None
+    images: Images | None = None
     try:
         if imu != "none":
             inertial = open_inertial(imu, with_raw_samples(sensors))
@@ -145,7 +147,7 @@ class _Recording:
         recorded: Recorded,
         config: RecordConfig,
         inertial: InertialSource | None,
-        images: Webcam | VideoCamera | None,
+        images: Images | None,
         drops_images: bool,
         is_over: Callable[[], bool],
     ) -> None:
@@ -231,7 +233,7 @@ class _Recording:
             elif was_finished:
                 self._images_ended.set()
                 return
-            if isinstance(images, Webcam):
+            if not isinstance(images, VideoCamera):
                 self._health[1] |= images.health()
 
     def _queue(self, image: CapturedImage) -> None:
@@ -300,7 +302,7 @@ class _Recording:
         }
         if self._images is not None:
             data["stamped_by"] = self._images.stamped_by
-        if isinstance(self._images, Webcam):
+        if isinstance(self._images, Webcam | LibraryCamera):
             data["camera_settings"] = [asdict(setting) for setting in self._images.settings]
         write_text(recorded.folder / "recording.json", json.dumps(data, indent=1) + "\n")
 
@@ -315,7 +317,7 @@ def _check_space(out: Path, config: RecordConfig) -> None:
         )
 
 
-def _first_image(images: Webcam | VideoCamera, name: str) -> CapturedImage:
+def _first_image(images: Images, name: str) -> CapturedImage:
     image = images.read(_FIRST_IMAGE_S)
     if image is None:
         raise HardwareError(f"camera {name} gives no image within {_FIRST_IMAGE_S:g} s")
@@ -350,8 +352,8 @@ def _stamp_notes(name: str, inertial: InertialSource | None) -> tuple[str, ...]:
     return (f"inertial samples of {name} are stamped by {stamped_by}",)
 
 
-def _camera_notes(images: Webcam | VideoCamera | None) -> tuple[str, ...]:
-    settings = images.settings if isinstance(images, Webcam) else ()
+def _camera_notes(images: Images | None) -> tuple[str, ...]:
+    settings = () if images is None or isinstance(images, VideoCamera) else images.settings
     return tuple(
         f"camera: {setting.name} {setting.asked} was asked for, it has {'none' if setting.got is None else setting.got}"
         for setting in settings

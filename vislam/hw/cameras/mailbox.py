@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import threading
+from typing import Generic, TypeVar
 
-from vislam.hw.source import CapturedImage
+Shot = TypeVar("Shot")
 
 
-class Mailbox:
+class Mailbox(Generic[Shot]):
     """Hands images from the thread that captures to the one that uses them."""
 
     def __init__(self) -> None:
         self.replaced = 0
         self._changed = threading.Condition()
-        self._image: CapturedImage | None = None
+        self._image: Shot | None = None
         self._is_closed = False
 
-    def put(self, image: CapturedImage) -> None:
+    def put(self, image: Shot) -> None:
         """Leave an image in place of the one that may still be there."""
         with self._changed:
             self.replaced += self._image is not None
@@ -28,7 +29,7 @@ class Mailbox:
         with self._changed:
             return self._changed.wait_for(lambda: self._image is None or self._is_closed, timeout_s)
 
-    def take(self, timeout_s: float) -> CapturedImage | None:
+    def take(self, timeout_s: float) -> Shot | None:
         """Return the image, waiting at most `timeout_s` for one; None if none came."""
         with self._changed:
             self._changed.wait_for(lambda: self._image is not None or self._is_closed, timeout_s)

@@ -38,7 +38,7 @@ class VideoCamera:
         self.is_finished = False
         self._stamps_ns = stamps_ns
         self._in_real_time = in_real_time
-        self._mailbox = Mailbox()
+        self._mailbox: Mailbox[CapturedImage] = Mailbox()
         self._counts: Counter[str] = Counter()
         if not path.is_file():
             raise HardwareError(f"there is no video {path} to stand in for a camera; give a camera's index or a file")

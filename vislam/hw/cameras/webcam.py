@@ -80,12 +80,13 @@ class Webcam:
             HardwareError: there is no such camera, it may not be opened, or it gives no image.
         """
         self.path = device_path(config.device)
+        self.rate_hz = config.rate_hz
         self.settings: tuple[Setting, ...] = ()
         self.stamped_by = "not known yet"
         self.problem = ""
         self._config = config
         self._open_capture = _open_v4l2 if open_capture is None else open_capture
-        self._mailbox = Mailbox()
+        self._mailbox: Mailbox[CapturedImage] = Mailbox()
         self._counts: Counter[str] = Counter()  # written by the thread alone, after it has started
         self._newest_ns = 0  # arrival
         self._stamper = _Stamper(config)
