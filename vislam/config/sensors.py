@@ -165,6 +165,31 @@ class PicamConfig(LibraryCameraConfig):
 
 
 @dataclass(frozen=True, slots=True)
+class DepthCameraConfig(LibraryCameraConfig):
+    """A camera with a stereo pair, or colour and depth, and its maker's calibration; where it sits on the body."""
+
+    # place of its first camera (left or colour), m; None: only a calibration file tells
+    position_m: Vector3 | None = None
+    tilt_deg: Annotated[float, Range(-90.0, 90.0)] = 0.0  # nose down from looking ahead
+
+
+@dataclass(frozen=True, slots=True)
+class RealsenseConfig(DepthCameraConfig):
+    """A RealSense, by pyrealsense2."""
+
+    # from the middle of the exposure to arrival, at the fastest: half of 10 ms, readout and USB; not measured
+    delay_s: NonNegative = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class OakConfig(DepthCameraConfig):
+    """The stereo pair of an OAK, by depthai."""
+
+    height_px: Count = 400  # with 640 the shape of its sensors: nothing is cut off
+    gain: NonNegative | None = 400.0  # ISO, with a fixed exposure: 100 to 1600
+
+
+@dataclass(frozen=True, slots=True)
 class SensorsConfig:
     """The sensors of a cart, for `vislam record`; a TOML file with these sections describes one cart."""
 
@@ -173,6 +198,8 @@ class SensorsConfig:
     serial: SerialConfig = field(default_factory=SerialConfig)
     webcam: WebcamConfig = field(default_factory=WebcamConfig)
     picam: PicamConfig = field(default_factory=PicamConfig)
+    realsense: RealsenseConfig = field(default_factory=RealsenseConfig)
+    oak: OakConfig = field(default_factory=OakConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     gyro_noise_density: NonNegative = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
     accel_noise_density: NonNegative = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis

@@ -14,7 +14,7 @@ import numpy as np
 from vislam.config import BoardConfig, Gy85Config, SensorsConfig, SerialConfig, WebcamConfig
 from vislam.core.errors import HardwareError
 from vislam.core.findings import Finding, Severity, worst
-from vislam.core.messages import ImuSample, MagSample
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.hw.board_check import check_board, check_rest, check_stamps
 from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.cameras.library_camera import LibraryCamera
@@ -22,7 +22,7 @@ from vislam.hw.cameras.webcam import Capture, Webcam
 from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
-from vislam.hw.library_cameras import is_library_camera, open_library_camera
+from vislam.hw.library_cameras import gives_frames, is_library_camera, open_frame_camera, open_image_camera
 from vislam.hw.sensors import open_inertial
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.hw.timing import Clock, HostClock
@@ -33,7 +33,8 @@ _SLOW_SHARE = 0.98  # of the rate that was asked for
 _NO_BUS = "on a Raspberry Pi: sudo raspi-config nonint do_i2c 0; elsewhere plug in a USB adapter, or a serial bridge"
 _MAX_JITTER_MS = 1.0  # of stamps; at 0.5 rad/s and 1 m/s it is worth 0.03 deg and 1 mm
 
-Sample = TypeVar("Sample", ImuSample, MagSample, CapturedImage)
+Sample = TypeVar("Sample", ImuSample, MagSample, CapturedImage | Frame)
+_AnyCamera = Webcam | LibraryCamera[CapturedImage] | LibraryCamera[Frame]
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,12 +329,8 @@ def _examine_cameras(
         _check_permission(notes, path, "error" if path == wanted else "warning")
     if wanted is None:
         return
-    camera: Webcam | LibraryCamera[CapturedImage]
     try:
-        if is_library_camera(wanted):
-            camera = open_library_camera(wanted, SensorsConfig())
-        else:
-            camera = Webcam(WebcamConfig(device=wanted), open_capture=open_capture)
+        camera = _opened(wanted, open_capture)
     except HardwareError as error:
         notes.failed(error, wanted, "error")
         return
@@ -355,7 +352,15 @@ def _examine_cameras(
             notes.add("ok", what, camera.path, "tell us what you see: docs/sensors.md")
 
 
-def _captured(camera: Webcam | LibraryCamera[CapturedImage], seconds: float, clock: Clock) -> Iterator[CapturedImage]:
+def _opened(wanted: str, open_capture: Callable[[str], Capture] | None) -> _AnyCamera:
+    if gives_frames(wanted):
+        return open_frame_camera(wanted, SensorsConfig())
+    if is_library_camera(wanted):
+        return open_image_camera(wanted, SensorsConfig())
+    return Webcam(WebcamConfig(device=wanted), open_capture=open_capture)
+
+
+def _captured(camera: _AnyCamera, seconds: float, clock: Clock) -> Iterator[CapturedImage | Frame]:
     end_ns = clock.now_ns() + round(seconds * _NS)
     while clock.now_ns() < end_ns:
         image = camera.read(0.1)

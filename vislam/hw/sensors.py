@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from vislam.config import BoardConfig, ImuChip, SensorCalibration, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
-from vislam.hw.library_cameras import check_library_camera, is_library_camera, open_library_camera
+from vislam.hw.library_cameras import check_library_camera, is_library_camera, open_image_camera
 
 if TYPE_CHECKING:
     import socket
@@ -101,7 +101,7 @@ def open_camera(
     Raises HardwareError when it is missing and must be there.
     """
     if is_library_camera(name):
-        return open_library_camera(name, config, must_be_there)
+        return open_image_camera(name, config, must_be_there)
     if is_video(name):
         from vislam.hw.cameras.video import VideoCamera
 

@@ -16,6 +16,7 @@ from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
+from vislam.hw.library_cameras import gives_frames, open_frame_camera
 from vislam.hw.reading_port import check_port
 from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
 from vislam.hw.source import InertialSource
@@ -28,6 +29,7 @@ from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.place import PlaceOptions
+from vislam.run.camera_rig import rig_of
 from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 
@@ -54,8 +56,8 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
     if not camera or inertial.partition(":")[0] not in INERTIAL_KINDS:
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
-            f"(an IMU of {', '.join(INERTIAL_KINDS)}; a camera's index or path or picam in place of webcam, or none: "
-            "attitude by the IMU alone)"
+            f"(an IMU of {', '.join(INERTIAL_KINDS)}; in place of webcam a camera's index or path, picam, "
+            "realsense[,depth], oak, or none: attitude by the IMU alone)"
         )
     return CartSensors(inertial, camera, config, sensors), with_clock(config)
 
@@ -109,7 +111,7 @@ class CartSensors:
         self.has_camera = camera != "none"
         told, ideal = calibration_of(inertial, sensors), SensorCalibration()
         self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
-        self.rig = _rig(config.calibration.camera) if self.has_camera else NO_CAMERA
+        self.rig = _rig(camera, sensors, config.calibration.camera) if self.has_camera else NO_CAMERA
         rate_hz = rate_of(inertial, sensors)
         self.imu_noise: ImuNoise | None = ImuNoise(
             sensors.gyro_noise_density, sensors.accel_noise_density, sensors.gyro_bias_walk, sensors.accel_bias_walk,
@@ -137,7 +139,7 @@ class CartSensors:
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens the camera."""
-        return partial(_open_one, self._camera, self._sensors) if self.has_camera else NoCamera
+        return partial(_open_frames, self._camera, self._sensors) if self.has_camera else NoCamera
 
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
         """Return what reads further sensors at their ports.
@@ -177,7 +179,12 @@ class CartSensors:
         return None
 
 
-def _rig(calibration: str | None) -> Rig:
+def _rig(camera: str, sensors: SensorsConfig, calibration: str | None) -> Rig:
+    if gives_frames(camera):
+        rig, guesses = rig_of(camera, sensors, calibration)
+        if guesses:
+            raise UsageError(f"{guesses[0]}, which cannot be taken for true; set it, in metres, or give a calibration")
+        return rig
     if calibration is None:
         raise UsageError(
             "a live camera needs its calibration: --calibration.camera FILE, which `vislam calibrate camera` writes; "
@@ -192,5 +199,7 @@ def _rig(calibration: str | None) -> Rig:
     return Rig((found.camera,), (found.T_body_cam,))
 
 
-def _open_one(name: str, sensors: SensorsConfig) -> OneCamera:
+def _open_frames(name: str, sensors: SensorsConfig) -> FrameSource:
+    if gives_frames(name):
+        return open_frame_camera(name, sensors)
     return OneCamera(open_camera(name, sensors))

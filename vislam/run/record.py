@@ -34,9 +34,11 @@ from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.video import VideoCamera
 from vislam.hw.cameras.webcam import Webcam
 from vislam.hw.health import Health
+from vislam.hw.library_cameras import gives_frames, open_frame_camera
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
+from vislam.run.camera_rig import rig_of
 
 _GB = 1e9
 _READ_S = 0.2  # a reading thread looks so often whether to stop
@@ -44,7 +46,8 @@ _WRITE_S = 0.05  # inertial samples wait at most so long for an image that does 
 _TOLD_S = 1.0  # between looks at the free space, and lines of progress
 _JOIN_S = 2.0
 _FIRST_IMAGE_S = 5.0
-Images = Webcam | VideoCamera | LibraryCamera[CapturedImage]
+Images = Webcam | VideoCamera | LibraryCamera[CapturedImage] | LibraryCamera[Frame]
+Shot = CapturedImage | Frame
 # x forward, y left, z up of the body, for a camera that looks ahead: x right, y down, z forward
 _T_BODY_CAM = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -88,7 +91,7 @@ def record(
     Args:
         out: folder to make.
         imu: `gy85[:BUS]`, `board[:BUS]` or a chip's name, `serial[:PORT]`, or `none`.
-        camera: index, device file, `webcam`, `picam`, video file or `none`.
+        camera: index, device file, `webcam`, `picam`, `realsense[,depth]`, `oak`, video file or `none`.
         sensors: settings of both.
         config: budget and queues.
         seconds: length, None: until stopped.
@@ -110,13 +113,15 @@ def record(
     files = sensors.calibration
     inertial: InertialSource | None = None
     images: Images | None = None
+    own_rig: tuple[Rig, tuple[str, ...]] | None = None
     try:
         if imu != "none":
             inertial = open_inertial(imu, with_raw_samples(sensors))
         if camera != "none":
-            images = open_camera(camera, sensors, stamps_ns=_video_stamps(camera), in_real_time=in_real_time)
+            own_rig = rig_of(camera, sensors, files.camera) if gives_frames(camera) else None
+            images = _open_images(camera, sensors, in_real_time)
         first = None if images is None else _first_image(images, camera)
-        rig, notes = (None, ()) if first is None else _rig(first, files, sensors.hfov_deg)
+        rig, notes = (None, ()) if first is None else own_rig or _rig(first, files, sensors.hfov_deg)
         notes = (*notes, *_camera_notes(images), *_stamp_notes(imu, inertial))
         noise = None if inertial is None else _noise(files, sensors, inertial.rate_hz)
         imu_calibration, mag_calibration = _calibrations(files, calibration_of(imu, sensors))
@@ -157,7 +162,7 @@ class _Recording:
         self._inertial = inertial
         self._images = images
         self._samples: Queue[ImuSample | MagSample] = Queue(config.imu_queue)
-        self._frames: Queue[CapturedImage] = Queue(config.image_queue)
+        self._frames: Queue[Shot] = Queue(config.image_queue)
         self._is_over = is_over
         self._drops_images = drops_images  # when the queue is full, as with a camera; else a video waits
         self._dropped = {"inertial samples": 0, "images": 0}  # each written by one thread
@@ -167,9 +172,7 @@ class _Recording:
         self._images_ended = threading.Event()
         self._began_utc = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
-    def run(
-        self, first: CapturedImage | None, seconds: float | None, progress: Callable[[Recorded], None] | None
-    ) -> Recorded:
+    def run(self, first: Shot | None, seconds: float | None, progress: Callable[[Recorded], None] | None) -> Recorded:
         recorded = self._recorded
         self._describe()
         threads = [
@@ -236,7 +239,7 @@ class _Recording:
             if not isinstance(images, VideoCamera):
                 self._health[1] |= images.health()
 
-    def _queue(self, image: CapturedImage) -> None:
+    def _queue(self, image: Shot) -> None:
         while not self._is_stopping.is_set():
             try:
                 self._frames.put(image, block=not self._drops_images, timeout=_READ_S)
@@ -257,7 +260,10 @@ class _Recording:
             return
         self._write_frame(image)
 
-    def _write_frame(self, image: CapturedImage) -> None:
+    def _write_frame(self, image: Shot) -> None:
+        if isinstance(image, Frame):
+            self._recorder.write(image)
+            return
         is_color = image.image.ndim == 3
         grey = cv2.cvtColor(image.image, cv2.COLOR_BGR2GRAY) if is_color else image.image
         color = image.image if is_color else None
@@ -317,16 +323,22 @@ def _check_space(out: Path, config: RecordConfig) -> None:
         )
 
 
-def _first_image(images: Images, name: str) -> CapturedImage:
+def _first_image(images: Images, name: str) -> Shot:
     image = images.read(_FIRST_IMAGE_S)
     if image is None:
         raise HardwareError(f"camera {name} gives no image within {_FIRST_IMAGE_S:g} s")
     return image
 
 
-def _rig(first: CapturedImage, files: CalibrationConfig, hfov_deg: float) -> tuple[Rig, tuple[str, ...]]:
+def _open_images(camera: str, sensors: SensorsConfig, in_real_time: bool) -> Images:
+    if gives_frames(camera):
+        return open_frame_camera(camera, sensors)
+    return open_camera(camera, sensors, stamps_ns=_video_stamps(camera), in_real_time=in_real_time)
+
+
+def _rig(first: Shot, files: CalibrationConfig, hfov_deg: float) -> tuple[Rig, tuple[str, ...]]:
     """Return the rig of the recording, and what is guessed in it."""
-    height, width = first.image.shape[:2]
+    height, width = (first.images[0] if isinstance(first, Frame) else first.image).shape[:2]
     if files.camera is None:
         focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(hfov_deg))
         guessed = Camera(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))

@@ -35,7 +35,7 @@ class DoctorOptions:
     serial: str | None = None
     """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that nobody names are not opened"""
     camera: str | None = None
-    """This camera must give images: its index or device file, picam[:0]"""
+    """This camera must give images: its index or device file, picam, realsense, oak"""
     seconds: Annotated[float, Range(0.5, 60.0)] = 3.0
     """How long each is measured; stand still"""
     json: bool = False

@@ -29,7 +29,7 @@ class LiveOptions:
     """Folder to make for everything that the run leaves"""
     source: str = "virtual-cart"
     """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, board+webcam,
-    serial:PORT+webcam, gy85+none"""
+    serial:PORT+webcam, gy85+none; in place of webcam also picam, realsense[,depth], oak"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     seconds: Positive | None = None

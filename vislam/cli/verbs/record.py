@@ -24,8 +24,9 @@ class RecordOptions:
     """gy85[:/dev/i2c-1], board[:/dev/i2c-1] (whichever chip answers) or a chip's name, serial[:/dev/ttyUSB0] (without
     a path as the settings say), or none"""
     camera: str = "webcam"
-    """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), picam[:0] (the Raspberry Pi's own), a video
-    file in place of a camera, or none"""
+    """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), picam[:0] (the Raspberry Pi's own),
+    realsense[:SERIAL][,depth] (stereo, or colour and depth), oak[:ID] (stereo), a video file in place of a camera, or
+    none"""
     seconds: Positive | None = None
     """How long; None: until Ctrl-C"""
     settings: Annotated[RecordConfig, tyro.conf.arg(name="")] = field(default_factory=RecordConfig)
