@@ -75,6 +75,9 @@ class Calibration:
     def getStereoRightCameraId(self) -> str:
         return CAMERAS[1]
 
+    def getDefaultIntrinsics(self, socket: str) -> tuple[list[list[float]], int, int]:
+        return self.getCameraIntrinsics(socket, 1280, 800), 1280, 800
+
     def getCameraIntrinsics(self, socket: str, width: int, height: int) -> list[list[float]]:
         return [[400.0 + CAMERAS.index(socket), 0.0, width / 2], [0.0, 402.0, height / 2], [0.0, 0.0, 1.0]]
 

@@ -59,6 +59,11 @@ def test_a_rational_model_is_refused(world: World) -> None:
         factory_rig("oak", SENSORS)
 
 
+def test_a_size_of_another_shape_is_refused(world: World) -> None:
+    with pytest.raises(DataError, match="for 1280x800, which is not the shape of 640x480; ask for 640x400"):
+        factory_rig("oak", replace(SENSORS, oak=replace(CAMERA, height_px=480)))
+
+
 def test_pairs_are_stamped_by_depthais_clock_put_on_the_hosts(world: World) -> None:
     with closing(OakStream(CAMERA)) as stream:
         pairs = [pair for _ in range(5) if (pair := stream.next()) is not None]
@@ -111,7 +116,7 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
     world.unplugged = True
     with pytest.raises(HardwareError, match="there is no OAK"):
         check_devices("bno085", "oak", SENSORS)
-    with pytest.raises(HardwareError, match=r"no OAK .* can be opened \(No available devices\)"):
+    with pytest.raises(HardwareError, match=r"no OAK can be opened \(No available devices\)"):
         factory_rig("oak", SENSORS)
     old = world.module()
     del old.node.Camera  # type: ignore[attr-defined]

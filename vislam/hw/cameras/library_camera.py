@@ -167,3 +167,8 @@ class LibraryCamera(Generic[Shot]):
             return
         self._stamp_ns = shot.t_ns
         self._mailbox.put(replace(shot, index=index))
+
+
+def named(config: LibraryCameraConfig) -> str:
+    """Return the device that is asked for with a space before it, for a message; nothing where any will do."""
+    return f" {config.device}" if config.device else ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
 from datetime import timedelta
 from typing import Any
 
@@ -11,10 +10,10 @@ import numpy as np
 
 from vislam.config import OakConfig
 from vislam.core.camera import Rig
-from vislam.core.errors import HardwareError
+from vislam.core.errors import DataError, HardwareError
 from vislam.core.messages import Array, Frame
 from vislam.hw.cameras.factory import factory_camera, mounted, rigid
-from vislam.hw.cameras.library_camera import LibraryCamera
+from vislam.hw.cameras.library_camera import LibraryCamera, named
 from vislam.hw.cameras.webcam import Setting
 
 _NEXT = timedelta(seconds=1)  # without an image for so long, the device is opened anew
@@ -62,9 +61,10 @@ class OakStream:
 
     def close(self) -> None:
         """Give the device back."""
-        with suppress(RuntimeError):  # it was pulled out
+        try:
             self._pipeline.stop()
-        self._device.close()
+        finally:  # where it was pulled out, too
+            self._device.close()
 
     def _queue(self, socket: Any, config: OakConfig) -> Any:
         """Return the queue of one camera's grey images."""
@@ -114,12 +114,13 @@ def oak_rig(config: OakConfig) -> Rig:
     try:
         device = _device(dai, config)
     except RuntimeError as error:
-        raise HardwareError(f"no OAK {config.device} can be opened ({error}); plug it into a USB 3 port") from error
+        raise HardwareError(f"no OAK{named(config)} can be opened ({error}); plug it into a USB 3 port") from error
     try:
         calibration = device.readCalibration()
         sockets = calibration.getStereoLeftCameraId(), calibration.getStereoRightCameraId()
         size, cameras = (config.width_px, config.height_px), []
         for socket in sockets:
+            _check_shape(calibration.getDefaultIntrinsics(socket)[1:], size)
             K = np.array(calibration.getCameraIntrinsics(socket, *size))
             model = calibration.getDistortionModel(socket).name
             coefficients = calibration.getDistortionCoefficients(socket)
@@ -139,7 +140,7 @@ def check_oak(config: OakConfig) -> None:
     """Raise HardwareError when depthai is not installed or no device is plugged in; none is opened."""
     if not depthai().Device.getAllConnectedDevices():
         raise HardwareError(
-            f"there is no OAK {config.device}; plug it into a USB 3 port, with a cable that carries data"
+            f"there is no OAK{named(config)}; plug it into a USB 3 port, with a cable that carries data"
         )
 
 
@@ -152,6 +153,15 @@ def depthai() -> Any:
     if not hasattr(module.node, "Camera"):
         raise HardwareError("oak needs depthai 3, an older one is installed; pip install 'vislam[oak]'")
     return module
+
+
+def _check_shape(sensor: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise DataError for images of another shape than the sensor's: what is cut off then, depthai does not tell."""
+    if sensor[0] * size[1] != sensor[1] * size[0]:
+        raise DataError(
+            f"the OAK's calibration is for {sensor[0]}x{sensor[1]}, which is not the shape of {size[0]}x{size[1]}; "
+            f"ask for {sensor[0] // 2}x{sensor[1] // 2} (width_px, height_px), or give --calibration.camera FILE"
+        )
 
 
 def _device(dai: Any, config: OakConfig) -> Any:

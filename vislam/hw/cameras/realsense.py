@@ -14,7 +14,7 @@ from vislam.core.errors import HardwareError
 from vislam.core.messages import Frame
 from vislam.hw.bridge.clock import DeviceClock
 from vislam.hw.cameras.factory import factory_camera, mounted, rigid
-from vislam.hw.cameras.library_camera import LibraryCamera
+from vislam.hw.cameras.library_camera import LibraryCamera, named
 from vislam.hw.cameras.webcam import Setting
 
 _NEXT_MS = 1000  # without frames for so long, the device is opened anew
@@ -142,7 +142,7 @@ def realsense_rig(config: RealsenseConfig, with_depth: bool) -> Rig:
         profile = _asked(rs, config, with_depth).resolve(rs.pipeline_wrapper(rs.pipeline()))
     except RuntimeError as error:
         raise HardwareError(
-            f"no RealSense {config.device} gives {config.width_px}x{config.height_px} at {config.rate_hz:g} Hz "
+            f"no RealSense{named(config)} gives {config.width_px}x{config.height_px} at {config.rate_hz:g} Hz "
             f"({error}); plug it into a USB 3 port, or ask for another size or rate"
         ) from error
     names = ((rs.stream.color, -1),) if with_depth else ((rs.stream.infrared, 1), (rs.stream.infrared, 2))
