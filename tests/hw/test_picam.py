@@ -22,7 +22,7 @@ from vislam.hw.sensors import check_devices, is_video, open_camera
 from vislam.run.record import record
 
 LONG_S = 30.0
-CONFIG = PicamConfig(rate_hz=100.0, reopen_s=0.01, missing_s=0.5)
+CONFIG = PicamConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0)
 
 
 @pytest.fixture
