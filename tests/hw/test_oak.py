@@ -107,6 +107,7 @@ def test_a_device_that_is_pulled_out_comes_back(world: World) -> None:
 
 
 def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vislam.hw.adafruit.check_driver", lambda name: None)
     with pytest.raises(UsageError, match="an OAK gives its stereo pair: write oak"):
         open_frame_camera("oak,depth", SENSORS)
     with pytest.raises(UsageError, match=r"oak\.position_m is not set"):

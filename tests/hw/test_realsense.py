@@ -145,6 +145,7 @@ def test_a_device_that_is_pulled_out_comes_back(world: World) -> None:
 
 
 def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vislam.hw.adafruit.check_driver", lambda name: None)
     with pytest.raises(UsageError, match="realsense,depth for colour and depth"):
         open_frame_camera("realsense,colour", SENSORS)
     with pytest.raises(HardwareError, match=r"1920x1080 at 30 Hz.*ask for another size"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +35,7 @@ class Bag:
         self.path = path
         self.files = bag_files(path)
         self._containers: list[Container] = []
+        weakref.finalize(self, _close, self._containers)  # who reads rows may hold nothing but their iterator
         try:
             for number, file in enumerate(self.files):
                 self._containers.append(_container(file, number))
@@ -76,8 +78,12 @@ class Bag:
 
     def close(self) -> None:
         """Close its files."""
-        for container in self._containers:
-            container.close()
+        _close(self._containers)
+
+
+def _close(containers: list[Container]) -> None:
+    for container in containers:
+        container.close()
 
 
 def bag_files(path: Path) -> list[Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +54,6 @@ class BagStreams:
         self._cameras, self._depth = tuple(cameras), depth
         self._imu, self._mag = samples
         self._by_log_time = by_log_time
-        weakref.finalize(self, bag.close)
 
     @property
     def size_bytes(self) -> int:

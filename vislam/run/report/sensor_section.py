@@ -6,7 +6,7 @@ from vislam.run.report.html import Cell, card, note, number, section, table
 from vislam.run.report.run_files import RunFiles, as_dict, as_list
 
 _ESTIMATORS = ("filter", "graph")
-_IN_GRAPH = ["sensor", "used", "outliers", "failed", "thinned", "beginning", "not there"]
+_IN_GRAPH = ["sensor", "used", "in window", "outliers", "failed", "thinned", "beginning", "not there"]
 _NOT_THERE = ("late", "unplaced", "at_submap", "after", "too_early", "early", "dropped", "crowded", "queued")
 
 
@@ -27,9 +27,10 @@ def sensors_section(run: RunFiles) -> str:
     )
     in_graph = [row for name in sensors if (row := _in_graph(name, as_dict(sensors, name, "readings", "graph")))]
     graph_text = (
-        "Used: in factors; outliers, of these, fail the sensor's gate at the final estimate. Thinned: too many between "
-        "two keyframes. Beginning: in the prior of own variables instead. Not there: late, without inertial data, at "
-        "the start of a submap, after the last keyframe, or from before the graph."
+        "Used: in factors; in window: while the camera was blind; outliers, of those used, fail the sensor's gate at "
+        "the final estimate. Thinned: too many between two keyframes. Beginning: in the prior of own variables "
+        "instead. Not there: late, without inertial data, at the start of a submap, after the last keyframe, or from "
+        "before the graph."
     )
     variables = table(["sensor", "variable", "filter", "± σ", "graph", "± σ"], own, text_columns=(0, 1))
     return section(
@@ -70,7 +71,7 @@ def _in_graph(name: str, counted: dict[str, object]) -> list[str | Cell]:
     if not counted:
         return []
     missing = sum(value for key in _NOT_THERE if isinstance(value := counted.get(key), int))
-    shown = [counted.get(key) for key in ("used", "outliers", "failed", "thinned", "beginning")]
+    shown = [counted.get(key) for key in ("used", "in_window", "outliers", "failed", "thinned", "beginning")]
     return [name, *(number(value, 0) for value in (*shown, missing))]
 
 
