@@ -17,7 +17,7 @@ from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.body_map import BodyMap, triple
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.timing import Clock, HostClock
+from vislam.hw.timing import Clock, HostClock, read_in_rounds
 
 MAX_RATE_HZ = 200.0  # each sample costs such a driver two or three transfers and some hundred lines of Python
 BNO085 = "adafruit_bno08x.i2c.BNO08X_I2C"
@@ -95,15 +95,7 @@ class AdafruitImu:
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
-        deadline = self._clock.now_ns() + round(timeout_s * _NS)
-        while True:
-            if self._next_ns > deadline:
-                self._clock.sleep_until(deadline)
-                return []
-            self._clock.sleep_until(self._next_ns)
-            samples = self._poll()
-            if samples:
-                return samples
+        return read_in_rounds(self._clock, timeout_s, lambda: self._next_ns, self._poll)
 
     def health(self) -> Health:
         """Return the sensor bits that hold now and the events since the last call."""

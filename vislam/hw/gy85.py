@@ -28,7 +28,7 @@ from vislam.hw.field_watch import FieldWatch
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 from vislam.hw.link import START_ATTEMPTS, Link, first_connection, refuse_shared
-from vislam.hw.timing import Clock, HostClock
+from vislam.hw.timing import Clock, HostClock, read_in_rounds
 from vislam.hw.track import SampleTrack
 
 _NS = 1_000_000_000
@@ -149,15 +149,7 @@ class Gy85:
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
-        deadline = self._clock.now_ns() + round(timeout_s * _NS)
-        while True:
-            if self._next_ns > deadline:
-                self._clock.sleep_until(deadline)
-                return []
-            self._clock.sleep_until(self._next_ns)
-            samples = self._poll()
-            if samples:
-                return samples
+        return read_in_rounds(self._clock, timeout_s, lambda: self._next_ns, self._poll)
 
     def health(self) -> Health:
         """Return the sensor bits that hold now and the events since the last call."""

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+Sample = TypeVar("Sample")
 
 _MAX_RATE_ERROR = 0.05  # of a chip's oscillator; ADXL345 and ITG3205 stay within 2 %
 _RATE_GAIN = 0.02  # of a contradiction; settles in a second and averages over many of them
@@ -71,3 +74,18 @@ class SampleClock:
         self._period_ns = max(min(period, self._nominal_ns + bound), self._nominal_ns - bound)
         self._newest_ns = expected + contradiction
         return round(self._newest_ns)
+
+
+def read_in_rounds(
+    clock: Clock, timeout_s: float, next_ns: Callable[[], int], poll: Callable[[], list[Sample]]
+) -> list[Sample]:
+    """Return what the first round gives that gives anything; `timeout_s` at most is waited for the rounds to come."""
+    deadline = clock.now_ns() + round(timeout_s * 1e9)
+    while True:
+        if next_ns() > deadline:
+            clock.sleep_until(deadline)
+            return []
+        clock.sleep_until(next_ns())
+        samples = poll()
+        if samples:
+            return samples

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vislam.core.reading import open_file
-from vislam.datasets.bags.stored import MOST_MESSAGE_BYTES, DamagedError
+from vislam.datasets.bags.stored import MOST_MESSAGE_BYTES, DamagedError, Place
 
 MOST_CHUNK_BYTES = 2**27  # unpacked; recorders make chunks of 1 to 16 MiB, and of one image where that is more
 _KEPT_BYTES = 2**26  # of unpacked chunks, so that images and inertial samples of one stretch unpack it once
@@ -83,6 +83,16 @@ class ChunkCache:
             while len(self._kept) > 1 and sum(len(kept) for kept, _ in self._kept.values()) > _KEPT_BYTES:
                 self._kept.popitem(last=False)
             return data
+
+    def message(self, file: FileBytes, place: Place) -> bytes:
+        """Return the bytes of a message, which lies open in the file or in one of its chunks; raises DamagedError."""
+        if place.chunk < 0:
+            data = file.fetch(place.at, place.length)
+        else:
+            data = self.get(place.chunk)[0][place.at : place.at + place.length]
+        if len(data) != place.length:
+            raise DamagedError("message cut short")
+        return data
 
 
 def unpacked(data: bytes, method: str, declared: int) -> tuple[bytes, bool]:

@@ -71,13 +71,7 @@ class Mcap:
 
     def read(self, place: Place) -> bytes:
         """Return the bytes of a message; raises DamagedError."""
-        if place.chunk < 0:
-            data = self._bytes.fetch(place.at, place.length)
-        else:
-            data = self._chunks.get(place.chunk)[0][place.at : place.at + place.length]
-        if len(data) != place.length:
-            raise DamagedError("message cut short")
-        return data
+        return self._chunks.message(self._bytes, place)
 
     def scan(self, problems: Problems) -> Iterator[Found]:
         """Yield the messages in the order in which they were stored; raises DataError when it is no MCAP file."""
