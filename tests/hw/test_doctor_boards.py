@@ -139,7 +139,7 @@ def test_a_board_is_recorded(tmp_path: Path) -> None:
 
 def test_the_verb_measures_an_imu_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     with emulated_bus(emulated_board("MPU-6050", still, time.monotonic_ns, seed=2)) as bus:
-        assert run_verb(["doctor", "--imu", f"mpu6050:{bus.path}", "--seconds", "0.5", "--json"]) == 0
+        assert run_verb(["doctor", "--imu", f"mpu6050:{bus.path}", "--seconds", "2", "--json"]) == 0
         answer = json.loads(capsys.readouterr().out)
         assert answer["timings"][0]["count"] > 20
         assert any("FIFO" in finding["what"] for finding in answer["findings"])

@@ -1,14 +1,18 @@
 """Every board with a FIFO through the real smbus2: samples at the right times, and whatever wires and plugs do."""
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 
-from vislam.config import BoardConfig, PowerUpConfig, SensorCalibration
+from vislam.config import BoardConfig, Gy85Config, PowerUpConfig, SensorCalibration
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import ImuSample, ImuSpan
-from vislam.hw.emulator import SteppedClock, emulated_bus, emulated_gy85
+from vislam.hw.emulator import SteppedClock, emulated_board, emulated_bus, emulated_gy85
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.fifo_stamps import FifoStamps
+from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.imu import PowerUp, power_up
@@ -340,3 +344,34 @@ def test_stamps_increase_whatever_the_questions_find() -> None:
         for stamp in stamps.of(int(rng.integers(1, 6)), t_ns, t_ns + int(rng.exponential(2e5))):
             assert stamp > last
             last = stamp
+
+
+class Stalled(SteppedClock):
+    """Moves on by 5 us with each look, and by a stall at one of them: the host is put aside."""
+
+    def __init__(self, at: int, stall_ns: int) -> None:
+        super().__init__()
+        self._left, self._stall_ns = at, stall_ns
+
+    def now_ns(self) -> int:
+        self._left -= 1
+        self.advance(self._stall_ns if self._left == 0 else 5_000)
+        return super().now_ns()
+
+
+@pytest.mark.parametrize("kind", ["LSM6DSOX", "MPU-6050", "GY-85"])
+@pytest.mark.parametrize("stall_ms", [150, 300])
+def test_a_host_put_aside_anywhere_blames_no_chip(kind: Any, stall_ms: int) -> None:
+    for at in range(1, 300):
+        clock = Stalled(at, stall_ms * 1_000_000)
+        make = emulated_gy85 if kind == "GY-85" else partial(emulated_board, kind, magnetometer="none")
+        with emulated_bus(make(still, clock.now_ns)) as bus:
+            fifo, gy85 = BoardConfig(bus=bus.path), Gy85Config(bus=bus.path, mag=False, self_test=False)
+            driver = Gy85(gy85, clock) if kind == "GY-85" else FifoBoard(fifo, clock)
+            end_ns, count = clock.now_ns() + 600_000_000, 0
+            while clock.now_ns() < end_ns:
+                count += len(driver.read(0.1))
+            counters = driver.counters()
+            driver.close()
+        assert not {"imu_silent", "accel_silent", "reopened"} & set(counters), (at, counters)
+        assert count > 20, at

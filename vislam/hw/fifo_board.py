@@ -162,7 +162,7 @@ class FifoBoard:
             self._counts["fifo_overrun"] += 1
             self._events |= Health.IMU_GAP
             self._samples.restart()
-            link.newest_ns = asked  # it lives
+            link.newest_ns = answered  # it lives
         self._must_empty = True  # until all are fetched: a transfer that breaks off leaves parts of samples
         raw = imu.take(waiting.units) if waiting.units else None
         self._must_empty = False
@@ -171,7 +171,7 @@ class FifoBoard:
                 self._counts["imu_silent"] += 1
                 link.drop(asked)
             return []
-        link.newest_ns = asked
+        link.newest_ns = self._clock.now_ns()  # not `asked`: a host put aside in between must not blame the chip
         made = self._samples.made(raw, asked, answered, self._counts)
         self._events |= made.events
         if made.is_stuck:

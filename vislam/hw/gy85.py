@@ -260,9 +260,10 @@ class Gy85:
         if (abs(counts) >= self._accel.limit_lsb).any():
             self._counts["accel_saturated"] += int((abs(counts) >= self._accel.limit_lsb).any(axis=1).sum())
             self._events |= Health.ACCEL_SATURATED
-        link.newest_ns = asked
+        answered = self._clock.now_ns()
+        link.newest_ns = answered  # not `asked`: a host put aside in between must not blame the chip
         values = counts @ self._accel_map.matrix.T + self._accel_map.offset
-        self._track.add(values, asked, self._clock.now_ns())
+        self._track.add(values, asked, answered)
         for row in counts:
             link.repeats = link.repeats + 1 if (row == self._last_accel).all() else 0
             self._last_accel = row
@@ -362,7 +363,7 @@ class Gy85:
                 problem = problem if problem is not None or link is self._mag_link else error
                 self._events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
                 continue
-            if link.came_up(now):
+            if link.came_up(self._clock.now_ns()):
                 self._counts["reopened"] += 1
         if not any(link.is_up for link, _ in starts):
             self.close()  # an adapter that comes back has a new device file
