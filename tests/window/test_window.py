@@ -125,11 +125,16 @@ def test_known_rolling_shutter_is_accounted_for() -> None:
 
 
 def test_outliers_are_taken_out() -> None:
-    world = World(Motion.random(1), MONO, 1, duration_s=8.0)
-    clean, truths, _ = run(world)
-    updates, _, _ = run(replace(world, outliers=0.05))
-    assert position_rmse(updates, truths) < 1.5 * position_rmse(clean, truths) + 0.02
-    assert sum(u.rejected_tracks for u in updates) > 0
+    """Over three worlds: in a single one of 8 s, which points are bad decides as much as how they are treated."""
+    clean_m, spoilt_m = [], []
+    for seed in (1, 2, 3):
+        world = World(Motion.random(seed), MONO, seed, duration_s=8.0)
+        clean, truths, _ = run(world)
+        updates, _, _ = run(replace(world, outliers=0.05))
+        clean_m.append(position_rmse(clean, truths))
+        spoilt_m.append(position_rmse(updates, truths))
+        assert sum(u.rejected_tracks for u in updates) > 0
+    assert np.mean(spoilt_m) < 1.5 * np.mean(clean_m) + 0.02
 
 
 def test_without_an_imu_stereo_is_bundle_adjustment() -> None:

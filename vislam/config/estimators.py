@@ -111,8 +111,6 @@ class WindowConfig:
     rest_sigma_m: NonNegative = 0.001  # motion between two keyframes at rest
     rest_sigma_deg: NonNegative = 0.05
 
-    min_excitation_m_s2: NonNegative = 0.15  # one camera: rms change of acceleration below which it does not see scale
-
     gauge_sigma_m: NonNegative = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
     gauge_sigma_rad: NonNegative = 1e-3
     restart_sigma_m: NonNegative = 0.1  # of the state a window restarts from after a failed solution

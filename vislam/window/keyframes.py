@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from vislam.core.geometry import interpolate, invert
 from vislam.core.messages import Array, KeyframePacket, Tracking
 from vislam.window.equations import STATE, Ints
+from vislam.window.one_scale import at_first_scale
 from vislam.window.posterior import pose
 
 
@@ -38,6 +39,15 @@ class Keyframes:
     def rate_rad_s(self) -> Array:
         """Return how fast the body turned [M, 3] at each keyframe, biases taken off."""
         return np.where(self._gyro_rad_s.any(axis=1, keepdims=True), self._gyro_rad_s - self.X[:, 15:18], 0.0)
+
+    def linearised(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Return first estimates [M, 21] and of which states [M] they are where equations are linearised.
+
+        Before anything was marginalised that is none: they are then what the first prior speaks of, no more.
+        """
+        if not self.held.any():
+            return self.X_first, self.held
+        return at_first_scale(self.X, self.X_first, self.held), np.ones(len(self), dtype=np.bool_)
 
     def push(self, packet: KeyframePacket, x: Array, T_odom_body: Array | None, turned_before: bool) -> None:
         """Append a keyframe at state [21]; `turned_before` says that its span tells the rate of the first, too."""

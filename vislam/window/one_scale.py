@@ -1,4 +1,4 @@
-"""First estimates that agree on scale while the motion does not show it.
+"""First estimates that agree on scale, place and attitude, whether or not the motion shows them.
 
 In uniform motion, "everything larger" is a direction that nothing measures: positions from each other and velocities,
 times one factor. A linearised inertial link finds that direction free only where the states that it is linearised at
@@ -9,6 +9,9 @@ estimated together with the held ones: at their scale, place and attitude (tilt 
 Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010;
 for scale under constant acceleration: Wu et al., "VINS on wheels", ICRA 2017. At rest the same goes for tilt and the
 bias of force, which are one there.
+
+It is done always, not only in uniform motion: the step is there just when a straight way ends in its first turn and the
+estimates move most, and where motion does show scale both agree anyway.
 """
 
 from __future__ import annotations
@@ -17,27 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.messages import Array
-from vislam.window.equations import Links
 
 _EXTENT_M = 0.1  # of the held keyframes about their mean, root of the sum of squares: less has no scale to agree on
-
-
-def excitation_m_s2(X: Array, links: Links) -> float:
-    """Return the rms change of acceleration over the links between states [M, 21]; infinite where it is not known."""
-    if len(links.dt) == 0 or not links.inertial.all():
-        return float("inf")
-    R = X[:-1, :9].reshape(-1, 3, 3)
-    force = np.einsum("kij,kj->ki", R, links.dv / links.dt[:, None])
-    change = force - np.average(force, axis=0, weights=links.dt)
-    with np.errstate(over="ignore"):  # nonsense from a sensor is excitation, too
-        return float(np.sqrt(np.average(np.sum(change * change, axis=1), weights=links.dt)))
 
 
 def at_first_scale(X: Array, X_first: Array, held: NDArray[np.bool_]) -> Array:
     """Return where to linearise states [M, 21]: those held where they were first, others as if they were with them."""
     out = np.where(held[:, None], X_first, X)
     others, of_prior = np.flatnonzero(~held), np.flatnonzero(held)
-    if len(others) == 0 or len(of_prior) == 0:
+    if len(others) == 0:
         return out
     k = of_prior[-1]
     turn = X_first[k, :9].reshape(3, 3) @ X[k, :9].reshape(3, 3).T

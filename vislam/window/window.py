@@ -41,7 +41,6 @@ from vislam.window.incoming import check_packet, check_state
 from vislam.window.keyframes import Keyframes
 from vislam.window.leaving import split
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
-from vislam.window.one_scale import at_first_scale, excitation_m_s2
 from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma, tilt
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import RHO_START, Selection, TrackTable
@@ -135,7 +134,6 @@ class SlidingWindow:
         self._speed_sigma_m_s = 0.0
         self._last_edges: list[WindowEdge] = []
         self._sure = self._at_rest = False
-        self._hides_something = False  # the motion: scale, or which part of gravity is the accelerometer's bias
 
     # ---- what comes in
 
@@ -235,28 +233,13 @@ class SlidingWindow:
         keyframes = self._keyframes
         self._links.refresh(keyframes.X[:, 15:])
         self._links.hear(keyframes.X, keyframes.held)
-        self._hides_something = self._rests() or (not self._measures_scale and self._is_uniform())
-        first, held = keyframes.X_first, keyframes.held
-        if self._hides_something and held.any():
-            first, held = at_first_scale(keyframes.X, first, held), np.ones(len(keyframes), dtype=np.bool_)
         problem = Problem(
-            keyframes.X, first, held, self._tracks.points[selection.slots],
+            keyframes.X, *keyframes.linearised(), self._tracks.points[selection.slots],
             self._calibration.values, selection.views, self._camera(), self._links.arrays, self._prior,
             self._gravity_m_s2, self._full,
         )  # fmt: skip
         iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
         return optimise(problem, iterations, self._config.tolerance, self._room)
-
-    def _rests(self) -> bool:
-        """Whether nothing moved in all of the window."""
-        return bool(self._links.arrays.rest_weight[1:].all())
-
-    def _is_uniform(self) -> bool:
-        """Whether the window is full of motion without the change of acceleration that shows scale."""
-        links, config = self._links.arrays, self._config
-        if len(self._keyframes) < config.keyframes or links.rest_weight.any():
-            return False
-        return excitation_m_s2(self._keyframes.X, links) < config.min_excitation_m_s2
 
     # ---- what leaves
 
@@ -328,12 +311,11 @@ class SlidingWindow:
         given, dropped = split(tracks, keyframes.ids, self._config.split_min)
         selection = tracks.arrange(given, keyframes.ids)
         leaving = Leaving(selection.views, tracks.points[selection.slots])
-        X_linear = np.where(keyframes.held[:, None], keyframes.X_first, keyframes.X)
-        if self._hides_something:
-            X_linear = at_first_scale(keyframes.X, keyframes.X_first, keyframes.held)
+        first, is_fixed = keyframes.linearised()
+        X_linear = np.where(is_fixed[:, None], first, keyframes.X)
         self._prior = marginalise(
-            keyframes.X, X_linear, self._calibration.values, leaving, self._camera(), self._links.arrays, self._prior,
-            self._gravity_m_s2, self._full, self._room,
+            keyframes.X, first, X_linear, self._calibration.values, leaving, self._camera(), self._links.arrays,
+            self._prior, self._gravity_m_s2, self._full, self._room,
         )  # fmt: skip
         tracks.remove_rows(np.concatenate([given, dropped]))
         keyframes.pop_front(touched(self._prior, len(keyframes) - 1, self._full), X_linear)

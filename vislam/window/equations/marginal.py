@@ -36,6 +36,7 @@ class Leaving:
 
 def marginalise(
     X: Array,
+    X_first: Array,
     X_linear: Array,
     calibration: Array,
     leaving: Leaving,
@@ -48,9 +49,9 @@ def marginalise(
 ) -> Prior:
     """Return the prior [5 + (M - 1) * S] on calibration and the keyframes after the first.
 
-    All states are linearised at `X_linear` [M, 21]: those that the old prior holds where they were, the others at X or
-    near it. The new prior speaks of states around there. The views in `leaving`, the link
-    of keyframe 0 and its rest must not be used again. What lies in the room is lost.
+    The old prior speaks of states around `X_first` [M, 21]. All are linearised at `X_linear` [M, 21]: those that a
+    marginal prior holds where they were, the others at X or near it. The new prior speaks of states around there. The
+    views in `leaving`, the link of keyframe 0 and its rest must not be used again. What lies in the room is lost.
     """
     count, size = len(X), 15 if full else 6
     D = size * count + CALIBRATION
@@ -59,7 +60,7 @@ def marginalise(
     (A, landmarks), g = room.of(D, len(leaving.points), D - poses_at), np.zeros(D)
     A[:] = 0.0
     held_count = (len(prior.b) - CALIBRATION) // size
-    dx = inertial.prior_shift(X, X_linear, calibration, prior.calibration, held_count, size)
+    dx = inertial.prior_shift(X, X_first, calibration, prior.calibration, held_count, size)
     add_prior(prior, dx, prior_positions(count, held_count, full), A, g)
     everywhere = np.ones(count, dtype=np.bool_)
     states, normal = States(X, X_linear, everywhere), Normal(A, g)
