@@ -143,7 +143,7 @@ def test_frames_whose_keyframes_waited_at_the_end_are_not_lost(tmp_path: Path) -
             os.kill(back, signal.SIGCONT)
 
     metrics = begin(out).execute(watch, PATIENCE_S)
-    assert len(read_tum(out / "trajectory_graph.tum").t_ns) < 0.5 * metrics["frames"]
+    assert len(read_tum(out / "trajectory_graph.tum").t_ns) < 0.8 * metrics["frames"]  # fewer than what is covered
     assert metrics["coverage_frames"] > 0.9
     assert metrics["verdict"]["state"] != "lost"
 
