@@ -18,7 +18,7 @@ LONG_CLASSES = {
     "Estimator": 470,  # ladder of solvers around one iSAM2
     "FastPath": 260,
     "Front": 470,  # odometry and keyframes of one run
-    "Gy85": 390,  # one board's clock, queue and faults
+    "Gy85": 260,  # one board's clock, queue and faults
     "Initialiser": 430,
     "LiveRun": 270,
     "LoopSet": 410,  # decides about all loops of a run

@@ -156,4 +156,4 @@ def test_what_is_no_magnetometer_is_not_taken_for_one() -> None:
         again = FifoBoard(BoardConfig(bus=virtual.path, mag=True), clock)
         assert again.magnetometer_name is None
         with pytest.raises(HardwareError, match="no magnetometer answers"):
-            again._start_mag(I2cBus(virtual.path, 0.02))
+            again._mag.start(I2cBus(virtual.path, 0.02))

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from contextlib import suppress
 
 import numpy as np
 
 from vislam.config import BoardConfig
-from vislam.core.errors import HardwareError, UsageError
+from vislam.core.errors import UsageError
 from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.affine import Affine
-from vislam.hw.chips import BusError, FifoImu, I2cBus, ImuSetup, Magnetometer, SelfTest, SettingsLostError, find_imu
+from vislam.hw.board_magnetometer import BoardMagnetometer
+from vislam.hw.chips import BusError, FifoImu, I2cBus, ImuSetup, SelfTest, SettingsLostError, find_imu
 from vislam.hw.chips.magnetometer import find_any_magnetometer
-from vislam.hw.field_watch import FieldWatch
 from vislam.hw.fifo_samples import FifoSamples
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.link import Link, first_connection, refuse_shared
+from vislam.hw.link import ChipLinks, Link, refuse_shared
 from vislam.hw.timing import Clock, HostClock, read_in_rounds
 
 _NS = 1_000_000_000
@@ -51,23 +49,15 @@ class FifoBoard:
         self._setup = ImuSetup(config.rate_hz, config.gyro_range_deg_s, config.accel_range_g, config.firmware)
         self.rate_hz = config.rate_hz
         self.self_tests: tuple[SelfTest, ...] = ()
-        c = config.calibration
-        self._mag_watch = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), config.stuck_samples)
-        self._counts: Counter[str] = Counter()
-        self._bus: I2cBus | None = None
         self._imu: FifoImu | None = None
-        self._mag: Magnetometer | None = None
-        self._imu_link, self._mag_link = Link(), Link()
-        self._wants_mag = config.mag is True
+        self._mag = BoardMagnetometer(config, find_any_magnetometer, config.mag is True)
+        self._imu_link = Link(self._start_imu, Health.GYRO_FAULT | Health.ACCEL_FAULT)
+        self._links = ChipLinks(config, self._clock, (self._imu_link, self._mag.link))
         self._samples = FifoSamples(config)
-        self._events = Health(0)
         self._must_empty = False
         self._last_out_ns = self._next_ns = self._clock.now_ns()
-        self._next_mag_ns = self._next_watch_ns = self._retry_bus_ns = 0
-        problem = first_connection(self._connect, self._clock, config.reopen_s, must_be_there)
-        if must_be_there and problem is not None:
-            self.close()
-            raise problem
+        self._next_watch_ns = 0
+        self._links.begin(must_be_there)
         self._next_ns = self._clock.now_ns()
 
     @property
@@ -83,7 +73,7 @@ class FifoBoard:
     @property
     def magnetometer_name(self) -> str | None:
         """Which magnetometer was found; None if there is none."""
-        return None if self._mag is None else self._mag.name
+        return self._mag.name
 
     @property
     def stamp_bound_ms(self) -> float | None:
@@ -100,44 +90,37 @@ class FifoBoard:
 
     def health(self) -> Health:
         """Return the sensor bits that hold now and the events since the last call."""
-        word, self._events = self._events, Health(0)
+        word = self._links.health()
         if self._clock.now_ns() - self._last_out_ns > self._config.silent_s * _NS:
             word |= Health.IMU_MISSING
-        if not self._imu_link.is_up:
-            word |= Health.GYRO_FAULT | Health.ACCEL_FAULT
-        if self._wants_mag and not self._mag_link.is_up:
-            word |= Health.MAG_FAULT
-        if self._bus is None:
-            word |= Health.BUS_FAULT
         if self._samples.is_far:
             word |= Health.TEMPERATURE_DRIFT
         return word
 
     def counters(self) -> dict[str, int]:
         """Return how often each fault occurred since the start."""
-        return dict(self._counts)
+        return dict(self._links.counts)
 
     def close(self) -> None:
         """Close the bus; may be called twice."""
-        if self._bus is not None:
-            self._bus.close()
-        self._bus = None
-        self._imu_link.is_up = self._mag_link.is_up = False
+        self._links.close()
 
     # ---- one round --------------------------------------------------------------------------------------------
 
     def _poll(self) -> list[ImuSample | MagSample]:
         now = self._clock.now_ns()
-        if not self._imu_link.is_up or (self._wants_mag and not self._mag_link.is_up):
-            self._connect(now)
+        if not self._links.are_up:
+            self._links.connect(now)
         samples: list[ImuSample | MagSample] = []
         if self._imu is not None and self._imu_link.is_up:
             try:
                 samples += self._inertial(self._imu)
                 self._look(self._imu, now)
             except (BusError, SettingsLostError) as error:
-                self._failed(self._imu_link, error)
-        mag = self._magnetic(now) if self._wants_mag and now >= self._next_mag_ns else None
+                if self._must_empty or isinstance(error, SettingsLostError):
+                    self._links.events |= Health.IMU_GAP
+                self._links.failed(self._imu_link, error)
+        mag = self._mag.read(self._links, now)
         if mag is not None:
             samples.append(mag)
             samples.sort(key=lambda sample: sample.t_ns)
@@ -145,7 +128,7 @@ class FifoBoard:
         late = max(self._clock.now_ns() - self._next_ns, 0) // period_ns
         self._next_ns += (late + 1) * period_ns
         if not self._imu_link.is_up:
-            self._next_ns = max(self._next_ns, self._imu_link.retry_ns)
+            self._next_ns = max(self._next_ns, self._links.retry_ns(self._imu_link))
         return samples
 
     def _inertial(self, imu: FifoImu) -> list[ImuSample]:
@@ -159,8 +142,8 @@ class FifoBoard:
         answered = self._clock.now_ns()
         link.nacks = 0
         if waiting.is_overrun:
-            self._counts["fifo_overrun"] += 1
-            self._events |= Health.IMU_GAP
+            self._links.counts["fifo_overrun"] += 1
+            self._links.events |= Health.IMU_GAP
             self._samples.restart()
             link.newest_ns = answered  # it lives
         self._must_empty = True  # until all are fetched: a transfer that breaks off leaves parts of samples
@@ -168,12 +151,12 @@ class FifoBoard:
         self._must_empty = False
         if raw is None or len(raw) == 0:
             if asked - link.newest_ns > self._config.silent_s * _NS:
-                self._counts["imu_silent"] += 1
+                self._links.counts["imu_silent"] += 1
                 link.drop(asked)
             return []
         link.newest_ns = self._clock.now_ns()  # not `asked`: a host put aside in between must not blame the chip
-        made = self._samples.made(raw, asked, answered, self._counts)
-        self._events |= made.events
+        made = self._samples.made(raw, asked, answered, self._links.counts)
+        self._links.events |= made.events
         if made.is_stuck:
             link.drop(asked)
         if made.samples:
@@ -187,69 +170,7 @@ class FifoBoard:
         self._next_watch_ns = now + round(_WATCH_S * _NS)
         self._samples.take_temperature(imu.temperature_c())
 
-    def _magnetic(self, now: int) -> MagSample | None:
-        if self._mag is None or not self._mag_link.is_up:
-            return None
-        rate_hz = min(self._config.mag_rate_hz, self._mag.rate_hz)
-        self._next_mag_ns = max(self._next_mag_ns + round(_NS / rate_hz), now)
-        try:
-            reading = self._mag.read()
-        except (BusError, SettingsLostError) as error:
-            self._failed(self._mag_link, error)
-            return None
-        sample, fault = self._mag_watch.taken(reading, self._mag_link, now, self._mag.rate_hz, self._counts)
-        if fault == "mag_overflow":
-            self._events |= Health.MAG_FAULT
-        elif fault:
-            self._mag_link.drop(now)
-        return sample
-
     # ---- coming and going -------------------------------------------------------------------------------------
-
-    def _failed(self, link: Link, error: BusError | SettingsLostError) -> None:
-        """Take note of a failed transfer; the chip is given up after several, or at once if the wire is dead."""
-        now = self._clock.now_ns()
-        if isinstance(error, SettingsLostError):
-            self._counts["settings_lost"] += 1
-            self._events |= Health.IMU_GAP if link is self._imu_link else Health(0)
-            link.drop(now)
-            return
-        self._events |= Health.BUS_FAULT | (Health.IMU_GAP if self._must_empty else Health(0))
-        link.nacks += 1
-        if error.kind != "nack" or link.nacks >= self._config.nacks_to_reopen:
-            link.drop(now)
-        if error.kind == "gone":
-            self._imu_link.drop(now)
-            self._mag_link.drop(now)
-
-    def _connect(self, now: int) -> HardwareError | None:
-        """Set up what is down and due; return what keeps the inertial chip from coming up."""
-        reopen_ns = round(self._config.reopen_s * _NS)
-        if self._bus is None:
-            if now < self._retry_bus_ns:
-                return None
-            self._retry_bus_ns = now + reopen_ns
-            try:
-                self._bus = I2cBus(self._config.bus, self._config.bus_timeout_s, self._counts)
-            except BusError as error:
-                self._imu_link.retry_ns = self._retry_bus_ns
-                return error
-        problem: HardwareError | None = None
-        for link, start in ((self._imu_link, self._start_imu), (self._mag_link, self._start_mag)):
-            if link.is_up or now < link.retry_ns or (link is self._mag_link and not self._wants_mag):
-                continue
-            link.retry_ns = now + reopen_ns
-            try:
-                start(self._bus)
-            except HardwareError as error:
-                problem = error if link is self._imu_link else problem
-                self._events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
-                continue
-            if link.came_up(self._clock.now_ns()):
-                self._counts["reopened"] += 1
-        if not (self._imu_link.is_up or self._mag_link.is_up):
-            self.close()  # an adapter that comes back has a new device file
-        return problem
 
     def _start_imu(self, bus: I2cBus) -> None:
         imu = find_imu(bus, self._setup, self._config.chip, self._config.address)
@@ -257,13 +178,6 @@ class FifoBoard:
         imu.configure(self._clock)
         self._samples.begin(imu, self._clock.now_ns() + round(imu.start_up_s * _NS))
         self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, False
-        if self._config.mag is None and not self._wants_mag:
+        if self._config.mag is None and not self._mag.link.is_wanted:
             with suppress(BusError):  # one that is on the board answers now: what is inside the chip is on the bus
-                self._wants_mag = find_any_magnetometer(bus, self._config.mag_range_ga) is not None
-
-    def _start_mag(self, bus: I2cBus) -> None:
-        found = find_any_magnetometer(bus, self._config.mag_range_ga)
-        if found is None:
-            raise HardwareError(f"{bus.path}: no magnetometer answers")
-        self._mag = found
-        found.configure()
+                self._mag.link.is_wanted = find_any_magnetometer(bus, self._config.mag_range_ga) is not None

@@ -1,21 +1,28 @@
-"""How a board stands with one of its chips, and chips that the kernel has taken."""
+"""How a board stands with its bus and its chips: which are up, what failed, what is set up again and when."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from vislam.config import BoardConfig, Gy85Config
 from vislam.core.errors import HardwareError
-from vislam.hw.chips import I2cBus, SelfTest, kernel_driver, unbind_command
+from vislam.hw.chips import BusError, I2cBus, SelfTest, SettingsLostError, kernel_driver, unbind_command
+from vislam.hw.health import Health
 from vislam.hw.timing import Clock
 
 START_ATTEMPTS = 3  # a wire may be disturbed just then
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Link:
-    """How it stands with one chip."""
+    """How it stands with one chip: `start` finds it and sets it up, `fault` says in the health word that it is bad."""
 
+    start: Callable[[I2cBus], None]
+    fault: Health
+    is_inertial: bool = True  # the board is nothing without it
+    is_wanted: bool = True
     retry_ns: int = 0
     good_from_ns: int = 0
     newest_ns: int = 0  # when it last gave something new
@@ -24,6 +31,11 @@ class Link:
     silent: int = 0  # reads in a row that found nothing new
     is_up: bool = False
     self_test: SelfTest | None = None
+
+    @property
+    def is_bad(self) -> bool:
+        """Whether the chip is down or failed its self-test."""
+        return not self.is_up or (self.self_test is not None and self.self_test.passed is False)
 
     def drop(self, now_ns: int) -> None:
         """Take the chip for lost; it is looked for in the next round, then at the board's own pace."""
@@ -38,17 +50,105 @@ class Link:
         return was_up
 
 
-def first_connection(
-    connect: Callable[[int], HardwareError | None], clock: Clock, reopen_s: float, must_be_there: bool
-) -> HardwareError | None:
-    """Return what keeps a board from coming up; where it must be there, a wire may be disturbed twice."""
-    problem = connect(clock.now_ns())
-    for _ in range(START_ATTEMPTS - 1):
-        if problem is None or not must_be_there:
-            break
-        clock.sleep_until(clock.now_ns() + round(reopen_s * 1e9))
-        problem = connect(clock.now_ns())
-    return problem
+class ChipLinks:
+    """Owns a board's bus: opens it and sets its chips up, again and again where they go away, and keeps count.
+
+    Attributes:
+        counts: how often each fault occurred since the start.
+        events: health bits of what happened since `health` last told them.
+    """
+
+    def __init__(self, config: Gy85Config | BoardConfig, clock: Clock, links: tuple[Link, ...]) -> None:
+        """Take the board's settings and its chips, in the order in which they are set up; nothing is opened yet."""
+        self._config, self._clock, self._links = config, clock, links
+        self.counts: Counter[str] = Counter()
+        self.events = Health(0)
+        self._bus: I2cBus | None = None
+        self._retry_bus_ns = 0
+
+    @property
+    def are_up(self) -> bool:
+        """Whether no chip has to be set up."""
+        return all(link.is_up for link in self._links if link.is_wanted)
+
+    def health(self) -> Health:
+        """Return the bits of bus and chips that hold now and the events since the last call."""
+        word, self.events = self.events, Health(0)
+        for link in self._links:
+            if link.is_wanted and link.is_bad:
+                word |= link.fault
+        return word if self._bus is not None else word | Health.BUS_FAULT
+
+    def close(self) -> None:
+        """Close the bus; may be called twice."""
+        if self._bus is not None:
+            self._bus.close()
+        self._bus = None
+        for link in self._links:
+            link.is_up = False
+
+    def retry_ns(self, link: Link) -> int:
+        """Return when a chip that is down is looked for again."""
+        return link.retry_ns if self._bus is not None else max(link.retry_ns, self._retry_bus_ns)
+
+    def begin(self, must_be_there: bool) -> None:
+        """Connect for the first time.
+
+        Raises HardwareError: what keeps an inertial chip from coming up, where it must be there; a wire may be
+        disturbed twice.
+        """
+        problem = self.connect(self._clock.now_ns())
+        for _ in range(START_ATTEMPTS - 1):
+            if problem is None or not must_be_there:
+                return
+            self._clock.sleep_until(self._clock.now_ns() + round(self._config.reopen_s * 1e9))
+            problem = self.connect(self._clock.now_ns())
+        if problem is not None and must_be_there:
+            self.close()
+            raise problem
+
+    def connect(self, now: int) -> HardwareError | None:
+        """Set up what is down and due; return what keeps an inertial chip from coming up."""
+        reopen_ns = round(self._config.reopen_s * 1e9)
+        if self._bus is None:
+            if now < self._retry_bus_ns:
+                return None
+            self._retry_bus_ns = now + reopen_ns
+            try:
+                self._bus = I2cBus(self._config.bus, self._config.bus_timeout_s, self.counts)
+            except BusError as error:
+                return error
+        problem: HardwareError | None = None
+        for link in self._links:
+            if link.is_up or now < link.retry_ns or not link.is_wanted:
+                continue
+            link.retry_ns = now + reopen_ns
+            try:
+                link.start(self._bus)
+            except HardwareError as error:
+                problem = error if problem is None and link.is_inertial else problem
+                self.events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
+                continue
+            if link.came_up(self._clock.now_ns()):
+                self.counts["reopened"] += 1
+        if not any(link.is_up for link in self._links):
+            self.close()  # an adapter that comes back has a new device file
+        return problem
+
+    def failed(self, link: Link, error: BusError | SettingsLostError) -> None:
+        """Take note of a failed transfer; the chip is given up after several, or at once if the wire is dead."""
+        now = self._clock.now_ns()
+        if isinstance(error, SettingsLostError):
+            self.counts["settings_lost"] += 1
+            link.drop(now)
+            return
+        self.events |= Health.BUS_FAULT
+        link.nacks += 1
+        if error.kind != "nack" or link.nacks >= self._config.nacks_to_reopen:
+            link.drop(now)
+        if error.kind == "gone":
+            for other in self._links:
+                other.drop(now)
 
 
 def refuse_shared(bus: I2cBus, address: int) -> None:

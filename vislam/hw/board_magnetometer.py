@@ -1,0 +1,72 @@
+"""The magnetometer of a board: found, asked at its rate, judged, and told as samples of the body's axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from vislam.config import BoardConfig, Gy85Config
+from vislam.core.errors import HardwareError
+from vislam.core.messages import MagSample
+from vislam.hw.affine import Affine
+from vislam.hw.chips import BusError, Hmc5883l, I2cBus, Magnetometer, SettingsLostError
+from vislam.hw.field_watch import FieldWatch
+from vislam.hw.health import Health
+from vislam.hw.link import ChipLinks, Link
+
+_NS = 1_000_000_000
+
+
+class BoardMagnetometer:
+    """Owns the chip, its link, and when it is asked again.
+
+    Attributes:
+        chip: None before one was found.
+        link: how it stands with it.
+    """
+
+    def __init__(
+        self,
+        config: Gy85Config | BoardConfig,
+        find: Callable[[I2cBus, float], Magnetometer | None],
+        is_wanted: bool,
+    ) -> None:
+        """Take the board's settings and how such chips are found on a bus for a range in gauss."""
+        c = config.calibration
+        self._config, self._find = config, find
+        self._watch = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), config.stuck_samples)
+        self._next_ns = 0
+        self.chip: Magnetometer | None = None
+        self.link = Link(self.start, Health.MAG_FAULT, is_inertial=False, is_wanted=is_wanted)
+
+    @property
+    def name(self) -> str | None:
+        """Which chip was found; None if there is none."""
+        return None if self.chip is None else self.chip.name
+
+    def start(self, bus: I2cBus) -> None:
+        """Find the chip and set it up, with the scale that its last self-test gave; raises HardwareError."""
+        found = self._find(bus, self._config.mag_range_ga)
+        if found is None:
+            raise HardwareError(f"{bus.path}: no magnetometer answers")
+        if isinstance(found, Hmc5883l) and isinstance(self.chip, Hmc5883l):
+            found.scale = self.chip.scale
+        self.chip = found
+        found.configure()
+
+    def read(self, links: ChipLinks, now: int) -> MagSample | None:
+        """Return a sample [uT] if one is due and new; faults go to the board's counts, events and link."""
+        if self.chip is None or not self.link.is_up or now < self._next_ns:
+            return None
+        rate_hz = min(self._config.mag_rate_hz, self.chip.rate_hz)
+        self._next_ns = max(self._next_ns + round(_NS / rate_hz), now)
+        try:
+            reading = self.chip.read()
+        except (BusError, SettingsLostError) as error:
+            links.failed(self.link, error)
+            return None
+        sample, fault = self._watch.taken(reading, self.link, now, self.chip.rate_hz, links.counts)
+        if fault == "mag_overflow":
+            links.events |= Health.MAG_FAULT
+        elif fault:
+            self.link.drop(now)
+        return sample
