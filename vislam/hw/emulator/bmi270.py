@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import struct
 
-from vislam.hw.emulator.chips import NowNs
 from vislam.hw.emulator.fifo_chip import FifoChip
-from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
 
-_G_M_S2 = 9.80665
 _INIT_DATA = 0x5E
 
 
@@ -23,26 +19,14 @@ class VirtualBmi270(FifoChip):
 
     FIFO_REGISTER = 0x26
     FIFO_BYTES = 2048 // 12 * 12
-
-    def __init__(
-        self,
-        truth: Truth,
-        now_ns: NowNs,
-        gyro: SensorError = IDEAL,
-        accel: SensorError = IDEAL,
-        seed: int = 0,
-        who_am_i: int = 0x24,
-    ) -> None:
-        """Take the motion, the host's clock and the errors."""
-        self._who_am_i = who_am_i
-        self.given = bytearray()
-        self.takes = True
-        super().__init__(truth, now_ns, gyro, accel, seed)
+    IDENTITY = (0x00, 0x24)
+    CLEARED_BY_READING = 0x1D
+    takes = True
 
     def power_cycle(self) -> None:
         """Come up in advanced power save without a configuration."""
         super().power_cycle()
-        self.registers[0x00], self.registers[0x40], self.registers[0x42] = self._who_am_i, 0xA8, 0xA9
+        self.registers[0x40], self.registers[0x42] = 0xA8, 0xA9
         self.registers[0x7C] = 0x03
         self.given = bytearray()
 
@@ -76,16 +60,14 @@ class VirtualBmi270(FifoChip):
             is_awake = not self.registers[0x7C] & 0x01
             self.registers[0x21] = 0x01 if self.takes and is_awake and self.given else 0x02
         runs = self.registers[0x21] == 0x01 and self.registers[0x7D] & 0x06 == 0x06 and self.registers[0x49] == 0xC0
-        if not runs:
-            self._next_ns = math.inf
-        elif register in (0x7D, 0x49, 0x42):
-            self._start()
+        begins = register in (0x7D, 0x49, 0x42)
+        self._pace(runs, begins)
+        if runs and begins:
             self.gyro_delay_ns = self.accel_delay_ns = round(0.225e9 / (0.4 * self._rate_hz()))
 
     def _packed(self, t_ns: int) -> bytes:
-        gyro_lsb = 32768.0 / (2000.0 / (1 << (self.registers[0x43] & 7))) * 180.0 / math.pi
-        accel_lsb = 16384.0 / (1 << (self.registers[0x41] & 3)) / _G_M_S2
-        gyro, accel = self._counts(t_ns, gyro_lsb, accel_lsb)
+        gyro_lsb = 32768.0 / (2000.0 / (1 << (self.registers[0x43] & 7)))
+        gyro, accel = self._counts(t_ns, gyro_lsb, 16384.0 / (1 << (self.registers[0x41] & 3)))
         return struct.pack("<6h", *gyro, *accel)
 
     def _overran(self) -> None:
@@ -93,8 +75,7 @@ class VirtualBmi270(FifoChip):
 
     def _begin_read(self, first: int, count: int) -> None:
         struct.pack_into("<H", self.registers, 0x24, len(self.fifo))
-        temperature_c = self._truth(self._now_ns())[3]
-        struct.pack_into("<h", self.registers, 0x22, round((temperature_c - 23.0) * 512.0))
+        self._to_temperature(0x22, "<", 23.0, 512.0)
 
     def read(self, count: int) -> bytes:
         """Answer a message that reads; what is read of a frame in part stays in the FIFO, and none is 0x8000."""
@@ -105,9 +86,3 @@ class VirtualBmi270(FifoChip):
         data = bytes(self.fifo[:count])
         del self.fifo[:whole]
         return data + (b"\x00\x80" * count)[: count - len(data)]
-
-    def _read_byte(self, register: int) -> int:
-        value = super()._read_byte(register)
-        if register == 0x1D:
-            self.registers[0x1D] = 0
-        return value

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import struct
+from typing import ClassVar
 
 from vislam.hw.emulator.chips import Chip, NowNs
 from vislam.hw.emulator.sensing import IDEAL, Sensing, SensorError, Truth, quantised
 
+_G_M_S2 = 9.80665
 Counts = tuple[int, int, int]
 
 
@@ -21,6 +24,8 @@ class FifoChip(Chip):
 
     FIFO_REGISTER = 0
     FIFO_BYTES = 512
+    IDENTITY: ClassVar[tuple[int, int]]  # register, and what the usual chip of the kind says there
+    CLEARED_BY_READING = -1  # the register that tells of an overrun, where reading it clears it
     gyro_delay_ns = 0
     accel_delay_ns = 0
 
@@ -31,8 +36,13 @@ class FifoChip(Chip):
         gyro: SensorError = IDEAL,
         accel: SensorError = IDEAL,
         seed: int = 0,
+        who_am_i: int | None = None,
     ) -> None:
-        """Take the motion, the host's clock and the errors of both sensors; the gyro's rate error is the chip's."""
+        """Take the motion, the host's clock and the errors of both sensors; the gyro's rate error is the chip's.
+
+        `who_am_i` makes it another chip of its kind.
+        """
+        self._who_am_i = self.IDENTITY[1] if who_am_i is None else who_am_i
         self._accel_sense = Sensing(accel, seed + 1)
         self.fifo = bytearray()
         self._next_ns = math.inf
@@ -41,6 +51,7 @@ class FifoChip(Chip):
     def power_cycle(self) -> None:
         """Come up asleep with an empty FIFO."""
         super().power_cycle()
+        self.registers[self.IDENTITY[0]] = self._who_am_i
         self._stop()
 
     def read(self, count: int) -> bytes:
@@ -56,7 +67,10 @@ class FifoChip(Chip):
     def _read_byte(self, register: int) -> int:
         if register == self.FIFO_REGISTER:
             return self.fifo.pop(0) if self.fifo else 0xFF
-        return self.registers[register]
+        value = self.registers[register]
+        if register == self.CLEARED_BY_READING:
+            self.registers[register] = 0
+        return value
 
     def _next(self, pointer: int) -> int:
         return pointer if pointer == self.FIFO_REGISTER else (pointer + 1) & 0xFF
@@ -79,6 +93,13 @@ class FifoChip(Chip):
 
     def _period_ns(self) -> float:
         return 1e9 / (self._rate_hz() * self._rate)
+
+    def _pace(self, runs: bool, begins: bool) -> None:
+        """Stop sampling, the FIFO left as it is, or begin anew."""
+        if not runs:
+            self._next_ns = math.inf
+        elif begins:
+            self._start()
 
     def _start(self) -> None:
         self._next_ns = self._now_ns() + self._period_ns()
@@ -104,11 +125,17 @@ class FifoChip(Chip):
                 del self.fifo[: len(self.fifo) - self.FIFO_BYTES]
                 self._overran()
 
-    def _counts(self, t_ns: int, gyro_lsb: float, accel_lsb: float) -> tuple[Counts, Counts]:
-        """Return the counts of gyro and accelerometer, of so many LSB per rad/s and m/s^2, late by the filters."""
+    def _counts(self, t_ns: int, lsb_per_deg_s: float, lsb_per_g: float) -> tuple[Counts, Counts]:
+        """Return the counts of gyro and accelerometer, late by the filters."""
         bandwidth_hz = 0.5 * self._rate_hz()
         rate, _, _, temperature_c = self._truth(t_ns - self.gyro_delay_ns)
         _, force, _, _ = self._truth(t_ns - self.accel_delay_ns)
         gyro = self._sense(rate, t_ns, temperature_c, bandwidth_hz)
         accel = self._accel_sense(force, t_ns, temperature_c, bandwidth_hz)
+        gyro_lsb, accel_lsb = lsb_per_deg_s * 180.0 / math.pi, lsb_per_g / _G_M_S2
         return quantised(gyro, gyro_lsb, -32768, 32767), quantised(accel, accel_lsb, -32768, 32767)
+
+    def _to_temperature(self, register: int, order: str, zero_c: float, lsb_per_c: float) -> None:
+        """Put the temperature into two registers, in the order of bytes that `struct` has for it."""
+        temperature_c = self._truth(self._now_ns())[3]
+        struct.pack_into(f"{order}h", self.registers, register, round((temperature_c - zero_c) * lsb_per_c))

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import struct
 
-from vislam.hw.emulator.chips import NowNs
 from vislam.hw.emulator.fifo_chip import FifoChip
-from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
 
-_G_M_S2 = 9.80665
 _LSB_PER_DEG_S = (131.0, 65.5, 32.8, 16.4)
 _BANK = 0x7F
 
@@ -18,22 +14,9 @@ class VirtualIcm20948(FifoChip):
     """Wakes up asleep in bank 0; `registers` are those of bank 0."""
 
     FIFO_REGISTER = 0x72
-    FIFO_BYTES = 512
+    IDENTITY = (0x00, 0xEA)
+    CLEARED_BY_READING = 0x1B
     gyro_delay_ns, accel_delay_ns = round(0.225e9 / 119.5), round(0.225e9 / 111.4)
-
-    def __init__(
-        self,
-        truth: Truth,
-        now_ns: NowNs,
-        gyro: SensorError = IDEAL,
-        accel: SensorError = IDEAL,
-        seed: int = 0,
-        who_am_i: int = 0xEA,
-    ) -> None:
-        """Take the motion, the host's clock and the errors."""
-        self._who_am_i = who_am_i
-        self.banks = {bank: bytearray(256) for bank in (1, 2, 3)}
-        super().__init__(truth, now_ns, gyro, accel, seed)
 
     @property
     def lets_through(self) -> bool:
@@ -43,9 +26,8 @@ class VirtualIcm20948(FifoChip):
     def power_cycle(self) -> None:
         """Come up asleep."""
         super().power_cycle()
-        for bank in self.banks.values():
-            bank[:] = bytes(256)
-        self.registers[0x00], self.registers[0x06] = self._who_am_i, 0x41
+        self.banks = {bank: bytearray(256) for bank in (1, 2, 3)}
+        self.registers[0x06] = 0x41
         self.banks[2][0x01] = self.banks[2][0x14] = 0x01
 
     def _bank(self) -> bytearray:
@@ -69,15 +51,11 @@ class VirtualIcm20948(FifoChip):
         if register == 0x68 and value & 0x01:
             self.fifo.clear()
         runs = self.registers[0x03] & 0x40 and self.registers[0x67] == 0x1E and not self.registers[0x06] & 0x40
-        if not runs:
-            self._next_ns = math.inf
-        elif register in (0x03, 0x67, 0x06):
-            self._start()
+        self._pace(bool(runs), register in (0x03, 0x67, 0x06))
 
     def _packed(self, t_ns: int) -> bytes:
-        gyro_lsb = _LSB_PER_DEG_S[self.banks[2][0x01] >> 1 & 3] * 180.0 / math.pi
-        accel_lsb = 16384.0 / (1 << (self.banks[2][0x14] >> 1 & 3)) / _G_M_S2
-        gyro, accel = self._counts(t_ns, gyro_lsb, accel_lsb)
+        gyro_lsb = _LSB_PER_DEG_S[self.banks[2][0x01] >> 1 & 3]
+        gyro, accel = self._counts(t_ns, gyro_lsb, 16384.0 / (1 << (self.banks[2][0x14] >> 1 & 3)))
         return struct.pack(">6h", *accel, *gyro)
 
     def _overran(self) -> None:
@@ -85,14 +63,10 @@ class VirtualIcm20948(FifoChip):
 
     def _begin_read(self, first: int, count: int) -> None:
         struct.pack_into(">H", self.registers, 0x70, len(self.fifo))
-        temperature_c = self._truth(self._now_ns())[3]
-        struct.pack_into(">h", self.registers, 0x39, round((temperature_c - 21.0) * 333.87))
+        self._to_temperature(0x39, ">", 21.0, 333.87)
 
     def _read_byte(self, register: int) -> int:
         bank = self._bank()
         if bank is not self.registers and register != _BANK:
             return bank[register]
-        value = super()._read_byte(register)
-        if register == 0x1B:
-            self.registers[0x1B] = 0
-        return value
+        return super()._read_byte(register)

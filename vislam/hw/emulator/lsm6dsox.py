@@ -5,40 +5,28 @@ from __future__ import annotations
 import math
 import struct
 
-from vislam.hw.emulator.chips import NowNs
 from vislam.hw.emulator.fifo_chip import FifoChip
-from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
 
-_G_M_S2 = 9.80665
 _TAG, _DATA_END = 0x78, 0x7E
 _GYRO_START_NS = 35_000_000
 
 
 class VirtualLsm6dsox(FifoChip):
-    """Continuous or bypass mode; a word leaves the FIFO with its last byte; the gyro's words begin 35 ms later."""
+    """Continuous or bypass mode; a word leaves the FIFO with its last byte; the gyro's words begin 35 ms later.
+
+    The id 0x6C is a LSM6DSOX, 0x6B an ISM330DHCX.
+    """
 
     FIFO_BYTES = 512 * 7
+    IDENTITY = (0x0F, 0x6C)
     _HALVINGS = (0, 512, 256, 128, 64, 32, 16, 8)
     _GYRO_MDEG_S = (8.75, 17.5, 35.0, 70.0)
     _ACCEL_MG = (0.061, 0.488, 0.122, 0.244)
 
-    def __init__(
-        self,
-        truth: Truth,
-        now_ns: NowNs,
-        gyro: SensorError = IDEAL,
-        accel: SensorError = IDEAL,
-        seed: int = 0,
-        who_am_i: int = 0x6C,
-    ) -> None:
-        """Take the motion, the host's clock and the errors; `who_am_i` 0x6B is an ISM330DHCX."""
-        self._who_am_i = who_am_i
-        super().__init__(truth, now_ns, gyro, accel, seed)
-
     def power_cycle(self) -> None:
         """Come up with both sensors off; FREQ_FINE says how far the oscillator is from its nominal rate."""
         super().power_cycle()
-        self.registers[0x0F], self.registers[0x12], self.registers[0x18] = self._who_am_i, 0x04, 0xE0
+        self.registers[0x12], self.registers[0x18] = 0x04, 0xE0
         self.registers[0x63] = max(min(round((self._rate - 1.0) / 0.0015), 127), -128) & 0xFF
         self._slot = 0
         self._gyro_from_ns = math.inf
@@ -71,7 +59,7 @@ class VirtualLsm6dsox(FifoChip):
     def _packed(self, t_ns: int) -> bytes:
         mg = self._ACCEL_MG[self.registers[0x10] >> 2 & 3]
         mdeg_s = self._GYRO_MDEG_S[self.registers[0x11] >> 2 & 3]
-        gyro, accel = self._counts(t_ns, 1e3 * 180.0 / math.pi / mdeg_s, 1e3 / (mg * _G_M_S2))
+        gyro, accel = self._counts(t_ns, 1e3 / mdeg_s, 1e3 / mg)
         self._slot = (self._slot + 1) & 3
         batched = self.registers[0x09]
         words = b""
@@ -93,8 +81,7 @@ class VirtualLsm6dsox(FifoChip):
         self.registers[0x3A] = words & 0xFF
         self.registers[0x3B] = self.registers[0x3B] & 0xF8 | words >> 8 & 3
         if first <= 0x21 and first + count > 0x20:
-            temperature_c = self._truth(self._now_ns())[3]
-            struct.pack_into("<h", self.registers, 0x20, round((temperature_c - 25.0) * 256.0))
+            self._to_temperature(0x20, "<", 25.0, 256.0)
 
     def _read_byte(self, register: int) -> int:
         if _TAG <= register <= _DATA_END:

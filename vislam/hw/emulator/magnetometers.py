@@ -92,7 +92,25 @@ class VirtualHmc5883l(Chip):
         return {0x08: 0x03, 0x0C: 0x00}.get(pointer, (pointer + 1) & 0xFF)
 
 
-class VirtualQmc5883(Chip):
+class _Sampling(Chip):
+    """Measures by its own clock since its mode was set; what is read is the newest measurement."""
+
+    def _begin(self) -> None:
+        self._start_ns, self._sample = self._now_ns(), 0
+
+    def _new_field(self, rate_hz: float) -> Triple | None:
+        """Return a measurement [uT] that was not there before, at a rate by the nominal clock; None without one."""
+        rate_hz *= self._rate
+        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
+        if sample == self._sample or self.is_frozen:
+            return None
+        self._sample = sample
+        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
+        _, _, field, temperature_c = self._truth(t_ns)
+        return self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
+
+
+class VirtualQmc5883(_Sampling):
     """QMC5883L ("L") or QMC5883P ("P"): little-endian X, Y, Z, ready and overflow bits that reading the data clears."""
 
     def __init__(
@@ -112,31 +130,25 @@ class VirtualQmc5883(Chip):
         """Come up suspended."""
         super().power_cycle()
         self.registers[0x00 if self._is_p else 0x0D] = 0x80 if self._is_p else 0xFF
-        self._start_ns = self._now_ns()
-        self._sample = 0
+        self._begin()
 
     def _write_register(self, register: int, value: int) -> None:
         if register in (0x09, 0x0A, 0x0B, 0x29) and register != self._status:
             self.registers[register] = value
         if register == self._control:
-            self._start_ns, self._sample = self._now_ns(), 0
+            self._begin()
 
     def _begin_read(self, first: int, count: int) -> None:
         control = self.registers[self._control]
-        rate_hz = (10.0, 50.0, 100.0, 200.0)[control >> 2 & 3] * self._rate
-        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
-        if not control & 3 or sample == self._sample or self.is_frozen:
+        value = self._new_field((10.0, 50.0, 100.0, 200.0)[control >> 2 & 3]) if control & 3 else None
+        if value is None:
             return
-        self._sample = sample
-        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
-        _, _, field, temperature_c = self._truth(t_ns)
-        x, y, z = self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
         if self._is_p:
             lsb = (1000.0, 2500.0, 3750.0, 15000.0)[self.registers[0x0B] >> 2 & 3]
         else:
             lsb = 3000.0 if control >> 4 & 1 else 12000.0
-        exact = quantised((x, y, z), lsb / _UT_PER_GA, -(1 << 20), 1 << 20)
-        counts = [min(max(value, -32768), 32767) for value in exact]
+        exact = quantised(value, lsb / _UT_PER_GA, -(1 << 20), 1 << 20)
+        counts = [min(max(count, -32768), 32767) for count in exact]
         struct.pack_into("<3h", self.registers, self._data, *counts)
         self.registers[self._status] = 0x01 | (0x02 if tuple(counts) != exact else 0)
 
@@ -145,7 +157,7 @@ class VirtualQmc5883(Chip):
             self.registers[self._status] = 0
 
 
-class VirtualLis3mdl(Chip):
+class VirtualLis3mdl(_Sampling):
     """Little-endian X, Y, Z; a register's number moves on only with its highest bit set; ready until data are read."""
 
     _RATES_HZ = (0.625, 1.25, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
@@ -155,7 +167,7 @@ class VirtualLis3mdl(Chip):
         """Come up powered down."""
         super().power_cycle()
         self.registers[0x0F], self.registers[0x20], self.registers[0x22] = 0x3D, 0x10, 0x03
-        self._start_ns, self._sample = self._now_ns(), 0
+        self._begin()
 
     def write(self, data: bytes) -> None:
         """Take a message: the pointer and whether it moves on, then values for registers."""
@@ -168,17 +180,13 @@ class VirtualLis3mdl(Chip):
     def _write_register(self, register: int, value: int) -> None:
         if 0x20 <= register <= 0x24:
             self.registers[register] = value
-            self._start_ns, self._sample = self._now_ns(), 0
+            self._begin()
 
     def _begin_read(self, first: int, count: int) -> None:
-        rate_hz = self._RATES_HZ[self.registers[0x20] >> 2 & 7] * self._rate
-        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
-        if self.registers[0x22] & 3 or sample == self._sample or self.is_frozen:
+        is_down = self.registers[0x22] & 3
+        value = None if is_down else self._new_field(self._RATES_HZ[self.registers[0x20] >> 2 & 7])
+        if value is None:
             return
-        self._sample = sample
-        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
-        _, _, field, temperature_c = self._truth(t_ns)
-        value = self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
         lsb = self._LSB_PER_GA[self.registers[0x21] >> 5 & 3]
         struct.pack_into("<3h", self.registers, 0x28, *quantised(value, lsb / _UT_PER_GA, -32768, 32767))
         self.registers[0x27] |= 0x08
@@ -195,7 +203,7 @@ class _Around(Protocol):
     def lets_through(self) -> bool: ...
 
 
-class VirtualAkm(Chip):
+class VirtualAkm(_Sampling):
     """AK09916 ("AK09916") or AK8963 inside another chip: silent until that lets the bus through.
 
     Reading the second status frees the data for the next; the AK8963 keeps its sensitivity in fuses.
@@ -227,12 +235,14 @@ class VirtualAkm(Chip):
         self.registers[0x00] = 0x48
         if not self._is_8963:
             self.registers[0x01] = 0x09
-        self._start_ns, self._sample, self._is_held = self._now_ns(), 0, False
+        self._is_held = False
+        self._begin()
 
     def _write_register(self, register: int, value: int) -> None:
         if register == self._control:
             self.registers[register] = value
-            self._start_ns, self._sample, self._is_held = self._now_ns(), 0, False
+            self._is_held = False
+            self._begin()
             in_fuses = self._is_8963 and value & 0x0F == 0x0F
             if self._is_8963:
                 self.registers[0x10:0x13] = bytes(self._fuses) if in_fuses else bytes(3)
@@ -244,14 +254,10 @@ class VirtualAkm(Chip):
         return {0x02: 10.0, 0x04: 20.0, 0x06: 50.0, 0x08: 100.0}.get(mode, 0.0)
 
     def _begin_read(self, first: int, count: int) -> None:
-        rate_hz = self._rate_hz() * self._rate
-        sample = int((self._now_ns() - self._start_ns) * 1e-9 * rate_hz)
-        if not rate_hz or sample == self._sample or self._is_held or self.is_frozen:
+        value = None if self._is_held or not self._rate_hz() else self._new_field(self._rate_hz())
+        if value is None:
             return
-        self._sample = sample
-        t_ns = self._start_ns + int(sample * 1e9 / rate_hz)
-        _, _, field, temperature_c = self._truth(t_ns)
-        x, y, z = self._sense(field, t_ns, temperature_c, 0.5 * rate_hz)
+        x, y, z = value
         own = (y, x, -z) if self._is_8963 else (x, -y, -z)
         if self._is_8963:
             a, b, c = (1.0 + (fuse - 128) / 256.0 for fuse in self._fuses)

@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import struct
 
-from vislam.hw.emulator.chips import NowNs
 from vislam.hw.emulator.fifo_chip import FifoChip
-from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
 
-_G_M_S2 = 9.80665
 _LSB_PER_DEG_S = (131.0, 65.5, 32.8, 16.4)
+_FIRST = 0x68  # what the first of them says it is
 
 
 class VirtualMpu6050(FifoChip):
-    """Wakes up asleep; FIFO and its reset by USER_CTRL; an overflow loses the boundaries of samples."""
+    """Wakes up asleep; FIFO and its reset by USER_CTRL; an overflow loses the boundaries of samples.
+
+    The id 0x68 is a MPU-6050, 0x70 a MPU-6500, 0x71 a MPU-9250.
+    """
 
     FIFO_REGISTER = 0x74
-
-    def __init__(
-        self,
-        truth: Truth,
-        now_ns: NowNs,
-        gyro: SensorError = IDEAL,
-        accel: SensorError = IDEAL,
-        seed: int = 0,
-        who_am_i: int = 0x68,
-    ) -> None:
-        """Take the motion, the host's clock and the errors; `who_am_i` 0x71 is a MPU-9250."""
-        self._who_am_i = who_am_i
-        self.FIFO_BYTES = 1024 if who_am_i == 0x68 else 512
-        later = who_am_i != 0x68
-        self.gyro_delay_ns, self.accel_delay_ns = (3_900_000, 2_880_000) if later else (2_800_000, 3_000_000)
-        super().__init__(truth, now_ns, gyro, accel, seed)
+    IDENTITY = (0x75, _FIRST)
+    CLEARED_BY_READING = 0x3A
 
     @property
     def lets_through(self) -> bool:
@@ -42,8 +28,10 @@ class VirtualMpu6050(FifoChip):
     def power_cycle(self) -> None:
         """Come up asleep (the later ones awake) with the FIFO off."""
         super().power_cycle()
-        self.registers[0x75] = self._who_am_i
-        self.registers[0x6B] = 0x40 if self._who_am_i == 0x68 else 0x01
+        is_first = self._who_am_i == _FIRST
+        self.FIFO_BYTES = 1024 if is_first else 512
+        self.gyro_delay_ns, self.accel_delay_ns = (2_800_000, 3_000_000) if is_first else (3_900_000, 2_880_000)
+        self.registers[0x6B] = 0x40 if is_first else 0x01
 
     def _rate_hz(self) -> float:
         inside = 8000.0 if self.registers[0x1A] & 7 in (0, 7) else 1000.0
@@ -61,15 +49,11 @@ class VirtualMpu6050(FifoChip):
             self.fifo.clear()
             self.registers[0x6A] &= ~0x04 & 0xFF
         runs = self.registers[0x6A] & 0x40 and self.registers[0x23] == 0x78 and not self.registers[0x6B] & 0x40
-        if not runs:
-            self._next_ns = math.inf
-        elif register in (0x6A, 0x23, 0x6B, 0x19, 0x1A):
-            self._start()
+        self._pace(bool(runs), register in (0x6A, 0x23, 0x6B, 0x19, 0x1A))
 
     def _packed(self, t_ns: int) -> bytes:
-        gyro_lsb = _LSB_PER_DEG_S[self.registers[0x1B] >> 3 & 3] * 180.0 / math.pi
-        accel_lsb = 16384.0 / (1 << (self.registers[0x1C] >> 3 & 3)) / _G_M_S2
-        gyro, accel = self._counts(t_ns, gyro_lsb, accel_lsb)
+        gyro_lsb = _LSB_PER_DEG_S[self.registers[0x1B] >> 3 & 3]
+        gyro, accel = self._counts(t_ns, gyro_lsb, 16384.0 / (1 << (self.registers[0x1C] >> 3 & 3)))
         return struct.pack(">6h", *accel, *gyro)
 
     def _overran(self) -> None:
@@ -78,13 +62,4 @@ class VirtualMpu6050(FifoChip):
 
     def _begin_read(self, first: int, count: int) -> None:
         struct.pack_into(">H", self.registers, 0x72, len(self.fifo))
-        temperature_c = self._truth(self._now_ns())[3]
-        is_first = self._who_am_i == 0x68
-        raw = (temperature_c - 36.53) * 340.0 if is_first else (temperature_c - 21.0) * 333.87
-        struct.pack_into(">h", self.registers, 0x41, round(raw))
-
-    def _read_byte(self, register: int) -> int:
-        value = super()._read_byte(register)
-        if register == 0x3A:
-            self.registers[0x3A] = 0
-        return value
+        self._to_temperature(0x41, ">", *((36.53, 340.0) if self._who_am_i == _FIRST else (21.0, 333.87)))
