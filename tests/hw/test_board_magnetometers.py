@@ -1,18 +1,32 @@
 """Magnetometers beside or inside an inertial chip: found by address and id, in its axes, with the right scale."""
 
+import math
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 
-from vislam.config import BoardConfig, SensorCalibration
+from vislam.config import BoardConfig, Gy85Config, SensorCalibration
 from vislam.core.errors import HardwareError
+from vislam.core.messages import MagSample
 from vislam.hw.chips import I2cBus, SettingsLostError
 from vislam.hw.chips.akm import AK8963, Akm
 from vislam.hw.chips.lis3mdl import Lis3mdl
 from vislam.hw.chips.magnetometer import find_any_magnetometer
-from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualAkm, VirtualLis3mdl, emulated_bus
+from vislam.hw.emulator import (
+    EmulatedBus,
+    SteppedClock,
+    VirtualAkm,
+    VirtualLis3mdl,
+    emulated_board,
+    emulated_bus,
+    emulated_gy85,
+)
 from vislam.hw.fifo_board import FifoBoard
+from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
-from worlds.fifo_boards import fifo_board, gathered, inertial_chip
+from worlds.fifo_boards import Stalled, fifo_board, gathered, inertial_chip
 from worlds.gy85 import FIELD_UT, driving, still
 
 BOARDS = (
@@ -78,6 +92,32 @@ def test_one_that_hangs_and_one_beyond_its_range_are_told(
         assert len(inertial) > 350
         assert driver.counters()["mag_overflow"] > 30
         assert driver.health() & Health.MAG_FAULT
+
+
+def turning(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:
+    """At rest, in a field that turns once a second: its direction tells when it was measured."""
+    angle = 2e-9 * math.pi * (t_ns % 1_000_000_000)
+    return (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665), (30.0 * math.cos(angle), 30.0 * math.sin(angle), -20.0), 30.0
+
+
+@pytest.mark.parametrize("kind", ["LSM6DSOX", "GY-85"])
+def test_a_host_put_aside_anywhere_dates_no_field_wrongly(kind: Any) -> None:
+    for at in range(1, 400, 3):
+        clock = Stalled(at, 300_000_000)
+        gy85 = kind == "GY-85"
+        make = emulated_gy85 if gy85 else partial(emulated_board, kind, magnetometer="LIS3MDL")
+        with emulated_bus(make(turning, clock.now_ns, grade="exact")) as bus:
+            config = BoardConfig(bus=bus.path)
+            driver = Gy85(Gy85Config(bus=bus.path, self_test=False), clock) if gy85 else FifoBoard(config, clock)
+            end_ns, fields = clock.now_ns() + 600_000_000, []
+            while clock.now_ns() < end_ns:
+                fields += [sample for sample in driver.read(0.1) if isinstance(sample, MagSample)]
+            driver.close()
+        assert len(fields) > 5, at
+        for sample in fields:
+            told_s = math.atan2(sample.field_ut[1], sample.field_ut[0]) / (2.0 * math.pi)
+            wrong_s = (sample.t_ns % 1_000_000_000 * 1e-9 - told_s + 0.5) % 1.0 - 0.5
+            assert abs(wrong_s) < 0.03, (at, wrong_s)
 
 
 def test_unplugging_takes_and_brings_both() -> None:

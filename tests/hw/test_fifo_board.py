@@ -16,7 +16,7 @@ from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.imu import PowerUp, power_up
-from worlds.fifo_boards import FIRMWARE, KINDS, fifo_board, gathered, inertial_chip, stamp_errors_ms
+from worlds.fifo_boards import FIRMWARE, KINDS, Stalled, fifo_board, gathered, inertial_chip, stamp_errors_ms
 from worlds.gy85 import driving, errors, still
 
 GONE = Health.IMU_MISSING | Health.ACCEL_FAULT | Health.GYRO_FAULT
@@ -344,19 +344,6 @@ def test_stamps_increase_whatever_the_questions_find() -> None:
         for stamp in stamps.of(int(rng.integers(1, 6)), t_ns, t_ns + int(rng.exponential(2e5))):
             assert stamp > last
             last = stamp
-
-
-class Stalled(SteppedClock):
-    """Moves on by 5 us with each look, and by a stall at one of them: the host is put aside."""
-
-    def __init__(self, at: int, stall_ns: int) -> None:
-        super().__init__()
-        self._left, self._stall_ns = at, stall_ns
-
-    def now_ns(self) -> int:
-        self._left -= 1
-        self.advance(self._stall_ns if self._left == 0 else 5_000)
-        return super().now_ns()
 
 
 @pytest.mark.parametrize("kind", ["LSM6DSOX", "MPU-6050", "GY-85"])

@@ -43,6 +43,19 @@ def fifo_board(
             driver.close()
 
 
+class Stalled(SteppedClock):
+    """Moves on by 5 us with each look, and by a stall at one of them: the host is put aside."""
+
+    def __init__(self, at: int, stall_ns: int) -> None:
+        super().__init__()
+        self._left, self._stall_ns = at, stall_ns
+
+    def now_ns(self) -> int:
+        self._left -= 1
+        self.advance(self._stall_ns if self._left == 0 else 5_000)
+        return super().now_ns()
+
+
 def inertial_chip(bus: EmulatedBus) -> FifoChip:
     return next(chip for chip in bus.chips.values() if isinstance(chip, FifoChip))
 

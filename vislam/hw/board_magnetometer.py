@@ -12,6 +12,7 @@ from vislam.hw.chips import BusError, Hmc5883l, I2cBus, Magnetometer, SettingsLo
 from vislam.hw.field_watch import FieldWatch
 from vislam.hw.health import Health
 from vislam.hw.link import ChipLinks, Link
+from vislam.hw.timing import Clock
 
 _NS = 1_000_000_000
 
@@ -27,12 +28,13 @@ class BoardMagnetometer:
     def __init__(
         self,
         config: Gy85Config | BoardConfig,
+        clock: Clock,
         find: Callable[[I2cBus, float], Magnetometer | None],
         is_wanted: bool,
     ) -> None:
-        """Take the board's settings and how such chips are found on a bus for a range in gauss."""
+        """Take the board's settings and clock, and how such chips are found on a bus for a range in gauss."""
         c = config.calibration
-        self._config, self._find = config, find
+        self._config, self._clock, self._find = config, clock, find
         self._watch = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), config.stuck_samples)
         self._next_ns = 0
         self.chip: Magnetometer | None = None
@@ -54,19 +56,25 @@ class BoardMagnetometer:
         found.configure()
 
     def read(self, links: ChipLinks, now: int) -> MagSample | None:
-        """Return a sample [uT] if one is due and new; faults go to the board's counts, events and link."""
+        """Return a sample [uT] if one is due and new; faults go to the board's counts, events and link.
+
+        One during whose transfer the host was put aside for longer than a measurement takes has no time: it is dropped.
+        """
         if self.chip is None or not self.link.is_up or now < self._next_ns:
             return None
         rate_hz = min(self._config.mag_rate_hz, self.chip.rate_hz)
         self._next_ns = max(self._next_ns + round(_NS / rate_hz), now)
+        asked = self._clock.now_ns()  # not `now`: the inertial chips were read since
         try:
             reading = self.chip.read()
         except (BusError, SettingsLostError) as error:
             links.failed(self.link, error)
             return None
-        sample, fault = self._watch.taken(reading, self.link, now, self.chip.rate_hz, links.counts)
+        answered = self._clock.now_ns()
+        middle = (asked + answered) // 2
+        sample, fault = self._watch.taken(reading, self.link, middle, self.chip.rate_hz, links.counts)
         if fault == "mag_overflow":
             links.events |= Health.MAG_FAULT
         elif fault:
             self.link.drop(now)
-        return sample
+        return sample if answered - asked < _NS / self.chip.rate_hz else None

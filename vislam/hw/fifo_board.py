@@ -50,7 +50,7 @@ class FifoBoard:
         self.rate_hz = config.rate_hz
         self.self_tests: tuple[SelfTest, ...] = ()
         self._imu: FifoImu | None = None
-        self._mag = BoardMagnetometer(config, find_any_magnetometer, config.mag is True)
+        self._mag = BoardMagnetometer(config, self._clock, find_any_magnetometer, config.mag is True)
         self._imu_link = Link(self._start_imu, Health.GYRO_FAULT | Health.ACCEL_FAULT)
         self._links = ChipLinks(config, self._clock, (self._imu_link, self._mag.link))
         self._samples = FifoSamples(config)

@@ -70,7 +70,7 @@ class Gy85:
         self._accel_map = Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, _G_M_S2 / adxl345.LSB_PER_G)
         self._gyro: Itg3205 | None = None
         self._accel: Adxl345 | None = None
-        self._mag = BoardMagnetometer(config, find_magnetometer, config.mag)
+        self._mag = BoardMagnetometer(config, self._clock, find_magnetometer, config.mag)
         self._gyro_link = Link(self._start_gyro, Health.GYRO_FAULT)
         self._accel_link = Link(self._start_accel, Health.ACCEL_FAULT)
         self._links = ChipLinks(config, self._clock, (self._gyro_link, self._accel_link, self._mag.link))
