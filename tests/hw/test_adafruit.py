@@ -182,6 +182,33 @@ def test_a_host_that_comes_late_is_told() -> None:
     assert source.health() & Health.IMU_GAP
 
 
+@pytest.mark.parametrize("where", ["before", "within"])
+def test_one_question_in_vain_after_a_host_was_put_aside_replaces_no_driver(where: str) -> None:
+    class Flaky(Driver):
+        in_vain = False
+
+        def _read(self, k: int) -> Any:
+            if self.in_vain:
+                self.in_vain = False
+                if where == "within":
+                    self._clock.advance(300_000_000)
+                raise OSError(121, "Remote I/O error")
+            return super()._read(k)
+
+    clock = SteppedClock()
+    driver = Flaky(clock)
+    source = AdafruitImu(driver, BoardConfig(), clock, lambda: pytest.fail("made anew"))
+    for _ in range(3):
+        for _ in range(40):
+            assert source.read(0.1)
+        driver.in_vain = True
+        if where == "before":
+            clock.advance(300_000_000)
+        assert source.read(0.5)
+    assert source.counters()["read_failed"] == 3
+    assert "reopened" not in source.counters()
+
+
 def test_what_is_no_inertial_sensor_or_too_fast_is_refused() -> None:
     clock = SteppedClock()
     with pytest.raises(UsageError, match="has no acceleration and no gyro"):

@@ -69,6 +69,7 @@ class AdafruitImu:
         self._events = Health(0)
         self._last: Array = np.full(6, np.nan)
         self._last_ns = self._next_mag_ns = self._next_temperature_ns = 0
+        self._vain_ns: int | None = None  # since when it is asked and gives nothing new
         self._has_mag = self._config.mag is not False and hasattr(type(device), "magnetic")
         try:
             triple(device.acceleration)
@@ -100,7 +101,7 @@ class AdafruitImu:
     def health(self) -> Health:
         """Return the sensor bits that hold now and the events since the last call."""
         word, self._events = self._events, Health(0)
-        if self._is_silent():
+        if self._clock.now_ns() - self._last_out_ns > self._config.silent_s * _NS:
             word |= Health.IMU_MISSING
         return word | (Health.TEMPERATURE_DRIFT if self._map.is_far else Health(0))
 
@@ -122,12 +123,13 @@ class AdafruitImu:
         except Exception as error:  # a driver may raise anything
             self._failed(error)
         else:
-            t_ns = (asked + self._clock.now_ns()) // 2
+            answered = self._clock.now_ns()
+            t_ns = (asked + answered) // 2
             values = np.concatenate([rate, force])
             if (values == self._last).all() or not force.any():  # zeros: a BNO085 before its first report
                 self._counts["repeated"] += 1
             elif t_ns > self._last_ns:
-                self._last, self._last_ns, self._last_out_ns = values, t_ns, self._clock.now_ns()
+                self._last, self._last_ns, self._last_out_ns, self._vain_ns = values, t_ns, answered, None
                 samples.append(self._map.inertial(t_ns, rate, force))
         self._look(asked)
         if self._has_mag and asked >= self._next_mag_ns:
@@ -136,7 +138,7 @@ class AdafruitImu:
             field_ut = self._field()
             if field_ut is not None and field_ut.any():  # zeros as above
                 samples.append(self._map.magnetic((begin + self._clock.now_ns()) // 2, field_ut))
-        self._replace_silent()
+        self._replace_silent(asked)
         period_ns = round(_NS / self.rate_hz)
         late = max(self._clock.now_ns() - self._next_ns, 0) // period_ns
         if late > 0:
@@ -163,15 +165,18 @@ class AdafruitImu:
         self._counts["bad_values" if isinstance(error, ValueError | TypeError) else "read_failed"] += 1
         self._events |= Health.BUS_FAULT | Health.IMU_GAP
 
-    def _is_silent(self) -> bool:
-        return self._clock.now_ns() - self._last_out_ns > self._config.silent_s * _NS
+    def _replace_silent(self, asked: int) -> None:
+        """Make a new object where the old one gives nothing, every `config.reopen_s`.
 
-    def _replace_silent(self) -> None:
-        """Make a new object where the old one gives nothing, every `config.reopen_s`."""
-        now = self._clock.now_ns()
-        if self._open_again is None or not self._is_silent() or now < self._retry_ns:
+        Only the time in which it was asked counts: a host put aside must not blame the driver.
+        """
+        if self._last_out_ns >= asked:
             return
-        self._retry_ns = now + round(self._config.reopen_s * _NS)
+        if self._vain_ns is None:
+            self._vain_ns = asked
+        if self._open_again is None or asked - self._vain_ns <= self._config.silent_s * _NS or asked < self._retry_ns:
+            return
+        self._retry_ns = asked + round(self._config.reopen_s * _NS)
         try:
             self._device = self._open_again()
         except Exception:  # as above
