@@ -1,10 +1,13 @@
 """The kernel's IIO devices, on a tree of files and pipes as the ABI describes them."""
 
+import itertools
 import os
 import shutil
 import struct
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from hypothesis import strategies as st
 from vislam.config import BoardConfig, SensorCalibration
 from vislam.core.errors import HardwareError
 from vislam.core.messages import ImuSample
+from vislam.hw import timing
 from vislam.hw.health import Health
 from vislam.hw.iio_device import Element
 from vislam.hw.iio_imu import IioImu, find_devices
@@ -145,6 +149,19 @@ def test_stamps_of_the_wall_clock_are_moved_and_others_are_refused(tmp_path: Pat
     assert source.counters()["stamps_far"] == 1
     assert source.health() & Health.CLOCK_STEP
     source.close()
+
+
+def test_a_process_put_aside_moves_no_stamp_of_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    for at in range(1, 10):
+        looks = itertools.count(1)
+
+        def now_ns(looks: Iterator[int] = looks, at: int = at) -> int:
+            look = next(looks)
+            return 10**12 + look * 100 + (300_000_000 if look >= at else 0)
+
+        fake = SimpleNamespace(monotonic_ns=now_ns, time_ns=lambda now=now_ns: now() + 7 * 10**17)
+        monkeypatch.setattr(timing, "time", fake)
+        assert abs(timing.wall_ahead_ns() - 7 * 10**17) < 1000, at
 
 
 def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from vislam.hw.body_map import BodyMap
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 from vislam.hw.iio_device import KINDS, IioDevice, Scans, kinds_of
+from vislam.hw.timing import wall_ahead_ns
 
 _NS = 1_000_000_000
 _BUFFER_S = 1.0  # that the kernel keeps
@@ -126,7 +127,7 @@ class IioImu:
 
     def _take(self, device: IioDevice, scans: Scans) -> None:
         now = time.monotonic_ns()
-        shift_ns = 0 if device.clock == "monotonic" else time.time_ns() - now
+        shift_ns = 0 if device.clock == "monotonic" else wall_ahead_ns()
         newest_ns = self._newest_ns.get(device.name, 0)
         for row, t_ns in enumerate((scans.t_ns - shift_ns).tolist()):
             if abs(t_ns - now) > _FAR_NS:

@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 Sample = TypeVar("Sample")
 
 _MAX_RATE_ERROR = 0.05  # of a chip's oscillator; ADXL345 and ITG3205 stay within 2 %
+_WALL_LOOKS = 3
 _RATE_GAIN = 0.02  # of a contradiction; settles in a second and averages over many of them
 
 
@@ -74,6 +75,18 @@ class SampleClock:
         self._period_ns = max(min(period, self._nominal_ns + bound), self._nominal_ns - bound)
         self._newest_ns = expected + contradiction
         return round(self._newest_ns)
+
+
+def wall_ahead_ns() -> int:
+    """Return by how much the wall clock is ahead of CLOCK_MONOTONIC, whenever the process is put aside meanwhile."""
+    shortest_ns, ahead_ns = None, 0
+    for _ in range(_WALL_LOOKS):
+        begin_ns = time.monotonic_ns()
+        wall_ns = time.time_ns()
+        took_ns = time.monotonic_ns() - begin_ns
+        if shortest_ns is None or took_ns < shortest_ns:
+            shortest_ns, ahead_ns = took_ns, wall_ns - begin_ns - took_ns // 2
+    return ahead_ns
 
 
 def read_in_rounds(
