@@ -308,6 +308,18 @@ def test_a_chip_at_its_other_address_is_found_and_one_that_is_named_is_taken() -
         assert driver.imu.address == 0x69
 
 
+def test_a_fifo_emptied_after_a_host_was_put_aside_is_no_silent_chip() -> None:
+    with fifo_board("MPU-6050", driving) as (driver, virtual, clock):
+        gathered(driver, clock, 1.0)
+        for way in range(1, 12):  # one of these breaks off while samples are fetched
+            virtual.nack_every = way
+            driver.read(0.01)
+            virtual.nack_every = 0
+            clock.advance(300_000_000)
+            gathered(driver, clock, 0.2)
+        assert not {"imu_silent", "reopened"} & set(driver.counters()), driver.counters()
+
+
 def test_random_faults_never_raise_and_never_lie() -> None:
     rng = np.random.default_rng(11)
     for kind in KINDS:

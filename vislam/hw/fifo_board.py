@@ -109,6 +109,8 @@ class FifoBoard:
 
     def _poll(self) -> list[ImuSample | MagSample]:
         now = self._clock.now_ns()
+        if self._imu_link.is_up:
+            self._imu_link.newest_ns += max(now - self._next_ns, 0)  # while nobody asked, the chip was not silent
         if not self._links.are_up:
             self._links.connect(now)
         samples: list[ImuSample | MagSample] = []
