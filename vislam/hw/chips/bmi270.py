@@ -14,7 +14,7 @@ import numpy as np
 
 from vislam.core.errors import HardwareError
 from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
-from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, ImuSetup, RawSamples, Waiting, next_of, refuse_other
+from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, ImuSetup, RawSamples, Waiting, next_of, popped, refuse_other
 from vislam.hw.timing import Clock
 
 ADDRESSES = (0x68, 0x69)
@@ -112,9 +112,7 @@ class Bmi270:
 
     def take(self, units: int) -> RawSamples:
         """Take so many frames, each the gyro and then the accelerometer; raises BusError: then `empty` it."""
-        data = b""
-        for first in range(0, units, MAX_READS):
-            data += self._pops.run(min(units - first, MAX_READS))
+        data = popped(self._pops, units)
         if not data:
             return NO_SAMPLES
         counts = np.frombuffer(data, dtype="<i2").reshape(-1, 6).astype(np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Array
-from vislam.hw.chips.bus import I2cBus
+from vislam.hw.chips.bus import MAX_READS, I2cBus, Reads
 from vislam.hw.timing import Clock
 
 G_M_S2 = 9.80665
@@ -113,3 +113,11 @@ def refuse_other(bus: I2cBus, address: int, found: int, names: dict[int, str]) -
 def divided(asked_hz: float, base_hz: float, most: int = 256) -> int:
     """Return by what `base_hz` is divided, 1 to `most`, for a rate that is not below what is asked for."""
     return max(min(int(base_hz / asked_hz), most), 1)
+
+
+def popped(pops: Reads, units: int) -> bytes:
+    """Return so many units that a FIFO holds, each fetched by one of `MAX_READS` prepared reads; raises BusError."""
+    data = b""
+    for first in range(0, units, MAX_READS):
+        data += pops.run(min(units - first, MAX_READS))
+    return data

@@ -10,7 +10,7 @@ import numpy as np
 
 from vislam.core.errors import HardwareError
 from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
-from vislam.hw.chips.fifo_imu import G_M_S2, ImuSetup, RawSamples, Waiting, divided, next_of, refuse_other
+from vislam.hw.chips.fifo_imu import G_M_S2, ImuSetup, RawSamples, Waiting, divided, next_of, popped, refuse_other
 from vislam.hw.chips.mpu6050 import SAMPLE_BYTES, decoded
 from vislam.hw.timing import Clock
 
@@ -106,10 +106,7 @@ class Icm20948:
 
     def take(self, units: int) -> RawSamples:
         """Take so many samples; raises BusError: then `empty` it."""
-        data = b""
-        for first in range(0, units, MAX_READS):
-            data += self._pops.run(min(units - first, MAX_READS))
-        return decoded(data)
+        return decoded(popped(self._pops, units))
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""

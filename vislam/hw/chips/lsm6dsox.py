@@ -13,7 +13,7 @@ import numpy as np
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Array
 from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
-from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, ImuSetup, RawSamples, Waiting, next_of, refuse_other
+from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, ImuSetup, RawSamples, Waiting, next_of, popped, refuse_other
 from vislam.hw.timing import Clock
 
 ADDRESSES = (0x6A, 0x6B)
@@ -93,9 +93,7 @@ class Lsm6dsox:
 
     def take(self, units: int) -> RawSamples:
         """Take words and return the samples that are whole; raises BusError: then `empty` it."""
-        data = b""
-        for first in range(0, units // 2, MAX_READS):
-            data += self._pairs.run(min(units // 2 - first, MAX_READS))
+        data = popped(self._pairs, units // 2)
         if units % 2:
             data += self._single.run()
         both = list(self._paired(data))

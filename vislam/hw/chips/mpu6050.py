@@ -19,6 +19,7 @@ from vislam.hw.chips.fifo_imu import (
     Waiting,
     divided,
     next_of,
+    popped,
     refuse_other,
 )
 from vislam.hw.timing import Clock
@@ -103,10 +104,7 @@ class Mpu6050:
 
     def take(self, units: int) -> RawSamples:
         """Take so many samples; raises BusError: then `empty` it."""
-        data = b""
-        for first in range(0, units, MAX_READS):
-            data += self._pops.run(min(units - first, MAX_READS))
-        return decoded(data)
+        return decoded(popped(self._pops, units))
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""
