@@ -13,6 +13,7 @@ from vislam.hw.emulator import (
     EmulatedBus,
     SensorError,
     SteppedClock,
+    Truth,
     VirtualAdxl345,
     VirtualHmc5883l,
     VirtualItg3205,
@@ -160,13 +161,13 @@ def test_wrong_chips_are_refused(clock: SteppedClock) -> None:
 # ---- magnetometers
 
 
-def magnetometers(clock: SteppedClock, error: SensorError) -> dict[str, tuple[int, object]]:
+def magnetometers(clock: SteppedClock, error: SensorError, truth: Truth = still) -> dict[str, tuple[int, object]]:
     now = clock.now_ns
     return {
-        "HMC5883L": (0x1E, VirtualHmc5883l(still, now, error)),
-        "DA5883": (0x1E, VirtualHmc5883l(still, now, error, status_works=False)),
-        "QMC5883L": (0x0D, VirtualQmc5883(still, now, error, variant="L")),
-        "QMC5883P": (0x2C, VirtualQmc5883(still, now, error, variant="P")),
+        "HMC5883L": (0x1E, VirtualHmc5883l(truth, now, error)),
+        "DA5883": (0x1E, VirtualHmc5883l(truth, now, error, status_works=False)),
+        "QMC5883L": (0x0D, VirtualQmc5883(truth, now, error, variant="L")),
+        "QMC5883P": (0x2C, VirtualQmc5883(truth, now, error, variant="P")),
     }
 
 
@@ -206,12 +207,7 @@ def test_a_field_beyond_the_range_is_told(clock: SteppedClock, name: str) -> Non
     def strong(t_ns: int):  # type: ignore[no-untyped-def]
         return (0, 0, 0), (0, 0, 9.8), (0.0, 320.0, 0.0), 20.0
 
-    now = clock.now_ns
-    address, virtual = {
-        "HMC5883L": (0x1E, VirtualHmc5883l(strong, now)),
-        "QMC5883L": (0x0D, VirtualQmc5883(strong, now, variant="L")),
-        "QMC5883P": (0x2C, VirtualQmc5883(strong, now, variant="P")),
-    }[name]
+    address, virtual = magnetometers(clock, SensorError(), strong)[name]
     with emulated_bus(EmulatedBus({address: virtual})) as bus:  # type: ignore[dict-item]
         chip = find_magnetometer(I2cBus(bus.path, 0.02), 1.9)
         assert chip is not None

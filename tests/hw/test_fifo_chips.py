@@ -2,10 +2,12 @@
 
 import struct
 from collections import Counter
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, bmi27
 from vislam.hw.chips.fifo_imu import divided, next_of
 from vislam.hw.emulator import (
     EmulatedBus,
+    FifoChip,
     SteppedClock,
     VirtualBmi270,
     VirtualIcm20948,
@@ -48,6 +51,22 @@ class Words:
         assert self.pointer == 0x78
         taken, self.data = bytes(self.data[:count]), self.data[count:]
         return taken
+
+
+@contextmanager
+def alone(
+    driver: Any, virtual: type[FifoChip], setup: ImuSetup = SETUP, is_configured: bool = True, **options: Any
+) -> Iterator[tuple[Any, Any, EmulatedBus, SteppedClock]]:
+    """Yield a driver, its virtual chip at the usual address, their bus and the clock that transfers move on."""
+    clock = SteppedClock()
+    chip = virtual(still, clock.now_ns, **{k: options.pop(k) for k in ("who_am_i",) if k in options})
+    address = 0x6A if virtual is VirtualLsm6dsox else 0x69 if virtual is VirtualIcm20948 else 0x68
+    bus = EmulatedBus({address: chip}, clock=clock, **options)
+    with emulated_bus(bus):
+        made = driver(I2cBus(bus.path, 0.02), setup)
+        if is_configured:
+            made.configure(clock)
+        yield made, chip, bus, clock
 
 
 def word(sensor: int, slot: int, counts: tuple[int, ...]) -> bytes:
@@ -98,12 +117,7 @@ def test_bytes_of_the_mpu_are_accelerometer_then_gyro_high_byte_first(
 
 
 def test_what_is_written_to_an_lsm6dsox_is_what_the_data_sheet_says() -> None:
-    clock = SteppedClock()
-    chip = VirtualLsm6dsox(still, clock.now_ns)
-    bus = EmulatedBus({0x6A: chip}, clock=clock)
-    with emulated_bus(bus):
-        driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
-        driver.configure(clock)
+    with alone(lsm6dsox.Lsm6dsox, VirtualLsm6dsox) as (driver, chip, _, _):
         assert chip.registers[0x10] == 0b0101_11_00, "208 Hz, 8 g"
         assert chip.registers[0x11] == 0b0101_01_00, "208 Hz, 500 deg/s"
         assert chip.registers[0x12] == 0x44, "data that belong together, the pointer moves on"
@@ -131,12 +145,7 @@ def test_the_oscillator_s_own_error_is_taken_from_the_chip() -> None:
 
 @pytest.mark.parametrize(("who_am_i", "accel_filter"), [(0x68, 0), (0x71, 2)])
 def test_what_is_written_to_an_mpu_is_what_the_register_map_says(who_am_i: int, accel_filter: int) -> None:
-    clock = SteppedClock()
-    chip = VirtualMpu6050(still, clock.now_ns, who_am_i=who_am_i)
-    bus = EmulatedBus({0x68: chip}, clock=clock)
-    with emulated_bus(bus):
-        driver = mpu6050.Mpu6050(I2cBus(bus.path, 0.02), SETUP)
-        driver.configure(clock)
+    with alone(mpu6050.Mpu6050, VirtualMpu6050, who_am_i=who_am_i) as (driver, chip, _, _):
         assert bytes(chip.registers[0x19:0x1D]) == bytes((4, 2, 0x08, 0x10)), "1 kHz / 5, 98 Hz, 500 deg/s, 8 g"
         assert chip.registers[0x1D] == accel_filter
         assert (chip.registers[0x23], chip.registers[0x6A], chip.registers[0x6B]) == (0x78, 0x40, 0x01)
@@ -150,12 +159,7 @@ def test_what_is_written_to_an_mpu_is_what_the_register_map_says(who_am_i: int, 
 
 
 def test_an_overflow_of_an_mpu_loses_the_boundaries_and_is_thrown_away() -> None:
-    clock = SteppedClock()
-    chip = VirtualMpu6050(still, clock.now_ns)
-    bus = EmulatedBus({0x68: chip}, clock=clock)
-    with emulated_bus(bus):
-        driver = mpu6050.Mpu6050(I2cBus(bus.path, 0.02), SETUP)
-        driver.configure(clock)
+    with alone(mpu6050.Mpu6050, VirtualMpu6050) as (driver, chip, _, clock):
         clock.advance(420_500_000)
         assert driver.waiting().units == 84, "1024 bytes hold one more, which is left as a margin"
         clock.advance(20_000_000)
@@ -169,12 +173,7 @@ def test_an_overflow_of_an_mpu_loses_the_boundaries_and_is_thrown_away() -> None
 
 
 def test_an_overrun_of_an_lsm6dsox_leaves_the_newest_512_words() -> None:
-    clock = SteppedClock()
-    chip = VirtualLsm6dsox(still, clock.now_ns)
-    bus = EmulatedBus({0x6A: chip}, clock=clock)
-    with emulated_bus(bus):
-        driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
-        driver.configure(clock)
+    with alone(lsm6dsox.Lsm6dsox, VirtualLsm6dsox) as (driver, _, _, clock):
         clock.advance(5_000_000_000)
         found = driver.waiting()
         assert (found.units, found.is_overrun) == (512, True)
@@ -185,12 +184,10 @@ def test_an_overrun_of_an_lsm6dsox_leaves_the_newest_512_words() -> None:
 
 
 def test_a_chip_that_never_leaves_its_reset_is_refused() -> None:
-    clock = SteppedClock()
-    chip = VirtualLsm6dsox(still, clock.now_ns)
-    chip._write_register = chip.registers.__setitem__  # type: ignore[method-assign]
-    bus = EmulatedBus({0x6A: chip}, clock=clock)
-    with emulated_bus(bus), pytest.raises(HardwareError, match="does not come out of its reset"):
-        lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP).configure(clock)
+    with alone(lsm6dsox.Lsm6dsox, VirtualLsm6dsox, is_configured=False) as (driver, chip, _, clock):
+        chip._write_register = chip.registers.__setitem__
+        with pytest.raises(HardwareError, match="does not come out of its reset"):
+            driver.configure(clock)
 
 
 def test_a_transfer_that_breaks_off_is_a_bus_error() -> None:
@@ -217,11 +214,7 @@ def test_the_next_rate_and_range_that_a_chip_has() -> None:
 
 
 def test_what_is_written_to_an_icm20948_is_in_the_right_bank() -> None:
-    clock = SteppedClock()
-    chip = VirtualIcm20948(still, clock.now_ns)
-    bus = EmulatedBus({0x69: chip}, clock=clock)
-    with emulated_bus(bus):
-        driver = icm20948.Icm20948(I2cBus(bus.path, 0.02), SETUP)
+    with alone(icm20948.Icm20948, VirtualIcm20948, is_configured=False) as (driver, chip, _, clock):
         chip.registers[0x7F] = 0x20  # another program left it there
         driver.configure(clock)
         second = chip.banks[2]
@@ -246,11 +239,8 @@ def test_what_is_written_to_an_icm20948_is_in_the_right_bank() -> None:
 def test_a_bmi270_is_sent_its_configuration_byte_for_byte(tmp_path: Path, smbus_only: bool) -> None:
     file = tmp_path / "whole.bin"
     file.write_bytes(bytes(k * 7 & 0xFF for k in range(8192)))
-    clock = SteppedClock()
-    chip = VirtualBmi270(still, clock.now_ns)
-    bus = EmulatedBus({0x68: chip}, clock=clock, smbus_only=smbus_only)
-    with emulated_bus(bus):
-        driver = bmi270.Bmi270(I2cBus(bus.path, 0.02), replace(SETUP, firmware=str(file)))
+    setup = replace(SETUP, firmware=str(file))
+    with alone(bmi270.Bmi270, VirtualBmi270, setup, False, smbus_only=smbus_only) as (driver, chip, _, clock):
         begin_ns = clock.now_ns()
         driver.configure(clock)
         assert chip.given == file.read_bytes()
