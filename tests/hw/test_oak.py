@@ -8,17 +8,18 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.hw.fake_depthai import World
+from tests.hw.fake_depthai import P_IMU_CAM_CM, R_IMU_CAM, World
 from vislam import Config, open_dataset
 from vislam.config import OakConfig, RecordConfig, SensorsConfig
 from vislam.core.errors import DataError, HardwareError, UsageError
-from vislam.core.messages import Frame
+from vislam.core.messages import Frame, ImuSample
 from vislam.hw.cameras.oak import OakStream
 from vislam.hw.doctor import Wanted, examine
 from vislam.hw.health import Health
-from vislam.hw.library_cameras import factory_rig, open_frame_camera
+from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_imu
 from vislam.hw.sensors import check_devices
 from vislam.live.sources import open_live
 from vislam.run.record import record
@@ -44,13 +45,13 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def test_the_rig_is_that_of_the_factory(world: World) -> None:
-    rig = factory_rig("oak", SENSORS)
+    rig, _ = factory_rig("oak", SENSORS)
     assert [camera.fx for camera in rig.cameras] == [400.0, 401.0]
     assert (rig.cameras[0].width, rig.cameras[0].height, rig.cameras[0].cy) == (640, 400, 200.0)
     assert (rig.cameras[0].distortion, rig.cameras[0].coefficients) == ("radtan", tuple(world.coeffs[:5]))
     assert rig.T_cam0_cam1[:3, 3] == pytest.approx([0.075, 0.0, 0.0])
     world.model, world.coeffs = "Fisheye", [0.1, 0.01, 0.0, 0.0]
-    assert factory_rig("oak", SENSORS).cameras[1].distortion == "equidistant"
+    assert factory_rig("oak", SENSORS)[0].cameras[1].distortion == "equidistant"
 
 
 def test_a_rational_model_is_refused(world: World) -> None:
@@ -108,8 +109,8 @@ def test_a_device_that_is_pulled_out_comes_back(world: World) -> None:
 
 def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vislam.hw.adafruit.check_driver", lambda name: None)
-    with pytest.raises(UsageError, match="an OAK gives its stereo pair: write oak"):
-        open_frame_camera("oak,depth", SENSORS)
+    with pytest.raises(UsageError, match="write oak for the stereo pair, oak,depth for colour and depth"):
+        open_frame_camera("oak,colour", SENSORS)
     with pytest.raises(UsageError, match=r"oak\.position_m is not set"):
         open_live("gy85+oak", Config(), SensorsConfig())
     assert open_live("gy85+oak", Config(), SENSORS)[0].rig.is_stereo
@@ -140,3 +141,119 @@ def test_it_is_recorded_and_examined(world: World, tmp_path: Path) -> None:
     said = [finding.what for finding in examine(Wanted(camera="oak"), 0.3).findings if finding.where == "oak"]
     assert any("by depthai's match of its clock" in what for what in said)
     assert any("has not met a real camera" in what for what in said)
+
+
+# ---- depth, and its IMU ---------------------------------------------------------------------------------------------
+
+SLOW = replace(SENSORS, oak=replace(CAMERA, rate_hz=33.0, imu_silent_s=30.0))
+
+
+@pytest.mark.parametrize("platform", ["RVC2", "RVC4"])
+def test_colour_comes_with_depth_aligned_on_the_device(world: World, platform: str) -> None:
+    world.platform = platform
+    with closing(open_frame_camera("oak,depth", SENSORS)) as camera:
+        frame = camera.read(LONG_S)
+    assert frame is not None
+    assert frame.color is not None
+    assert frame.depth_m is not None
+    assert (frame.images[0][0, 0], frame.color.shape, len(frame.images)) == (90, (400, 640, 3), 1)
+    assert frame.depth_m[0, 0] == pytest.approx(1.5)
+    assert {("CAM_B", "stereo left"), ("CAM_C", "stereo right"), ("CAM_A", "sync color")} <= set(world.links)
+    aligned = {
+        "RVC2": {("CAM_A", "stereo align"), ("depth", "sync depth")},
+        "RVC4": {("depth", "align in"), ("CAM_A", "align to"), ("aligned", "sync depth")},
+    }
+    assert aligned[platform] <= set(world.links)
+    rig, _ = factory_rig("oak,depth", SENSORS)
+    # images are freed of their distortion on the device, so that a rational model does not matter
+    assert (rig.has_depth, rig.cameras[0].fx, rig.cameras[0].distortion) == (True, 450.0, "none")
+
+
+def test_images_and_its_imu_are_put_on_the_host_by_one_offset(world: World) -> None:
+    world.period_ns = 30_000_000
+    camera, imu = open_with_imu("oak", SLOW)
+    with closing(camera):
+        samples = []
+        while len(samples) < 100:
+            new = imu.read(LONG_S)
+            assert new
+            samples += new
+        assert "which its images have too" in imu.stamped_by
+        frame = camera.read(LONG_S)
+    assert frame is not None
+    off_ns = []
+    for sample in samples:
+        true_ns = sample.t_ns - sample.t_ns % 10**12 + round(-sample.gyro_rad_s[1] * 1e9)
+        off_ns.append(sample.t_ns - true_ns)
+        assert sample.accel_m_s2[1] == pytest.approx(sample.gyro_rad_s[1])
+        assert sample.accel_m_s2[2] == pytest.approx(9.81)
+    assert np.ptp(off_ns) < 3_000  # depthai's microseconds
+    taken_ns = (frame.t_ns - off_ns[0] - world.began_ns + world.age_ns) % world.period_ns
+    assert min(taken_ns, world.period_ns - taken_ns) < 5_000
+    assert world.asked["imu"] == ["accel", "gyro"]
+
+
+def test_an_older_depthai_gives_what_its_imu_measured_as_it_is(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.is_calibrated = False
+    monkeypatch.setitem(sys.modules, "depthai", world.module())
+    camera, _ = open_with_imu("oak", SLOW)
+    camera.close()
+    assert world.asked["imu"] == ["accel raw", "gyro raw"]
+
+
+def test_the_place_of_its_imu_is_the_factorys_or_has_to_be_told(world: World) -> None:
+    rig, guesses = factory_rig("oak", SensorsConfig(), with_imu=True)
+    assert guesses == ()
+    p_cam = R_IMU_CAM.T @ np.array(P_IMU_CAM_CM) * 0.01
+    assert rig.T_body_cams[0][:3, 3] == pytest.approx([p_cam[2], -p_cam[0], -p_cam[1]])
+    world.knows_imu = False  # as most are
+    _, guesses = factory_rig("oak", SensorsConfig(), with_imu=True)
+    assert "no extrinsics in its memory" in guesses[0]
+    axes = replace(CAMERA.calibration, gyro_axes=("z", "y", "-x"), accel_axes=("z", "y", "-x"))
+    told = replace(SLOW, oak=replace(SLOW.oak, calibration=axes))
+    assert factory_rig("oak", told, with_imu=True)[1] == ()
+    camera, imu = open_with_imu("oak", told)
+    with closing(camera):
+        sample = imu.read(LONG_S)[0]
+    assert isinstance(sample, ImuSample)
+    assert sample.accel_m_s2[2] == pytest.approx(9.81)
+    assert sample.gyro_rad_s[1] == pytest.approx(sample.accel_m_s2[1])
+
+
+def test_an_oak_without_an_imu_or_with_a_foreign_clock_says_so(world: World) -> None:
+    settings = replace(SENSORS, oak=replace(SLOW.oak, start_s=0.5))
+    world.imu = "NONE"
+    with pytest.raises(HardwareError, match="this OAK has no IMU"):
+        open_with_imu("oak", settings)
+    world.imu, world.epoch_ns = "BMI270", 5_000_000_000
+    camera, imu = open_with_imu("oak", SLOW)
+    with closing(camera):
+        world.epoch_ns = -(10**13)  # reports are of another clock from now on
+        wait_for(lambda: imu.counters().get("bad_stamps", 0) > 0)
+
+
+def test_a_device_with_its_imu_comes_back(world: World) -> None:
+    settings = replace(SENSORS, oak=replace(SLOW.oak, missing_s=0.2, imu_silent_s=0.2))
+    camera, imu = open_with_imu("oak", settings)
+    with closing(camera):
+        world.unplugged = True
+        wait_for(lambda: Health.IMU_MISSING in imu.health() and camera.health() == Health.CAMERA_MISSING)
+        wait_for(lambda: camera.counters().get("open_failures", 0) > 0)
+        imu.read(0.0)
+        world.unplugged = False
+        assert imu.read(LONG_S)
+        assert imu.counters()["opened"] == 2
+
+
+@pytest.mark.parametrize("name", ["oak", "oak,depth"])
+def test_a_recording_holds_images_and_its_imu(world: World, tmp_path: Path, name: str) -> None:
+    world.period_ns = 30_000_000
+    record(tmp_path / "r", "oak", name, SLOW, RecordConfig(min_free_gb=0.0), seconds=1.0)
+    recording = open_dataset(str(tmp_path / "r"))
+    events = list(recording.events())
+    frame = next(event for event in events if isinstance(event, Frame))
+    assert (frame.depth_m is not None, recording.rig.has_depth) == ("depth" in name, "depth" in name)
+    assert sum(isinstance(event, ImuSample) for event in events) > 20
+    report = examine(Wanted(imu="oak", camera=name), 0.4)
+    assert {timing.name for timing in report.timings} == {"oak: inertial", f"{name}: images"}
+    assert any("which its images have too" in finding.what for finding in report.findings)

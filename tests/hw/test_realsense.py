@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.hw.fake_realsense import ANGLE, BASELINE_M, World
+from tests.hw.fake_realsense import ANGLE, BASELINE_M, P_IMU_CAM, R_IMU_CAM, World
 from vislam import Config, open_dataset
 from vislam.config import RealsenseConfig, RecordConfig, SensorsConfig
 from vislam.core.errors import DataError, HardwareError, UsageError
-from vislam.core.messages import Frame
+from vislam.core.messages import Frame, ImuSample
 from vislam.hw.cameras.factory import factory_camera
 from vislam.hw.doctor import Wanted, examine
 from vislam.hw.health import Health
-from vislam.hw.library_cameras import factory_rig, open_frame_camera
-from vislam.hw.sensors import check_devices, is_video
+from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_imu, reads_own_imu
+from vislam.hw.sensors import check_devices, is_video, open_inertial
 from vislam.live.sources import open_live
 from vislam.run.record import record
 
@@ -53,7 +53,7 @@ def first(camera: Any) -> Frame:
 
 
 def test_the_rig_is_that_of_the_factory_where_the_settings_put_it(world: World) -> None:
-    rig = factory_rig("realsense", SENSORS)
+    rig, _ = factory_rig("realsense", SENSORS)
     assert [camera.distortion for camera in rig.cameras] == ["none", "none"]
     assert (rig.cameras[0].fx, rig.cameras[0].cy, rig.cameras[0].width) == (380.0, 239.5, 640)
     T = rig.T_cam0_cam1
@@ -64,9 +64,9 @@ def test_the_rig_is_that_of_the_factory_where_the_settings_put_it(world: World) 
     assert ahead == pytest.approx([1.0, 0.0, 0.0])
     assert right == pytest.approx([0.0, -1.0, 0.0])
     assert rig.T_body_cams[0][:3, 3] == pytest.approx([0.1, 0.0, 0.2])
-    down = factory_rig("realsense", replace(SENSORS, realsense=replace(CAMERA, tilt_deg=30.0)))
+    down = factory_rig("realsense", replace(SENSORS, realsense=replace(CAMERA, tilt_deg=30.0)))[0]
     assert down.T_body_cams[0][:3, 2] == pytest.approx([np.cos(np.pi / 6), 0.0, -0.5])
-    with_depth = factory_rig("realsense:0123,depth", SENSORS)
+    with_depth = factory_rig("realsense:0123,depth", SENSORS)[0]
     assert with_depth.has_depth
     assert len(with_depth.cameras) == 1
     assert world.serial == "0123"
@@ -75,7 +75,7 @@ def test_the_rig_is_that_of_the_factory_where_the_settings_put_it(world: World) 
 @pytest.mark.parametrize("model", ["inverse_brown_conrady", "ftheta", "modified_brown_conrady"])
 def test_a_distortion_that_vislam_has_not_is_refused_unless_it_is_none(world: World, model: str) -> None:
     world.model = model
-    assert factory_rig("realsense,depth", SENSORS).cameras[0].distortion == "none"
+    assert factory_rig("realsense,depth", SENSORS)[0].cameras[0].distortion == "none"
     world.coeffs = [-0.05, 0.06, 0.0, 0.0, -0.02]
     with pytest.raises(DataError, match=f"distortion '{model}'.*--calibration.camera"):
         factory_rig("realsense,depth", SENSORS)
@@ -83,7 +83,7 @@ def test_a_distortion_that_vislam_has_not_is_refused_unless_it_is_none(world: Wo
 
 def test_brown_conrady_is_taken_over(world: World) -> None:
     world.coeffs = [-0.05, 0.06, 0.001, 0.002, -0.02]
-    camera = factory_rig("realsense", SENSORS).cameras[0]
+    camera = factory_rig("realsense", SENSORS)[0].cameras[0]
     assert (camera.distortion, camera.coefficients) == ("radtan", tuple(world.coeffs))
     with pytest.raises(DataError, match="radtan"):  # a rational model: k4 and more
         factory_camera((640, 480), (1.0, 1.0, 0.0, 0.0), "radtan", [0.1, 0, 0, 0, 0, 0.2])
@@ -207,3 +207,150 @@ def test_doctor_says_where_stamps_come_from_and_their_jitter(world: World) -> No
     assert any("has not met a real camera" in what for what in said)
     (timing,) = [timing for timing in report.timings if timing.name == "realsense: images"]
     assert timing.jitter_ms is not None
+
+
+# ---- its IMU --------------------------------------------------------------------------------------------------------
+
+SLOW = replace(SENSORS, realsense=replace(CAMERA, rate_hz=30.0, imu_silent_s=30.0))
+
+
+def told_ns(seconds: float, near_ns: int) -> int:
+    """The true time that a value of the stand-in's ramp tells."""
+    return near_ns - near_ns % 10**12 + round(seconds * 1e9)
+
+
+def test_images_and_its_imu_are_stamped_by_one_clock(world: World) -> None:
+    world.period_s = 1.0 / 30.0
+    camera, imu = open_with_imu("realsense", SLOW)
+    samples, frames = [], []
+    with closing(camera):
+        end = time.monotonic() + LONG_S
+        while len(frames) < 30 or len(samples) < 300:
+            assert time.monotonic() < end
+            samples += imu.read(0.02)
+            if (frame := camera.read(0.0)) is not None:
+                # which of the stand-in's images that is: the newest that can have come
+                frames.append(frame)
+        assert camera.stamped_by == "the device's clock, in the middle of the exposure, on one line with its IMU's"
+        assert imu.stamped_by == "the device's clock, on a line under the arrivals of the gyro"
+    t_ns = np.array([sample.t_ns for sample in samples])
+    assert np.all(np.diff(t_ns) > 0)
+    # the camera's x is to the right: the body's -y, whatever the IMU's axes are
+    true_s = -np.array([sample.gyro_rad_s[1] for sample in samples])
+    off_ns = t_ns - np.array([told_ns(s, t) for s, t in zip(true_s, t_ns, strict=True)])
+    captured = np.array(sorted(world.captured_ns.values()))
+    for frame in frames:
+        nearest = captured[np.argmin(np.abs(captured - frame.t_ns))]
+        own_off = frame.t_ns - nearest
+        near = int(np.argmin(np.abs(t_ns - frame.t_ns)))
+        if abs(int(t_ns[near]) - frame.t_ns) < 10_000_000:
+            assert abs(own_off - int(off_ns[near])) < 50_000  # of one clock, however late this machine was
+    # the accelerometer, at another rate, is taken to the gyro's stamps
+    forces = -np.array([sample.accel_m_s2[1] for sample in samples])
+    assert np.median(np.abs(forces - true_s)) < 1e-4
+    assert samples[0].accel_m_s2[2] == pytest.approx(9.81)
+    assert world.options["imu"] == {"enable_motion_correction": 1.0, "global_time_enabled": 0.0}
+    assert imu.rate_hz == 200.0
+    assert imu.counters()["samples"] >= 300
+
+
+def test_the_body_is_its_imu_by_the_factorys_extrinsics(world: World) -> None:
+    rig, guesses = factory_rig("realsense", SensorsConfig(), with_imu=True)
+    assert guesses == ()  # it says where it is
+    T = rig.T_body_cams[0]
+    assert T[:3, 2] == pytest.approx([1.0, 0.0, 0.0])
+    # of the camera in the IMU, turned with it until the camera looks ahead
+    p_cam = R_IMU_CAM.T @ np.array(P_IMU_CAM)
+    assert T[:3, 3] == pytest.approx([p_cam[2], -p_cam[0], -p_cam[1]])
+    down, _ = factory_rig("realsense,depth", replace(SENSORS, realsense=replace(CAMERA, tilt_deg=30.0)), with_imu=True)
+    assert down.T_body_cams[0][:3, 2] == pytest.approx([np.cos(np.pi / 6), 0.0, -0.5])
+    assert np.linalg.norm(down.T_body_cams[0][:3, 3]) == pytest.approx(np.linalg.norm(P_IMU_CAM))
+
+
+def test_what_its_imu_cannot_do_is_told(world: World) -> None:
+    with pytest.raises(UsageError, match=r"inside a camera.*ask for the camera realsense"):
+        open_inertial("realsense", SENSORS)
+    with pytest.raises(UsageError, match="inside a camera"):
+        reads_own_imu("realsense:1", "realsense:2")
+    with pytest.raises(UsageError, match="write realsense for it"):
+        reads_own_imu("realsense,depth", "realsense,depth")
+    assert reads_own_imu("realsense", "realsense:2,depth")
+    assert not reads_own_imu("gy85", "realsense")
+    world.has_imu = False
+    with pytest.raises(HardwareError, match="has no IMU"):
+        open_with_imu("realsense", SLOW)
+    with pytest.raises(HardwareError, match="has no IMU"):
+        factory_rig("realsense", SENSORS, with_imu=True)
+
+
+def test_an_imu_without_a_clock_is_stamped_by_arrival_and_says_so(world: World) -> None:
+    world.imu_domain = "system_time"
+    camera, imu = open_with_imu("realsense", SLOW)
+    with closing(camera):
+        assert imu.stamped_by == "arrival"
+        assert imu.counters()["bad_stamps"] > 0
+        assert len(imu.read(LONG_S)) > 0
+
+
+def test_images_by_another_clock_than_the_imus_are_told(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vislam.hw.cameras.realsense._SETTLE_NS", 0)
+    world.imu_late_us = 500_000_000
+    camera, _ = open_with_imu("realsense", SLOW)
+    with closing(camera):
+        assert first(camera).t_ns < time.monotonic_ns()
+        assert camera.stamped_by == "the device's clock, in the middle of the exposure"
+        assert camera.counters()["bad_stamps"] > 0
+
+
+def test_a_set_that_lost_an_image_is_left_out(world: World) -> None:
+    world.lost = set(range(0, 10**6, 2))
+    world.period_s = 0.02
+    camera, _ = open_with_imu("realsense", SLOW)
+    with closing(camera):
+        assert all(len(first(camera).images) == 2 for _ in range(5))
+        assert camera.counters()["unstamped"] > 2
+
+
+def test_a_device_with_its_imu_comes_back(world: World) -> None:
+    settings = replace(SENSORS, realsense=replace(CAMERA, missing_s=0.2, imu_silent_s=0.2))
+    camera, imu = open_with_imu("realsense", settings)
+    with closing(camera):
+        wait_for(lambda: imu.health() == Health(0))
+        before = imu.read(LONG_S)[-1].t_ns
+        world.unplugged = True
+        wait_for(lambda: Health.IMU_MISSING in imu.health() and camera.health() == Health.CAMERA_MISSING)
+        wait_for(lambda: camera.counters().get("open_failures", 0) > 0)
+        imu.read(0.0)
+        world.unplugged = False
+        after = imu.read(LONG_S)
+        assert after[0].t_ns > before
+        wait_for(lambda: camera.health() == Health(0))
+        assert imu.counters()["opened"] == 2
+        assert Health.IMU_GAP in imu.health()
+
+
+@pytest.mark.parametrize("name", ["realsense", "realsense,depth"])
+def test_a_recording_holds_images_and_its_imu(world: World, tmp_path: Path, name: str) -> None:
+    world.period_s = 0.03
+    recorded = record(tmp_path / "r", "realsense", name, SensorsConfig(), RecordConfig(min_free_gb=0.0), seconds=2.0)
+    assert any("stamped by the device's clock" in note for note in recorded.notes)
+    assert not any("position_m" in note for note in recorded.notes)
+    recording = open_dataset(str(tmp_path / "r"))
+    events = list(recording.events())
+    samples = [event for event in events if isinstance(event, ImuSample)]
+    assert len(samples) > 20
+    assert any(isinstance(event, Frame) for event in events)
+    assert recording.rig.T_body_cams[0][:3, 2] == pytest.approx([1.0, 0.0, 0.0])
+    assert samples[0].accel_m_s2[2] == pytest.approx(9.81)
+    assert {"imu", "camera"} <= set(recorded.faults)
+
+
+def test_doctor_measures_both(world: World) -> None:
+    report = examine(Wanted(imu="realsense", camera="realsense,depth"), 0.5)
+    said = [finding.what for finding in report.findings]
+    assert "stamped by the device's clock, on a line under the arrivals of the gyro" in said
+    assert any(what.endswith("on one line with its IMU's") for what in said)
+    assert sum("has not met a real" in what for what in said) == 2
+    jitters = {timing.name: timing.jitter_ms for timing in report.timings}
+    assert jitters.keys() == {"realsense: inertial", "realsense,depth: images"}
+    assert None not in jitters.values()

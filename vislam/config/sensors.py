@@ -171,6 +171,9 @@ class DepthCameraConfig(LibraryCameraConfig):
     # place of its first camera (left or colour), m; None: only a calibration file tells
     position_m: Vector3 | None = None
     tilt_deg: Annotated[float, Range(-90.0, 90.0)] = 0.0  # nose down from looking ahead
+    imu_rate_hz: Positive = 200.0  # of its own IMU's gyro, where that is read; the nearest that it has
+    imu_silent_s: NonNegative = 0.1  # without a sample for so long, its IMU is missing
+    calibration: SensorCalibration = field(default_factory=SensorCalibration)  # of its own IMU, beside its maker's
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +182,13 @@ class RealsenseConfig(DepthCameraConfig):
 
     # from the middle of the exposure to arrival, at the fastest: half of 10 ms, readout and USB; not measured
     delay_s: NonNegative = 0.02
+    # from a sample of its IMU to arrival, at the fastest: the filter and USB; not measured
+    imu_delay_s: NonNegative = 0.002
 
 
 @dataclass(frozen=True, slots=True)
 class OakConfig(DepthCameraConfig):
-    """The stereo pair of an OAK, by depthai."""
+    """An OAK, by depthai."""
 
     height_px: Count = 400  # with 640 the shape of its sensors: nothing is cut off
     gain: NonNegative | None = 400.0  # ISO, with a fixed exposure: 100 to 1600

@@ -22,7 +22,15 @@ from vislam.hw.cameras.webcam import Capture, Webcam
 from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
-from vislam.hw.library_cameras import gives_frames, is_library_camera, open_frame_camera, open_image_camera
+from vislam.hw.library_cameras import (
+    WITH_IMU,
+    gives_frames,
+    is_library_camera,
+    open_frame_camera,
+    open_image_camera,
+    open_with_imu,
+    reads_own_imu,
+)
 from vislam.hw.sensors import open_inertial
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.hw.timing import Clock, HostClock
@@ -111,12 +119,18 @@ def examine(
     """
     clock = HostClock() if clock is None else clock
     notes = _Notes()
-    if wanted.imu is None:
-        _examine_buses(notes, wanted.i2c, seconds, clock, root)
-    else:
+    camera = wanted.camera
+    if wanted.imu is not None and wanted.imu.partition(":")[0] in WITH_IMU:
+        camera = wanted.imu if camera is None else camera
+        reads_own_imu(wanted.imu, camera)
+        _examine_both(notes, wanted.imu, camera, seconds, clock)
+        camera = None
+    elif wanted.imu is not None:
         _examine_named(notes, wanted.imu, seconds, clock)
+    else:
+        _examine_buses(notes, wanted.i2c, seconds, clock, root)
     _examine_ports(notes, wanted.serial, seconds, clock, root)
-    _examine_cameras(notes, wanted.camera, seconds, clock, root, open_capture)
+    _examine_cameras(notes, camera, seconds, clock, root, open_capture)
     return HardwareReport(tuple(notes.devices), tuple(notes.timings), tuple(notes.findings))
 
 
@@ -220,18 +234,35 @@ def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock) -> No
         notes.failed(error, name, "error")
         return
     with closing(source):
-        inertial, magnetic = _listen(source, seconds, clock)
-        notes.findings += check_stamps(source, name)
-        if isinstance(source, Gy85 | FifoBoard):
-            notes.findings += check_board(source, inertial, magnetic, name)
-        else:
-            notes.findings += check_rest(inertial, name)
-        _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, "error")
-        if magnetic:
-            notes.timings.append(_timing(f"{name}: magnetic", [sample.t_ns for sample in magnetic]))
-        word = source.health()
-        if word:
-            notes.add("warning", f"health: {word.name}; {_counted(source.counters())}", name, "see docs/sensors.md")
+        _look_at_imu(notes, source, name, seconds, clock)
+
+
+def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: Clock) -> None:
+    """Open a camera with the IMU inside it, once, and measure what each gives."""
+    try:
+        images, inertial = open_with_imu(camera, SensorsConfig())
+    except HardwareError as error:
+        notes.failed(error, camera, "error")
+        return
+    with closing(images):
+        _look_at_imu(notes, inertial, imu, seconds, clock)
+        _look_at_camera(notes, images, seconds, clock)
+
+
+def _look_at_imu(notes: _Notes, source: InertialSource, name: str, seconds: float, clock: Clock) -> None:
+    """Measure what an IMU gives, and note what it says of itself."""
+    inertial, magnetic = _listen(source, seconds, clock)
+    notes.findings += check_stamps(source, name)
+    if isinstance(source, Gy85 | FifoBoard):
+        notes.findings += check_board(source, inertial, magnetic, name)
+    else:
+        notes.findings += check_rest(inertial, name)
+    _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, "error")
+    if magnetic:
+        notes.timings.append(_timing(f"{name}: magnetic", [sample.t_ns for sample in magnetic]))
+    word = source.health()
+    if word:
+        notes.add("warning", f"health: {word.name}; {_counted(source.counters())}", name, "see docs/sensors.md")
 
 
 def _listen(source: InertialSource, seconds: float, clock: Clock) -> tuple[list[ImuSample], list[MagSample]]:
@@ -335,21 +366,26 @@ def _examine_cameras(
         notes.failed(error, wanted, "error")
         return
     with closing(camera):
-        images = list(_captured(camera, seconds, clock))
-        _note_timing(notes, f"{camera.path}: images", images, camera.rate_hz, "error")
-        for setting in camera.settings:
-            if setting.differs:
-                got = "does not offer it" if setting.got is None else f"does {setting.got}"
-                what = f"{setting.name}: asked {setting.asked}, the camera {got}"
-                notes.add("warning", what, camera.path, "ask for what it does, or use another camera")
-        if camera.stamped_by == "arrival":
-            what = "images carry no time of capture: stamps are those of arrival"
-            notes.add("warning", what, camera.path, "let the time offset be estimated, or use another camera")
-        elif images:
-            notes.add("ok", f"stamped by {camera.stamped_by}", camera.path)
-        if isinstance(camera, LibraryCamera):
-            what = "this driver was tested against a stand-in for its library and has not met a real camera"
-            notes.add("ok", what, camera.path, "tell us what you see: docs/sensors.md")
+        _look_at_camera(notes, camera, seconds, clock)
+
+
+def _look_at_camera(notes: _Notes, camera: _AnyCamera, seconds: float, clock: Clock) -> None:
+    """Measure what a camera gives, and note what it says of itself."""
+    images = list(_captured(camera, seconds, clock))
+    _note_timing(notes, f"{camera.path}: images", images, camera.rate_hz, "error")
+    for setting in camera.settings:
+        if setting.differs:
+            got = "does not offer it" if setting.got is None else f"does {setting.got}"
+            what = f"{setting.name}: asked {setting.asked}, the camera {got}"
+            notes.add("warning", what, camera.path, "ask for what it does, or use another camera")
+    if camera.stamped_by == "arrival":
+        what = "images carry no time of capture: stamps are those of arrival"
+        notes.add("warning", what, camera.path, "let the time offset be estimated, or use another camera")
+    elif images:
+        notes.add("ok", f"stamped by {camera.stamped_by}", camera.path)
+    if isinstance(camera, LibraryCamera):
+        what = "this driver was tested against a stand-in for its library and has not met a real camera"
+        notes.add("ok", what, camera.path, "tell us what you see: docs/sensors.md")
 
 
 def _opened(wanted: str, open_capture: Callable[[str], Capture] | None) -> _AnyCamera:

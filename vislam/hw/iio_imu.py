@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from vislam.config import BoardConfig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.hw.accel_at_gyro import AccelAtGyro
 from vislam.hw.body_map import BodyMap
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
@@ -50,9 +51,9 @@ class IioImu:
         self._counts: Counter[str] = Counter()
         self._events = Health(0)
         self._devices: list[IioDevice] = []
-        self._waiting: dict[str, deque[tuple[int, Array]]] = {kind: deque(maxlen=_KEPT) for kind in KINDS}
+        self._pairs = AccelAtGyro(_KEPT)
         self._newest_ns: dict[str, int] = {}  # by device
-        self._last_ns = self._retry_ns = 0
+        self._retry_ns = 0
         self._last_out_ns = time.monotonic_ns()
         self._is_reopening = False
         try:
@@ -138,27 +139,13 @@ class IioImu:
             else:
                 newest_ns = t_ns
                 for kind, values in scans.values.items():
-                    self._waiting[kind].append((t_ns, values[row]))
+                    (self._pairs.add_gyro if kind == "anglvel" else self._pairs.add_accel)(t_ns, values[row])
         self._newest_ns[device.name] = newest_ns
 
     def _merged(self) -> list[ImuSample]:
         """Return the gyro's samples around which the accelerometer has some, with those interpolated."""
-        gyro, accel = self._waiting["anglvel"], self._waiting["accel"]
         delay_ns = round((self._config.delay_s or 0.0) * _NS)
-        merged = []
-        while gyro and accel and gyro[0][0] <= accel[-1][0]:
-            t_ns, rate = gyro.popleft()
-            while len(accel) > 1 and accel[1][0] <= t_ns:
-                accel.popleft()
-            if t_ns < accel[0][0] or t_ns <= self._last_ns:
-                continue  # before the accelerometer's first
-            force = accel[0][1]
-            if t_ns > accel[0][0]:
-                share = (t_ns - accel[0][0]) / (accel[1][0] - accel[0][0])
-                force = (1.0 - share) * force + share * accel[1][1]
-            self._last_ns = t_ns
-            merged.append(self._map.inertial(t_ns - delay_ns, rate, force))
-        return merged
+        return [self._map.inertial(t_ns - delay_ns, rate, force) for t_ns, rate, force in self._pairs.merged()]
 
     # ---- coming and going -------------------------------------------------------------------------------------
 
@@ -186,8 +173,7 @@ class IioImu:
         self._devices = devices
         gyro = next(device for device in devices if "anglvel" in device.kinds)
         self.rate_hz = gyro.rate_hz or self._config.rate_hz
-        for queue in self._waiting.values():
-            queue.clear()
+        self._pairs.clear()
 
 
 def find_devices(root: Path, name: str = "") -> list[Path]:

@@ -6,15 +6,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vislam.config import DepthCameraConfig, OakConfig, PicamConfig, RealsenseConfig, SensorsConfig
-from vislam.core.errors import UsageError
+from vislam.core.errors import HardwareError, UsageError
 
 if TYPE_CHECKING:  # they load OpenCV, which the process that reads the IMU does without
     from vislam.core.camera import Rig
     from vislam.core.messages import Frame
     from vislam.hw.cameras.library_camera import LibraryCamera
+    from vislam.hw.own_imu import OwnImu
     from vislam.hw.source import CapturedImage
 
 KINDS = ("picam", "realsense", "oak")
+WITH_IMU = ("realsense", "oak")  # those that carry an IMU of their own
 _DEPTH = "depth"  # the option by which colour and aligned depth are asked for, in place of the stereo pair
 
 
@@ -32,8 +34,6 @@ def has_depth(name: str) -> bool:
     """Return whether depth is asked for; raises UsageError for an option that there is not."""
     options = name.split(",")[1:]
     kind = _kind(name)
-    if kind == "oak" and options:
-        raise UsageError(f"'{name}' is no camera; an OAK gives its stereo pair: write oak")
     if options not in ([], [_DEPTH]):
         raise UsageError(
             f"'{name}' is no camera; write {kind} for the stereo pair, {kind},{_DEPTH} for colour and depth"
@@ -51,31 +51,80 @@ def open_image_camera(name: str, config: SensorsConfig, must_be_there: bool = Tr
     return open_picam(_picam(name, config), must_be_there)
 
 
-def open_frame_camera(name: str, config: SensorsConfig, must_be_there: bool = True) -> LibraryCamera[Frame]:
-    """Open a camera that gives frames; raises as `open_image_camera` does, and UsageError for a wrong option."""
+def open_frame_camera(
+    name: str, config: SensorsConfig, must_be_there: bool = True, imu: OwnImu | None = None
+) -> LibraryCamera[Frame]:
+    """Open a camera that gives frames; what its own IMU measures goes to `imu`, where that is given.
+
+    Raises as `open_image_camera` does, and UsageError for a wrong option.
+    """
     with_depth = has_depth(name)
     if _kind(name) == "oak":
         from vislam.hw.cameras.oak import open_oak
 
-        return open_oak(_oak(name, config), must_be_there)
+        return open_oak(_oak(name, config), must_be_there, with_depth, imu)
     from vislam.hw.cameras.realsense import open_realsense
 
-    return open_realsense(_realsense(name, config), with_depth, must_be_there)
+    return open_realsense(_realsense(name, config), with_depth, must_be_there, imu)
 
 
-def factory_rig(name: str, config: SensorsConfig) -> Rig:
-    """Return the rig of a camera that gives frames, by the calibration in the device.
+def reads_own_imu(inertial: str, camera: str) -> bool:
+    """Return whether an IMU is the one inside a camera; raises UsageError where that camera is not the one beside it.
+
+    A device can be opened once only, so its IMU and its images are read together.
+    """
+    kind = _kind(inertial)
+    if kind not in WITH_IMU:
+        return False
+    if "," in inertial:
+        raise UsageError(f"'{inertial}' is no IMU; write {kind} for it, and {camera} for the camera")
+    if _kind(camera) != kind or _device(inertial) not in ("", _device(camera)):
+        raise UsageError(
+            f"the IMU {inertial} is inside a camera and can be read together with that only; "
+            f"ask for the camera {inertial} (or {inertial},{_DEPTH}) too, got {camera}"
+        )
+    return True
+
+
+def open_with_imu(name: str, config: SensorsConfig, must_be_there: bool = True) -> tuple[LibraryCamera[Frame], OwnImu]:
+    """Open a camera and the IMU inside it, in this process; closing the camera gives both back.
+
+    Raises HardwareError where either is missing, or its package is not installed.
+    """
+    from vislam.hw.own_imu import OwnImu
+
+    settings = frame_config(name, config)
+    imu = OwnImu(_kind(name), settings)
+    camera = open_frame_camera(name, config, must_be_there, imu)
+    if must_be_there and not imu.wait(settings.start_s):
+        camera.close()
+        raise HardwareError(
+            f"the {_kind(name)} gives images, but its IMU no samples within {settings.start_s:g} s "
+            f"({imu.counters()}); replug it, into a USB 3 port, and update its firmware"
+        )
+    return camera, imu
+
+
+def factory_rig(name: str, config: SensorsConfig, with_imu: bool = False) -> tuple[Rig, tuple[str, ...]]:
+    """Return the rig of a camera that gives frames, by the calibration in the device, and what is guessed in it.
+
+    With its own IMU the body is there, as the device's extrinsics say.
 
     Raises HardwareError when it or its package is missing, DataError when its calibration cannot be used.
     """
-    with_depth = has_depth(name)
-    if _kind(name) == "oak":
+    with_depth, kind = has_depth(name), _kind(name)
+    if kind == "oak":
         from vislam.hw.cameras.oak import oak_rig
 
-        return oak_rig(_oak(name, config))
-    from vislam.hw.cameras.realsense import realsense_rig
+        rig, is_known = oak_rig(_oak(name, config), with_depth, with_imu)
+    else:
+        from vislam.hw.cameras.realsense import realsense_rig
 
-    return realsense_rig(_realsense(name, config), with_depth)
+        rig, is_known = realsense_rig(_realsense(name, config), with_depth, with_imu), with_imu
+    if is_known or frame_config(name, config).position_m is not None:
+        return rig, ()
+    unknown = f", and {kind}.calibration with the axes of its IMU: it has no extrinsics in its memory" * with_imu
+    return rig, (f"{kind}.position_m is not set{unknown}: the camera looks ahead from the IMU's place",)
 
 
 def frame_config(name: str, config: SensorsConfig) -> DepthCameraConfig:

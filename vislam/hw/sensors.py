@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 
 from vislam.config import BoardConfig, ImuChip, SensorCalibration, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
-from vislam.hw.library_cameras import check_library_camera, is_library_camera, open_image_camera
+from vislam.hw.library_cameras import (
+    WITH_IMU,
+    check_library_camera,
+    frame_config,
+    is_library_camera,
+    open_image_camera,
+    reads_own_imu,
+)
 
 if TYPE_CHECKING:
     import socket
@@ -26,7 +33,7 @@ CHIPS: dict[str, ImuChip | None] = {
     "board": None, "lsm6dsox": "lsm6dsox", "lsm6dso": "lsm6dsox", "ism330dhcx": "lsm6dsox",
     "mpu6050": "mpu6050", "mpu6500": "mpu6050", "mpu9250": "mpu6050", "icm20948": "icm20948", "bmi270": "bmi270",
 }  # fmt: skip
-INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial")
+INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial", *WITH_IMU)
 
 
 def open_inertial(
@@ -66,6 +73,7 @@ def open_inertial(
 
         bridge = replace(config.serial, port=where) if where else config.serial
         return SerialBridge(bridge, must_be_there, further)
+    reads_own_imu(name, "none")  # says that its camera has to be opened with it
     raise UsageError(
         f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, with a place such as gy85:/dev/i2c-1, "
         "serial:/dev/ttyUSB0, iio:lsm6dsox, adafruit:adafruit_lsm6ds.lsm6dsox.LSM6DSOX"
@@ -81,12 +89,14 @@ def _board(kind: str, where: str, config: SensorsConfig) -> BoardConfig:
 
 def rate_of(name: str, config: SensorsConfig) -> float:
     """Return the samples per second that are asked of an inertial sensor."""
+    if name.partition(":")[0] in WITH_IMU:
+        return frame_config(name, config).imu_rate_hz
     return config.board.rate_hz if _is_board(name) else config.gy85.rate_hz
 
 
 def _is_board(name: str) -> bool:
     """Return whether a sensor's settings are those of `board`."""
-    return name.partition(":")[0] not in ("gy85", "serial")
+    return name.partition(":")[0] not in ("gy85", "serial", *WITH_IMU)
 
 
 def open_camera(
@@ -117,6 +127,7 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
     Raises HardwareError where one is missing or may not be opened.
     """
     kind, _, where = inertial.partition(":")
+    reads_own_imu(inertial, camera)
     if kind == "gy85" or kind in CHIPS:
         from vislam.hw.chips import I2cBus
 
@@ -162,11 +173,15 @@ def with_raw_samples(config: SensorsConfig) -> SensorsConfig:
     gy85 = replace(config.gy85, calibration=raw(config.gy85.calibration))
     serial = replace(config.serial, calibration=raw(config.serial.calibration))
     board = replace(config.board, calibration=raw(config.board.calibration))
-    return replace(config, gy85=gy85, serial=serial, board=board)
+    realsense = replace(config.realsense, calibration=raw(config.realsense.calibration))
+    oak = replace(config.oak, calibration=raw(config.oak.calibration))
+    return replace(config, gy85=gy85, serial=serial, board=board, realsense=realsense, oak=oak)
 
 
 def calibration_of(name: str, config: SensorsConfig) -> SensorCalibration:
     """Return the calibration in the settings of an inertial sensor."""
     if name.startswith("serial"):
         return config.serial.calibration
+    if name.partition(":")[0] in WITH_IMU:
+        return frame_config(name, config).calibration
     return config.board.calibration if _is_board(name) and name != "none" else config.gy85.calibration

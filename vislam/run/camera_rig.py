@@ -11,13 +11,16 @@ from vislam.datasets.camera_files import read_cameras
 from vislam.hw.library_cameras import factory_rig, frame_config, has_depth
 
 
-def rig_of(name: str, sensors: SensorsConfig, calibration: str | None) -> tuple[Rig, tuple[str, ...]]:
+def rig_of(
+    name: str, sensors: SensorsConfig, calibration: str | None, with_imu: bool = False
+) -> tuple[Rig, tuple[str, ...]]:
     """Return the rig of a camera that gives frames, and what is guessed in it.
 
     Args:
         name: as a command line has it, such as `realsense,depth`.
         sensors: settings, with the camera's place on the body.
         calibration: file of all its cameras; None: its maker's calibration, read from the device.
+        with_imu: the IMU is its own.
 
     Raises:
         UsageError: the file is of another size, or of another number of cameras.
@@ -26,9 +29,7 @@ def rig_of(name: str, sensors: SensorsConfig, calibration: str | None) -> tuple[
     """
     config = frame_config(name, sensors)
     if calibration is None:
-        kind = name.partition(",")[0].partition(":")[0]
-        note = f"{kind}.position_m is not set: the camera looks ahead from the IMU's place"
-        return factory_rig(name, sensors), (note,) * (config.position_m is None)
+        return factory_rig(name, sensors, with_imu)
     found, count = read_cameras(Path(calibration)), 1 if has_depth(name) else 2
     if len(found) != count:
         raise UsageError(f"{calibration} has {len(found)} cameras, {name} has {count}; calibrate all of them together")

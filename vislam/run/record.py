@@ -34,7 +34,7 @@ from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.video import VideoCamera
 from vislam.hw.cameras.webcam import Webcam
 from vislam.hw.health import Health
-from vislam.hw.library_cameras import gives_frames, open_frame_camera
+from vislam.hw.library_cameras import gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -90,8 +90,9 @@ def record(
 
     Args:
         out: folder to make.
-        imu: `gy85[:BUS]`, `board[:BUS]` or a chip's name, `serial[:PORT]`, or `none`.
-        camera: index, device file, `webcam`, `picam`, `realsense[,depth]`, `oak`, video file or `none`.
+        imu: `gy85[:BUS]`, `board[:BUS]` or a chip's name, `serial[:PORT]`, `realsense` or `oak` for the one inside such
+            a camera, or `none`.
+        camera: index, device file, `webcam`, `picam`, `realsense[,depth]`, `oak[,depth]`, video file or `none`.
         sensors: settings of both.
         config: budget and queues.
         seconds: length, None: until stopped.
@@ -115,11 +116,15 @@ def record(
     images: Images | None = None
     own_rig: tuple[Rig, tuple[str, ...]] | None = None
     try:
-        if imu != "none":
+        is_inside = reads_own_imu(imu, camera)
+        if imu != "none" and not is_inside:
             inertial = open_inertial(imu, with_raw_samples(sensors))
         if camera != "none":
-            own_rig = rig_of(camera, sensors, files.camera) if gives_frames(camera) else None
-            images = _open_images(camera, sensors, in_real_time)
+            own_rig = rig_of(camera, sensors, files.camera, is_inside) if gives_frames(camera) else None
+            if is_inside:
+                images, inertial = open_with_imu(camera, with_raw_samples(sensors))
+            else:
+                images = _open_images(camera, sensors, in_real_time)
         first = None if images is None else _first_image(images, camera)
         rig, notes = (None, ()) if first is None else own_rig or _rig(first, files, sensors.hfov_deg)
         notes = (*notes, *_camera_notes(images), *_stamp_notes(imu, inertial))

@@ -31,7 +31,7 @@ class DoctorOptions:
     i2c: str | None = None
     """A GY-85 or another known board must be on this bus, such as /dev/i2c-1; without, every bus is looked at"""
     imu: str | None = None
-    """This IMU must give samples, as `vislam live` names it: board, lsm6dsox:/dev/i2c-1 ..."""
+    """This IMU must give samples, as `vislam live` names it: board, lsm6dsox:/dev/i2c-1, realsense ..."""
     serial: str | None = None
     """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that nobody names are not opened"""
     camera: str | None = None

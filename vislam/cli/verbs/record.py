@@ -22,10 +22,10 @@ class RecordOptions:
     """Folder to make for the recording (ASL layout)"""
     imu: str = "gy85"
     """gy85[:/dev/i2c-1], board[:/dev/i2c-1] (whichever chip answers) or a chip's name, serial[:/dev/ttyUSB0] (without
-    a path as the settings say), or none"""
+    a path as the settings say), realsense or oak (the one inside the camera of that name), or none"""
     camera: str = "webcam"
     """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), picam[:0] (the Raspberry Pi's own),
-    realsense[:SERIAL][,depth] (stereo, or colour and depth), oak[:ID] (stereo), a video file in place of a camera, or
+    realsense[:SERIAL][,depth] (stereo, or colour and depth), oak[:ID][,depth], a video file in place of a camera, or
     none"""
     seconds: Positive | None = None
     """How long; None: until Ctrl-C"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -51,11 +52,39 @@ def mounted(cameras: Sequence[Camera], T_cam0_cams: Sequence[Array], has_depth: 
     Without `config.position_m` it looks ahead from the IMU's place.
     """
     T_body_cam0 = np.eye(4)
-    tilt = np.deg2rad(config.tilt_deg)  # nose down is a turn about y, which points left
-    R_tilt = np.array([[np.cos(tilt), 0.0, np.sin(tilt)], [0.0, 1.0, 0.0], [-np.sin(tilt), 0.0, np.cos(tilt)]])
-    T_body_cam0[:3, :3] = R_tilt @ _R_BODY_CAM
+    T_body_cam0[:3, :3] = looking_ahead(config)
     T_body_cam0[:3, 3] = config.position_m or (0.0, 0.0, 0.0)
     return Rig(tuple(cameras), tuple(T_body_cam0 @ T for T in T_cam0_cams), has_depth)
+
+
+def mounted_on_imu(
+    cameras: Sequence[Camera],
+    T_cam0_cams: Sequence[Array],
+    has_depth: bool,
+    config: DepthCameraConfig,
+    T_cam0_imu: Array,
+) -> Rig:
+    """Return the rig of cameras beside an IMU in the same housing: the body is at the IMU, and the camera looks ahead.
+
+    Args:
+        cameras: of the rig.
+        T_cam0_cams: poses [4, 4] of each in the first.
+        has_depth: of the first.
+        config: says how far it is tilted; its position is the factory's.
+        T_cam0_imu: [4, 4] of the factory.
+    """
+    T_body_cam0 = np.eye(4)
+    T_body_cam0[:3, :3] = looking_ahead(config)
+    T_body_cam0[:3, 3] = -T_body_cam0[:3, :3] @ T_cam0_imu[:3, 3]
+    return Rig(tuple(cameras), tuple(T_body_cam0 @ T for T in T_cam0_cams), has_depth)
+
+
+def looking_ahead(config: DepthCameraConfig) -> Array:
+    """Return the rotation [3, 3] of the first camera in the body: it looks ahead, nose down by `tilt_deg`."""
+    tilt = np.deg2rad(config.tilt_deg)  # nose down is a turn about y, which points left
+    R_tilt = np.array([[np.cos(tilt), 0.0, np.sin(tilt)], [0.0, 1.0, 0.0], [-np.sin(tilt), 0.0, np.cos(tilt)]])
+    R_body_cam: Array = R_tilt @ _R_BODY_CAM
+    return R_body_cam
 
 
 def rigid(rotation: Array, translation_m: Array) -> Array:
@@ -67,3 +96,10 @@ def rigid(rotation: Array, translation_m: Array) -> Array:
             f"the camera's factory extrinsics are no rigid transform: {T_cam1_cam0.tolist()}; {_NO_FILE}"
         )
     return invert(T_cam1_cam0)
+
+
+def grey(color: Any) -> Any:
+    """Return the grey image [H, W] of a BGR image [H, W, 3]."""
+    import cv2
+
+    return cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)

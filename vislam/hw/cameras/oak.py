@@ -1,52 +1,74 @@
-"""OAK cameras (OAK-D and its like) through depthai 3: the stereo pair, stamped in the middle of the exposure."""
+"""OAK cameras (OAK-D and its like) through depthai 3: the stereo pair or colour with depth, and their IMU."""
 
 from __future__ import annotations
 
-import time
 from datetime import timedelta
 from typing import Any
 
 import numpy as np
 
 from vislam.config import OakConfig
-from vislam.core.camera import Rig
+from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, HardwareError
 from vislam.core.messages import Array, Frame
-from vislam.hw.cameras.factory import factory_camera, mounted, rigid
+from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_imu, rigid
 from vislam.hw.cameras.library_camera import LibraryCamera, named
+from vislam.hw.cameras.oak_depth import colour_and_depth, colour_camera, set_exposure
+from vislam.hw.cameras.oak_imu import CM, OakClock, OakMotion, imu_pose, in_ns
 from vislam.hw.cameras.webcam import Setting
+from vislam.hw.own_imu import OwnImu
 
 _NEXT = timedelta(seconds=1)  # without an image for so long, the device is opened anew
-_EARLY_NS = 5_000_000  # depthai's match of clocks was seen to be early by a couple of milliseconds
 _MODELS = {"Perspective": "radtan", "Fisheye": "equidistant"}
-_CM = 0.01  # in which depthai states extrinsics
+_MM = 0.001  # in which depthai states depth
 
 
 class OakStream:
-    """Satisfies `Stream`: a pipeline that runs on the device."""
+    """Satisfies `Stream`: a pipeline that runs on the device, and with it the device's IMU where that is asked for."""
 
     settings: tuple[Setting, ...] = ()  # depthai 3 does not read back what the sensors do
 
-    def __init__(self, config: OakConfig) -> None:
-        """Load the device's firmware and start; without a device depthai raises RuntimeError."""
+    def __init__(self, config: OakConfig, with_depth: bool = False, imu: OwnImu | None = None) -> None:
+        """Load the device's firmware and start; without a device depthai raises RuntimeError.
+
+        What the device's IMU measures goes to `imu`. Raises HardwareError where it has none.
+        """
         self._dai = depthai()
+        self._with_depth = with_depth
         self._period_ns = round(1e9 / config.rate_hz)
-        self._max_age_ns = round(config.max_age_s * 1e9)
-        self._age_ns = 0
         self.stamped_by, self.bad_stamps = "not known yet", 0
+        self._clock = OakClock(self._dai, config.max_age_s)
+        self._motion: OakMotion | None = None
+        self._pipeline: Any = None
         self._device = _device(self._dai, config)
         try:
             calibration = self._device.readCalibration()
             self._pipeline = self._dai.Pipeline(self._device)
-            sockets = calibration.getStereoLeftCameraId(), calibration.getStereoRightCameraId()
-            self._queues = [self._queue(socket, config) for socket in sockets]
+            if imu is not None:
+                first = _sockets(calibration, self._dai, with_depth)[0]
+                T_cam_imu = imu_pose(calibration, first)
+                self._motion = OakMotion(self._dai, self._pipeline, self._device, config, imu, self._clock, T_cam_imu)
+            if with_depth:
+                is_newer = self._device.getPlatform() == self._dai.Platform.RVC4
+                self._queues = [colour_and_depth(self._dai, self._pipeline, calibration, config, is_newer)]
+            else:
+                self._queues = [self._queue(socket, config) for socket in _sockets(calibration, self._dai, with_depth)]
             self._pipeline.start()
+            if self._motion is not None:
+                self._motion.start()
         except BaseException:
-            self._device.close()
+            self.close()
             raise
 
     def next(self) -> Frame | None:
-        """Return the next pair; None for an image whose partner was lost. Raises HardwareError after a second."""
+        """Return the next frame; None for an image whose partner was lost. Raises HardwareError after a second."""
+        if self._motion is not None and self._motion.failure is not None:
+            raise self._motion.failure
+        if self._with_depth:
+            group = self._image(self._queues[0])
+            color = np.array(group["color"].getCvFrame(), dtype=np.uint8)
+            depth_m = np.asarray(group["depth"].getFrame(), dtype=np.float32) * np.float32(_MM)
+            return Frame(self._stamp(_middle_ns(self._dai, group["color"])), 0, (grey(color),), color, depth_m)
         pair = [self._image(queue) for queue in self._queues]
         for _ in range(2):  # what is older by more than half a period has no partner
             lag_ns = _middle_ns(self._dai, pair[0]) - _middle_ns(self._dai, pair[1])
@@ -62,16 +84,17 @@ class OakStream:
     def close(self) -> None:
         """Give the device back."""
         try:
-            self._pipeline.stop()
+            if self._motion is not None:
+                self._motion.stop()
+            if self._pipeline is not None:
+                self._pipeline.stop()
         finally:  # where it was pulled out, too
             self._device.close()
 
     def _queue(self, socket: Any, config: OakConfig) -> Any:
         """Return the queue of one camera's grey images."""
         camera = self._pipeline.create(self._dai.node.Camera).build(socket)
-        if config.exposure_s is not None:
-            iso = 400 if config.gain is None else round(config.gain)
-            camera.initialControl.setManualExposure(round(config.exposure_s * 1e6), iso)
+        set_exposure(camera, config)
         size, grey = (config.width_px, config.height_px), self._dai.ImgFrame.Type.GRAY8
         return camera.requestOutput(size, type=grey, fps=config.rate_hz).createOutputQueue(maxSize=4, blocking=False)
 
@@ -83,28 +106,31 @@ class OakStream:
 
     def _stamp(self, middle_ns: int) -> int:
         """Return depthai's time of the middle of the exposure on CLOCK_MONOTONIC."""
-        now_ns = time.monotonic_ns()
-        age_ns = _ns(self._dai.Clock.now()) - middle_ns
-        if -_EARLY_NS <= age_ns <= self._max_age_ns:
+        t_ns = self._clock.host_ns(middle_ns)
+        if t_ns is not None:
             self.stamped_by = "the device, in the middle of the exposure, by depthai's match of its clock to the host's"
-            self._age_ns = age_ns
-        else:
-            self.stamped_by = "arrival"
-            self.bad_stamps += 1
-        return now_ns - self._age_ns
+            return t_ns
+        self.stamped_by = "arrival"
+        self.bad_stamps += 1
+        return self._clock.arrival_ns()
 
 
-def open_oak(config: OakConfig, must_be_there: bool = True) -> LibraryCamera[Frame]:
-    """Open an OAK camera.
+def open_oak(
+    config: OakConfig, must_be_there: bool = True, with_depth: bool = False, imu: OwnImu | None = None
+) -> LibraryCamera[Frame]:
+    """Open an OAK camera; samples of its IMU go to `imu`, where that is given.
 
     Raises HardwareError when depthai is not installed or, where it must be there, the device is missing.
     """
     depthai()
-    return LibraryCamera("oak", lambda: OakStream(config), config, must_be_there)
+    name = "oak,depth" if with_depth else "oak"
+    return LibraryCamera(name, lambda: OakStream(config, with_depth, imu), config, must_be_there)
 
 
-def oak_rig(config: OakConfig) -> Rig:
-    """Return the rig by the calibration in the device, which is opened for it, mounted as the settings say.
+def oak_rig(config: OakConfig, with_depth: bool = False, with_imu: bool = False) -> tuple[Rig, bool]:
+    """Return the rig by the calibration in the device, which is opened for it, and whether its IMU's place is known.
+
+    It is mounted as the settings say, or with its own IMU as that lies beside its cameras, where the device tells.
 
     Raises:
         HardwareError: depthai or the device is missing.
@@ -117,23 +143,43 @@ def oak_rig(config: OakConfig) -> Rig:
         raise HardwareError(f"no OAK{named(config)} can be opened ({error}); plug it into a USB 3 port") from error
     try:
         calibration = device.readCalibration()
-        sockets = calibration.getStereoLeftCameraId(), calibration.getStereoRightCameraId()
-        size, cameras = (config.width_px, config.height_px), []
-        for socket in sockets:
-            _check_shape(calibration.getDefaultIntrinsics(socket)[1:], size)
-            K = np.array(calibration.getCameraIntrinsics(socket, *size))
-            model = calibration.getDistortionModel(socket).name
-            coefficients = calibration.getDistortionCoefficients(socket)
-            pinhole = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-            cameras.append(factory_camera(size, pinhole, _MODELS.get(model, model), coefficients))
-        T: Array = np.array(calibration.getCameraExtrinsics(*sockets))  # takes points of the left into the right
+        sockets = _sockets(calibration, dai, with_depth)
+        cameras = (
+            [colour_camera(calibration, sockets[0], config)] if with_depth else _pair(calibration, sockets, config)
+        )
+        T_cam_imu = imu_pose(calibration, sockets[0]) if with_imu else None
+        # takes points of the left into the right
+        T: Array = np.eye(4) if with_depth else np.array(calibration.getCameraExtrinsics(*sockets))
     except RuntimeError as error:
         raise HardwareError(
             f"the OAK does not tell its calibration ({error}); give --calibration.camera FILE"
         ) from error
     finally:
         device.close()
-    return mounted(cameras, [np.eye(4), rigid(T[:3, :3], T[:3, 3] * _CM)], False, config)
+    poses = [np.eye(4)] if with_depth else [np.eye(4), rigid(T[:3, :3], T[:3, 3] * CM)]
+    if T_cam_imu is not None:
+        return mounted_on_imu(cameras, poses, with_depth, config, T_cam_imu), True
+    return mounted(cameras, poses, with_depth, config), False
+
+
+def _pair(calibration: Any, sockets: tuple[Any, ...], config: OakConfig) -> list[Camera]:
+    """Return the two grey cameras by their calibration."""
+    size, cameras = (config.width_px, config.height_px), []
+    for socket in sockets:
+        _check_shape(calibration.getDefaultIntrinsics(socket)[1:], size)
+        K = np.array(calibration.getCameraIntrinsics(socket, *size))
+        model = calibration.getDistortionModel(socket).name
+        coefficients = calibration.getDistortionCoefficients(socket)
+        pinhole = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        cameras.append(factory_camera(size, pinhole, _MODELS.get(model, model), coefficients))
+    return cameras
+
+
+def _sockets(calibration: Any, dai: Any, with_depth: bool) -> tuple[Any, ...]:
+    """Return the sockets of the cameras of the rig, the first one first."""
+    if with_depth:
+        return (dai.CameraBoardSocket.CAM_A,)
+    return calibration.getStereoLeftCameraId(), calibration.getStereoRightCameraId()
 
 
 def check_oak(config: OakConfig) -> None:
@@ -169,8 +215,4 @@ def _device(dai: Any, config: OakConfig) -> Any:
 
 
 def _middle_ns(dai: Any, image: Any) -> int:
-    return _ns(image.getTimestamp(dai.CameraExposureOffset.MIDDLE))
-
-
-def _ns(since: timedelta) -> int:
-    return (since // timedelta(microseconds=1)) * 1000
+    return in_ns(image.getTimestamp(dai.CameraExposureOffset.MIDDLE))

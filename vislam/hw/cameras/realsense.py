@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
+from queue import Empty, Full, Queue
 from typing import Any
 
 import numpy as np
@@ -13,42 +14,54 @@ from vislam.core.camera import Rig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Frame
 from vislam.hw.bridge.clock import DeviceClock
-from vislam.hw.cameras.factory import factory_camera, mounted, rigid
+from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_imu, rigid
 from vislam.hw.cameras.library_camera import LibraryCamera, named
+from vislam.hw.cameras.realsense_imu import RealsenseMotion, ask_motion, imu_pose
 from vislam.hw.cameras.webcam import Setting
+from vislam.hw.own_imu import OwnImu
 
 _NEXT_MS = 1000  # without frames for so long, the device is opened anew
 _WRAP_US = 2**32
+_SETTLE_NS = 3_000_000_000  # in which an IMU that is there has laid the line of the clock
+_WAITING = 2  # sets of images; the library has 16 to fill
 _MODELS = {"none": "none", "brown_conrady": "radtan", "kannala_brandt4": "equidistant"}
 
 
 class RealsenseStream:
-    """Satisfies `Stream`: a pipeline that runs."""
+    """Satisfies `Stream`: a pipeline that runs, and with it the device's IMU where that is asked for."""
 
-    def __init__(self, config: RealsenseConfig, with_depth: bool) -> None:
-        """Start the pipeline; without a device the library raises RuntimeError."""
+    def __init__(self, config: RealsenseConfig, with_depth: bool, imu: OwnImu | None = None) -> None:
+        """Start the pipeline; without a device the library raises RuntimeError.
+
+        What the device's IMU measures goes to `imu`. Raises HardwareError where it has none.
+        """
         self._rs = pyrealsense2()
         self._config, self._with_depth = config, with_depth
-        self._pipeline = self._rs.pipeline()
-        profile = self._pipeline.start(_asked(self._rs, config, with_depth))
         self.stamped_by, self.bad_stamps = "not known yet", 0
         self._align = self._rs.align(self._rs.stream.color) if with_depth else None
         self._clock = DeviceClock(BridgeClockConfig())
         self._delay_ns = round(config.delay_s * 1e9)
-        self._number = -1
+        self._number, self._began_ns = -1, time.monotonic_ns()
+        self._motion = None if imu is None else RealsenseMotion(self._rs, config, imu)
+        self._framesets: Queue[tuple[Any, int]] = Queue(_WAITING)
+        self._failure: Exception | None = None  # of a callback
+        asked = _asked(self._rs, config, with_depth, with_imu=imu is not None)
+        self._pipeline = self._rs.pipeline()
+        profile = self._pipeline.start(asked) if imu is None else self._pipeline.start(asked, self._called)
         try:
             self._m_per_unit = profile.get_device().first_depth_sensor().get_depth_scale()
             self.settings = self._set(profile.get_device())
+            if self._motion is not None:
+                self._motion.begin(profile, profile.get_stream(*_first(self._rs, with_depth)))
         except BaseException:
             self.close()
             raise
 
     def next(self) -> Frame | None:
         """Return the next frame; None while its stamp is not to be trusted. Raises HardwareError after a second."""
-        has_come, frames = self._pipeline.try_wait_for_frames(_NEXT_MS)
-        if not has_come:
-            raise HardwareError("the RealSense stopped giving images; replug it, into a USB 3 port")
-        arrival_ns = time.monotonic_ns()
+        frames, arrival_ns = self._next_frameset()
+        if self._motion is not None and not self._is_whole(frames):
+            return None  # one of the pair was lost
         first = frames.get_color_frame() if self._with_depth else frames.get_infrared_frame(1)
         t_ns = self._stamp(first, arrival_ns)
         if t_ns is None:
@@ -66,6 +79,44 @@ class RealsenseStream:
         with suppress(RuntimeError):  # it was pulled out
             self._pipeline.stop()
 
+    def _next_frameset(self) -> tuple[Any, int]:
+        """Return images and when they arrived. Raises HardwareError after a second without any."""
+        if self._motion is None:
+            has_come, frames = self._pipeline.try_wait_for_frames(_NEXT_MS)
+            if has_come:
+                return frames, time.monotonic_ns()
+        else:
+            with suppress(Empty):
+                return self._framesets.get(timeout=_NEXT_MS * 1e-3)
+            if self._failure is not None:
+                raise self._failure
+        raise HardwareError("the RealSense stopped giving images; replug it, into a USB 3 port")
+
+    def _called(self, frame: Any) -> None:
+        """Take what a thread of the library brings: images in sets, each sample of the IMU by itself.
+
+        The pipeline's own queue keeps the newest sample of each set of images only; by callback none is lost.
+        """
+        arrival_ns = time.monotonic_ns()
+        try:
+            if not frame.is_frameset():
+                if self._motion is not None and frame.is_motion_frame():
+                    self._motion.take(frame, arrival_ns)
+                return
+            if self._framesets.full():
+                with suppress(Empty):
+                    self._framesets.get_nowait()  # the newest is wanted
+            with suppress(Full):
+                self._framesets.put_nowait((frame.as_frameset(), arrival_ns))
+        except Exception as error:  # a callback that raises would end the process
+            self._failure = error
+
+    def _is_whole(self, frames: Any) -> bool:
+        """Return whether a set has all images that were asked for."""
+        if self._with_depth:
+            return bool(frames.get_color_frame()) and bool(frames.get_depth_frame())
+        return all(bool(frames.get_infrared_frame(k)) for k in (1, 2))
+
     def _stamp(self, frame: Any, arrival_ns: int) -> int | None:
         """Return the middle of the exposure on CLOCK_MONOTONIC; None where it is not known, or the frame is not new."""
         rs, number = self._rs, int(frame.get_frame_number())
@@ -82,8 +133,14 @@ class RealsenseStream:
             self.bad_stamps += 1
             self.stamped_by = "arrival"
             return arrival_ns - self._delay_ns
+        if self._motion is not None and (t_ns := self._motion.clock.at(device_us)) is not None:
+            self.stamped_by += ", on one line with its IMU's"
+            return t_ns
+        is_waiting = self._motion is not None and arrival_ns - self._began_ns < _SETTLE_NS
+        if self._motion is not None and not is_waiting:
+            self.bad_stamps += 1  # its IMU is silent, or counts by another clock: a line of its own
         stamp_ns = self._clock.stamp(device_us % _WRAP_US, arrival_ns)
-        return None if stamp_ns is None else stamp_ns - self._delay_ns
+        return None if stamp_ns is None or is_waiting else stamp_ns - self._delay_ns
 
     def _set(self, device: Any) -> tuple[Setting, ...]:
         """Fix what the device would change by itself; return all as read back."""
@@ -92,6 +149,9 @@ class RealsenseStream:
         if self._with_depth:
             sensors["color"] = device.first_color_sensor()
         wanted = [("depth", "emitter_enabled", float(self._with_depth))]  # its dots move along with a stereo pair
+        if self._motion is not None:
+            sensors["imu"] = device.first_motion_sensor()
+            wanted.append(("imu", "enable_motion_correction", 1.0))  # by the calibration in the device
         for name in sensors:
             wanted.append((name, "global_time_enabled", 0.0))
         lens = "color" if self._with_depth else "depth"
@@ -113,25 +173,22 @@ class RealsenseStream:
         return tuple(settings)
 
 
-def grey(color: Any) -> Any:
-    """Return the grey image [H, W] of a BGR image [H, W, 3]."""
-    import cv2
-
-    return cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
-
-
-def open_realsense(config: RealsenseConfig, with_depth: bool, must_be_there: bool = True) -> LibraryCamera[Frame]:
-    """Open a RealSense.
+def open_realsense(
+    config: RealsenseConfig, with_depth: bool, must_be_there: bool = True, imu: OwnImu | None = None
+) -> LibraryCamera[Frame]:
+    """Open a RealSense; samples of its IMU go to `imu`, where that is given.
 
     Raises HardwareError when pyrealsense2 is not installed or, where it must be there, the device is missing.
     """
     pyrealsense2()
     name = "realsense,depth" if with_depth else "realsense"
-    return LibraryCamera(name, lambda: RealsenseStream(config, with_depth), config, must_be_there)
+    return LibraryCamera(name, lambda: RealsenseStream(config, with_depth, imu), config, must_be_there)
 
 
-def realsense_rig(config: RealsenseConfig, with_depth: bool) -> Rig:
-    """Return the rig by the calibration in the device, mounted as the settings say; nothing streams.
+def realsense_rig(config: RealsenseConfig, with_depth: bool, with_imu: bool = False) -> Rig:
+    """Return the rig by the calibration in the device; nothing streams.
+
+    Mounted as the settings say, or with its own IMU as that lies beside its cameras.
 
     Raises:
         HardwareError: pyrealsense2 or the device is missing, or it has not these streams.
@@ -139,13 +196,13 @@ def realsense_rig(config: RealsenseConfig, with_depth: bool) -> Rig:
     """
     rs = pyrealsense2()
     try:
-        profile = _asked(rs, config, with_depth).resolve(rs.pipeline_wrapper(rs.pipeline()))
+        profile = _asked(rs, config, with_depth, with_imu).resolve(rs.pipeline_wrapper(rs.pipeline()))
     except RuntimeError as error:
         raise HardwareError(
             f"no RealSense{named(config)} gives {config.width_px}x{config.height_px} at {config.rate_hz:g} Hz "
             f"({error}); plug it into a USB 3 port, or ask for another size or rate"
         ) from error
-    names = ((rs.stream.color, -1),) if with_depth else ((rs.stream.infrared, 1), (rs.stream.infrared, 2))
+    names = (_first(rs, with_depth),) if with_depth else (_first(rs, with_depth), (rs.stream.infrared, 2))
     streams = [profile.get_stream(*name).as_video_stream_profile() for name in names]
     cameras, poses = [], [np.eye(4)]
     for stream in streams:
@@ -156,6 +213,8 @@ def realsense_rig(config: RealsenseConfig, with_depth: bool) -> Rig:
     for stream in streams[1:]:
         e = streams[0].get_extrinsics_to(stream)  # takes points of the first into it; columns of the rotation in a row
         poses.append(rigid(np.reshape(e.rotation, (3, 3)).T, np.array(e.translation)))
+    if with_imu:
+        return mounted_on_imu(cameras, poses, with_depth, config, imu_pose(rs, profile, streams[0]))
     return mounted(cameras, poses, with_depth, config)
 
 
@@ -168,8 +227,16 @@ def pyrealsense2() -> Any:
     return module
 
 
-def _asked(rs: Any, config: RealsenseConfig, with_depth: bool) -> Any:
-    """Return the library's request for the streams."""
+def _first(rs: Any, with_depth: bool) -> tuple[Any, int]:
+    """Return type and index of the stream of the first camera."""
+    return (rs.stream.color, -1) if with_depth else (rs.stream.infrared, 1)
+
+
+def _asked(rs: Any, config: RealsenseConfig, with_depth: bool, with_imu: bool = False) -> Any:
+    """Return the library's request for the streams.
+
+    With an IMU the device is looked at; RuntimeError where there is none, HardwareError where it has no IMU.
+    """
     asked = rs.config()
     if config.device:
         asked.enable_device(config.device)
@@ -180,4 +247,7 @@ def _asked(rs: Any, config: RealsenseConfig, with_depth: bool) -> Any:
     else:
         for index in (1, 2):
             asked.enable_stream(rs.stream.infrared, index, *size, rs.format.y8, rate)
+    if with_imu:
+        device = asked.resolve(rs.pipeline_wrapper(rs.pipeline())).get_device()
+        ask_motion(rs, asked, device, config.imu_rate_hz)
     return asked
