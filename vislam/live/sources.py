@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,12 +17,15 @@ from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_noise
-from vislam.hw.library_cameras import gives_frames, open_frame_camera
+from vislam.hw.library_cameras import WITH_IMU, frame_config, gives_frames, open_frame_camera, reads_own_imu
 from vislam.hw.reading_port import check_port
 from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
+from vislam.live.device_owner import own_device
 from vislam.live.frames import NO_CAMERA, FrameSource, NoCamera, OneCamera
+from vislam.live.handed_frames import HandedFrames
+from vislam.live.handed_imu import HandedImu
 from vislam.live.port_readings import PortReadings
 from vislam.live.processes.child import Life
 from vislam.live.reading_source import ReadingSource, refuse_unread
@@ -29,6 +33,7 @@ from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.place import PlaceOptions
+from vislam.live.wire.slot import remove
 from vislam.run.camera_rig import rig_of
 from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
@@ -52,12 +57,15 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
         return cart, cart.settings(config)
     if asked.startswith("replay:"):
         return ReplaySource(asked.removeprefix("replay:"), config.seed), config
-    inertial, _, camera = asked.partition("+")
+    inertial, plus, camera = asked.partition("+")
+    if not plus and kind.partition(":")[0] in WITH_IMU:
+        inertial, camera = kind, asked  # a camera with the IMU inside it
     if not camera or inertial.partition(":")[0] not in INERTIAL_KINDS:
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
             f"(an IMU of {', '.join(INERTIAL_KINDS)}; in place of webcam a camera's index or path, picam, "
-            "realsense[,depth], oak, or none: attitude by the IMU alone)"
+            "realsense[,depth], oak[,depth], or none: attitude by the IMU alone); realsense[,depth] and oak[,depth] "
+            "for such a camera with the IMU inside it"
         )
     return CartSensors(inertial, camera, config, sensors), with_clock(config)
 
@@ -107,11 +115,13 @@ class CartSensors:
                     "live drivers take the calibration of their chips from the sensors file (--sensors FILE, section "
                     f"calibration of gy85, board or serial), not from --calibration.{name}"
                 )
+        self._is_inside = reads_own_imu(inertial, camera)
         self.name = f"live {inertial}+{camera}"
         self.has_camera = camera != "none"
         told, ideal = calibration_of(inertial, sensors), SensorCalibration()
         self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
-        self.rig = _rig(camera, sensors, config.calibration.camera) if self.has_camera else NO_CAMERA
+        calibration = config.calibration.camera
+        self.rig = _rig(camera, sensors, calibration, self._is_inside) if self.has_camera else NO_CAMERA
         rate_hz = rate_of(inertial, sensors)
         self.imu_noise: ImuNoise | None = ImuNoise(
             sensors.gyro_noise_density, sensors.accel_noise_density, sensors.gyro_bias_walk, sensors.accel_bias_walk,
@@ -123,22 +133,33 @@ class CartSensors:
         self.duration_s: float | None = None
         self._inertial, self._camera, self._sensors = inertial, camera, sensors
         self._passed: tuple[socket.socket, socket.socket] | None = None  # from the bridge to who reads further sensors
+        self._handed: tuple[socket.socket, socket.socket] | None = None  # from a device's process to the fast one
+        self._memory = f"vislam-device-{os.getpid()}-{id(self):x}"
 
     def __getstate__(self) -> dict[str, object]:
-        """Return what travels to other processes: each end of the bridge's wire goes with what opens it, and alone."""
-        return {**self.__dict__, "_passed": None}
+        """Return what travels to other processes: each end of a wire goes with what opens it, and alone."""
+        return {**self.__dict__, "_passed": None, "_handed": None}
 
     def check(self) -> None:
         """Raise HardwareError where a device is missing or may not be opened."""
         check_devices(self._inertial, self._camera, self._sensors)
 
     def inertial(self) -> Callable[[], InertialSource]:
-        """Return what opens the IMU; call `readings` before, for a bridge passes on what further sensors say."""
+        """Return what opens the IMU; call `readings` before, for a bridge passes on what further sensors say.
+
+        That of a camera is in the hands of a process of its own: call `helpers` after.
+        """
+        if self._is_inside:
+            self._handed = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            settings = frame_config(self._camera, self._sensors)
+            return partial(HandedImu, self._handed[1], settings.imu_rate_hz, settings.imu_silent_s)
         passed = None if self._passed is None else self._passed[0]
         return partial(open_inertial, self._inertial, self._sensors, further=passed)
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens the camera."""
+        if self._is_inside:
+            return partial(HandedFrames, self._memory, frame_config(self._camera, self._sensors).missing_s)
         return partial(_open_frames, self._camera, self._sensors) if self.has_camera else NoCamera
 
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
@@ -162,13 +183,21 @@ class CartSensors:
         return partial(PortReadings, setup.ports, None if self._passed is None else self._passed[1])
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
-        """Return nothing: real sensors need no processes."""
-        return {}
+        """Return the process that owns a camera with the IMU inside it; other sensors need none."""
+        if self._handed is None:
+            return {}
+        return {
+            "device": partial(
+                own_device, name=self._camera, sensors=self._sensors, memory=self._memory, samples=self._handed[0]
+            )
+        }
 
     def close(self) -> None:
-        """Close our ends of the bridge's wire; no memory is shared."""
-        for end in self._passed or ():
+        """Close our ends of the wires, and remove the memory of a device's process that was killed."""
+        for end in (*(self._passed or ()), *(self._handed or ())):
             end.close()
+        if self._is_inside:
+            remove(self._memory)
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
         """Raise DataError: live sensors cannot be read twice."""
@@ -179,9 +208,9 @@ class CartSensors:
         return None
 
 
-def _rig(camera: str, sensors: SensorsConfig, calibration: str | None) -> Rig:
+def _rig(camera: str, sensors: SensorsConfig, calibration: str | None, with_imu: bool) -> Rig:
     if gives_frames(camera):
-        rig, guesses = rig_of(camera, sensors, calibration)
+        rig, guesses = rig_of(camera, sensors, calibration, with_imu)
         if guesses:
             raise UsageError(f"{guesses[0]}, which cannot be taken for true; set it, in metres, or give a calibration")
         return rig
