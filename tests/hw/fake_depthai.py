@@ -44,6 +44,7 @@ class World:
         self.imu = "BMI270"
         self.motion: Callable[[int], tuple[tuple[float, ...], tuple[float, ...]]] = ramp
         self.knows_imu = True  # most devices have no extrinsics of it
+        self.imu_memory_is_empty = False  # as older versions of the package left it
         self.is_calibrated = True  # depthai 3.12 and later
         self.platform = "RVC2"
         self.links: list[tuple[str, str]] = []
@@ -127,6 +128,8 @@ class Calibration:
 
     def getCameraToImuExtrinsics(self, socket: str) -> list[list[float]]:
         if not self.world.knows_imu:
+            raise RuntimeError("IMU calibration data is not available on device yet.")
+        if self.world.imu_memory_is_empty:
             return [[0.0] * 4, [0.0] * 4, [0.0] * 4, [0.0, 0.0, 0.0, 1.0]]
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R_IMU_CAM, P_IMU_CAM_CM

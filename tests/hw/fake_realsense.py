@@ -256,7 +256,7 @@ class Pipeline:
 
     def try_wait_for_frames(self, timeout_ms: int) -> tuple[bool, "Frames"]:
         if self.callback is not None:
-            raise RuntimeError("wait_for_frames cannot be called if a callback was provided")
+            raise RuntimeError("try_wait_for_frames cannot be called if a callback was provided")
         time.sleep(self.world.period_s)
         self.world.number += 1
         return not self.world.unplugged, Frames(self)

@@ -206,12 +206,19 @@ def test_the_place_of_its_imu_is_the_factorys_or_has_to_be_told(world: World) ->
     assert guesses == ()
     p_cam = R_IMU_CAM.T @ np.array(P_IMU_CAM_CM) * 0.01
     assert rig.T_body_cams[0][:3, 3] == pytest.approx([p_cam[2], -p_cam[0], -p_cam[1]])
+    world.imu_memory_is_empty = True
+    assert "no extrinsics in its memory" in factory_rig("oak,depth", SensorsConfig(), with_imu=True)[1][0]
     world.knows_imu = False  # as most are
     _, guesses = factory_rig("oak", SensorsConfig(), with_imu=True)
     assert "no extrinsics in its memory" in guesses[0]
     axes = replace(CAMERA.calibration, gyro_axes=("z", "y", "-x"), accel_axes=("z", "y", "-x"))
     told = replace(SLOW, oak=replace(SLOW.oak, calibration=axes))
+    with pytest.raises(UsageError, match=r"oak\.position_m is not set, and oak\.calibration"):
+        open_live("oak+oak", Config(), SensorsConfig())
     assert factory_rig("oak", told, with_imu=True)[1] == ()
+    source, _ = open_live("oak", Config(), told)
+    assert source.rig.T_body_cams[0][:3, 3] == pytest.approx([0.1, 0.0, 0.2])
+    source.close()
     camera, imu = open_with_imu("oak", told)
     with closing(camera):
         sample = imu.read(LONG_S)[0]
