@@ -104,6 +104,7 @@ class Config:
     """The whole configuration of a run."""
 
     seed: Whole = 0  # of every random choice in the pipeline
+    up: str = "auto"  # without an IMU: X,Y,Z in the first camera's axes, camera (as its first image has it) or none
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
     sensors: FurtherSensorsConfig = field(default_factory=FurtherSensorsConfig)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,6 +49,9 @@ class KnownCamera:
 
     camera: Camera | None = None
     T_body_cam: Array | None = None  # [4, 4]
+
+
+ForceRows = Callable[[Problems], Iterator[Row[list[float]]]]
 
 
 class Streams(Protocol):
@@ -97,6 +100,7 @@ class Survey:
     mag_calibration: MagCalibration | None = None  # as for the IMU, in the magnetometer's own axes
     R_body_mag: Array = field(default_factory=lambda: np.eye(3))
     truth: Truth | None = None
+    forces: ForceRows | None = None  # of an accelerometer without a gyroscope, in body axes
     streams: Streams | None = None  # images and samples come from here; the files of a camera are names for messages
     topics: tuple[TopicSummary, ...] = ()
     known_cameras: tuple[KnownCamera, ...] = ()  # what is known where there is no rig yet
@@ -217,6 +221,19 @@ class FileRecording:
         self._known.update(met)
         self._counter.update(met)
         return trajectory
+
+    def forces(self) -> tuple[NDArray[np.int64], Array] | None:
+        """Return stamps [N] and forces [N, 3] in body axes of an accelerometer without a gyroscope; None without one.
+
+        Their unit is the file's. Raises DataError when most of its rows are unusable.
+        """
+        if self._survey.forces is None:
+            return None
+        met = Problems()
+        rows = list(in_time_order(self._survey.forces(met), met, "accelerometer"))
+        self._known.update(met)
+        self._counter.update(met)
+        return np.array([t for t, _ in rows], dtype=np.int64), np.array([f for _, f in rows]).reshape(-1, 3)
 
     def _check_first_images(self) -> None:
         """Compare the first readable image of each camera with its calibration, before a run starts."""

@@ -18,15 +18,17 @@ from vislam.mapping.cloud.mesh import Mesh, fuse_mesh
 from vislam.mapping.cloud.store import KeyframeStore, Scan
 from vislam.mapping.cloud.surfels import SurfelMap, Surfels
 from vislam.mapping.depth.extract import ScanExtractor
-from vislam.mapping.depth.image import surface_points
+from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.depth.mono import LateDepth
 from vislam.mapping.drive.drive import DriveGrid, DriveMap
 from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
-from vislam.mapping.products import remove_products, write_products
+from vislam.mapping.products import LEVEL, NotLevel, remove_products, write_products
+from vislam.mapping.upright import View, view_of
 
 _RIGID_TOLERANCE = 1e-4
 _MAX_COLOURED_VOXELS = 1 << 22  # of the octree; more, and neighbours share a colour
+_MOST_VIEWS = 200  # keyframes that are asked for the directions of surfaces; 10 ms each
 
 
 class Mapper:
@@ -139,7 +141,7 @@ class Mapper:
         """Return one keyframe's points in its body frame, one per voxel; empty if it has none."""
         if keyframe_id not in self._store:
             return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-        return voxel_filter(self._points(self._store.scan(keyframe_id), np.eye(4)), voxel_m)
+        return voxel_filter(_points(self._store.scan(keyframe_id), self._extractor.view, np.eye(4)), voxel_m)
 
     def cloud(self) -> Cloud:
         """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
@@ -187,20 +189,36 @@ class Mapper:
         surfels = surfels.select(surfels.views >= self._config.surfel_min_views)
         return surfels.select(self.occupancy.state_at(surfels.points_m) != Occupancy.FREE)
 
-    def export(self, folder: Path, step: Callable[[str], None] | None = None) -> dict[str, Path]:
+    def turned(self, T: Array) -> Mapper:
+        """Return a map of the same keyframes with all poses moved by T [4, 4], made anew: voxels cannot be turned."""
+        if np.array_equal(T, np.eye(4)):
+            return self
+        poses = {i: T @ pose for i, pose in sorted((self._occupancy.poses | self._apart).items())}
+        return self._made_again(poses, self._submaps)
+
+    def views(self) -> list[View]:
+        """Return the directions of surfaces that keyframes with dense depth saw, evenly over a long run."""
+        poses, view = self._occupancy.poses, self._extractor.view
+        R_body_cam = self._rig.T_body_cams[0][:3, :3]
+        scans = ((poses[i], self._store.geometry(i).depth) for i in sorted(poses)[:: 1 + len(poses) // _MOST_VIEWS])
+        return [view_of(depth, view, T[:3, :3], R_body_cam) for T, depth in scans if depth is not None]
+
+    def export(
+        self, folder: Path, step: Callable[[str], None] | None = None, not_level: NotLevel = LEVEL
+    ) -> dict[str, Path]:
         """Write the configured products of the map; return what was written, and note what could not be.
 
         Keyframes of submaps that are not joined with the map get one of their own, in a folder `submap_N`. Each file is
-        replaced whole. `step` is told the name of each product before it is made. Raises StorageError when one cannot
-        be written.
+        replaced whole. Where z may not be up, `not_level` says why, and grids are left out. `step` is told the name of
+        each product before it is made. Raises StorageError when one cannot be written.
         """
-        written, self.notes = write_products(self, folder, self._config, step)
+        written, self.notes = write_products(self, folder, self._config, step, not_level.map)
         layers = self._layers()
         for old in sorted(folder.glob("submap_*")):
             if old.name not in layers:
                 remove_products(old)
         for name, layer in layers.items():
-            files, _ = write_products(layer, folder / name, self._config)
+            files, _ = write_products(layer, folder / name, self._config, not_level=not_level.submaps)
             written |= {f"{name}_{product}": path for product, path in files.items()}
             self.notes[f"{name} in the map"] = (
                 f"no loop joined these {len(layer._store.ids)} keyframes with it; {folder.name}/{name} is their own"
@@ -231,10 +249,16 @@ class Mapper:
         layers: dict[str, Mapper] = {}
         for submap in sorted({self._submaps.group(i) for i in self._apart}):
             poses = {i: T for i, T in self._apart.items() if self._submaps.group(i) == submap}
-            layer = layers[f"submap_{submap}"] = Mapper(self._config, self._rig, self._one_camera)
-            layer.restore({i: scan for i in poses if (scan := self._store.packed(i)) is not None}, poses)
-            layer.finish()
+            layers[f"submap_{submap}"] = self._made_again(poses, Submaps())
         return layers
+
+    def _made_again(self, poses: dict[int, Array], submaps: Submaps) -> Mapper:
+        """Return the complete map of some keyframes at other poses."""
+        other = Mapper(self._config, self._rig, self._one_camera)
+        other._submaps = submaps
+        other.restore({i: scan for i in poses if (scan := self._store.packed(i)) is not None}, poses)
+        other.finish()
+        return other
 
     def _scans(self) -> Iterator[tuple[Scan, Array]]:
         for keyframe_id, T_map_body in self._occupancy.poses.items():
@@ -246,21 +270,22 @@ class Mapper:
         sparse_only = True
         for scan, T in self._scans():
             sparse_only = sparse_only and scan.depth is None
-            points = self._points(scan, T)
+            points = _points(scan, self._extractor.view, T)
             seen_from = (T @ self._extractor.view.T_body_view)[:3, 3].astype(np.float32)
             squared_m2 = np.maximum(np.sum((points.points_m - seen_from) ** 2, axis=1), self._config.min_range_m**2)
             # depth from disparity, structured light included, errs with the square of range: weight 1 / sigma^2
             average.add(points, (1.0 / squared_m2**2).astype(np.float32))
         return average, sparse_only
 
-    def _points(self, scan: Scan, T_frame_body: Array) -> Cloud:
-        if scan.depth is not None:
-            points, pixels = surface_points(scan.depth, self._extractor.view, T_frame_body)
-            return Cloud(points, scan.colors.reshape(-1, 3)[pixels])
-        if scan.points_body_m is None:
-            return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-        points_body = scan.points_body_m.astype(np.float64)
-        return Cloud((points_body @ T_frame_body[:3, :3].T + T_frame_body[:3, 3]).astype(np.float32), scan.colors)
+
+def _points(scan: Scan, view: DepthView, T_frame_body: Array) -> Cloud:
+    if scan.depth is not None:
+        points, pixels = surface_points(scan.depth, view, T_frame_body)
+        return Cloud(points, scan.colors.reshape(-1, 3)[pixels])
+    if scan.points_body_m is None:
+        return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    points_body = scan.points_body_m.astype(np.float64)
+    return Cloud((points_body @ T_frame_body[:3, :3].T + T_frame_body[:3, 3]).astype(np.float32), scan.colors)
 
 
 def _check_rigid(T: Array, keyframe_ids: NDArray[np.int64]) -> None:

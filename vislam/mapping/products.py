@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -26,6 +27,19 @@ FILES = {
     "grid": "grid.pgm", "drive": "drive.pgm",
     "mesh": "mesh.ply", "glb": "mesh.glb", "obj": "mesh.obj", "poisson": "poisson.ply", "surfels": "surfels.ply",
 }  # fmt: skip
+
+NEEDS_UP = ("grid", "drive")  # what means nothing in a map that is not level
+
+
+@dataclass(frozen=True, slots=True)
+class NotLevel:
+    """Why z is not known to be up: in the map, and in submaps that are not joined with it; None where it is."""
+
+    map: str | None
+    submaps: str | None
+
+
+LEVEL = NotLevel(None, None)  # z is up everywhere
 
 
 class MapSource(Protocol):
@@ -55,9 +69,12 @@ class MapSource(Protocol):
 
 
 def write_products(
-    source: MapSource, folder: Path, config: MapConfig, step: Callable[[str], None] | None = None
-) -> tuple[dict[str, Path], dict[str, str]]:
+    source: MapSource, folder: Path, config: MapConfig, step: Callable[[str], None] | None = None,
+    not_level: str | None = None,
+) -> tuple[dict[str, Path], dict[str, str]]:  # fmt: skip
     """Write the configured products into a folder; return the files, and the reasons why some are missing.
+
+    Where z of the map may not be up, `not_level` says why: what needs that is removed, if it is there, and not written.
 
     Raises StorageError when one cannot be written.
     """
@@ -82,6 +99,10 @@ def write_products(
         if step is not None:
             step(product)
         path = folder / FILES[product]
+        if not_level is not None and product in NEEDS_UP:
+            notes[product] = not_level
+            _remove_grid(folder, product)
+            continue
         try:
             reason = writers[product](path) if product in writers else _write_mesh(path, *mesh())
         except DataError as error:  # too large for a grid, say; the other products are none the worse
@@ -99,10 +120,15 @@ def remove_products(folder: Path) -> None:
     """Remove the files of a map, and its folder if nothing else is in it."""
     for name in FILES.values():
         (folder / name).unlink(missing_ok=True)
-    for product in ("grid", "drive"):
-        (folder / f"{product}.yaml").unlink(missing_ok=True)
+    for product in NEEDS_UP:
+        _remove_grid(folder, product)
     with suppress(OSError):
         folder.rmdir()
+
+
+def _remove_grid(folder: Path, product: str) -> None:
+    for name in (FILES[product], f"{product}.yaml"):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _write_octree(path: Path, content: bytes) -> None:

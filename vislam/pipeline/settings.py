@@ -8,6 +8,7 @@ from vislam.config import Config, EkfConfig, GraphConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.imu_noise import ImuNoise
+from vislam.core.up import told_up
 from vislam.frontend import lasting_scale_sigma, mode_for
 
 
@@ -20,6 +21,8 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
     itself; who writes settings down or sends them to other processes does so before there is one. Raises UsageError for
     settings that contradict each other.
     """
+    if not isinstance(told_up(config.up), str) or config.up != "auto":
+        refuse_up(noise)
     mode = mode_for(config.frontend, rig)
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
     lasting = lasting_scale_sigma(config.frontend, rig, noise)
@@ -33,6 +36,12 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
         window=replace(config.window, readout_s=readout_s),
         graph=graph if noise is not None else without_gravity(graph, rig),
     )
+
+
+def refuse_up(noise: ImuNoise | None) -> None:
+    """Raise UsageError where up is told, and an IMU knows it."""
+    if noise is not None:
+        raise UsageError("--up is for runs without an IMU, which knows it better; leave it away, or --imu.no-enabled")
 
 
 def refuse_without_scale(ekf: EkfConfig, mode: str, has_imu: bool) -> None:

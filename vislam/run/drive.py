@@ -33,6 +33,7 @@ from vislam.run.evidence import KeyframeWitness, front_evidence, whole_evidence
 from vislam.run.folder import RunLog
 from vislam.run.further_sensors import further_readings
 from vislam.run.geodetic_outputs import GeodeticOutputs, datums_of
+from vislam.run.levelled import Known, find_up
 from vislam.run.loop_gallery import LoopGallery
 from vislam.run.metrics import accuracy, in_metres, initialisation, refuse, sensors_entry, verdict_entry
 from vislam.run.pipeline import Pipeline
@@ -243,11 +244,15 @@ class Run:
         final, rows, loops = self._write_estimates()
         self._explain([] if is_brief else rows)
         truth = self._truth()
-        self.log.write_trajectories(self.out, final, truth)
+        of_map = None if self.base is None or self.joined_t_ns is None else self.base.get("up")
+        level = find_up(self.recording, self.config, Known(final, mapper, self.slam.front, of_map))
+        self.warnings += level.warnings
+        level_path = level.trajectory(final)
+        self.log.write_trajectories(self.out, level_path, truth)
         if mapper is not None:
             with self.slam.clock.measure("map export"):
-                mapper.export(self.out / "map")
-            self.warnings += [f"no {name}: {reason}" for name, reason in mapper.notes.items()]
+                level_map = level.export(mapper, self.out / "map")
+            self.warnings += [f"no {name}: {reason}" for name, reason in level_map.notes.items()]
         show_paths(self.viewer, final, truth, self.slam.front.report().alignment)
         is_level = self.slam.front.start is not None
         if mapper is not None and len(self.log):
@@ -256,8 +261,11 @@ class Run:
         wall_s = time.perf_counter() - start  # everything but pictures and report
         if mapper is not None:
             with self.slam.clock.measure("pictures"):
-                write_pictures(mapper, self.out / "map", final.positions_m, is_level)
-        metrics = self._metrics(final, truth, wall_s, loops)
+                write_pictures(level_map, self.out / "map", level_path.positions_m, level.is_level)
+        metrics = self._metrics(level_path, truth, wall_s, loops)
+        if up := level.entry(final, self.recording.rig):
+            self.session.tell(up)
+            metrics |= up
         estimates = {"filter": self.log.odometry_trajectory(), "graph": final}
         if (datum := self._geodetic.write(self.out, metrics["sensors"], estimates)) is not None:
             self.session.tell({"datum": datum})

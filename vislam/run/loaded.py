@@ -16,6 +16,7 @@ from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Array, LoopDecision
 from vislam.loop.table import LoopRow, read_loops
 from vislam.run.folder import read_metrics, recorded_alignment
+from vislam.run.levelled import onto_map
 from vislam.trajectory import Trajectory, align, associate, read_states_csv, read_tum
 
 _MAX_DRAWN = 2000  # poses per line: more cannot be seen and only make the notebook heavy
@@ -91,7 +92,7 @@ class LoadedRun:
         figure = Figure(figsize=(5.0, 4.0), layout="constrained")
         axes = figure.add_subplot()
         for name, path in drawn.items():
-            x, y, _ = self._onto_truth(path)[:: max(1, len(path) // _MAX_DRAWN)].T
+            x, y, _ = self._onto_truth(onto_map(path, name, self.metrics))[:: max(1, len(path) // _MAX_DRAWN)].T
             is_truth = name == "truth"
             axes.plot(x, y, label=name, color="black" if is_truth else None, linewidth=0.8 if is_truth else 1.4)
         axes.set_aspect("equal", adjustable="datalim")

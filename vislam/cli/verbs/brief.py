@@ -18,7 +18,7 @@ COMMON = (
     "frontend.mode", "frontend.max_tracks", "frontend.readout_s", "frontend.planar.height_m", "calibration.camera",
     "calibration.imu", "calibration.imu_noise", "imu.enabled", "imu.gyro_noise_density", "imu.accel_noise_density",
     "ekf.coupling", "window.keyframes", "loop.enabled", "loop.vocabulary", "loop.tag_size_m", "map.enabled",
-    "map.resolution_m", "map.max_range_m", "map.products", "map.mono_depth.enabled", "view.enabled", "seed",
+    "map.resolution_m", "map.max_range_m", "map.products", "map.mono_depth.enabled", "view.enabled", "up", "seed",
 )  # fmt: skip
 _COLUMN = 40
 _WIDEST = 120

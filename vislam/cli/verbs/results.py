@@ -52,6 +52,10 @@ def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {loops['accepted']} loops of "
         f"{loops['candidates']} candidates, {number(metrics['realtime_factor'], 1)} x real time"
     )
+    if metrics.get("up"):
+        from vislam.run.levelled import up_sentence
+
+        console.print(f"{printable(up_sentence(metrics['up']))}.", soft_wrap=True, markup=False, highlight=False)
     _print_cost(console, metrics["cost"])
     for warning in metrics["warnings"]:
         console.print(f"warning: {printable(warning)}", style="yellow", markup=False)

@@ -3,12 +3,13 @@
 Intrinsics are those that the benchmark publishes per camera (Sturm et al., "A benchmark for the evaluation of RGB-D
 SLAM systems", IROS 2012, and the page "file formats" beside it), unless the folder brings its own calibration. Depth is
 registered to colour, 5000 units per metre; the page's depth correction is already in the images. The accelerometer has
-no gyroscope beside it and is ignored.
+no gyroscope beside it: it says which way is up, and nothing else.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,12 @@ from vislam.core.errors import DataError
 from vislam.datasets.calibration import CAMERA_EXAMPLE, CameraFile, read_camera
 from vislam.datasets.formats.truth import tum_truth
 from vislam.datasets.images import ImageList
-from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import Problems, parse_seconds, read_names
+from vislam.datasets.stream import ForceRows, Survey, image_list
+from vislam.datasets.tables import Problems, Row, parse_seconds, read_names, read_numbers
 
 LOOKS_FOR = "rgb.txt"
 _DEPTH_UNITS_PER_M = 5000.0
+_FORCE_SIGNS = (-1.0, -1.0, 1.0)  # of the Kinect's accelerometer in camera axes, as freiburg1_desk's truth shows
 _CALIBRATION_FILES = ("sensor.yaml", "calibration.yaml")
 _FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
 _FR2 = (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)
@@ -66,9 +68,20 @@ def survey(path: Path) -> Survey:
         depth_units_per_m=(calibration and calibration.depth_units_per_m) or _DEPTH_UNITS_PER_M,
         rig=rig,
         truth=tum_truth(truth) if truth.is_file() else None,
+        forces=_forces(path / "accelerometer.txt") if (path / "accelerometer.txt").is_file() else None,
         problems=problems,
         errors=tuple(errors),
     )
+
+
+def _forces(path: Path) -> ForceRows:
+    """Return what reads an accelerometer's file: seconds and three numbers, turned into the camera's axes."""
+
+    def read(problems: Problems) -> Iterator[Row[list[float]]]:
+        for t_ns, (x, y, z) in read_numbers(path, 3, problems, parse_seconds, separator=None):
+            yield t_ns, [_FORCE_SIGNS[0] * x, _FORCE_SIGNS[1] * y, _FORCE_SIGNS[2] * z]
+
+    return read
 
 
 def _images(name: str, root: Path, list_name: str, problems: Problems) -> ImageList:

@@ -23,6 +23,7 @@ from vislam.loop.table import read_loops
 from vislam.run.folder import RunLog, read_metrics, recorded_alignment
 from vislam.run.further_sensors import suite_of
 from vislam.run.geodetic_outputs import LINES, TABLES, GeodeticOutputs
+from vislam.run.levelled import Levelled, stored_level
 from vislam.run.metrics import with_own_of_graph
 from vislam.run.session import Session, SessionWriter, recall
 from vislam.trajectory import evaluate, read_tum, write_states_csv, write_tum
@@ -94,7 +95,7 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
         "moved_max_m": float(moved_m.max()),
         "note": redone.update.note,
     }
-    return answer | {"written": ["session.db", *_write(run, log, redone, answer)]}
+    return answer | {"written": ["session.db", *_write(run, log, redone, answer, stored_level(info))]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,11 +149,12 @@ def _optimise(config: Config, info: dict[str, Any], memory: SlamMemory) -> _Redo
     return _Redone(graph, graph.finish(), graph.take_news(), config)
 
 
-def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any]) -> list[str]:
+def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any], level: Levelled) -> list[str]:
     """Write the trajectory, states, loops and metrics of the run again; return the names of the files."""
     graph, states = redone.graph, redone.graph.states()
     ids = graph.ids.tolist()
-    final = log.final_trajectory(ids, graph.poses(), states, redone.config.imu)
+    estimated = log.final_trajectory(ids, graph.poses(), states, redone.config.imu)
+    final = level.trajectory(estimated)
     if (run / "trajectory_graph.tum").is_file() and not (run / _FIRST).exists():
         shutil.copyfile(run / "trajectory_graph.tum", run / _FIRST)
     write_tum(final, run / "trajectory_graph.tum")
@@ -163,7 +165,7 @@ def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any]) -> l
     if metrics:
         metrics |= {"loops": counts, "loops_changed": answer}
         metrics["sensors"] = with_own_of_graph(metrics.get("sensors", {}), graph)
-        estimates = {"filter": log.odometry_trajectory(), "graph": final}
+        estimates = {"filter": log.odometry_trajectory(), "graph": estimated}
         if GeodeticOutputs({}).write(run, metrics["sensors"], estimates) is not None:
             written += [TABLES["graph"], LINES]
         truth = run / "trajectory_truth.tum"

@@ -19,6 +19,7 @@ from vislam.core.messages import NavState
 from vislam.factors.factor_log import FactorLog
 from vislam.run.folder import read_metrics, recorded_alignment
 from vislam.run.further_sensors import suite_of
+from vislam.run.levelled import Levelled, stored_level
 from vislam.run.session import Session
 from vislam.sensors import Suite
 from vislam.trajectory import Alignment, Trajectory, evaluate, read_tum, write_states_csv, write_tum
@@ -35,10 +36,10 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
     """
     _check(run, name)
     start = time.perf_counter()
-    log, settings = _read(run, config)
+    log, settings, level = _read(run, config)
     suite, problems = _suite(settings, log)
     result = optimize_run(log, settings, suite)
-    trajectory = _placed(log, result.states, settings.imu.max_gap_s)
+    trajectory = level.trajectory(_placed(log, result.states, settings.imu.max_gap_s))
     metrics = read_metrics(run)
     entry = _entry(result, log, trajectory, problems)
     entry["sensors"] = _sensors(result, suite)
@@ -49,7 +50,7 @@ def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, A
         metrics.setdefault("accuracy", {})[name] = accuracy[alignment]
     metrics.setdefault("batch", {})[name] = entry
     write_tum(trajectory, run / f"trajectory_{name}.tum")
-    write_states_csv(run / f"states_{name}.csv", range(len(result.states)), result.states)
+    write_states_csv(run / f"states_{name}.csv", range(len(result.states)), level.states(result.states))
     write_json(run / "metrics.json", metrics)
     return entry
 
@@ -71,11 +72,12 @@ def _check(run: Path, name: str) -> None:
         raise UsageError(f"--out-name '{name}': small letters, digits and _ only, and none of {', '.join(_TAKEN)}")
 
 
-def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config]:
-    """Return the factor log and the settings; of those stored, the ones that this version knows."""
+def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config, Levelled]:
+    """Return the factor log, the settings (of those stored, the ones that this version knows), and which way is up."""
     session = Session(run / "session.db")
     try:
-        stored = session.info().get("config")
+        info = session.info()
+        stored, level = info.get("config"), stored_level(info)
         log = session.factor_log()
     finally:
         session.close()
@@ -86,7 +88,7 @@ def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config]:
         if isinstance(values, dict):
             data[section] = {key: value for key, value in values.items() if key in known}
     try:
-        return log, from_data(data, source=str(run / "session.db"))
+        return log, from_data(data, source=str(run / "session.db")), level
     except UsageError as error:
         raise DataError(f"{error}; the settings stored with the run are damaged, run the recording again") from error
 

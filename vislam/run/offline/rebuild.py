@@ -20,12 +20,15 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.files import write_json
 from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
+from vislam.core.up import Up
 from vislam.factors.factor_log import rig_from
 from vislam.frontend import mode_for
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.of_map import write_pictures
+from vislam.mapping.upright import up_of_planes
 from vislam.run.folder import read_setup
+from vislam.run.levelled import Levelled, stored_level
 from vislam.run.session import Session
 from vislam.run.sources import open_source
 from vislam.trajectory import read_trajectory
@@ -58,7 +61,8 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         info = session.info()
         ran = session.config()
         rig = rig_from(info["rig"])
-        placed = _poses(session, run, poses)
+        level = stored_level(info)
+        placed = _poses(session, run, poses, level.T_level_map)
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
         one_camera = ran.map.mono_depth.enabled and mode_for(ran.frontend, rig) == "mono"
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
@@ -75,11 +79,13 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     finally:
         session.close()
     mapper.finish()
+    if info.get("first_state") is None:
+        level, mapper, placed = _levelled(level, mapper, placed, ran)
     folder = run / "map" if out is None else out
     steps = iter(range(len(placed), total))
-    written = mapper.export(folder, lambda product: tell(next(steps), product))
+    written = mapper.export(folder, lambda product: tell(next(steps), product), level.not_level)
     path_m = np.array([T[:3, 3] for T in placed.values()]).reshape(-1, 3)
-    pictures = write_pictures(mapper, folder, path_m, info.get("first_state") is not None)
+    pictures = write_pictures(mapper, folder, path_m, level.is_level)
     answer: dict[str, Any] = {
         "keyframes": len(placed),
         "depth": "session" if from_session else "recording",
@@ -88,8 +94,22 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         "pictures": [str(path) for path in pictures],
         "left_out": mapper.notes,
     }
+    if level.up is not None:
+        answer["up"] = level.up.entry()
     write_json(folder / "map.json", {**answer, "settings": asdict(config)})
     return answer
+
+
+def _levelled(
+    level: Levelled, mapper: Mapper, placed: dict[int, Array], ran: Config
+) -> tuple[Levelled, Mapper, dict[int, Array]]:
+    """Return up, map and poses of a run without gravity; where the run did not know up, its surfaces are asked."""
+    if level.up is not None:
+        return level, mapper, placed  # it is level already
+    is_asked = ran.up == "auto"
+    level = Levelled(up_of_planes(mapper.views()) if is_asked else Up.unknown(f"the run had --up {ran.up}"))
+    T = level.T_level_map
+    return level, mapper.turned(T), {i: T @ pose for i, pose in placed.items()}
 
 
 def _teller(progress: Progress | None, total: int) -> Callable[[int, str], None]:
@@ -108,13 +128,16 @@ def _same_extraction(ran: MapConfig, config: MapConfig, rig: Rig) -> bool:
     return ScanExtractor(ran, rig).view.unit_m == ScanExtractor(config, rig).view.unit_m
 
 
-def _poses(session: Session, run: Path, poses: str) -> dict[int, Array]:
-    """Return T_map_body of the keyframes by id, in order; those before and after the trajectory are left out."""
+def _poses(session: Session, run: Path, poses: str, T_level_map: Array) -> dict[int, Array]:
+    """Return T_map_body of the keyframes by id, in order; those before and after the trajectory are left out.
+
+    Session and causal trajectories are in the axes of the first image where the run had no gravity: they are turned.
+    """
     stored = [(i, t_ns, T) for i, t_ns, T in ((k.id, k.t_ns, k.T_map_body) for k in session.keyframes())]
     if not stored:
         raise DataError(f"{session.path} holds no keyframe; run the recording again")
     if poses == "graph":
-        return {i: T for i, _, T in stored}
+        return {i: T_level_map @ T for i, _, T in stored} if _is_turn(T_level_map) else {i: T for i, _, T in stored}
     path = run / f"trajectory_{poses}.tum"
     if not path.is_file():
         names = sorted(p.stem.removeprefix("trajectory_") for p in run.glob("trajectory_*.tum"))
@@ -122,7 +145,13 @@ def _poses(session: Session, run: Path, poses: str) -> dict[int, Array]:
     trajectory = read_trajectory(path)
     inside = [(i, t_ns) for i, t_ns, _ in stored if trajectory.t_ns[0] <= t_ns <= trajectory.t_ns[-1]]
     T = trajectory.at(np.array([t_ns for _, t_ns in inside], dtype=np.int64))
+    if poses in ("ekf", "live") and _is_turn(T_level_map):
+        T = T_level_map @ T
     return {i: T[k] for k, (i, _) in enumerate(inside)}
+
+
+def _is_turn(T: Array) -> bool:
+    return not np.array_equal(T, np.eye(4))
 
 
 def _submaps(session: Session) -> Submaps:

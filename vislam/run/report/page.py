@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vislam.core.files import write_text
+from vislam.run.levelled import up_sentence
 from vislam.run.report import plots
 from vislam.run.report.html import (
     Cell,
@@ -105,6 +106,7 @@ def _head(run: RunFiles) -> str:
         if noise:
             told, seen = number(noise.get("told"), 5), number(noise.get("typical"), 5)
             parts.append(f"{sensor}: white noise of {seen} in motion, {told} told (SI units per √Hz).")
+    parts += [f"{up_sentence(up)}."] if (up := as_dict(m, "up")) else []
     parts += _track_noise(as_dict(m, "track_noise"))
     source = run.manifest.get("source")
     if source:
@@ -228,7 +230,7 @@ def _trajectories(run: RunFiles, scene: Scene) -> str:
     views = grid(
         card(plots.top_view(run, scene), title="From above"), card(plots.side_view(scene), title="From the side")
     )
-    tilted = not scene.has_gravity and scene.truth is None
+    tilted = not scene.has_gravity and scene.truth is None and not as_dict(run.metrics, "up").get("direction")
     text = "There is no IMU to tell what is up: z is that of the first camera." if tilted else ""
     return section("Trajectories", views, note(text) if text else "")
 

@@ -12,6 +12,7 @@ from vislam.core.errors import VislamError
 from vislam.core.geometry import invert, sim3_parts, transform
 from vislam.core.messages import Array
 from vislam.run.folder import recorded_alignment
+from vislam.run.levelled import onto_map
 from vislam.run.report.run_files import RunFiles, as_dict
 from vislam.trajectory import Trajectory, align, associate, nees
 
@@ -31,7 +32,8 @@ class ErrorCurve:
 class Scene:
     """Trajectories in one frame, aligned where there is a truth; times count from `zero_ns`.
 
-    The frame is the map (z up). Without an IMU the map is tilted as the first camera was, so then it is the truth's.
+    The frame is the map (z up). Without an IMU nothing but the run's own word says that it is level, so then it is
+    the truth's.
     """
 
     zero_ns: int
@@ -61,7 +63,7 @@ def build_scene(run: RunFiles) -> Scene:
         scene.has_gravity = False
         scene.labels["ekf"] = "odometry"  # without an IMU there is no filter
     if run.truth is None:
-        scene.paths = dict(run.estimates)
+        scene.paths = {name: onto_map(path, name, run.metrics) for name, path in run.estimates.items()}
         return scene
     alignment = recorded_alignment(run.metrics)
     aligned: dict[str, Trajectory] = {}

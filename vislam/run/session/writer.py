@@ -112,7 +112,7 @@ class SessionWriter:
                 writer._db.execute("DELETE FROM states WHERE whose = 'filter'")
                 writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2')")
                 count = writer._db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
-                origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only}
+                origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only, **base.up()}
                 sensors = {"imu_noise": None if noise is None else asdict(noise)}
                 writer._tell({**info, **sensors, "map": origin, "finished": False})
             writer._db.close()
