@@ -1,7 +1,6 @@
 """Runs without an IMU: what is final of them stands upright, or says why not."""
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,8 +167,8 @@ def test_a_recording_without_an_accelerometer_has_no_forces(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "up"), [("tum_fr1_desk", (0, 0, 1)), ("hololens_000", (0, 1, 0))])
-def test_recordings_stand_upright(name, up, tmp_path):
-    path = Path(os.environ.get("VISLAM_DATA", "/nowhere")) / name
+def test_recordings_stand_upright(name, up, data_root, tmp_path):
+    path = data_root / name
     if not path.is_dir():
         missing(f"needs {path}")
     config = replace(CONFIG, map=MapConfig(products=("cloud",)))

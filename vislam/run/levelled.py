@@ -144,10 +144,8 @@ class Known:
 def find_up(recording: Recording, config: Config, known: Known) -> Levelled:
     """Return which way is up, without gravity: as told, by the map, the accelerometer, the floor, or surfaces."""
     told = told_up(config.up)
-    if known.front.start is not None:
+    if known.front.start is not None or not len(known.path):
         return Levelled()
-    if not len(known.path):
-        return Levelled(Up.unknown("there is no trajectory"))
     if not isinstance(told, str):
         up = known.path.T_world_body[0, :3, :3] @ recording.rig.T_body_cams[0][:3, :3] @ told
         return Levelled(Up("told", up / np.linalg.norm(up), None, 1.0, f"--up {config.up}"))
