@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import heapq
 import time
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
+from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
@@ -41,23 +43,27 @@ class Outages:
 class ReplaySource:
     """Satisfies `LiveSource`: any source of `vislam run` that has an IMU."""
 
-    def __init__(self, uri: str, seed: int = 0, outages: Outages | None = None) -> None:
+    def __init__(
+        self,
+        uri: str,
+        seed: int = 0,
+        outages: Outages | None = None,
+        calibration: CalibrationConfig | None = None,
+    ) -> None:
         """Read the inertial data of a recording; images are read as they are played.
 
-        Raises UsageError for an unknown source, DataError when it has no inertial data.
+        `calibration` names files that take the place of what the recording says itself, as in `vislam run`. Raises
+        UsageError for an unknown source, or for such files where it takes none; DataError when it cannot be used or has
+        no inertial data.
         """
-        recording = open_source(uri, seed)
+        self._open: Callable[[], Recording] = partial(open_source, uri, seed, calibration)
+        recording = self._open()
         self.name = f"live {recording.name}"
         self.rig, self.imu_noise = recording.rig, recording.imu_noise
         self.frame_count, self.problems = 0, recording.problems
-        samples = [value for value in recording.events(_NO_FRAMES_NS) if isinstance(value, ImuSample)]
-        if len(samples) < 2 or recording.imu_noise is None:
+        if recording.imu_noise is None:
             raise DataError(f"{uri} has no inertial data to play")
-        self._table = InertialTable(
-            np.array([sample.t_ns for sample in samples], dtype=np.int64),
-            np.array([[*sample.gyro_rad_s, *sample.accel_m_s2] for sample in samples]),
-            recording.imu_noise.rate_hz,
-        )
+        self._table = _inertial_table(recording, uri, recording.imu_noise.rate_hz)
         self.duration_s: float | None = float(self._table.t_ns[-1] - self._table.t_ns[0]) / _NS
         self._zero_ns = int(self._table.t_ns[0])
         self.has_camera, self.is_mag_calibrated = True, False  # its magnetometer is not played
@@ -74,7 +80,7 @@ class ReplaySource:
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what plays the frames."""
-        return partial(ReplayedFrames, self._uri, self._seed, self._zero_ns, self._epoch, self._outages.camera)
+        return partial(ReplayedFrames, self._open, self._zero_ns, self._epoch, self._outages.camera)
 
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
         """Return what plays the files of further sensors, and draws those that are simulated on the truth.
@@ -82,7 +88,7 @@ class ReplaySource:
         Raises UsageError for a sensor that has neither.
         """
         refuse_unread(setup, {**setup.files, **setup.simulated_hz}, "a replay needs its file, or simulated_hz")
-        streams = partial(read_along, self._uri, setup, self._seed)
+        streams = partial(read_along, self._open, setup, self._seed)
         return partial(ReplayedReadings, setup.suite.names, streams, self._zero_ns, self._epoch)
 
     def helpers(self) -> dict[str, Callable[[Life], None]]:
@@ -98,7 +104,7 @@ class ReplaySource:
 
     def truth(self) -> Trajectory | None:
         """Return the truth at the times when it was played."""
-        truth = open_source(self._uri, self._seed).truth()
+        truth = self._open().truth()
         shift_ns = self._epoch.begin_ns() - self._zero_ns
         return None if truth is None else Trajectory(truth.t_ns + shift_ns, truth.T_world_body)
 
@@ -107,11 +113,14 @@ class ReplayedFrames:
     """Plays the frames of a recording at their times; those that nobody took in time are dropped and counted."""
 
     def __init__(
-        self, uri: str, seed: int, zero_ns: int, epoch: Epoch, outages: tuple[tuple[float, float], ...] = ()
+        self,
+        opener: Callable[[], Recording],
+        zero_ns: int,
+        epoch: Epoch,
+        outages: tuple[tuple[float, float], ...] = (),
     ) -> None:
         """Open the recording; `zero_ns` of it is the epoch."""
-        recording: Recording = open_source(uri, seed)
-        self._frames = (value for value in recording.events() if isinstance(value, Frame))
+        self._frames = (value for value in opener().events() if isinstance(value, Frame))
         self._zero_ns, self._epoch, self._outages = zero_ns, epoch, outages
         self._next: Frame | None = next(self._frames, None)
         self._counts = {"captured": 0, "dropped": 0}
@@ -152,12 +161,26 @@ class ReplayedFrames:
         self._next = None
 
 
-def read_along(uri: str, setup: SensorSetup, seed: int) -> Iterator[Reading]:
+def _inertial_table(recording: Recording, uri: str, rate_hz: float) -> InertialTable:
+    """Return the inertial samples of a recording, 56 bytes each; raises DataError when it has none."""
+    t_ns, values = array("q"), array("d")
+    for value in recording.events(_NO_FRAMES_NS):
+        if isinstance(value, ImuSample):
+            t_ns.append(value.t_ns)
+            values.extend((*value.gyro_rad_s, *value.accel_m_s2))
+    if len(t_ns) < 2:
+        raise DataError(f"{uri} has no inertial data to play")
+    return InertialTable(
+        np.frombuffer(t_ns, dtype=np.int64), np.frombuffer(values, dtype=np.float64).reshape(-1, 6), rate_hz
+    )
+
+
+def read_along(opener: Callable[[], Recording], setup: SensorSetup, seed: int) -> Iterator[Reading]:
     """Return the readings of all further sensors beside a recording in time order.
 
     Raises DataError where one cannot be read, or shall be drawn and the recording has no truth.
     """
-    further = FurtherReadings(open_source(uri, seed), setup, seed)
+    further = FurtherReadings(opener(), setup, seed)
     return heapq.merge(*further.streams(), key=lambda reading: reading.t_ns)
 
 

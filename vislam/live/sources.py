@@ -56,7 +56,8 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
         cart = VirtualCart(_place_options(rest), config.imu.gravity_m_s2)
         return cart, cart.settings(config)
     if asked.startswith("replay:"):
-        return ReplaySource(asked.removeprefix("replay:"), config.seed), config
+        replay = ReplaySource(asked.removeprefix("replay:"), config.seed, calibration=config.calibration)
+        return replay, with_clock(config)
     inertial, plus, camera = asked.partition("+")
     if not plus and kind.partition(":")[0] in WITH_IMU:
         inertial, camera = kind, asked  # a camera with the IMU inside it
