@@ -43,6 +43,7 @@ lenses = st.one_of(
     st.tuples(st.just("radtan"), st.tuples(*[numbers] * 4)),
     st.tuples(st.just("radtan"), st.tuples(*[numbers] * 5)),
     st.tuples(st.just("equidistant"), st.tuples(*[numbers] * 4)),
+    st.tuples(st.just("rational"), st.tuples(*[numbers] * 8)),
 )
 cameras = st.builds(
     lambda size, f, c, skew, lens: Camera(*size, *f, *c, skew, *lens),
@@ -67,8 +68,9 @@ def same_camera(a: Camera, b: Camera) -> bool:
     """Equal but for coefficients that are zero anyway."""
 
     def key(camera: Camera) -> tuple[object, ...]:
-        k = [*camera.coefficients, *[0.0] * (5 - len(camera.coefficients))]
-        return replace(camera, distortion="none", coefficients=()), camera.distortion if any(k) else "none", k
+        k = [*camera.coefficients, *[0.0] * (8 - len(camera.coefficients))]
+        model = "radtan" if camera.distortion == "rational" and not any(k[5:]) else camera.distortion
+        return replace(camera, distortion="none", coefficients=()), model if any(k) else "none", k
 
     return key(a) == key(b)
 
@@ -110,7 +112,7 @@ def test_kalibrs_relative_poses_are_followed() -> None:
 
 
 RATIONAL = camera_info_text(replace(CAMERA, coefficients=(-0.1, 0.01, 1e-4, 2e-4, 0.5)), "c")
-RATIONAL = RATIONAL.replace("plumb_bob", "rational_polynomial").replace("0.5]", "0.5, 0.1, 0.1, 0.1]")
+RATIONAL = RATIONAL.replace("plumb_bob", "rational_polynomial").replace("0.5]", "0.5, 0.1, 0.1, 0.1, 0.1]")
 
 
 @pytest.mark.parametrize(

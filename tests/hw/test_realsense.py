@@ -85,8 +85,10 @@ def test_brown_conrady_is_taken_over(world: World) -> None:
     world.coeffs = [-0.05, 0.06, 0.001, 0.002, -0.02]
     camera = factory_rig("realsense", SENSORS)[0].cameras[0]
     assert (camera.distortion, camera.coefficients) == ("radtan", tuple(world.coeffs))
-    with pytest.raises(DataError, match="radtan"):  # a rational model: k4 and more
-        factory_camera((640, 480), (1.0, 1.0, 0.0, 0.0), "radtan", [0.1, 0, 0, 0, 0, 0.2])
+    lens = factory_camera((640, 480), (1.0, 1.0, 0.0, 0.0), "radtan", [0.1, 0, 0, 0, 0, 0.2])
+    assert (lens.distortion, lens.coefficients) == ("rational", (0.1, 0, 0, 0, 0, 0.2, 0, 0))
+    with pytest.raises(DataError, match="has the first 8"):  # thin prisms
+        factory_camera((640, 480), (1.0, 1.0, 0.0, 0.0), "radtan", [0.1, 0, 0, 0, 0, 0, 0, 0, 0.2])
 
 
 def test_a_stereo_pair_is_stamped_by_the_devices_clock(world: World) -> None:

@@ -1,7 +1,8 @@
 """Cameras and rigs: projection, unprojection, undistortion of points and images, stereo rectification.
 
-Two distortion models on a pinhole with pixel skew: radial-tangential (Brown; k1, k2, p1, p2[, k3], as in OpenCV) and
-equidistant (Kannala-Brandt, PAMI 2006; k1..k4, as in OpenCV's fisheye and in Kalibr).
+Three distortion models on a pinhole with pixel skew: radial-tangential (Brown; k1, k2, p1, p2[, k3], as in OpenCV),
+rational (the same over a polynomial; k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV's CALIB_RATIONAL_MODEL and ROS have it)
+and equidistant (Kannala-Brandt, PAMI 2006; k1..k4, as in OpenCV's fisheye and in Kalibr).
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 
 MapF32 = NDArray[np.float32]
-Distortion = Literal["none", "radtan", "equidistant"]
+Distortion = Literal["none", "radtan", "equidistant", "rational"]
 
-_MODEL_CODES = {"none": 0, "radtan": 1, "equidistant": 2}
-_COEFFICIENT_COUNTS = {"none": (0,), "radtan": (4, 5), "equidistant": (4,)}
+_MODEL_CODES = {"none": 0, "radtan": 1, "equidistant": 2, "rational": 3}
+_COEFFICIENT_COUNTS = {"none": (0,), "radtan": (4, 5), "equidistant": (4,), "rational": (8,)}
 _MAX_NEWTON_STEPS = 20
 _MIN_Z_M = 1e-6
+_NO_COEFFICIENT = 1e-12  # of a polynomial in r^2: what it changes at any radius that a lens sees is no pixel's part
 
 
 @njit(cache=True, nogil=True)
@@ -53,6 +55,21 @@ def _distort(x: float, y: float, model: int, k: Array) -> tuple[float, float, fl
         # d(scale)/dr divided by r, so that multiplying by x and y gives the gradient of scale
         change = (slope / (1.0 + r2) - scale) / r2
         return x * scale, y * scale, scale + change * x * x, change * x * y, change * x * y, scale + change * y * y
+    if model == 3:
+        over = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+        under = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+        if not under > 0.0:  # at a pole, which lies beyond what the model can see
+            return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
+        radial = over / under
+        over_slope = k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2)
+        under_slope = k[5] + r2 * (2.0 * k[6] + 3.0 * k[7] * r2)
+        slope = 2.0 * (over_slope - radial * under_slope) / under
+        u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
+        v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
+        ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
+        uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
+        vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
+        return u, v, ux, uy, uy, vy
     return x, y, 1.0, 0.0, 0.0, 1.0
 
 
@@ -91,6 +108,21 @@ def _project_jacobian(points: Array, pinhole: Array, model: int, k: Array) -> Ar
 
 
 @njit(cache=True, nogil=True)
+def _first_guess(u0: float, v0: float, model: int, max_r2: float) -> tuple[float, float]:
+    """Return where to begin the search of the ray to a distorted point; NaN where there is none."""
+    if model == 2:  # on the undistorted side: theta ~ bent radius
+        bent = np.sqrt(u0 * u0 + v0 * v0)
+        if bent >= 1.5:
+            return np.nan, np.nan
+        if bent > 1e-9:
+            return u0 * np.tan(bent) / bent, v0 * np.tan(bent) / bent
+    elif model == 3 and u0 * u0 + v0 * v0 > max_r2:  # where the model holds
+        shrink = 0.9 * np.sqrt(max_r2 / (u0 * u0 + v0 * v0))
+        return u0 * shrink, v0 * shrink
+    return u0, v0
+
+
+@njit(cache=True, nogil=True)
 def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: float) -> Array:
     """Invert the projection by Newton's method with halved steps; NaN where no ray gives the pixel."""
     out = np.full((len(pixels), 2), np.nan)
@@ -100,14 +132,9 @@ def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: floa
         u0 = (pixels[i, 0] - cx - skew * v0) / fx
         if not (np.isfinite(u0) and np.isfinite(v0)):
             continue
-        x, y = u0, v0
-        if model == 2:
-            # start on the undistorted side: theta ~ bent radius
-            bent = np.sqrt(u0 * u0 + v0 * v0)
-            if bent >= 1.5:
-                continue
-            if bent > 1e-9:
-                x, y = u0 * np.tan(bent) / bent, v0 * np.tan(bent) / bent
+        x, y = _first_guess(u0, v0, model, max_r2)
+        if np.isnan(x):
+            continue
         u, v, ux, uy, vx, vy = _distort(x, y, model, k)
         error = (u - u0) ** 2 + (v - v0) ** 2
         for _ in range(_MAX_NEWTON_STEPS):
@@ -122,6 +149,9 @@ def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: floa
             improved = False
             while step > 1e-3:
                 xn, yn = x + step * dx, y + step * dy
+                if model == 3 and xn * xn + yn * yn > max_r2:  # behind a pole other rays give the same pixel
+                    step *= 0.5
+                    continue
                 un, vn, uxn, uyn, vxn, vyn = _distort(xn, yn, model, k)
                 new_error = (un - u0) ** 2 + (vn - v0) ** 2
                 if new_error < error:
@@ -180,7 +210,7 @@ class Camera:
 
     @cached_property
     def _k(self) -> Array:
-        k = np.zeros(5)
+        k = np.zeros(max(5, len(self.coefficients)))
         k[: len(self.coefficients)] = self.coefficients
         return k
 
@@ -194,6 +224,8 @@ class Camera:
             slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[4]])
             limit = _smallest_positive_root(slope)
             return limit if np.isfinite(limit) else float("inf")
+        if self.distortion == "rational":
+            return _rational_limit(k)
         slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]])
         theta = min(float(np.sqrt(_smallest_positive_root(slope))), np.deg2rad(89.5))
         return float(np.tan(theta) ** 2)
@@ -252,6 +284,15 @@ class Camera:
 
 def _rows(values: Array, columns: int) -> Array:
     return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)
+
+
+def _rational_limit(k: Array) -> float:
+    """Return the squared radius at which r * over(r^2) / under(r^2) first turns back, or meets a pole."""
+    over = np.polynomial.Polynomial([1.0, k[0], k[1], k[4]])
+    under = np.polynomial.Polynomial([1.0, k[5], k[6], k[7]])
+    r2 = np.polynomial.Polynomial([0.0, 1.0])
+    slope = over * under + 2.0 * r2 * (over.deriv() * under - over * under.deriv())
+    return min(_smallest_positive_root(part.trim(_NO_COEFFICIENT)) for part in (slope, under))
 
 
 def _smallest_positive_root(polynomial: np.polynomial.Polynomial) -> float:

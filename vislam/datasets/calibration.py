@@ -26,9 +26,11 @@ DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write t
 _MAX_YAML_BYTES = 2**18
 MODELS: dict[str, Distortion] = {
     "radial-tangential": "radtan", "radtan": "radtan", "plumb_bob": "radtan",
-    "equidistant": "equidistant", "fisheye": "equidistant", "none": "none",
+    "equidistant": "equidistant", "fisheye": "equidistant", "none": "none", "rational_polynomial": "rational",
 }  # fmt: skip
-MODEL_NAMES: dict[Distortion, str] = {"radtan": "radial-tangential", "equidistant": "equidistant", "none": "none"}
+MODEL_NAMES: dict[Distortion, str] = {
+    "radtan": "radial-tangential", "equidistant": "equidistant", "none": "none", "rational": "rational_polynomial",
+}  # fmt: skip
 NOISE_KEYS = {
     "gyro_noise_density": "gyroscope_noise_density",
     "accel_noise_density": "accelerometer_noise_density",

@@ -19,8 +19,14 @@ from vislam.core.messages import Array
 from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_camera, read_pose
 
 _MAX_CAMERAS = 2
-_KALIBR_MODELS: dict[Distortion, str] = {"radtan": "radtan", "equidistant": "equidistant", "none": "none"}
-_ROS_MODELS: dict[Distortion, str] = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
+_RATIONAL = "rational_polynomial"
+_KALIBR_MODELS: dict[Distortion, str] = {
+    "radtan": "radtan", "equidistant": "equidistant", "none": "none",
+    "rational": _RATIONAL,  # which Kalibr does not have
+}  # fmt: skip
+_ROS_MODELS: dict[Distortion, str] = {
+    "radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob", "rational": _RATIONAL,
+}  # fmt: skip
 _RIGID = 1e-3
 
 
@@ -130,16 +136,22 @@ def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list
     Raises DataError for a lens that vislam does not have.
     """
     width, height = size_px
-    if name in ("equidistant", "fisheye") and len(coefficients) >= 4 and not any(coefficients[4:]):
+    if name in ("equidistant", "fisheye", "kannala_brandt") and len(coefficients) >= 4 and not any(coefficients[4:]):
         model: Distortion = "equidistant"
         coefficients = coefficients[:4]
-    elif name in ("plumb_bob", "rational_polynomial", "none", "") and not any(coefficients):
+    elif name in ("plumb_bob", _RATIONAL, "none", "") and not any(coefficients):
         model = "none"
-    elif name in ("plumb_bob", "rational_polynomial") and not any(coefficients[5:]):
+    elif name in ("plumb_bob", _RATIONAL) and not any(coefficients[5:]):
         model = "radtan"
         coefficients = coefficients[: 5 if len(coefficients) > 4 and coefficients[4] != 0.0 else 4]
+    elif name == _RATIONAL and not any(coefficients[8:]):  # thin prisms and tilted sensors are behind the eighth
+        model = "rational"
+        coefficients = (coefficients + [0.0] * 8)[:8]
     else:
-        raise DataError(f"{where}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob")
+        raise DataError(
+            f"{where}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob, "
+            f"{_RATIONAL} with 8, or equidistant with 4"
+        )
     try:
         return Camera(
             width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model,

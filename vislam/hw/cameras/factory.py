@@ -26,15 +26,15 @@ def factory_camera(
     Args:
         size: width and height, px.
         pinhole: fx, fy, cx, cy, px.
-        model: `none`, `radtan` (k1, k2, p1, p2, k3, and more that have to be 0), `equidistant` (k1 to k4), or the
-            maker's name of another one, which is refused unless its coefficients are 0.
+        model: `none`, `radtan` (k1, k2, p1, p2, k3; with k4 to k6 that are not 0 `rational`; more have to be 0),
+            `equidistant` (k1 to k4), or the maker's name of another, which is refused unless its coefficients are 0.
         coefficients: of it.
 
     Raises:
         DataError: a model, or coefficients, that vislam does not have; or numbers that are none of a camera.
     """
     given = [float(value) for value in coefficients]
-    taken = {"radtan": 5, "equidistant": 4}.get(model, 0)
+    taken = {"radtan": 8, "equidistant": 4}.get(model, 0)
     if any(given[taken:]):
         raise DataError(
             f"the camera's factory calibration has distortion '{model}' with coefficients {given}, of which vislam "
@@ -43,7 +43,11 @@ def factory_camera(
     kept = tuple(given[:taken])
     if not any(kept):
         return Camera(*size, *pinhole)
-    return Camera(*size, *pinhole, distortion="radtan" if model == "radtan" else "equidistant", coefficients=kept)
+    if model == "equidistant":
+        return Camera(*size, *pinhole, distortion="equidistant", coefficients=kept)
+    if any(kept[5:]):
+        return Camera(*size, *pinhole, distortion="rational", coefficients=(*kept, *[0.0] * (8 - len(kept))))
+    return Camera(*size, *pinhole, distortion="radtan", coefficients=kept[:5])
 
 
 def mounted(cameras: Sequence[Camera], T_cam0_cams: Sequence[Array], has_depth: bool, config: DepthCameraConfig) -> Rig:
