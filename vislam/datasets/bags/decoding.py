@@ -1,4 +1,4 @@
-"""Messages decoded through `rosbags`, by its own definitions of the standard types.
+"""Messages decoded through `rosbags`, by its own definitions of the standard types; Foxglove's by ours.
 
 The definitions that a bag brings are never parsed: what is read here is standard, and a definition from outside could
 be anything. Where ROS 1's checksum of it differs from the standard's, the topic is refused.
@@ -11,6 +11,7 @@ from functools import cache
 from typing import Any
 
 from vislam.core.errors import DataError
+from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.stored import DamagedError, Topic
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -45,8 +46,10 @@ def why_unreadable(topic: Topic) -> str:
     """Return why messages of a topic cannot be decoded, empty when they can."""
     if topic.type not in KNOWN:
         return "a type that vislam does not read"
+    if topic.schema:
+        return topic.refused
     if topic.encoding not in ("ros1", "cdr"):
-        return f"encoded as '{topic.encoding}'; ros1 and cdr are read"
+        return f"encoded as '{topic.encoding}'; ros1, cdr and Foxglove's protobuf and json are read"
     if topic.encoding == "ros1" and topic.digest not in ("", "*", _standard_sum(topic.type)):
         return f"its definition of {topic.type} is not the standard one"
     return ""
@@ -54,6 +57,8 @@ def why_unreadable(topic: Topic) -> str:
 
 def decoded(topic: Topic, data: bytes) -> Any:
     """Return a message with the fields of its type; raises DamagedError when the bytes are none."""
+    if topic.schema:
+        return foxglove.decoded(topic.schema, topic.encoding, data)
     ros1, *ros2 = _stores()
     type_ = TRANSFORMS if topic.type == OLD_TRANSFORMS else topic.type
     try:
@@ -72,7 +77,10 @@ def decoded(topic: Topic, data: bytes) -> Any:
 
 
 def stamp_ns(topic: Topic, head: bytes) -> int | None:
-    """Return the stamp in a message's header; None when it has none or its seconds are impossible."""
+    """Return the stamp in a message's header by its first bytes; None when there is none or it is impossible."""
+    if topic.schema:
+        told = foxglove.stamp(topic.schema, topic.encoding, head)
+        return None if told is None else _whole_ns(*told)
     try:
         if topic.encoding == "ros1":
             _sequence, seconds, rest_ns = _ROS1_STAMP.unpack_from(head)
@@ -80,13 +88,18 @@ def stamp_ns(topic: Topic, head: bytes) -> int | None:
             seconds, rest_ns = _STAMP["<" if head[1:2] == b"\x01" else ">"].unpack_from(head, 4)
     except struct.error:
         return None
-    return None if rest_ns >= 10**9 or seconds < 0 or (seconds == 0 and rest_ns == 0) else seconds * 10**9 + rest_ns
+    return _whole_ns(seconds, rest_ns)
 
 
 def header_ns(header: Any) -> int | None:
     """Return the stamp in a decoded header, as `stamp_ns`."""
-    seconds, rest_ns = int(header.stamp.sec), int(header.stamp.nanosec)
-    return None if rest_ns >= 10**9 or seconds < 0 or (seconds == 0 and rest_ns == 0) else seconds * 10**9 + rest_ns
+    return _whole_ns(int(header.stamp.sec), int(header.stamp.nanosec))
+
+
+def _whole_ns(seconds: int, rest_ns: int) -> int | None:
+    if not 0 <= rest_ns < 10**9 or seconds < 0 or (seconds == 0 and rest_ns == 0):
+        return None
+    return seconds * 10**9 + rest_ns
 
 
 @cache

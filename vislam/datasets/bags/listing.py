@@ -80,8 +80,18 @@ class Listing:
             entry.places.append(found.place)
         if entry.topic.type in (IMAGE, COMPRESSED):
             t_ns = stamp(found, self._by_log_time)
+            if t_ns is None and found.topic.schema:
+                t_ns = self._stamp_behind(found)
             entry.unstamped += t_ns is None
             entry.images.extend((fitting(found.log_ns if t_ns is None else t_ns), *found.place))
+
+    def _stamp_behind(self, found: Found) -> int | None:
+        """Return the stamp of a message of Foxglove's, whose fields may come in any order, from all of its bytes."""
+        try:
+            t_ns = stamp_ns(found.topic, self._bag.read(found.place))
+        except (DamagedError, OSError):
+            return None
+        return None if t_ns is None else fitting(t_ns)
 
     def of_type(self, *types: str) -> list[Entry]:
         """Return the topics of certain types that can be read, with messages, by their names."""
@@ -99,7 +109,10 @@ class Listing:
 
 def stamp(found: Found, by_log_time: bool) -> int | None:
     """Return the time of a message: its header's, or the recorder's where asked; None when its header has none."""
-    return fitting(found.log_ns) if by_log_time else stamp_ns(found.topic, found.head)
+    if by_log_time:
+        return fitting(found.log_ns)
+    t_ns = stamp_ns(found.topic, found.head)
+    return None if t_ns is None else fitting(t_ns)
 
 
 def fitting(t_ns: int) -> int:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vislam.core.errors import DataError
+from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, Bytes, ChunkCache, FileBytes, unpacked
 from vislam.datasets.bags.stored import (
     HEAD_BYTES,
@@ -39,10 +40,17 @@ _BLOCK_BYTES = 2**20
 _MOST_HEAD_BYTES = _CHUNK_HEAD.size + 32 + 8
 
 
+class _Schema(NamedTuple):
+    """What a schema says of the messages on its channels."""
+
+    name: str
+    refused: str = ""
+
+
 class _Known(NamedTuple):
     """What was announced so far."""
 
-    schemas: dict[int, str]
+    schemas: dict[int, _Schema]
     topics: dict[int, Topic]
 
 
@@ -194,10 +202,18 @@ def _one(
         fields = _Fields(reader.read(at, length))
         number = fields.number(_U16)
         if op == _SCHEMA:
-            known.schemas.setdefault(number, message_type(fields.text()))
+            name = fields.text()
+            known.schemas.setdefault(number, _Schema(name, foxglove.why_refused(name, fields.text(), fields.data())))
         else:
-            type_ = known.schemas.get(fields.number(_U16), "without a schema")
-            known.topics.setdefault(number, Topic(fields.text(), type_, fields.text()))
+            schema = known.schemas.get(fields.number(_U16), _Schema("without a schema"))
+            known.topics.setdefault(number, _topic(fields.text(), schema, fields.text()))
+
+
+def _topic(name: str, schema: _Schema, encoding: str) -> Topic:
+    """Return a channel as a topic; one in a schema of Foxglove has the type of the ROS message that it stands for."""
+    if encoding in (foxglove.PROTOBUF, foxglove.JSON) and schema.name in foxglove.ROS_TYPES:
+        return Topic(name, foxglove.ROS_TYPES[schema.name], encoding, schema=schema.name, refused=schema.refused)
+    return Topic(name, message_type(schema.name), encoding)
 
 
 class _Fields:
@@ -211,7 +227,10 @@ class _Fields:
         return int(kind.unpack(self._take(kind.size))[0])
 
     def text(self) -> str:
-        return self._take(self.number(_U32)).decode("utf-8", "replace")
+        return self.data().decode("utf-8", "replace")
+
+    def data(self) -> bytes:
+        return self._take(self.number(_U32))
 
     def _take(self, length: int) -> bytes:
         data = self._data[self._at : self._at + length]

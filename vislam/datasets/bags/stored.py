@@ -19,8 +19,10 @@ class Topic:
 
     name: str
     type: str  # "sensor_msgs/msg/Image", for ROS 1 too
-    encoding: str  # "ros1" or "cdr"; others are listed and never decoded
+    encoding: str  # "ros1" or "cdr", "protobuf" or "json" of a schema that we know; others are never decoded
     digest: str = ""  # ROS 1: the sum over the definition
+    schema: str = ""  # of Foxglove, where the type is what it stands for
+    refused: str = ""  # why its definition is not the one of that name
 
 
 class Place(NamedTuple):

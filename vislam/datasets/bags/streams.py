@@ -142,7 +142,9 @@ def messages_of(bag: Bag, topic: Topic, problems: Problems) -> Iterator[tuple[Fo
             continue
         try:
             whole = found.place.length == len(found.head) < HEAD_BYTES  # else it may be packed, or go on
-            yield found, decoded(topic, found.head if whole else bag.read(found.place))
+            data = found.head if whole else bag.read(found.place)
+            message = decoded(topic, data)
+            yield found._replace(head=data) if topic.schema else found, message  # whose stamp may lie anywhere
             good += 1
         except (DamagedError, OSError) as error:
             bad += 1

@@ -133,7 +133,7 @@ def _topics(listing: Listing, told: dict[str, str]) -> tuple[TopicSummary, ...]:
     return tuple(
         TopicSummary(
             name,
-            entry.topic.type,
+            entry.topic.schema or entry.topic.type,
             entry.count,
             entry.rate_hz,
             told.get(name, why_unreadable(entry.topic) or "not used"),
