@@ -128,7 +128,7 @@ def test_options_that_do_not_fit_are_named(options: str, error: type[Exception],
 
 def test_only_bags_take_options(tmp_path: Path) -> None:
     mav0 = write_asl(tmp_path / "asl")
-    with pytest.raises(UsageError, match="only a bag takes options"):
+    with pytest.raises(UsageError, match="only a bag or a film takes options"):
         open_dataset(f"euroc:{mav0},imu=none")
 
 

@@ -52,16 +52,18 @@ def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Reco
 def survey(uri: str) -> Survey:
     """Return what `FORMAT:PATH` or a bare path holds, for `open_dataset` and `vislam doctor`; raises as it does.
 
-    A bag's topics may be told behind it: `bag:PATH,cam0=/left/image_raw,imu=/imu`.
+    A bag's topics may be told behind it: `bag:PATH,cam0=/left/image_raw,imu=/imu`; of a film `chapters=one`.
     """
     name, path, options = _split(uri)
     try:
         reader = _reader(name, path)
         if not options:
             return reader.survey(path)
-        if reader is not bags:
-            raise UsageError(f"'{options}' in {uri}: only a bag takes options, and {path} is none")
-        return bags.survey_with(path, _told(uri, options))
+        if reader is bags:
+            return bags.survey_with(path, _told(uri, options))
+        if reader is video:
+            return video.survey_with(path, _told(uri, options))
+        raise UsageError(f"'{options}' in {uri}: only a bag or a film takes options, and {path} is none")
     except OSError as error:  # a folder that may not be entered, a disk that fails
         raise DataError(f"{error.filename or path} cannot be read: {error.strerror or error}") from error
 

@@ -173,8 +173,7 @@ class _Inspector:
             if found.video is None and found.streams is None:
                 is_depth = images is found.depth
                 self._check_images(images, _camera_of(found.rig, 0 if is_depth else index), is_depth)
-        if found.video is not None:
-            self._size_bytes += found.video.stat().st_size
+        self._size_bytes += sum(path.stat().st_size for path in found.videos)
         if found.streams is not None and frames is not None:
             self._findings += _message_findings(found, frames)
         if frames is not None and not len(frames.t_ns):

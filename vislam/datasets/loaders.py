@@ -99,12 +99,15 @@ class FolderLoader:
 
 
 class VideoLoader:
-    """Loads frames from a video file, in rising order only, in one thread."""
+    """Loads frames from a video file and those that follow it, in rising order only, in one thread."""
 
     workers = 1
 
-    def __init__(self, path: Path, frame_numbers: tuple[str, ...], camera: Camera) -> None:
+    def __init__(
+        self, path: Path, frame_numbers: tuple[str, ...], camera: Camera, later: tuple[tuple[Path, int], ...] = ()
+    ) -> None:
         self._path = path
+        self._later = list(later)  # files, and the numbers of their first frames
         self._frame_numbers = frame_numbers
         self._camera = camera
         self._next = 0
@@ -114,6 +117,10 @@ class VideoLoader:
     def load(self, i: int) -> LoadedImages:
         """Return frame `i`; raises DataError when the size changes within the video."""
         wanted = int(self._frame_numbers[i])
+        while self._later and wanted >= self._later[0][1]:
+            self._capture.release()
+            self._path, self._next = self._later.pop(0)
+            self._capture = open_video(self._path)
         while self._next <= wanted:
             if not self._capture.grab():
                 return LoadedImages((), trouble=UnreadableImageError("video frame", self._path))

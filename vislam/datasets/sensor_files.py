@@ -22,7 +22,7 @@ from vislam.datasets.tables import (
     parse_seconds,
     read_rows,
 )
-from vislam.datasets.telemetry import open_telemetry
+from vislam.datasets.telemetry import open_joined
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import LocalFrame
 from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
@@ -172,7 +172,7 @@ def _ubx(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Re
 
 
 def _gpmf(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
-    telemetry = open_telemetry(file.path)
+    telemetry = open_joined(file.path)
     if telemetry is None or not telemetry.fix_count:
         raise DataError(f"{file.path}: no GNSS in it; switch the camera's GPS on, or name a .nmea, .ubx or .csv file")
     for fix in telemetry.fixes(problems):

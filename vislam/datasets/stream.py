@@ -90,6 +90,7 @@ class Survey:
     depth: ImageList | None = None
     depth_units_per_m: float = 1.0
     video: Path | None = None  # the frames come from here; the files of cam0 are frame numbers
+    later_videos: tuple[tuple[Path, int], ...] = ()  # what follows it, and the numbers of their first frames
     rig: Rig | None = None
     imu_file: Path | None = None
     samples: ImuRows | None = None  # inertial ones, where there is no table of them
@@ -113,6 +114,11 @@ class Survey:
         """Whether there are inertial samples."""
         has = self.streams is not None and self.streams.has_imu
         return has or self.imu_file is not None or self.samples is not None
+
+    @property
+    def videos(self) -> tuple[Path, ...]:
+        """The files that the frames come from, if they are videos."""
+        return () if self.video is None else (self.video, *(path for path, _ in self.later_videos))
 
     def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         """Yield stamp, rates and forces as recorded, without calibration; raises DataError when most are unusable."""
@@ -168,7 +174,7 @@ def open_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | Non
     if survey.streams is not None:
         return survey.streams.open_loader(rig, frames, cameras)
     if survey.video is not None:
-        return VideoLoader(survey.video, survey.cameras[0].files, rig.cameras[0])
+        return VideoLoader(survey.video, survey.cameras[0].files, rig.cameras[0], survey.later_videos)
     return FolderLoader(frames, survey.cameras[:cameras], survey.depth, rig, survey.depth_units_per_m)
 
 

@@ -4,17 +4,20 @@ For `ride.mp4`: `ride.csv` (one row a frame, stamp in ns), `ride.yaml` (a camera
 IMU, `ride.imu.csv` and `ride.imu.yaml` in the ASL layout. Every stamp must be from the clock that stamps the IMU.
 
 An MP4 without `ride.csv` has its frames stamped by its own table of times. Of a GoPro's, the IMU in its telemetry is
-by that clock, too, and is read where `ride.imu.yaml` says its noise.
+by that clock, too, and is read where `ride.imu.yaml` says its noise; later chapters are one film with the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.config import validated
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
@@ -24,7 +27,17 @@ from vislam.datasets.images import ImageList, check_size_px
 from vislam.datasets.loaders import video_facts
 from vislam.datasets.stream import Survey, image_list
 from vislam.datasets.tables import Problems, Row, read_frame_stamps
-from vislam.datasets.telemetry import Telemetry, frame_times_ns, is_mp4, open_telemetry
+from vislam.datasets.telemetry import (
+    Film,
+    JoinedTelemetry,
+    Telemetry,
+    frame_times_ns,
+    is_mp4,
+    joined_film,
+    later_chapters,
+    open_joined,
+    open_telemetry,
+)
 from vislam.imu import ImuNoise
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
@@ -36,13 +49,31 @@ def recognises(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
+@dataclass(frozen=True, slots=True)
+class FilmOptions:
+    """What may be told of a film behind its path, as `video:GX010001.MP4,chapters=one`."""
+
+    chapters: Literal["all", "one"] = "all"  # one: the file that is named alone
+
+
 def survey(path: Path) -> Survey:
     """Return what a video and the files beside it hold; what is wrong with them is in `errors`."""
+    return survey_with(path, {})
+
+
+def survey_with(path: Path, options: Mapping[str, str]) -> Survey:
+    """Return what a video holds, as told; raises UsageError for an option that is none."""
+    return _survey(path, validated(FilmOptions, options, f"video:{path}").chapters == "all")
+
+
+def _survey(path: Path, joined: bool) -> Survey:
     problems = Problems()
     errors: list[DataError] = []
     imu_file, imu_noise, T_body_imu = None, None, np.eye(4)
     cameras: tuple[ImageList, ...] = ()
-    rig, telemetry = None, _telemetry(path)
+    film: Film | None = None
+    joined = joined and not path.with_suffix(".csv").is_file() and not path.with_suffix(".imu.csv").is_file()
+    rig, telemetry = None, _telemetry(path, joined)
     findings = [] if telemetry is None else telemetry.findings()
     if (why := _why_unused(path)) and telemetry is not None and telemetry.has_imu:
         findings.append(Finding("warning", f"the IMU of the telemetry is not used: {why}", path.name, ""))
@@ -59,9 +90,10 @@ def survey(path: Path) -> Survey:
     except DataError as error:
         errors.append(error)
     try:
-        cameras = (_frames(path, problems),)
+        film = joined_film(path) if joined and is_mp4(path) and later_chapters(path) != ([], "") else None
+        cameras = (_frames(path, problems) if film is None else _of_film(film, path, problems),)
         size, frames = video_facts(path)
-        if frames > 0:  # some containers do not know
+        if frames > 0 and (film is None or len(film.chapters) == 1):  # some containers do not know
             last = int(cameras[0].files[-1]) + 1 if cameras[0].files else 0
             problems.count("video frame without a stamp", times=max(0, frames - last))
         if rig is not None:
@@ -73,11 +105,12 @@ def survey(path: Path) -> Survey:
         root=path,
         cameras=cameras,
         video=path,
+        later_videos=() if film is None else tuple((one.path, one.first_frame) for one in film.chapters[1:]),
         rig=rig,
         imu_file=imu_file,
         samples=samples,
         imu_noise=imu_noise,
-        findings=tuple(findings),
+        findings=(*findings, *(() if film is None else film.findings)),
         problems=problems,
         errors=tuple(errors),
     )
@@ -103,10 +136,15 @@ def _own_times(path: Path) -> Iterator[Row[str]]:
     return ((t_ns, str(frame)) for frame, t_ns in enumerate(frame_times_ns(path).tolist()))
 
 
-def _telemetry(path: Path) -> Telemetry | None:
+def _of_film(film: Film, path: Path, problems: Problems) -> ImageList:
+    stamps = np.concatenate([chapter.frames_ns for chapter in film.chapters]).tolist()
+    return image_list("cam0", path.parent, ((t_ns, str(frame)) for frame, t_ns in enumerate(stamps)), problems)
+
+
+def _telemetry(path: Path, joined: bool) -> Telemetry | JoinedTelemetry | None:
     """Return a GoPro's telemetry; what is wrong with the file is told where its frames are looked for."""
     try:
-        return open_telemetry(path)
+        return open_joined(path) if joined else open_telemetry(path)
     except DataError:
         return None
 

@@ -110,14 +110,40 @@ class Telemetry:
 
         Raises DataError for units or samples that are not those of an IMU.
         """
-        problems.count(f"{self.path.name}: damaged payloads of telemetry", times=self._damaged)
-        rates, forces = (in_time_order(self._rows(key, problems), problems, key) for key in ("GYRO", "ACCL"))
+        self.count_damage(problems)
+        rates, forces = (in_time_order(self.rows(key, problems), problems, key) for key in ("GYRO", "ACCL"))
         yield from paired(rates, forces, problems, self.path.name)
+
+    def count_damage(self, problems: Problems) -> None:
+        """Count the payloads that were damaged."""
+        problems.count(f"{self.path.name}: damaged payloads of telemetry", times=self._damaged)
+
+    def rows(self, key: str, problems: Problems) -> Rows:
+        """Yield stamp and samples of GYRO (rad/s) or ACCL (m/s^2), as they were stored; raises as `imu_rows`."""
+        example = self._counted[key].example
+        assert example is not None
+        turned = _axes(example)[0] * self._unit(key, example)
+        good = False
+        for index, streams in self._payloads():
+            stream = _of_key(streams, key)
+            if stream is None or index not in self._times[key].begin_s:
+                continue
+            try:
+                samples = stream.samples(key)
+                if samples.shape[1] != 3 or not np.isfinite(samples).all():
+                    raise ValueError(f"{key} of {samples.shape[1]} numbers a sample, or not finite")
+            except ValueError as error:
+                problems.count(f"{self.path.name}: payloads that cannot be read", str(error))
+                continue
+            good = True
+            yield from zip(self._stamps(key, index, len(samples)), (samples @ turned.T).tolist(), strict=True)
+        if not good:
+            raise DataError(f"{self.path}: no payload of its telemetry has {key} that can be read")
 
     def fixes(self, problems: Problems) -> Iterator[Fix]:
         """Yield the GNSS fixes, stamped like the samples of the IMU; those without a place in space have no kind."""
         key = self._fix_key
-        problems.count(f"{self.path.name}: damaged payloads of telemetry", times=self._damaged)
+        self.count_damage(problems)
         for index, streams in self._payloads():
             stream = _of_key(streams, key)
             if stream is None or index not in self._times[key].begin_s:
@@ -236,27 +262,6 @@ class Telemetry:
         at_s = times.begin_s[index] + times.period_s[index] * np.arange(count)
         stamps: list[int] = np.rint(at_s * 1e9).astype(np.int64).tolist()
         return stamps
-
-    def _rows(self, key: str, problems: Problems) -> Rows:
-        example = self._counted[key].example
-        assert example is not None
-        turned = _axes(example)[0] * self._unit(key, example)
-        good = False
-        for index, streams in self._payloads():
-            stream = _of_key(streams, key)
-            if stream is None or index not in self._times[key].begin_s:
-                continue
-            try:
-                samples = stream.samples(key)
-                if samples.shape[1] != 3 or not np.isfinite(samples).all():
-                    raise ValueError(f"{key} of {samples.shape[1]} numbers a sample, or not finite")
-            except ValueError as error:
-                problems.count(f"{self.path.name}: payloads that cannot be read", str(error))
-                continue
-            good = True
-            yield from zip(self._stamps(key, index, len(samples)), (samples @ turned.T).tolist(), strict=True)
-        if not good:
-            raise DataError(f"{self.path}: no payload of its telemetry has {key} that can be read")
 
     def _unit(self, key: str, stream: Stream) -> float:
         told = stream.text("SIUN") or stream.text("UNIT") or _USUAL_UNIT[key]
