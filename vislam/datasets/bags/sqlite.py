@@ -25,6 +25,7 @@ from vislam.datasets.tables import Problems
 
 MAGIC = b"SQLite format 3\0"
 _ERRORS = (sqlite3.Error, ValueError, OverflowError, MemoryError)  # ValueError: of its own message that is no text
+_SMALL_BYTES = 2**12  # a message whose beginning is read with its row; of larger ones that alone is fetched
 _STEP_ROWS = 1000  # of one question; a row that cannot be read costs no more than those behind it
 
 
@@ -89,17 +90,23 @@ class Database:
         """Return the next rows, none at the end or where the rest cannot be read."""
         found: list[tuple[object, int, object, object, object]] = []
         asked = (
-            "SELECT rowid, topic_id, timestamp, length(data), substr(data, 1, ?) FROM messages "
-            "WHERE rowid > ? ORDER BY rowid LIMIT ?"
+            "SELECT rowid, topic_id, timestamp, length(data), CASE WHEN typeof(data) = 'blob' AND length(data) > ? "
+            "THEN NULL ELSE substr(data, 1, ?) END FROM messages WHERE rowid > ? ORDER BY rowid LIMIT ?"
         )
         try:
             with self._lock:
-                for row in self._base.execute(asked, (HEAD_BYTES, last, _STEP_ROWS)):
-                    found.append(row)  # those before a row that cannot be read stay
+                for row in self._base.execute(asked, (_SMALL_BYTES, HEAD_BYTES, last, _STEP_ROWS)):
+                    # those before a row that cannot be read stay
+                    found.append(row if row[4] is not None or row[3] is None else (*row[:4], self._beginning(row[0])))
         except _ERRORS as error:
             if not found:
                 problems.count(f"{self._path.name}: cut off or damaged: {error}", f"behind row {last}")
         return found
+
+    def _beginning(self, row: int) -> bytes:
+        """Return the first bytes of a large message; `substr` would read all of it. Raises sqlite3.Error."""
+        with self._base.blobopen("messages", "data", row, readonly=True) as blob:
+            return blob.read(HEAD_BYTES)
 
     def _topics(self) -> dict[int, Topic]:
         kinds = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND rootpage > 0 AND name = ?"
