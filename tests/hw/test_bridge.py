@@ -18,10 +18,12 @@ from vislam.config import BridgeClockConfig, SensorCalibration, SerialConfig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.bridge import protocol
+from vislam.hw.bridge.behind import Behind
 from vislam.hw.bridge.bridge import SerialBridge, why_not_open
 from vislam.hw.emulator import SensorError
 from vislam.hw.emulator import bridge as emulator
 from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults, at_rest
+from vislam.hw.emulator.bridged import bridged
 from vislam.hw.health import Health
 
 EXACT = (SensorError(), SensorError(), SensorError())
@@ -82,6 +84,87 @@ def test_samples_are_calibrated_and_stamped_at_capture(config: SerialConfig) -> 
     fields = [sample for sample in samples if isinstance(sample, MagSample)]
     assert len(fields) == pytest.approx(900 / 9, abs=30)
     assert fields[-1].field_ut == pytest.approx([-10.0, -20.0, -43.0], abs=0.06)
+
+
+def rocking(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
+    """A motion in which gyro and accelerometer tell their time."""
+    phase = 2.0 * math.pi * 2.0 * (t_ns % 500_000_000) * 1e-9
+    return (math.sin(phase), math.cos(phase), 0.5), (5.0 * math.sin(phase), -2.0, 9.8), (20.0, -10.0, -43.0), 31.0
+
+
+def late_ms(told: np.ndarray, slope: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return by how much each sample was taken before its stamp, from where the slope is steep."""
+    steep = abs(slope) > 0.5 * abs(slope).max()
+    return (true - told)[steep] / slope[steep] * 1e3
+
+
+@pytest.mark.parametrize("name", ["MPU-6050", "MPU-6500", "MPU-9250", "MPU-9255"])
+def test_an_mpu_gives_right_units_at_the_right_time(config: SerialConfig, name: str) -> None:
+    with BridgeEmulator(Path(config.port), rocking, drift=-0.02, errors=EXACT, board=name):
+        bridge = SerialBridge(config)
+        samples = collect(bridge, lambda found: len(found) > 900)
+        assert bridge.temperature_c == pytest.approx(31.0, abs=0.1)
+        assert bridge.board_name == (f"{name}, AK8963" if name in ("MPU-9250", "MPU-9255") else name)
+        word, counts = bridge.health(), bridge.counters()
+        bridge.close()
+    assert word & (Health.MAG_FAULT | Health.GYRO_FAULT | Health.ACCEL_FAULT) == 0  # without a magnetometer as well
+    assert counts.get("before_hello", 0) == 0
+    found = imu(samples)[300:]
+    truth = [rocking(sample.t_ns) for sample in found]
+    rates, forces = np.array([t[0] for t in truth]), np.array([t[1] for t in truth])
+    gyro, accel = np.array([s.gyro_rad_s for s in found]), np.array([s.accel_m_s2 for s in found])
+    assert gyro[:, 2] == pytest.approx(rates[:, 2], abs=1e-3)
+    assert accel[:, 1:] == pytest.approx(forces[:, 1:], abs=3e-3)
+    slope = 4.0 * math.pi * rates[:, 1]
+    of_gyro, of_accel = (
+        late_ms(*of) for of in ((gyro[:, 0], slope, rates[:, 0]), (accel[:, 0], 5 * slope, forces[:, 0]))
+    )
+    print(f"{name}: gyro {np.median(of_gyro):.2f} ms late, {np.std(of_gyro):.2f} rms; accel {np.median(of_accel):.2f}")
+    assert abs(np.median(of_gyro)) < 1.6  # of the host's clock, on a busy machine
+    assert np.median(of_accel) - np.median(of_gyro) == pytest.approx(0.0, abs=0.15)  # whatever the host does
+    if "AK8963" in bridge.board_name:
+        fields = [sample for sample in samples if isinstance(sample, MagSample)]
+        assert fields[-1].field_ut == pytest.approx([20.0, -10.0, -43.0], abs=0.1)
+
+
+def test_an_mpu_in_the_place_of_a_gy85_is_never_read_in_its_units(config: SerialConfig) -> None:
+    with BridgeEmulator(Path(config.port), at_rest, errors=EXACT):
+        bridge = SerialBridge(config)
+        samples = imu(collect(bridge, lambda found: len(imu(found)) > 100))
+    with BridgeEmulator(Path(config.port), at_rest, errors=EXACT, board="MPU-6050") as board:
+        samples += imu(collect(bridge, lambda found: len(imu(found)) > 100))
+        board.unplug()
+        collect(bridge, lambda _: bridge.counters().get("port_lost", 0) > 1)
+        board.plug()
+        samples += imu(collect(bridge, lambda found: len(imu(found)) > 100))
+        assert bridge.board_name == "MPU-6050"
+    bridge.close()
+    assert np.array([s.accel_m_s2 for s in samples])[:, 2] == pytest.approx(9.807, abs=0.03)
+
+
+def test_a_chip_that_the_sketch_does_not_know_is_named(config: SerialConfig) -> None:
+    with (
+        BridgeEmulator(Path(config.port), at_rest, board="stranger"),
+        pytest.raises(HardwareError, match=r"a chip that says 0x98, and the sketch knows MPU-6050 0x68"),
+    ):
+        SerialBridge(replace(config, start_s=3.0))
+
+
+def test_counts_of_an_mpu_wait_until_it_is_known_how_old_they_are() -> None:
+    board = bridged("MPU-9250")
+    assert board.ages is not None
+    behind = Behind(SerialConfig())
+    behind.greet(board.hello)
+    assert not behind.is_known
+    other = bridged("MPU-6050")
+    assert other.ages is not None
+    behind.take_ages(other.ages)  # of the chip before
+    assert not behind.is_known
+    behind.take_ages(board.ages)
+    assert behind.is_known
+    behind.greet(bridged("GY-85").hello)
+    assert behind.is_known  # its filters are in the settings
+    assert behind.name == "ADXL345, ITG3205, HMC5883L"
 
 
 def test_no_wrong_sample_passes_a_bad_cable(config: SerialConfig) -> None:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from vislam.hw.bridge import protocol
 from vislam.hw.bridge.protocol import (
+    Ages,
     Chips,
     Counts,
     FrameDecoder,
@@ -54,6 +55,12 @@ int32, sequences, times = st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**16
 counts = st.builds(Counts, sequence=sequences, t_us=times, left=int32, right=int32)
 passed = st.builds(Passed, sequence=sequences, t_us=times, data=st.binary(min_size=1, max_size=protocol.MOST_PASSED))
 
+counts_us = st.integers(0, 2**16 - 1)
+ages = st.builds(
+    Ages, sequence=sequences, t_us=times, accel_id=st.integers(0, 255), gyro_us=counts_us, accel_us=counts_us,
+    mag_us=counts_us,
+)  # fmt: skip
+
 
 @given(st.binary(max_size=1000))
 def test_stuffing_comes_back_without_zeros(data: bytes) -> None:
@@ -77,7 +84,7 @@ def test_stuffing_is_that_of_cobs(data: str, stuffed: str) -> None:
     assert protocol.stuff(bytes.fromhex(data)) == bytes.fromhex(stuffed)
 
 
-@given(st.lists(st.one_of(samples, hellos, counts, passed), max_size=20), st.randoms(use_true_random=False))
+@given(st.lists(st.one_of(samples, hellos, counts, passed, ages), max_size=20), st.randoms(use_true_random=False))
 def test_messages_come_back_however_they_are_cut(sent: list, rng: random.Random) -> None:
     stream = b"".join(encode(message) for message in sent)
     decoder, got, at = FrameDecoder(), [], 0

@@ -15,10 +15,12 @@ from vislam.hw.chips import I2cBus, identify
 from vislam.hw.chips.imus import KNOWN_IMUS
 from vislam.hw.doctor import HardwareReport, Wanted, examine
 from vislam.hw.emulator import SteppedClock, emulated_board, emulated_bus
+from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
 from vislam.live.sources import open_live
 from vislam.run.record import record
 from vislam.run.sources import recorded_path
+from worlds.fifo_boards import FIRMWARE
 from worlds.gy85 import driving, still
 
 
@@ -51,6 +53,34 @@ def test_a_good_board_is_approved_of_with_its_stamps_and_with_what_it_has_not_me
     if kind in ("MPU-9250", "ICM-20948"):
         assert "the magnetometer is a AK" in good
         assert "the field is 4" in good
+
+
+@pytest.mark.parametrize(("option", "at"), [("--serial", ""), ("--imu", "serial:")])
+def test_a_bridge_says_which_chip_it_has(
+    option: str, at: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BridgeEmulator(tmp_path / "tty", at_rest, seed=1, board="MPU-6050"):
+        arguments = ["doctor", option, f"{at}{tmp_path / 'tty'}", "--seconds", "1", "--serial.start-s", "30", "--json"]
+        assert run_verb(arguments) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {"kind": "chips", "path": f"{at}{tmp_path / 'tty'}", "name": "MPU-6050"} in told["devices"]
+    good = "\n".join(finding["what"] for finding in told["findings"] if finding["severity"] == "ok")
+    for words in ("gravity is measured as 9.8", "stamped by the board's clock"):
+        assert words in good
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_the_doctor_sends_a_bmi270_its_configuration(
+    in_file: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus = emulated_board("BMI270", still, time.monotonic_ns, seed=2)
+    (tmp_path / "cart.toml").write_text(f'[board]\nfirmware = "{FIRMWARE}"\n')
+    told = ["--config", str(tmp_path / "cart.toml")] if in_file else ["--board.firmware", str(FIRMWARE)]
+    with emulated_bus(bus):
+        assert run_verb(["doctor", "--i2c", bus.path, "--seconds", "1"]) == HardwareError.exit_code
+        assert "name bmi270_maximum_fifo.c" in capsys.readouterr().out
+        assert run_verb(["doctor", "--i2c", bus.path, "--seconds", "2", *told]) == 0
+    assert "gravity is measured as 9.8" in capsys.readouterr().out
 
 
 def test_everything_on_the_bus_is_listed(tmp_path: Path) -> None:

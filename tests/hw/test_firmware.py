@@ -1,7 +1,9 @@
 """The sketch for the microcontroller, compiled for this machine on a small imitation of Arduino's core."""
 
+import os
 import shutil
 import subprocess
+from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +14,7 @@ from needs import missing
 from vislam.hw.bridge.protocol import (
     MOST_PASSED,
     SAMPLE_WIRE_BYTES,
+    Ages,
     Chips,
     Counts,
     FrameDecoder,
@@ -21,6 +24,7 @@ from vislam.hw.bridge.protocol import (
     Status,
     encode,
 )
+from vislam.hw.emulator.bridged import bridged
 
 SKETCH = Path(str(files("vislam.hw"))) / "firmware" / "vislam_bridge"
 FAKE = Path(__file__).parent / "fake_arduino"
@@ -64,10 +68,12 @@ def run(
     blocked: tuple = ("0", "0"),
     forgets_at: int = -1,
     further: tuple = (),
+    mpu: str = "",
 ) -> tuple[list, bytes, str]:
     """Return messages, the bytes they came in, and the registers that the sketch set."""
     command = [str(bridge), str(seconds), str(begin_us), *silent, *blocked, str(forgets_at), *further]
-    done = subprocess.run(command, capture_output=True, check=True, timeout=60)
+    surroundings = {**os.environ, "MPU": mpu} if mpu else None
+    done = subprocess.run(command, capture_output=True, check=True, timeout=60, env=surroundings)
     decoder = FrameDecoder()
     messages = decoder.feed(done.stdout)
     assert decoder.bad == 0
@@ -187,6 +193,113 @@ def test_a_line_that_takes_nothing_costs_no_count(full_bridge: Path) -> None:
     gaps_s = [(b.t_us - a.t_us) * 1e-6 for a, b in pairwise(counts)]
     assert max(gaps_s) > 0.09
     assert counts[-1].left == pytest.approx(2400 * counts[-1].t_us * 1e-6, abs=5)
+
+
+MPU = "104 104 none 0"  # id, address, magnetometer, when it begins to answer
+
+
+@pytest.mark.parametrize(
+    ("who", "name", "magnetometer"),
+    [
+        (0x68, "MPU-6050", "none"), (0x68, "MPU-6050", "hmc"), (0x70, "MPU-6500", "none"), (0x71, "MPU-9250", "ak"),
+        (0x73, "MPU-9255", "ak"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("address", [0x68, 0x69])
+def test_an_mpu_is_found_and_its_frames_are_ours_byte_for_byte(
+    bridge: Path, who: int, name: str, magnetometer: str, address: int
+) -> None:
+    messages, wire, _ = run(bridge, 3.0, mpu=f"{who} {address} {magnetometer} 0")
+    assert b"".join(encode(message) for message in messages) == wire
+    # who it is stands twice before the first sample, and each time how old its values are
+    assert [type(m) for m in messages[:5]] == [Ages, Hello, Ages, Hello, RawSample]
+    samples, hellos = parts(messages)
+    shared = [m.sequence for m in messages if isinstance(m, RawSample | Hello)]
+    assert shared == list(range(len(shared)))
+    assert Chips.STARTED in hellos[0].chips
+    assert not any(Chips.STARTED in hello.chips for hello in hellos[1:])
+    expected = Chips.ACCEL | Chips.GYRO | (Chips.MAG if magnetometer != "none" else 0)
+    for hello in hellos:
+        assert hello.chips & ~Chips.STARTED == expected
+        assert (hello.accel_id, hello.gyro_id) == (who, who)
+        assert hello.accel_nm_s2 * 1e-9 * 4096 == pytest.approx(9.80665, rel=1e-6)
+        assert hello.gyro_nrad_s * 1e-9 * 65.5 == pytest.approx(0.017453293, rel=4e-6)
+    data_sheet_c = -1234 / 340 + 36.53 if who == 0x68 else -1234 / 333.87 + 21.0
+    assert -1234e-9 * hellos[0].temperature_nk + 1e-3 * hellos[0].temperature_mc == pytest.approx(
+        data_sheet_c, abs=1e-3
+    )
+    ages = [m for m in messages if isinstance(m, Ages)]
+    assert [a.sequence for a in ages] == list(range(len(hellos)))
+    if magnetometer != "hmc":  # the emulator has what the sketch says
+        emulated = bridged(name)
+        assert replace(hellos[1], sequence=0, t_us=0) == emulated.hello
+        assert {replace(a, sequence=0, t_us=0) for a in ages} == {emulated.ages}
+    for n, sample in enumerate(samples):
+        assert sample.accel == (n % 500, -(n % 500), 4096)
+        assert sample.gyro == (-(n % 700), 0, n % 700)
+        assert sample.temperature == -1234
+        assert sample.status & ~Status.MAG_NEW == 0
+    steps_us = [b.t_us - a.t_us for a, b in pairwise(samples)]
+    assert 2400 < min(steps_us) < max(steps_us) < 2600
+    fields = [(n // 8, sample.mag) for n, sample in enumerate(samples) if Status.MAG_NEW in sample.status]
+    if magnetometer == "none":
+        assert not fields
+    elif magnetometer == "hmc":
+        assert all(mag == (200 + n % 9, n % 9, -400) for n, mag in fields)
+    else:
+        # x and y change places and z is turned over; fuses 176, 128, 80: 1.1875, 1 and 0.8125 times what is read
+        assert all(mag == (-100, (19 * (160 + n % 9) + 8) // 16, -208) for n, mag in fields if n != 20)
+        assert all(n % 5 != 4 for n, _ in fields)
+        assert [mag[2] for n, mag in fields if n == 20] == [-32767]  # an overflow
+        assert hellos[0].mag_limit == 32760
+    if magnetometer != "none":
+        assert 40 < len(fields) < 50 * 3
+
+
+def test_ranges_of_an_mpu_are_told_to_the_host(tmp_path: Path) -> None:
+    wide = compiled(tmp_path, "-DMPU_GYRO_RANGE=3", "-DMPU_ACCEL_RANGE=3")
+    hello = parts(run(wide, 0.5, mpu=MPU)[0])[1][0]
+    assert hello.accel_nm_s2 * 1e-9 * 32768 == pytest.approx(16 * 9.80665, rel=1e-6)
+    assert hello.gyro_nrad_s * 1e-9 * 16.4 == pytest.approx(0.017453293, rel=1e-6)
+
+
+def test_an_mpu_that_comes_late_is_told_before_its_first_sample(bridge: Path) -> None:
+    messages, _, _ = run(bridge, 3.0, mpu="104 104 none 1500000")
+    first = next(i for i, m in enumerate(messages) if isinstance(m, RawSample) and not m.status & Status.GYRO_ERROR)
+    told = [m for m in messages[:first] if isinstance(m, Hello) and m.accel_id == 0x68]
+    assert len(told) >= 2
+    assert all(m.accel_id == 0 for m in messages[:first] if isinstance(m, Hello) and m not in told)
+    samples, _ = parts(messages[first:])
+    assert samples[0].t_us > 1_500_000 + 90_000  # its gyro has to start
+    assert all(sample.status == 0 for sample in samples)
+
+
+@pytest.mark.parametrize("who", [0x68, 0x71])
+def test_an_mpu_that_lost_its_settings_is_not_believed(bridge: Path, who: int) -> None:
+    messages = run(bridge, 2.0, silent=(GYRO, "0", "0"), forgets_at=1000, mpu=f"{who} 104 none 0")[0]
+    samples, _ = parts(messages)
+    failed = [i for i, s in enumerate(samples) if Status.GYRO_ERROR | Status.ACCEL_ERROR in s.status]
+    assert 40 <= len(failed) <= 100  # tried again after a tenth of a second, and a tenth until it has started
+    assert failed[-1] - failed[0] + 1 == len(failed)
+    assert samples[-1].accel[2] == 4096
+
+
+def test_a_chip_that_the_sketch_does_not_know_is_told(bridge: Path) -> None:
+    samples, hellos = parts(run(bridge, 2.0, mpu=f"{0x98} 104 none 0")[0])
+    assert {hello.accel_id for hello in hellos} == {0x98}
+    assert not any(hello.chips & (Chips.ACCEL | Chips.GYRO) for hello in hellos)
+    assert all(Status.GYRO_ERROR | Status.ACCEL_ERROR in sample.status for sample in samples)
+
+
+def test_an_mpu_carries_encoders_and_a_receiver_as_well(full_bridge: Path) -> None:
+    messages = run(full_bridge, 4.0, further=("4800", "-1200", SENTENCE), mpu="113 104 ak 0")[0]
+    shared = [m.sequence for m in messages if isinstance(m, RawSample | Hello)]
+    assert shared == list(range(len(shared)))
+    assert all(Status.MISSED not in m.status for m in messages if isinstance(m, RawSample))
+    for kind in (Counts, Passed, Ages):
+        numbers = [m.sequence for m in messages if isinstance(m, kind)]
+        assert numbers == list(range(len(numbers)))
+        assert numbers
 
 
 def test_a_sample_fits_the_smallest_buffer() -> None:

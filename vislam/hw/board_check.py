@@ -16,7 +16,7 @@ from vislam.hw.own_imu import OwnImu
 Add = Callable[..., None]
 
 _GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = 9.81, 0.5
-_MAX_RATE_DEG_S = 40.0  # zero-rate output of an ITG3205 by the data sheet
+MAX_RATE_DEG_S = 40.0  # zero-rate output of an ITG3205 by the data sheet
 _MAX_GYRO_STD_DEG_S, _MAX_ACCEL_STD_M_S2 = 1.0, 0.3  # three times the noise of the chips
 _FIELD_UT = (22.0, 67.0)  # of the earth, anywhere
 _TEMPERATURE_C = (-40.0, 85.0)
@@ -58,7 +58,7 @@ def check_board(
     word = board.health() & ~Health.MAG_FAULT
     if word:
         add("warning", f"health: {word.name}", "docs/cart.md says what each bit means")
-    max_rate_deg_s = board.imu.max_zero_deg_s if isinstance(board, FifoBoard) and board.imu else _MAX_RATE_DEG_S
+    max_rate_deg_s = board.imu.max_zero_deg_s if isinstance(board, FifoBoard) and board.imu else MAX_RATE_DEG_S
     findings += check_rest(inertial, where, max_rate_deg_s)
     if board.temperature_c is not None:
         low, high = _TEMPERATURE_C
@@ -91,7 +91,7 @@ def _check_rest(inertial: list[ImuSample], max_rate_deg_s: float, add: Add) -> N
         add("ok", f"the gyro's zero is at {axes} deg/s, noise {gyro_std:.2f} deg/s rms")
 
 
-def check_rest(inertial: list[ImuSample], where: str, max_rate_deg_s: float = _MAX_RATE_DEG_S) -> list[Finding]:
+def check_rest(inertial: list[ImuSample], where: str, max_rate_deg_s: float = MAX_RATE_DEG_S) -> list[Finding]:
     """Return what samples at rest say: gravity, the gyro's zero; nothing of less than 50 samples."""
     findings: list[Finding] = []
 

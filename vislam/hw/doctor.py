@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from vislam.config import BoardConfig, Gy85Config, SensorsConfig, SerialConfig, WebcamConfig
+from vislam.config import SensorsConfig
 from vislam.core.errors import HardwareError
 from vislam.core.findings import Finding, Severity, worst
 from vislam.core.messages import Frame, ImuSample, MagSample
-from vislam.hw.board_check import check_board, check_rest, check_stamps
+from vislam.hw.board_check import MAX_RATE_DEG_S, check_board, check_rest, check_stamps
 from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.webcam import Capture, Webcam
@@ -111,33 +111,38 @@ def examine(
     clock: Clock | None = None,
     root: Path = Path("/"),
     open_capture: Callable[[str], Capture] | None = None,
+    sensors: SensorsConfig | None = None,
 ) -> HardwareReport:
     """Look for buses, chips, ports and cameras, and measure what answers for so long each.
 
     Only reads: chips at known addresses are asked for their ids and set up if they are what they should be; serial
-    ports, cameras and an IMU are opened when they are asked for by name. `root` is where /dev and /sys are.
+    ports, cameras and an IMU are opened when they are asked for by name. `root` is where /dev and /sys are;
+    `sensors` are the settings of all, but for the bus, port and device that are looked at.
     """
+    sensors = SensorsConfig() if sensors is None else sensors
     clock = HostClock() if clock is None else clock
     notes = _Notes()
     camera = wanted.camera
     if wanted.imu is not None and wanted.imu.partition(":")[0] in WITH_IMU:
         camera = wanted.imu if camera is None else camera
         reads_own_imu(wanted.imu, camera)
-        _examine_both(notes, wanted.imu, camera, seconds, clock)
+        _examine_both(notes, wanted.imu, camera, seconds, clock, sensors)
         camera = None
     elif wanted.imu is not None:
-        _examine_named(notes, wanted.imu, seconds, clock)
+        _examine_named(notes, wanted.imu, seconds, clock, sensors)
     else:
-        _examine_buses(notes, wanted.i2c, seconds, clock, root)
-    _examine_ports(notes, wanted.serial, seconds, clock, root)
-    _examine_cameras(notes, camera, seconds, clock, root, open_capture)
+        _examine_buses(notes, wanted.i2c, seconds, clock, root, sensors)
+    _examine_ports(notes, wanted.serial, seconds, clock, root, sensors)
+    _examine_cameras(notes, camera, seconds, clock, root, open_capture, sensors)
     return HardwareReport(tuple(notes.devices), tuple(notes.timings), tuple(notes.findings))
 
 
 # ---- I2C ----------------------------------------------------------------------------------------------------------
 
 
-def _examine_buses(notes: _Notes, wanted: str | None, seconds: float, clock: Clock, root: Path) -> None:
+def _examine_buses(
+    notes: _Notes, wanted: str | None, seconds: float, clock: Clock, root: Path, sensors: SensorsConfig
+) -> None:
     paths = sorted(str(path) for path in (root / "dev").glob("i2c-*")) if wanted is None else [wanted]
     if not paths:
         has_adapter = any((root / "sys/bus/i2c/devices").glob("i2c-*"))
@@ -150,8 +155,8 @@ def _examine_buses(notes: _Notes, wanted: str | None, seconds: float, clock: Clo
     severity: Severity = "warning" if wanted is None else "error"
     for path in paths:
         try:
-            with closing(I2cBus(path, Gy85Config().bus_timeout_s)) as bus:
-                make = _examine_chips(notes, bus, clock, root, severity)
+            with closing(I2cBus(path, sensors.gy85.bus_timeout_s)) as bus:
+                make = _examine_chips(notes, bus, clock, root, severity, sensors)
         except HardwareError as error:
             notes.failed(error, path, severity)
             continue
@@ -160,7 +165,7 @@ def _examine_buses(notes: _Notes, wanted: str | None, seconds: float, clock: Clo
 
 
 def _examine_chips(
-    notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severity: Severity
+    notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severity: Severity, sensors: SensorsConfig
 ) -> Callable[[str, Clock], Gy85 | FifoBoard] | None:
     """Note the chips of a bus; return what opens the board that they make up, if they are free."""
     notes.devices.append(Device("bus", bus.path, "I2C" if bus.is_combined else "SMBus only"))
@@ -182,14 +187,14 @@ def _examine_chips(
     imu = next((address for name, address in found.items() if name in IMU_NAMES), None)
     if imu is not None:
         _note_speed(notes, bus, imu, clock)
-        return lambda path, clock: FifoBoard(BoardConfig(bus=path), clock)
+        return lambda path, clock: FifoBoard(replace(sensors.board, bus=path), clock)
     missing = [name for name in ("ITG3205", "ADXL345") if name not in found]
     if missing:
         what = f"no {' and no '.join(missing)} free to use"
         notes.add(severity, what, bus.path, "check power (3.3 V), ground, SDA and SCL; a GY-85 has both")
         return None
     _note_speed(notes, bus, 0x53, clock)
-    return lambda path, clock: Gy85(Gy85Config(bus=path), clock)
+    return lambda path, clock: Gy85(replace(sensors.gy85, bus=path), clock)
 
 
 def _note_speed(notes: _Notes, bus: I2cBus, address: int, clock: Clock) -> None:
@@ -226,10 +231,10 @@ def _measure_board(
             notes.timings.append(_timing(f"{path}: magnetic", [sample.t_ns for sample in magnetic]))
 
 
-def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock) -> None:
+def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock, sensors: SensorsConfig) -> None:
     """Open the IMU that a command line names and measure what comes."""
     try:
-        source = open_inertial(name, SensorsConfig())
+        source = open_inertial(name, sensors)
     except HardwareError as error:
         notes.failed(error, name, "error")
         return
@@ -237,10 +242,12 @@ def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock) -> No
         _look_at_imu(notes, source, name, seconds, clock)
 
 
-def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: Clock) -> None:
+def _examine_both(
+    notes: _Notes, imu: str, camera: str, seconds: float, clock: Clock, sensors: SensorsConfig
+) -> None:
     """Open a camera with the IMU inside it, once, and measure what each gives."""
     try:
-        images, inertial = open_with_imu(camera, SensorsConfig())
+        images, inertial = open_with_imu(camera, sensors)
     except HardwareError as error:
         notes.failed(error, camera, "error")
         return
@@ -252,11 +259,13 @@ def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: C
 def _look_at_imu(notes: _Notes, source: InertialSource, name: str, seconds: float, clock: Clock) -> None:
     """Measure what an IMU gives, and note what it says of itself."""
     inertial, magnetic = _listen(source, seconds, clock)
+    if isinstance(source, SerialBridge):
+        notes.devices.append(Device("chips", name, source.board_name))
     notes.findings += check_stamps(source, name)
     if isinstance(source, Gy85 | FifoBoard):
         notes.findings += check_board(source, inertial, magnetic, name)
     else:
-        notes.findings += check_rest(inertial, name)
+        notes.findings += check_rest(inertial, name, getattr(source, "max_zero_deg_s", MAX_RATE_DEG_S))
     _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, "error")
     if magnetic:
         notes.timings.append(_timing(f"{name}: magnetic", [sample.t_ns for sample in magnetic]))
@@ -305,7 +314,9 @@ def _note_timing(notes: _Notes, name: str, samples: list[Sample], asked_hz: floa
 # ---- serial ports -------------------------------------------------------------------------------------------------
 
 
-def _examine_ports(notes: _Notes, wanted: str | None, seconds: float, clock: Clock, root: Path) -> None:
+def _examine_ports(
+    notes: _Notes, wanted: str | None, seconds: float, clock: Clock, root: Path, sensors: SensorsConfig
+) -> None:
     paths = _files(root, ("ttyUSB*", "ttyACM*", "ttyAMA*"))
     if not paths and wanted is None:
         notes.add("warning", "there is no serial port of a bridge", "/dev/ttyUSB*", "plug it in, if the cart has one")
@@ -315,12 +326,14 @@ def _examine_ports(notes: _Notes, wanted: str | None, seconds: float, clock: Clo
     if wanted is None:
         return
     try:
-        bridge = SerialBridge(SerialConfig(port=wanted))
+        bridge = SerialBridge(replace(sensors.serial, port=wanted))
     except HardwareError as error:
         notes.failed(error, wanted, "error")
         return
     with closing(bridge):
         inertial, magnetic = _listen(bridge, seconds, clock)
+        notes.devices.append(Device("chips", wanted, bridge.board_name))
+        notes.findings += check_stamps(bridge, wanted) + check_rest(inertial, wanted, bridge.max_zero_deg_s)
         _note_timing(notes, f"{wanted}: inertial", inertial, bridge.rate_hz, "error")
         if magnetic:
             notes.timings.append(_timing(f"{wanted}: magnetic", [sample.t_ns for sample in magnetic]))
@@ -347,6 +360,7 @@ def _examine_cameras(
     clock: Clock,
     root: Path,
     open_capture: Callable[[str], Capture] | None,
+    sensors: SensorsConfig,
 ) -> None:
     paths = _files(root, ("video*",))
     if not paths and wanted is None:
@@ -361,7 +375,7 @@ def _examine_cameras(
     if wanted is None:
         return
     try:
-        camera = _opened(wanted, open_capture)
+        camera = _opened(wanted, open_capture, sensors)
     except HardwareError as error:
         notes.failed(error, wanted, "error")
         return
@@ -388,12 +402,13 @@ def _look_at_camera(notes: _Notes, camera: _AnyCamera, seconds: float, clock: Cl
         notes.add("ok", what, camera.path, "tell us what you see: docs/sensors.md")
 
 
-def _opened(wanted: str, open_capture: Callable[[str], Capture] | None) -> _AnyCamera:
+def _opened(wanted: str, open_capture: Callable[[str], Capture] | None, sensors: SensorsConfig) -> _AnyCamera:
     if gives_frames(wanted):
-        return open_frame_camera(wanted, SensorsConfig())
+        return open_frame_camera(wanted, sensors)
     if is_library_camera(wanted):
-        return open_image_camera(wanted, SensorsConfig())
-    return Webcam(WebcamConfig(device=wanted), open_capture=open_capture)
+        return open_image_camera(wanted, sensors)
+    webcam = sensors.webcam if wanted == "webcam" else replace(sensors.webcam, device=wanted)
+    return Webcam(webcam, open_capture=open_capture)
 
 
 def _captured(camera: _AnyCamera, seconds: float, clock: Clock) -> Iterator[CapturedImage | Frame]:

@@ -364,7 +364,7 @@ def _rig(first: Shot, files: CalibrationConfig, hfov_deg: float) -> tuple[Rig, t
 def _stamp_notes(name: str, inertial: InertialSource | None) -> tuple[str, ...]:
     """Return where the stamps of an inertial source come from; those of a GY-85 and a bridge are in the docs."""
     stamped_by = getattr(inertial, "stamped_by", None)
-    if stamped_by is None or name.startswith("gy85"):
+    if stamped_by is None or name.startswith(("gy85", "serial")):
         return ()
     return (f"inertial samples of {name} are stamped by {stamped_by}",)
 

@@ -1,5 +1,6 @@
 // Runs the sketch: `bridge SECONDS BEGIN_US SILENT_ADDRESS FROM UNTIL BLOCKED_FROM_MS BLOCKED_UNTIL_MS FORGETS_AT`
 // and for a sketch with encoders and a receiver `LEFT RIGHT TEXT`: quarters of a period per second, and what it says.
+// The environment's MPU, as `WHO_AM_I ADDRESS MAGNETOMETER APPEARS_US`, puts another board in the place of the GY-85.
 #include <cmath>
 
 #include "Arduino.h"
@@ -44,6 +45,14 @@ int main(int count, char **arguments) {
   Wire.silent_until = atoi(arguments[5]);
   const uint32_t blocked_from = (uint32_t)atoi(arguments[6]) * 1000, blocked_until = (uint32_t)atoi(arguments[7]) * 1000;
   Wire.forgets_at = atoi(arguments[8]);
+  if (const char *mpu = getenv("MPU")) {
+    unsigned who, at;
+    unsigned long appears_us;
+    char magnetometer[8];
+    if (sscanf(mpu, "%u %u %7s %lu", &who, &at, magnetometer, &appears_us) != 4) return 2;
+    Wire.who = (uint8_t)who, Wire.mpu_at = (uint8_t)at, Wire.appears_us = (uint32_t)appears_us;
+    Wire.has_hmc = !strcmp(magnetometer, "hmc"), Wire.has_ak = !strcmp(magnetometer, "ak");
+  }
   if (count > 11) {
     wheels[0].quarters_s = atof(arguments[9]), wheels[1].quarters_s = atof(arguments[10]);
     Serial1.text = arguments[11];

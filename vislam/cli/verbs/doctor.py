@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
+import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
-from vislam.cli.verbs.arguments import parse
+from vislam.cli.verbs.arguments import parse, take_path
 from vislam.cli.verbs.terminal import number, print_table
+from vislam.config import SensorsConfig, load_sensors
 from vislam.config.ranges import Range
 from vislam.core.errors import DataError, HardwareError, UsageError, printable
 
@@ -38,16 +40,19 @@ class DoctorOptions:
     """This camera must give images: its index or device file, picam, realsense, oak"""
     seconds: Annotated[float, Range(0.5, 60.0)] = 3.0
     """How long each is measured; stand still"""
+    sensors: Annotated[SensorsConfig, tyro.conf.arg(name="")] = field(default_factory=SensorsConfig)
     json: bool = False
     """Print JSON instead of lines"""
 
 
 OPTIONS = (DoctorOptions,)
+TAKEN = {"--config FILE": "TOML file of sensors, as for record; options go before it"}
 
 
 def main(arguments: list[str]) -> int:
     """Examine a recording, or without one the sensors of this machine."""
-    options = parse(DoctorOptions, arguments, "doctor")
+    default = DoctorOptions(sensors=load_sensors(take_path(arguments, "--config")))
+    options = parse(DoctorOptions, arguments, "doctor", default)
     return _examine_recording(options) if options.source else _examine_hardware(options)
 
 
@@ -70,7 +75,8 @@ def _examine_recording(options: DoctorOptions) -> int:
 def _examine_hardware(options: DoctorOptions) -> int:
     from vislam.hw.doctor import Wanted, examine
 
-    report = examine(Wanted(options.i2c, options.serial, options.camera, options.imu), options.seconds)
+    wanted = Wanted(options.i2c, options.serial, options.camera, options.imu)
+    report = examine(wanted, options.seconds, sensors=options.sensors)
     if options.json:
         print(json.dumps(asdict(report)))
     else:

@@ -14,12 +14,12 @@ import numpy as np
 from vislam.config import SerialConfig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.affine import Affine
+from vislam.hw.bridge.behind import Behind
 from vislam.hw.bridge.clock import DeviceClock
 from vislam.hw.bridge.passer import Passer
 from vislam.hw.bridge.protocol import (
     PROTOCOL_VERSION,
-    SAMPLE_WIRE_BYTES,
+    Ages,
     Chips,
     Counts,
     FrameDecoder,
@@ -43,11 +43,9 @@ _NS = 1_000_000_000
 PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
 _READ_BYTES = 4096
 _GLANCE_S = 0.05  # while the first sample is waited for, a port that cannot be opened is told so soon
-_BITS_PER_BYTE = 10  # start, eight, stop
 _NOMINAL_HZ = 400.0  # until the device says it
 _SEQUENCES = 2**16
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
-_CHIP_NAMES = {Health.ACCEL_FAULT: "the accelerometer", Health.GYRO_FAULT: "the gyro"}
 
 
 class SerialBridge:
@@ -57,6 +55,8 @@ class SerialBridge:
     goes away is looked for every `config.reopen_s`; one that gives no sample for `config.start_s` is opened anew, which
     starts an Arduino anew. Nothing is ever written to it. One thread only.
     """
+
+    stamped_by = "the board's clock, on the line below the arrivals of its frames"
 
     def __init__(self, config: SerialConfig, must_be_there: bool = True, further: socket.socket | None = None) -> None:
         """Open the port and wait for the first sample, `config.start_s` and a second at most.
@@ -71,17 +71,13 @@ class SerialBridge:
         self._config = config
         self.rate_hz = _NOMINAL_HZ
         self.problem = f"{config.port} has not been opened"
-        self._maps: tuple[Affine, Affine, Affine] | None = None  # gyro, accel, mag
-        wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
-        self._delay_ns = round((wire_s + config.chips_s + config.filter_s) * _NS)
-        self._mag_delay_ns = round((wire_s + config.chips_s + config.mag_delay_s) * _NS)
+        self._behind = Behind(config)
         self._decoder = FrameDecoder()
         self._clock = DeviceClock(config.clock)
-        self._passer = Passer(self._clock, round((wire_s + config.chips_s) * _NS), further)
+        self._passer = Passer(self._clock, self._behind.line_ns, further)
         self._port: serial.Serial | None = None
         self._retry_ns = 0  # when to open the port
         self._patience_ns = 0  # until when a frame must have come
-        self._hello: Hello | None = None
         self._other_version: int | None = None
         self._sequence: int | None = None
         self._counts: Counter[str] = Counter()
@@ -108,7 +104,17 @@ class SerialBridge:
     @property
     def hello(self) -> Hello | None:
         """What the device said about itself; None before it did."""
-        return self._hello
+        return self._behind.hello
+
+    @property
+    def max_zero_deg_s(self) -> float:
+        """Of its gyro at rest, by the data sheet."""
+        return self._behind.max_zero_deg_s
+
+    @property
+    def board_name(self) -> str:
+        """Which chips the device has, in words; empty before it said so."""
+        return self._behind.name
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the first sample, `timeout_s` at most."""
@@ -179,7 +185,8 @@ class SerialBridge:
         self._patience_ns = now + round(config.start_s * _NS)
         self._decoder.reset()
         self._clock.restart()
-        self._hello = self._other_version = self._sequence = None
+        self._behind.forget()
+        self._other_version = self._sequence = None
 
     def _wait_for_sample(self) -> None:
         end_ns = time.monotonic_ns() + round((self._config.start_s + 1.0) * _NS)
@@ -208,10 +215,8 @@ class SerialBridge:
                 f"{port} speaks version {self._other_version} of the protocol, this vislam speaks {PROTOCOL_VERSION}; "
                 "put the sketch of this vislam on the board, docs/cart.md says how"
             )
-        if self._hello is not None:
-            missing = [name for bit, name in _CHIP_NAMES.items() if bit in self._faults]
-            what = f"has no answer from {' and '.join(missing)}" if missing else "gives no sample"
-            return "no_sample", f"{port}: the board runs and {what}; check the chips' power, SDA and SCL"
+        if self._behind.hello is not None:
+            return "no_sample", f"{port}: {self._behind.why_silent(self._faults)}"
         if decoder.bytes_since_good > 0:
             return "no_valid_frame", (
                 f"{port} sends bytes that are no frames: another device, or another rate than {self._config.baud} "
@@ -251,33 +256,30 @@ class SerialBridge:
             return []
         if isinstance(message, OtherVersion):
             self._other_version = message.version
-            self._hello = None
+            self._behind.forget()
             self._events |= Health.BUS_FAULT
             return []
         if isinstance(message, Hello):
             self._greet(message)
             return []
+        if isinstance(message, Ages):
+            self._behind.take_ages(message)
+            return []
         self._follow(message.sequence)
-        if self._hello is None or self._maps is None:
+        hello = self._behind.hello
+        if hello is None or not self._behind.is_known:
             self._counts["before_hello"] += 1
             return []
-        return self._sampled(message, self._hello, self._maps, arrival_ns)
+        return self._sampled(message, hello, arrival_ns)
 
     def _greet(self, hello: Hello) -> None:
         """Take what the device says about itself."""
-        if Chips.STARTED in hello.chips and self._hello is not None:
+        if Chips.STARTED in hello.chips and self._behind.hello is not None:
             self._counts["device_restarts"] += 1
             self._clock.restart()
             self._sequence = None
         self._follow(hello.sequence)
-        if self._hello is None or hello.accel_nm_s2 != self._hello.accel_nm_s2:
-            c = self._config.calibration
-            self._maps = (
-                Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, hello.gyro_nrad_s * 1e-9),
-                Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, hello.accel_nm_s2 * 1e-9),
-                Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, hello.mag_pt * 1e-6),
-            )
-        self._hello = hello
+        self._behind.greet(hello)
         self._passer.greet(hello)
         self.rate_hz = float(hello.rate_hz)
 
@@ -290,26 +292,19 @@ class SerialBridge:
                 self._events |= Health.IMU_GAP
         self._sequence = sequence
 
-    def _sampled(
-        self, raw: RawSample, hello: Hello, maps: tuple[Affine, Affine, Affine], arrival_ns: int
-    ) -> list[ImuSample | MagSample]:
+    def _sampled(self, raw: RawSample, hello: Hello, arrival_ns: int) -> list[ImuSample | MagSample]:
         stamp_ns = self._clock.stamp(raw.t_us, arrival_ns)
         self._note_status(raw, hello)
         if stamp_ns is None:
             self._counts["unstamped"] += 1
             return []
-        gyro_map, accel_map, mag_map = maps
         samples: list[ImuSample | MagSample] = []
         if Status.MAG_NEW in raw.status and max(map(abs, raw.mag)) < hello.mag_limit:
-            field_ut = mag_map.matrix @ np.array(raw.mag, dtype=np.float64) + mag_map.offset
-            samples.append(MagSample(stamp_ns - self._mag_delay_ns, field_ut))
+            samples.append(self._behind.field(raw, stamp_ns))
         if raw.status & (Status.ACCEL_ERROR | Status.GYRO_ERROR):
             self._events |= Health.IMU_GAP | Health.BUS_FAULT
             return samples
-        rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
-        rate -= self._zero.drift_rad_s(self._temperature_c)
-        force = accel_map.matrix @ np.array(raw.accel, dtype=np.float64) + accel_map.offset
-        samples.append(ImuSample(stamp_ns - self._delay_ns, rate, force))
+        samples.append(self._behind.inertial(raw, stamp_ns, self._zero.drift_rad_s(self._temperature_c)))
         self._newest_ns = arrival_ns
         return samples
 

@@ -2,8 +2,9 @@
 
 A frame is `type, sequence, device time, body, CRC-16`, stuffed by COBS (Cheshire and Baker, 1999) and ended by a zero
 byte, all little-endian. Samples and hellos share one sequence; counts and passed bytes, which a sketch sends only where
-it is told of encoders or a receiver, have one each, so that a host which does not know them misses nothing. The CRC is
-CCITT's with initial value 0xFFFF (`binascii.crc_hqx`). docs/sensors.md has the table;
+it is told of encoders or a receiver, and ages, which it sends only of chips other than a GY-85's, have one each: a host
+which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`).
+docs/sensors.md has the table;
 firmware/vislam_bridge/vislam_bridge.ino is the other end.
 """
 
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 PROTOCOL_VERSION = 1
-SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE = 1, 2, 3, 4
+SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE, AGES_TYPE = 1, 2, 3, 4, 5
 # longest stuffed frame, without its zero; a longer stretch without a zero is noise, and nothing of it is kept
 MAX_STUFFED_BYTES = 64
 
@@ -24,6 +25,7 @@ _HELLO = struct.Struct("<BHIBBBB3sHIIIIiHHH")
 _COUNTS = struct.Struct("<BHIii")
 _PASSED = struct.Struct("<BHI")  # then the bytes
 MOST_PASSED = 20  # bytes in a frame: so that behind it an AVR's buffer still has room for a sample
+_AGES = struct.Struct("<BHIBHHH")
 _VERSION_AT = 7  # the same in every version: type, sequence, microseconds, version
 _CRC = struct.Struct("<H")
 _CRC_BEGIN = 0xFFFF
@@ -71,9 +73,10 @@ class Hello:
     sequence: int
     t_us: int
     chips: Chips
-    accel_id: int  # 0xE5: ADXL345
-    gyro_id: int  # 0x68, 0x69: ITG3200, ITG3205
-    mag_id: bytes  # 3 bytes, b"H43": HMC5883L
+    # 0xE5: ADXL345; of a chip that is both, what it says in WHO_AM_I, known to the sketch if ACCEL is among `chips`
+    accel_id: int
+    gyro_id: int  # 0x68, 0x69: ITG3200, ITG3205; of a chip that is both the same as `accel_id`
+    mag_id: bytes  # 3 bytes, b"H43": HMC5883L, b"H\0\0": AK8963
     rate_hz: int
     accel_nm_s2: int  # per count
     gyro_nrad_s: int  # per count
@@ -111,10 +114,25 @@ class Passed:
     data: bytes
 
 
-Message = RawSample | Hello | OtherVersion | Counts | Passed
+@dataclass(frozen=True, slots=True)
+class Ages:
+    """How old the values of a chip are when they are read: filters, and half a period; sent before each hello.
+
+    Of a GY-85 nothing is sent: the host knows its chips.
+    """
+
+    sequence: int  # 16 bits, of these frames alone
+    t_us: int
+    accel_id: int  # of the hello that follows
+    gyro_us: int
+    accel_us: int
+    mag_us: int
 
 
-def encode(message: RawSample | Hello | Counts | Passed) -> bytes:
+Message = RawSample | Hello | OtherVersion | Counts | Passed | Ages
+
+
+def encode(message: RawSample | Hello | Counts | Passed | Ages) -> bytes:
     """Return a frame with its zero at the end, byte for byte what the firmware sends."""
     if isinstance(message, RawSample):
         m = message
@@ -123,6 +141,9 @@ def encode(message: RawSample | Hello | Counts | Passed) -> bytes:
         body = _COUNTS.pack(COUNTS_TYPE, message.sequence, message.t_us, message.left, message.right)
     elif isinstance(message, Passed):
         body = _PASSED.pack(PASSED_TYPE, message.sequence, message.t_us) + message.data
+    elif isinstance(message, Ages):
+        a = message
+        body = _AGES.pack(AGES_TYPE, a.sequence, a.t_us, a.accel_id, a.gyro_us, a.accel_us, a.mag_us)
     else:
         h = message
         body = _HELLO.pack(
@@ -207,8 +228,12 @@ def _passed(body: bytes) -> Passed | None:
     return Passed(sequence, t_us, data) if len(data) <= MOST_PASSED else None
 
 
+def _ages(body: bytes) -> Ages | None:
+    return Ages(*_AGES.unpack(body)[1:]) if len(body) == _AGES.size else None
+
+
 _ALL_STATUS = sum(Status)
-_READERS = {SAMPLE_TYPE: _sample, HELLO_TYPE: _hello, COUNTS_TYPE: _counts, PASSED_TYPE: _passed}
+_READERS = {SAMPLE_TYPE: _sample, HELLO_TYPE: _hello, COUNTS_TYPE: _counts, PASSED_TYPE: _passed, AGES_TYPE: _ages}
 
 
 class FrameDecoder:

@@ -14,7 +14,7 @@ import time
 import tty
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -30,6 +30,7 @@ from vislam.hw.bridge.protocol import (
     Status,
     encode,
 )
+from vislam.hw.emulator.bridged import Bridged, BridgedName, bridged
 from vislam.hw.emulator.sensing import Sensing, SensorError, Truth, quantised
 
 _NS = 1_000_000_000
@@ -39,13 +40,8 @@ _COUNTS_EVERY = 8  # samples: 50 a second
 _LATE_NS = 20_000_000
 _HELLO_EVERY_NS = _NS
 _READ_NS = 500_000  # from a sample's time to its first byte
-_FILTER_NS = 3_300_000  # what the gyro shows is so old
 _BOOT_NS = 120_000_000
 _SEQUENCES, _WRAP_US = 2**16, 2**32
-_ACCEL_M_S2, _GYRO_RAD_S, _MAG_UT = 38_307_227e-9, 1_214_142e-9, 91_743e-6
-_HELLO = Hello(
-    0, 0, Chips(7), 0xE5, 0x68, b"H43", 400, 38_307_227, 1_214_142, 91_743, 3_571_429, 82_143, 4095, 28_750, 2048
-)
 NOISE = (  # per sqrt(Hz), of gyro, accelerometer and magnetometer
     SensorError(density=(5.2e-4, 5.2e-4, 5.2e-4)),
     SensorError(density=(4.1e-3, 4.1e-3, 6.0e-3)),
@@ -83,6 +79,7 @@ class BridgeEmulator:
         now_ns: Callable[[], int] = time.monotonic_ns,
         turned: Callable[[int], tuple[float, float]] | None = None,
         has_receiver: bool = False,
+        board: BridgedName = "GY-85",
     ) -> None:
         """Start the board and plug it in.
 
@@ -96,6 +93,7 @@ class BridgeEmulator:
             now_ns: the clock that truth and bytes follow.
             turned: by how many counts left and right wheel have turned at a time; None: a sketch without encoders.
             has_receiver: the sketch passes on what `say` tells.
+            board: what is behind it, see `bridged`.
         """
         self.path = path
         self.faults = LineFaults()
@@ -104,7 +102,8 @@ class BridgeEmulator:
         self._wire_ns = SAMPLE_WIRE_BYTES * 10 * _NS // baud
         self._now_ns = now_ns
         self._turned = turned
-        self._chips = Chips(7) | (Chips.ENCODERS if turned else 0) | (Chips.GNSS if has_receiver else 0)
+        self._board = bridged(board)
+        self._chips = self._board.hello.chips | (Chips.ENCODERS if turned else 0) | (Chips.GNSS if has_receiver else 0)
         self._said = b""  # by the receiver
         self._rng = random.Random(seed)
         self._sensing = [Sensing(error, seed + i) for i, error in enumerate(errors)]
@@ -170,13 +169,15 @@ class BridgeEmulator:
         sequence = ticks = 0
         hello_ns, chips = begin_ns, self._chips | Chips.STARTED
         further = _Further(self._turned, begin_ns)
-        due_ns = begin_ns
+        greeter, due_ns = _Greeter(self._board), begin_ns
         while True:
             frames = b""
             if due_ns >= hello_ns:
                 hello_ns += _HELLO_EVERY_NS
-                hello = self._hello(sequence, self._device_us(due_ns - begin_ns), chips)
-                frames, sequence, chips = encode(hello), (sequence + 1) % _SEQUENCES, self._chips
+                for _ in range(greeter.hellos()):
+                    t_us = self._device_us(due_ns - begin_ns)
+                    frames += greeter.ages(t_us) + encode(self._hello(sequence, t_us, chips))
+                    sequence, chips = (sequence + 1) % _SEQUENCES, self._chips
             sample = self._sample(sequence, self._device_us(due_ns - begin_ns), due_ns, ticks)
             sequence, ticks = (sequence + 1) % _SEQUENCES, ticks + 1
             if not self._waited_until(due_ns + _READ_NS + self._wire_ns):
@@ -199,32 +200,33 @@ class BridgeEmulator:
             chips &= ~Chips.ACCEL
         if self.faults.no_gyro:
             chips &= ~Chips.GYRO
-        h = _HELLO
-        return Hello(
-            sequence, t_us, chips, h.accel_id, h.gyro_id, h.mag_id, h.rate_hz, h.accel_nm_s2, h.gyro_nrad_s, h.mag_pt,
-            h.temperature_nk, h.temperature_mc, h.accel_limit, h.gyro_limit, h.mag_limit,
-        )  # fmt: skip
+        return replace(self._board.hello, sequence=sequence, t_us=t_us, chips=chips)
 
     def _sample(self, sequence: int, t_us: int, t_ns: int, tick: int) -> RawSample:
         """Return what the chips show at a time of the host's clock."""
-        rate, force, field_ut, temperature_c = self._truth(t_ns - _FILTER_NS)
+        board, hello = self._board, self._board.hello
+        newest_ns = board.newest_ns(t_ns)
+        rate, force, field_ut, temperature_c = self._truth(newest_ns - board.gyro_delay_ns)
+        if board.accel_delay_ns != board.gyro_delay_ns:
+            _, force, _, _ = self._truth(newest_ns - board.accel_delay_ns)
         gyro, accel, mag = self._sensing
         status = Status(0)
-        if tick % _MAG_EVERY == 0 and tick >= 2 * _MAG_EVERY:
+        if tick % _MAG_EVERY == 0 and tick >= 2 * _MAG_EVERY and Chips.MAG in hello.chips:
             status |= Status.MAG_NEW
-        if self.faults.no_accel:
+        if self.faults.no_accel or Chips.ACCEL not in hello.chips:
             status |= Status.ACCEL_ERROR
-        if self.faults.no_gyro:
+        if self.faults.no_gyro or Chips.GYRO not in hello.chips:
             status |= Status.GYRO_ERROR
-        counts = quantised(gyro(rate, t_ns, temperature_c, 98.0), 1.0 / _GYRO_RAD_S, -32768, 32767)
-        field = quantised(mag(field_ut, t_ns, temperature_c, 37.5), 1.0 / _MAG_UT, -32768, 32767)
-        field = field if max(map(abs, field)) < _HELLO.mag_limit else (-4096, -4096, -4096)
-        temperature = round((temperature_c - 82.143) * 280.0)
+        counts = quantised(gyro(rate, t_ns, temperature_c, 98.0), 1.0 / (hello.gyro_nrad_s * 1e-9), -32768, 32767)
+        field = quantised(mag(field_ut, t_ns, temperature_c, 37.5), 1.0 / (hello.mag_pt * 1e-6), -32768, 32767)
+        field = field if max(map(abs, field)) < hello.mag_limit else (board.mag_overflow,) * 3
+        temperature = round((temperature_c - hello.temperature_mc * 1e-3) / (hello.temperature_nk * 1e-9))
         if self.faults.frozen:
             counts, temperature = (1, 2, 3), 0
+        accel_lsb, most = 1.0 / (hello.accel_nm_s2 * 1e-9), board.accel_most
         return RawSample(
             sequence, t_us, status,
-            quantised(accel(force, t_ns, temperature_c, 200.0), 1.0 / _ACCEL_M_S2, -4096, 4095), counts,
+            quantised(accel(force, t_ns, temperature_c, 200.0), accel_lsb, -most - 1, most), counts,
             field, temperature,
         )  # fmt: skip
 
@@ -258,6 +260,26 @@ class BridgeEmulator:
         return bytes(
             byte ^ 1 << self._rng.randrange(8) if self._rng.random() < faults.flipped else byte for byte in kept
         )
+
+
+class _Greeter:
+    """How the sketch says who it is, since it started."""
+
+    def __init__(self, board: Bridged) -> None:
+        self._board = board
+        self._first, self._told = board.first_hellos, 0
+
+    def hellos(self) -> int:
+        """Return how many hellos are due now."""
+        count, self._first = self._first, 1
+        return count
+
+    def ages(self, t_us: int) -> bytes:
+        """Return the frame before a hello, nothing where there is none."""
+        if self._board.ages is None:
+            return b""
+        self._told += 1
+        return encode(replace(self._board.ages, sequence=(self._told - 1) % _SEQUENCES, t_us=t_us))
 
 
 class _Further:

@@ -1,7 +1,8 @@
-// vislam_bridge: reads a GY-85 (ADXL345, ITG3205, HMC5883L) on time and sends frames to vislam over a serial line.
+// vislam_bridge: reads a GY-85 (ADXL345, ITG3205, HMC5883L) or an MPU-6050, -6500, -9250 or -9255 on time and sends
+// frames to vislam over a serial line. Which of them is there it finds when it starts.
 //
 // For AVR (Nano, Uno, Mega, Leonardo) and ESP32 with their Arduino cores; no library but Wire. Connect 5 V or 3.3 V as
-// your GY-85 is made for, GND, SDA and SCL (Nano and Uno: A4 and A5; ESP32: 21 and 22). docs/cart.md of vislam has the
+// your board is made for, GND, SDA and SCL (Nano and Uno: A4 and A5; ESP32: 21 and 22). docs/sensors.md of vislam has the
 // protocol, which vislam/hw/bridge/protocol.py reads. Any change of a frame's layout needs a new PROTOCOL_VERSION.
 // It also counts the encoders of two wheels and passes on what a satellite receiver says, where it is told their pins:
 // docs/sensors/wheels.md and docs/sensors/gnss.md of vislam.
@@ -17,6 +18,14 @@ static const uint32_t I2C_HZ = 400000;    // at 100000 reduce RATE_HZ to 100
 static const uint32_t RETRY_MS = 100;     // between attempts to set up a chip that does not answer
 static const uint16_t I2C_TIMEOUT_MS = 3; // a stuck bus must not stop the clock
 
+// Ranges of an MPU-6050 and its kin, 0 to 3: 250, 500, 1000, 2000 degrees per second; 2, 4, 8, 16 g. The host is told.
+#ifndef MPU_GYRO_RANGE
+#define MPU_GYRO_RANGE 1
+#endif
+#ifndef MPU_ACCEL_RANGE
+#define MPU_ACCEL_RANGE 2
+#endif
+
 // Pins of the encoders' channels A and B; -1: there are none. A has to be a pin with interrupts: 2 and 3 of a Nano or Uno,
 // any of an ESP32 (but 34 to 39, which have no pull-up). Both edges of A count, up while the machine goes forward.
 #ifndef LEFT_A
@@ -31,26 +40,49 @@ static const uint16_t COUNTS_HZ = 50;
 static const uint32_t GNSS_BAUD = 9600;
 
 static const uint8_t PROTOCOL_VERSION = 1;
-static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2, COUNTS_TYPE = 3, PASSED_TYPE = 4;
+static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2, COUNTS_TYPE = 3, PASSED_TYPE = 4, AGES_TYPE = 5;
 static const uint8_t STATUS_MAG_NEW = 1, STATUS_ACCEL_ERROR = 2, STATUS_GYRO_ERROR = 4, STATUS_MAG_ERROR = 8,
                      STATUS_MISSED = 16;
 static const uint8_t CHIPS_ACCEL = 1, CHIPS_GYRO = 2, CHIPS_MAG = 4, CHIPS_ENCODERS = 8, CHIPS_GNSS = 16,
                      CHIPS_STARTED = 128;
 
-static const uint32_t ACCEL_NM_S2 = 38307227;    // 256 counts a g in full resolution, whatever the range
-static const uint32_t GYRO_NRAD_S = 1214142;     // 14.375 counts a degree per second
-static const uint32_t MAG_PT = 91743;            // 1090 counts a gauss
-static const uint32_t TEMPERATURE_NK = 3571429;  // 280 counts a degree
-static const int32_t TEMPERATURE_MC = 82143;     // 35 degrees at -13200
-static const uint16_t ACCEL_LIMIT = 4095;        // 16 g
-static const uint16_t GYRO_LIMIT = 28750;        // 2000 degrees per second
-static const uint16_t MAG_LIMIT = 2048;          // 12 bits; -4096 says overflow
+// What counts of gyro and accelerometer mean, and from which on they are saturated.
+struct Inertial {
+  uint32_t accelNmS2, gyroNradS, temperatureNk;
+  int32_t temperatureMc;  // at count 0
+  uint16_t accelLimit, gyroLimit;
+};
+// 256 counts a g in full resolution, whatever the range; 14.375 counts a degree per second; 280 a degree, 35 at -13200;
+// 16 g and 2000 degrees per second.
+static const Inertial GY85 = {38307227, 1214142, 3571429, 82143, 4095, 28750};
+static const uint32_t MPU_GYRO_NRAD_S[] = {133231, 266462, 532113, 1064225};      // 131, 65.5, 32.8, 16.4 counts
+static const uint32_t MPU_ACCEL_NM_S2[] = {598550, 1197101, 2394202, 4788403};  // 16384, 8192, 4096, 2048 counts a g
+// 340 counts a degree and 36.53 at 0; of the later chips 333.87, and 21
+static const Inertial MPU6050 = {MPU_ACCEL_NM_S2[MPU_ACCEL_RANGE], MPU_GYRO_NRAD_S[MPU_GYRO_RANGE], 2941176, 36530,
+                                 32767, 32767};
+static const Inertial LATER_MPU = {MPU_ACCEL_NM_S2[MPU_ACCEL_RANGE], MPU_GYRO_NRAD_S[MPU_GYRO_RANGE], 2995178, 21000,
+                                   32767, 32767};
+
+// What those of a magnetometer mean, and how old its values are on average: half a period.
+struct Magnetic {
+  uint32_t pt;
+  uint16_t limit, ageUs;
+};
+static const Magnetic HMC5883L = {91743, 2048, 6700};   // 1090 counts a gauss; 12 bits, and -4096 says overflow
+static const Magnetic AK8963 = {150000, 32760, 5000};  // 0.15 uT, and 16 bits
+
+// How old the values of gyro and accelerometer are when they are read: the delay of their filters (of 98 and 94 Hz; of
+// the later chips 92 and 99), and half a millisecond, for they come a thousand times a second.
+static const uint16_t MPU6050_AGES_US[] = {3300, 3500}, LATER_MPU_AGES_US[] = {4400, 3380};
 
 static const uint32_t PERIOD_US = 1000000UL / RATE_HZ;
 static const uint32_t HELLO_EVERY_US = 1000000UL;
 static const uint8_t MAG_EVERY = RATE_HZ / MAG_RATE_HZ;
 static const uint8_t ACCEL_FORMAT = 0x0B;          // full resolution, 16 g
 static const uint8_t GYRO_FILTER = (3 << 3) | 2;   // 2000 degrees per second, filter at 98 Hz
+static const uint8_t MPU_FILTER = 2;               // the widest below half of 200 Hz and more
+static const uint32_t MPU_START_MS = 100;          // until its gyro gives good samples
+static const uint8_t FIRST_HELLOS = 2;  // of such a chip before its first sample: one may be lost on the line
 static const uint8_t MAG_SETTLING = 2;  // its first readings still have the gain before
 static const uint8_t MAX_BODY = 48;     // the hello is 42 bytes
 static const uint8_t SAMPLE_WIRE = 32;  // bytes that a sample takes; for anything but a hello this much stays free
@@ -79,6 +111,15 @@ static int16_t accel[3], gyro[3], mag[3], temperature;
 static uint16_t sequence;
 static uint32_t dueUs, helloUs;
 static bool helloPending = true, started = true, missed = false;
+static bool isMpu = false, boardKnown = false;  // which board it is stays until the sketch starts anew
+static uint8_t strangerId;                      // that a chip says in a MPU's place, none that is known
+static uint8_t hellosOwed;                      // before another sample is sent
+static bool agesTold;                           // for the hello that follows
+static uint16_t agesSent;
+static uint32_t mpuBegunMs;
+static bool magIsAk = false, magFresh = false, magSeen = false;
+static bool magUntold = true;  // no hello has said yet which magnetometer it is
+static uint8_t akFuses[3];
 static uint8_t magCountdown, magSettling, magStatus;
 static uint8_t body[MAX_BODY];
 static uint8_t bodyLength;
@@ -141,7 +182,8 @@ static bool beginAccel() {
            && writeRegister(addresses[i], 0x38, 0x00)  // no FIFO: the newest sample is read
            && writeRegister(addresses[i], 0x2C, rate)  // its filter is at half the rate
            && writeRegister(addresses[i], 0x31, ACCEL_FORMAT)
-           && writeRegister(addresses[i], 0x2D, 0x08);  // measure
+           && writeRegister(addresses[i], 0x2D, 0x08)  // measure
+           && (boardKnown = true);
   }
   return false;
 }
@@ -162,7 +204,7 @@ static bool beginGyro() {
     return writeRegister(addresses[i], 0x3E, 0x01)     // clock from the X gyro's PLL
            && writeRegister(addresses[i], 0x15, 0x00)  // 1 kHz: the newest sample is at most 1 ms old
            && writeRegister(addresses[i], 0x16, GYRO_FILTER)
-           && writeRegister(addresses[i], 0x17, 0x00);
+           && writeRegister(addresses[i], 0x17, 0x00) && (boardKnown = true);
   }
   return false;
 }
@@ -175,17 +217,125 @@ static bool readGyro() {
   return true;
 }
 
-static bool beginMag() {
+// ---- an MPU-6050 or one of its kin: gyro and accelerometer in one chip
+
+static bool isMpuId(uint8_t id) { return id == 0x68 || id == 0x70 || id == 0x71 || id == 0x73; }
+
+// The gyro of a GY-85 has no register there, and what it says then nobody knows; but it is never without its ADXL345.
+static bool findMpu() {
+  const uint8_t adxl345[] = {0x53, 0x1D}, addresses[] = {0x68, 0x69};
+  uint8_t id = 0;
+  for (uint8_t i = 0; i < 2; i++) {
+    if (readRegisters(adxl345[i], 0x00, &id, 1) && id == 0xE5) return false;
+  }
+  for (uint8_t i = 0; i < 2; i++) {
+    if (!readRegisters(addresses[i], 0x75, &id, 1)) continue;
+    if (!isMpuId(id)) {
+      strangerId = id;
+      continue;
+    }
+    accelChip.address = gyroChip.address = addresses[i];
+    accelChip.id[0] = gyroChip.id[0] = id;
+    isMpu = boardKnown = true;
+    hellosOwed = FIRST_HELLOS;
+    return true;
+  }
+  return false;
+}
+
+static bool beginMpu() {
+  const uint8_t address = gyroChip.address;
+  uint8_t id = 0;
+  mpuBegunMs = millis();
+  return readRegisters(address, 0x75, &id, 1) && id == gyroChip.id[0]
+         && writeRegister(address, 0x6B, 0x01)  // awake, clock from the X gyro's PLL
+         && writeRegister(address, 0x19, 0x00)  // 1 kHz: the newest sample is at most 1 ms old
+         && writeRegister(address, 0x1A, MPU_FILTER) && writeRegister(address, 0x1B, MPU_GYRO_RANGE << 3) &&
+         writeRegister(address, 0x1C, MPU_ACCEL_RANGE << 3) &&
+         (id == 0x68 || writeRegister(address, 0x1D, MPU_FILTER))  // the accelerometer has a filter of its own
+         && writeRegister(address, 0x6A, 0x00) && writeRegister(address, 0x37, 0x02);  // a magnetometer behind it is let through
+}
+
+static bool readMpu() {
+  uint8_t data[14], settings[5];
+  if (!readRegisters(gyroChip.address, 0x3B, data, 14) || !readRegisters(gyroChip.address, 0x19, settings, 5) ||
+      settings[0] != 0x00 || settings[1] != MPU_FILTER || settings[2] != MPU_GYRO_RANGE << 3 ||
+      settings[3] != MPU_ACCEL_RANGE << 3 || (gyroChip.id[0] != 0x68 && settings[4] != MPU_FILTER))
+    return false;
+  temperature = bigEndian(data + 6);
+  for (uint8_t i = 0; i < 3; i++) {
+    accel[i] = bigEndian(data + 2 * i);
+    gyro[i] = bigEndian(data + 8 + 2 * i);
+  }
+  return true;
+}
+
+static bool beginGyroOrMpu() {
+  if (isMpu || (!boardKnown && findMpu())) return beginMpu();
+  return beginGyro();
+}
+
+static bool readGyroOrMpu() { return isMpu ? readMpu() : readGyro(); }
+
+// ---- magnetometers
+
+// The one inside an MPU-9250. Its sensitivity is burnt in, and readable in a mode of its own.
+static bool beginAk() {
+  uint8_t id = 0;
+  if (!readRegisters(0x0C, 0x00, &id, 1) || id != 0x48) return false;
+  magChip.address = 0x0C;
+  magChip.id[0] = id;
+  magChip.id[1] = magChip.id[2] = 0;
+  if (!writeRegister(0x0C, 0x0A, 0x00)) return false;  // off, between any two modes
+  delayMicroseconds(100);
+  if (!writeRegister(0x0C, 0x0A, 0x0F) || !readRegisters(0x0C, 0x10, akFuses, 3)) return false;
+  if (!writeRegister(0x0C, 0x0A, 0x00)) return false;
+  delayMicroseconds(100);
+  return writeRegister(0x0C, 0x0A, 0x16);  // 100 Hz, 16 bits
+}
+
+// In the axes of the chip around it: x and y change places, z is turned over.
+static bool readAk() {
+  const uint8_t places[] = {1, 0, 2};
+  uint8_t data[9];
+  if (!readRegisters(0x0C, 0x02, data, 9) || data[8] != 0x16) return false;
+  magFresh = (data[0] & 0x01) != 0;
+  if (!magFresh) return true;
+  for (uint8_t i = 0; i < 3; i++) {
+    const int32_t raw = littleEndian(data + 1 + 2 * i), scaled = raw * (128 + (int32_t)akFuses[i]);
+    int32_t counts = (scaled + (scaled < 0 ? -128 : 128)) / 256;
+    if (i == 2) counts = -counts;
+    if ((data[7] & 0x08) || counts > 32767 || counts < -32767) counts = -32767;  // overflow
+    mag[places[i]] = (int16_t)counts;
+  }
+  return true;
+}
+
+static bool beginHmc() {
   magChip.address = 0x1E;
-  magSettling = MAG_SETTLING;
   return readRegisters(0x1E, 0x0A, magChip.id, 3) && magChip.id[0] == 'H' && magChip.id[1] == '4' &&
          magChip.id[2] == '3' && writeRegister(0x1E, 0x00, 0x18)  // 75 Hz, no averaging
          && writeRegister(0x1E, 0x01, 0x20)                       // 1.3 gauss
          && writeRegister(0x1E, 0x02, 0x00);                      // continuous
 }
 
+static bool beginMag() {
+  magSettling = MAG_SETTLING;
+  const bool wasAk = magIsAk;
+  bool found = beginHmc();
+  if (found || !isMpu) {
+    magIsAk = false;
+  } else {
+    found = magIsAk = beginAk();
+  }
+  if (magIsAk != wasAk) magUntold = helloPending = true;
+  return found;
+}
+
 static bool readMag() {
+  if (magIsAk) return readAk();
   uint8_t data[6];
+  magFresh = true;
   if (!readRegisters(magChip.address, 0x03, data, 6)) return false;
   mag[0] = bigEndian(data);
   mag[2] = bigEndian(data + 2);  // the chip has x, z, y
@@ -274,24 +424,50 @@ static void sendSample(uint32_t timeUs, uint8_t status) {
   sendFrame();
 }
 
+static void sendAges(uint32_t timeUs) {
+  const uint16_t *ages = gyroChip.id[0] == 0x68 ? MPU6050_AGES_US : LATER_MPU_AGES_US;
+  beginFrame(AGES_TYPE, agesSent++, timeUs);
+  put8(accelChip.id[0]);
+  put16(ages[0]);
+  put16(ages[1]);
+  put16(magIsAk ? AK8963.ageUs : HMC5883L.ageUs);
+  sendFrame();
+}
+
 static bool sendHello(uint32_t timeUs) {
+  const Inertial &inertial = !isMpu ? GY85 : gyroChip.id[0] == 0x68 ? MPU6050 : LATER_MPU;
+  const Magnetic &magnetic = magIsAk ? AK8963 : HMC5883L;
   beginFrame(HELLO_TYPE, sequence++, timeUs);
   put8(PROTOCOL_VERSION);
   put8((accelChip.ready ? CHIPS_ACCEL : 0) | (gyroChip.ready ? CHIPS_GYRO : 0) | (magChip.ready ? CHIPS_MAG : 0) |
        (HAS_ENCODERS ? CHIPS_ENCODERS : 0) | (HAS_GNSS ? CHIPS_GNSS : 0) | (started ? CHIPS_STARTED : 0));
-  put8(accelChip.id[0]);
+  put8(boardKnown ? accelChip.id[0] : strangerId);
   put8(gyroChip.id[0]);
   for (uint8_t i = 0; i < 3; i++) put8(magChip.id[i]);
   put16(RATE_HZ);
-  put32(ACCEL_NM_S2);
-  put32(GYRO_NRAD_S);
-  put32(MAG_PT);
-  put32(TEMPERATURE_NK);
-  put32((uint32_t)TEMPERATURE_MC);
-  put16(ACCEL_LIMIT);
-  put16(GYRO_LIMIT);
-  put16(MAG_LIMIT);
-  return sendFrame();
+  put32(inertial.accelNmS2);
+  put32(inertial.gyroNradS);
+  put32(magnetic.pt);
+  put32(inertial.temperatureNk);
+  put32((uint32_t)inertial.temperatureMc);
+  put16(inertial.accelLimit);
+  put16(inertial.gyroLimit);
+  put16(magnetic.limit);
+  if (!sendFrame()) return false;
+  helloPending = started = magUntold = false;
+  return true;
+}
+
+// Say hello where the line takes it, before it how old the values of a MPU are. Returns whether it was said.
+static bool greet(uint32_t timeUs) {
+  if (Serial.availableForWrite() < MAX_BODY + 4) return false;
+  if (isMpu && !agesTold) {
+    agesTold = true;
+    sendAges(timeUs);
+    return false;
+  }
+  agesTold = false;
+  return sendHello(timeUs);
 }
 
 // ---- encoders: an interrupt at each edge of channel A
@@ -370,15 +546,23 @@ static void sampleAndSend(uint32_t timeUs) {
   uint8_t status = missed ? STATUS_MISSED : 0;
   missed = false;
   bool retried = false;
-  if (!readOrRetry(gyroChip, beginGyro, readGyro, retried)) status |= STATUS_GYRO_ERROR;
-  if (!readOrRetry(accelChip, beginAccel, readAccel, retried)) status |= STATUS_ACCEL_ERROR;
+  if (!readOrRetry(gyroChip, beginGyroOrMpu, readGyroOrMpu, retried)) status |= STATUS_GYRO_ERROR;
+  if (isMpu) {
+    accelChip.ready = gyroChip.ready;
+    if (millis() - mpuBegunMs < MPU_START_MS) status |= STATUS_GYRO_ERROR;  // it was set up anew, and is starting
+    if (status & STATUS_GYRO_ERROR) status |= STATUS_ACCEL_ERROR;
+  } else if (!readOrRetry(accelChip, beginAccel, readAccel, retried)) {
+    status |= STATUS_ACCEL_ERROR;
+  }
   if (magCountdown-- == 0) {
     magCountdown = MAG_EVERY - 1;
-    magStatus = readOrRetry(magChip, beginMag, readMag, retried) ? 0 : STATUS_MAG_ERROR;
-    if (magStatus == 0) {
+    const bool isRead = readOrRetry(magChip, beginMag, readMag, retried);
+    magSeen = magSeen || isRead;
+    magStatus = isRead || (isMpu && !magSeen) ? 0 : STATUS_MAG_ERROR;  // many boards with a MPU have none
+    if (isRead) {
       if (magSettling > 0)
         magSettling--;
-      else
+      else if (magFresh && !magUntold)
         status |= STATUS_MAG_NEW;
     }
   }
@@ -393,19 +577,26 @@ void setup() {
   beginEncoders();
   beginGnss();
   freeBus();
-  writeRegister(0x68, 0x3E, 0x80);  // reset the gyro, at either address
+  writeRegister(0x68, 0x3E, 0x80);  // reset the gyro, at either address; a MPU has data there, which stay what they are
   writeRegister(0x69, 0x3E, 0x80);
   delay(70);  // it starts, and so do the others
-  gyroChip.ready = beginGyro();
-  accelChip.ready = beginAccel();
+  if (findMpu()) {
+    writeRegister(gyroChip.address, 0x6B, 0x80);
+    delay(100);  // it resets itself
+  }
+  gyroChip.ready = beginGyroOrMpu();
+  accelChip.ready = isMpu ? gyroChip.ready : beginAccel();
   magChip.ready = beginMag();
-  delay(50);  // a gyro's first samples have a larger offset
+  delay(isMpu ? MPU_START_MS : 50);  // a gyro's first samples have a larger offset
   helloUs = dueUs = micros();
 }
 
 void loop() {
   const uint32_t now = micros();
-  if ((int32_t)(now - dueUs) >= 0) {
+  if (hellosOwed > 0) {
+    if (greet(now)) hellosOwed--;
+    helloUs = dueUs = now;
+  } else if ((int32_t)(now - dueUs) >= 0) {
     dueUs += PERIOD_US;
     if ((int32_t)(now - dueUs) >= 0) {  // more than a period late
       missed = true;
@@ -413,9 +604,7 @@ void loop() {
     }
     sampleAndSend(now);
   } else if (helloPending) {
-    if (Serial.availableForWrite() >= MAX_BODY + 4 && sendHello(now)) {
-      helloPending = started = false;
-    }
+    greet(now);
   } else if (now - helloUs >= HELLO_EVERY_US) {
     helloUs = now;
     helloPending = true;

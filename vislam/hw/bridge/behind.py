@@ -1,0 +1,159 @@
+"""The chips behind a serial bridge: which they are, what their counts mean, how old these are when they are read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.config import SerialConfig
+from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.hw.affine import Affine
+from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Ages, Chips, Hello, RawSample
+from vislam.hw.chips import mpu6050
+from vislam.hw.health import Health
+
+_NS = 1_000_000_000
+_BITS_PER_BYTE = 10  # start, eight, stop
+_ADXL345, _MPU6050 = 0xE5, 0x68
+_GYROS = {0x68: "ITG3205", 0x69: "ITG3205"}
+_MAGNETOMETERS = {b"H43": "HMC5883L", b"H\0\0": "AK8963"}
+_SENSORS = {Health.ACCEL_FAULT: "the accelerometer", Health.GYRO_FAULT: "the gyro"}
+_CLOCK = 2**32  # microseconds until it wraps
+_MOST_APART = 1.5  # periods between samples that follow each other
+
+
+class Behind:
+    """Turns counts into samples, by what the device says about its chips.
+
+    A GY-85's filters are known from the settings. Any other chip tells its own in a frame of `Ages`; before it has,
+    nothing is made of its counts.
+    """
+
+    def __init__(self, config: SerialConfig) -> None:
+        """Take the calibration and what is known of the line."""
+        self.hello: Hello | None = None
+        self._ages: Ages | None = None
+        self._config = config
+        wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
+        self.line_ns = round((wire_s + config.chips_s) * _NS)  # from a sample's time to its arrival on the clock's line
+        # kept for what it is: a sum that is rounded once
+        self._gy85_ns = round((wire_s + config.chips_s + config.filter_s) * _NS)
+        self._gy85_mag_ns = round((wire_s + config.chips_s + config.mag_delay_s) * _NS)
+        self._maps: tuple[Affine, Affine, Affine] | None = None  # gyro, accel, mag
+        self._accel_before: tuple[int, Array] | None = None  # device time, counts
+
+    def forget(self) -> None:
+        """Another device may answer from now on."""
+        self.hello = self._ages = None
+        self._accel_before = None
+
+    def take_ages(self, ages: Ages) -> None:
+        """Take what the device says of the hello that follows."""
+        self._ages = ages
+
+    def greet(self, hello: Hello) -> None:
+        """Take what the device says about its chips."""
+        before, c = self.hello, self._config.calibration
+        self.hello = hello
+        if before is None or _scales(before) != _scales(hello):
+            self._accel_before = None
+            self._maps = (
+                Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, hello.gyro_nrad_s * 1e-9),
+                Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, hello.accel_nm_s2 * 1e-9),
+                Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, hello.mag_pt * 1e-6),
+            )
+
+    @property
+    def is_known(self) -> bool:
+        """Whether counts can be made samples of."""
+        hello, ages = self.hello, self._ages
+        if hello is None:
+            return False
+        return not _is_one_chip(hello) or (ages is not None and ages.accel_id == hello.accel_id)
+
+    @property
+    def name(self) -> str:
+        """What the device says it has, in words; empty before it did."""
+        hello = self.hello
+        if hello is None:
+            return ""
+        if _is_one_chip(hello):
+            names = [mpu6050.IDS[hello.accel_id]]
+        else:
+            names = ["ADXL345"] if Chips.ACCEL in hello.chips else []
+            names += [_GYROS.get(hello.gyro_id, "a gyro")] if Chips.GYRO in hello.chips else []
+        names += [_MAGNETOMETERS.get(hello.mag_id, "a magnetometer")] if Chips.MAG in hello.chips else []
+        return ", ".join(names) or "no chip that answers"
+
+    @property
+    def max_zero_deg_s(self) -> float:
+        """Of the gyro at rest, by the data sheet: ITG3205, MPU-6050, later ones."""
+        if self.hello is None or not _is_one_chip(self.hello):
+            return 40.0
+        return 20.0 if self.hello.accel_id == _MPU6050 else 5.0
+
+    def why_silent(self, faults: Health) -> str:
+        """Return why a board that said hello gives no samples, and what to do."""
+        if stranger := self._stranger():
+            return (
+                f"the board has {stranger}; put one of these or a GY-85 behind it, or connect the chip to the host's "
+                "I2C bus: docs/sensors.md"
+            )
+        missing = [name for bit, name in _SENSORS.items() if bit in faults]
+        what = f"has no answer from {' and '.join(missing)}" if missing else "gives no sample"
+        return f"the board runs and {what}; check the chips' power, SDA and SCL"
+
+    def _stranger(self) -> str:
+        """Return what the device says of a chip that its sketch does not know; empty: there is none."""
+        hello = self.hello
+        if hello is None or hello.chips & (Chips.ACCEL | Chips.GYRO):
+            return ""
+        if hello.accel_id in (0, _ADXL345) or hello.accel_id in mpu6050.IDS:
+            return ""
+        known = ", ".join(f"{name} 0x{value:02x}" for value, name in mpu6050.IDS.items())
+        return f"a chip that says 0x{hello.accel_id:02x}, and the sketch knows {known}"
+
+    def field(self, raw: RawSample, stamp_ns: int) -> MagSample:
+        """Return the sample of the magnetometer whose frame was stamped so; call it where all is known."""
+        assert self._maps is not None
+        mag_map = self._maps[2]
+        told = self._told
+        delay_ns = self._gy85_mag_ns if told is None else self.line_ns + 1000 * told.mag_us
+        field_ut = mag_map.matrix @ np.array(raw.mag, dtype=np.float64) + mag_map.offset
+        return MagSample(stamp_ns - delay_ns, field_ut)
+
+    def inertial(self, raw: RawSample, stamp_ns: int, drift_rad_s: Array) -> ImuSample:
+        """Return the inertial sample of a frame that was stamped so, at the time of what the gyro's filter shows."""
+        assert self._maps is not None
+        gyro_map, accel_map, _ = self._maps
+        told = self._told
+        delay_ns = self._gy85_ns if told is None else self.line_ns + 1000 * told.gyro_us
+        rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
+        rate -= drift_rad_s
+        accel = np.array(raw.accel, dtype=np.float64)
+        if told is not None:
+            accel = self._at_gyro(raw.t_us, accel, told)
+        return ImuSample(stamp_ns - delay_ns, rate, accel_map.matrix @ accel + accel_map.offset)
+
+    @property
+    def _told(self) -> Ages | None:
+        return self._ages if self.hello is not None and _is_one_chip(self.hello) else None
+
+    def _at_gyro(self, t_us: int, accel: Array, ages: Ages) -> Array:
+        """Return counts [3] on the line of the last two, at the time of the gyro's; `FifoSamples` does the same."""
+        before, self._accel_before = self._accel_before, (t_us, accel)
+        assert self.hello is not None
+        if before is None:
+            return accel
+        since_us = (t_us - before[0]) % _CLOCK
+        if not 0 < since_us * self.hello.rate_hz <= _MOST_APART * 1e6:
+            return accel
+        share = (ages.gyro_us - ages.accel_us) / since_us
+        return np.asarray(accel - share * (accel - before[1]))
+
+
+def _is_one_chip(hello: Hello) -> bool:
+    return hello.accel_id in mpu6050.IDS
+
+
+def _scales(hello: Hello) -> tuple[int, ...]:
+    return hello.accel_id, hello.accel_nm_s2, hello.gyro_nrad_s, hello.mag_pt
