@@ -85,6 +85,7 @@ class Recorder:
         self._image_format: ImageFormat = image_format
         self._depth_units_per_m = depth_units_per_m
         self._logs: dict[str, _RowLog] = {}
+        self._readings: dict[str, _RowLog] = {}  # of further sensors
         self._newest_ns: int | None = None
         self._last_frame_ns: int | None = None
         try:
@@ -148,10 +149,31 @@ class Recorder:
             raise self._storage_error(error, self._root) from error
         self.counts["true poses"] += 1
 
+    def begin_readings(self, name: str, header: str) -> None:
+        """Make NAME.csv of a further sensor, beside the folders of IMU and camera; `header` names stamp and values.
+
+        Raises StorageError as `write` does.
+        """
+        try:
+            self._readings[name] = _RowLog(self._root.parent / f"{name}.csv", header)
+        except OSError as error:
+            self.close()
+            raise self._storage_error(error, self._root) from error
+        self.counts[f"{name} readings"] = 0
+
+    def write_reading(self, name: str, t_ns: int, values: Array) -> None:
+        """Append a reading to a table that was begun; raises StorageError as `write` does."""
+        try:
+            self.bytes_written += self._readings[name].append(t_ns, values)
+        except OSError as error:
+            self.close()
+            raise self._storage_error(error, self._root) from error
+        self.counts[f"{name} readings"] += 1
+
     def close(self) -> None:
         """Flush to the disk and close; the recorder cannot be written to afterwards. Closing twice does nothing."""
-        logs, self._logs = self._logs, {}
-        for log in logs.values():
+        logs, self._logs, self._readings = (*self._logs.values(), *self._readings.values()), {}, {}
+        for log in logs:
             log.close()
 
     def _make_folders(self, rig: Rig | None, noise: ImuNoise | None, comment: str, imu_keys: str) -> None:

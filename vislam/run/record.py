@@ -39,6 +39,7 @@ from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inerti
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.run.camera_rig import rig_of
+from vislam.run.recorded_readings import FurtherPorts, ReadingRecorder
 
 _GB = 1e9
 _READ_S = 0.2  # a reading thread looks so often whether to stop
@@ -85,6 +86,7 @@ def record(
     in_real_time: bool = True,
     stop: threading.Event | None = None,
     progress: Callable[[Recorded], None] | None = None,
+    further: FurtherPorts | None = None,
 ) -> Recorded:
     """Record until told to stop, for some seconds, to the end of a video, or until the disk budget is used up.
 
@@ -99,9 +101,10 @@ def record(
         in_real_time: of a video; otherwise as fast as it is written.
         stop: ends the recording when set, as a first signal does (`interrupts.SIGNALS`) once it is going.
         progress: is told how it stands once a second.
+        further: sensors at ports, whose readings are written beside the recording.
 
     Raises:
-        UsageError: the folder holds something, or a sensor's name is none.
+        UsageError: the folder holds something, a sensor's name is none, or one is at a bridge that is not the IMU.
         HardwareError: a sensor is missing at the start.
         StorageError: there is no space, or the disk failed; what was written is a recording.
         DataError: a calibration file cannot be used.
@@ -115,10 +118,12 @@ def record(
     inertial: InertialSource | None = None
     images: Images | None = None
     own_rig: tuple[Rig, tuple[str, ...]] | None = None
+    readings = None if further is None else ReadingRecorder(further, imu)
     try:
         is_inside = reads_own_imu(imu, camera)
         if imu != "none" and not is_inside:
-            inertial = open_inertial(imu, with_raw_samples(sensors))
+            passed = None if readings is None else readings.bridge_end
+            inertial = open_inertial(imu, with_raw_samples(sensors), further=passed)
         if camera != "none":
             own_rig = rig_of(camera, sensors, files.camera, is_inside) if gives_frames(camera) else None
             if is_inside:
@@ -135,15 +140,17 @@ def record(
             imu_calibration=imu_calibration, mag_calibration=mag_calibration,
         ) as recorder:  # fmt: skip
             recorded = Recorded(out, time.monotonic_ns(), notes=notes)
+            if readings is not None:
+                readings.begin(recorder, out)
             with interrupts.counted() as asked:
                 asked.take_time()
                 recording = _Recording(
-                    recorder, recorded, config, inertial, images, in_real_time,
+                    recorder, recorded, config, inertial, images, readings, in_real_time,
                     lambda: asked.count > 0 or (stop is not None and stop.is_set()),
                 )  # fmt: skip
                 return recording.run(first, seconds, progress)
     finally:
-        for source in (inertial, images):
+        for source in (inertial, images, readings):
             if source is not None:
                 source.close()
 
@@ -158,6 +165,7 @@ class _Recording:
         config: RecordConfig,
         inertial: InertialSource | None,
         images: Images | None,
+        readings: ReadingRecorder | None,
         drops_images: bool,
         is_over: Callable[[], bool],
     ) -> None:
@@ -166,6 +174,7 @@ class _Recording:
         self._config = config
         self._inertial = inertial
         self._images = images
+        self._readings = readings
         self._samples: Queue[ImuSample | MagSample] = Queue(config.imu_queue)
         self._frames: Queue[Shot] = Queue(config.image_queue)
         self._is_over = is_over
@@ -202,8 +211,11 @@ class _Recording:
             self._is_stopping.set()
             for thread in threads:
                 thread.join(_JOIN_S)
+            self._write_waiting(0.0)
             while not (self._samples.empty() and self._frames.empty()):
                 self._write_waiting(0.0)
+            if self._readings is not None:
+                recorded.notes += self._readings.notes()
         except StorageError as error:
             recorded.ended = str(error)
             with suppress(StorageError, OSError):  # what went wrong first is what is told
@@ -256,7 +268,9 @@ class _Recording:
                 return
 
     def _write_waiting(self, wait_s: float) -> None:
-        """Write all samples and one image that wait."""
+        """Write all samples and readings and one image that wait."""
+        if self._readings is not None:
+            self._readings.take()
         for _ in range(self._samples.qsize()):
             self._recorder.write(self._samples.get_nowait())
         try:
@@ -298,6 +312,8 @@ class _Recording:
             recorded.faults["imu"] = self._imu_faults
         if self._images is not None:
             recorded.faults["camera"] = self._images.counters()
+        if self._readings is not None:
+            recorded.faults |= {f"sensor {name}": counts for name, counts in self._readings.counters().items()}
         replaced = recorded.faults.get("camera", {}).get("replaced", 0)
         recorded.dropped = {**self._dropped, "images before the queue": replaced}
 

@@ -10,7 +10,7 @@ import tyro
 
 from vislam.cli.verbs.arguments import parse, take_path
 from vislam.cli.verbs.terminal import rewritten_line
-from vislam.config import RecordConfig, SensorsConfig, load_sensors
+from vislam.config import RecordConfig, SensorsConfig, load_cart
 from vislam.config.ranges import Positive
 
 
@@ -38,19 +38,22 @@ class RecordOptions:
 
 
 OPTIONS = (RecordOptions,)
-TAKEN = {"--config FILE": "TOML file of sensors; options go before it"}
+TAKEN = {"--config FILE": "TOML file of sensors, with tables [sensors.NAME] of further ones; options go before it"}
 
 
 def main(arguments: list[str]) -> int:
     """Record until the time is over or a signal comes."""
-    base = RecordOptions(out=tyro.MISSING, sensors=load_sensors(take_path(arguments, "--config")))
-    options = parse(RecordOptions, arguments, "record", base)
+    sensors, further = load_cart(take_path(arguments, "--config"))
+    options = parse(RecordOptions, arguments, "record", RecordOptions(out=tyro.MISSING, sensors=sensors))
+    from vislam.live.port_readings import PortReadings
     from vislam.run.record import record
+    from vislam.run.recorded_readings import further_ports
 
+    ports = None if further.file is None else further_ports(Path(further.file), PortReadings)
     with rewritten_line() as show:
         recorded = record(
             options.out, options.imu, options.camera, options.sensors, options.settings, options.seconds,
-            not options.full_speed, progress=lambda recorded: show(recorded.line()),
+            not options.full_speed, progress=lambda recorded: show(recorded.line()), further=ports,
         )  # fmt: skip
     if options.json:
         print((options.out / "recording.json").read_text(encoding="utf-8"), end="")
