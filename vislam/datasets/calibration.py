@@ -89,7 +89,9 @@ def read_camera(path: Path) -> CameraFile:
 def read_imu(path: Path) -> tuple[ImuNoise, Array]:
     """Return noise and pose `T_BS` [4, 4] of an ASL IMU file; raises DataError naming the key."""
     data = load_yaml(path)
-    return parse_noise(data, "rate_hz", path), read_pose(data, path)
+    # `vislam calibrate noise` writes Kalibr's key, and its file is put in the place of this one
+    key = "update_rate" if "update_rate" in data and "rate_hz" not in data else "rate_hz"
+    return parse_noise(data, key, path), read_pose(data, path)
 
 
 def read_camchain(path: Path, index: int) -> CameraFile:
