@@ -346,3 +346,23 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < peaks[0] + 50_000  # bytes; the rows themselves are 27000 times 200 more
+
+
+@pytest.mark.parametrize("rows", [3, 7])
+def test_an_imu_whose_file_tells_no_rate_has_the_one_of_its_samples(rows: int, tmp_path: Path) -> None:
+    root = write_asl(tmp_path)
+    (root / "imu0" / "sensor.yaml").write_text(IMU_YAML.replace("rate_hz: 200\n", ""))
+    table = root / "imu0" / "data.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:rows]))
+    noise = open_dataset(str(tmp_path)).imu_noise
+    assert noise is not None
+    assert noise.rate_hz == pytest.approx(200.0)
+
+
+def test_an_imu_without_rate_and_samples_is_refused(tmp_path: Path) -> None:
+    root = write_asl(tmp_path)
+    (root / "imu0" / "sensor.yaml").write_text(IMU_YAML.replace("rate_hz: 200\n", ""))
+    table = root / "imu0" / "data.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
+    with pytest.raises(DataError, match="no file tells the IMU's rate, and it has 1 samples"):
+        open_dataset(str(tmp_path))

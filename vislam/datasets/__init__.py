@@ -12,7 +12,7 @@ from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.recording import Recording
 from vislam.datasets import bags
-from vislam.datasets.calibrated import calibrated
+from vislam.datasets.calibrated import calibrated, with_imu_rate
 from vislam.datasets.formats import asl, kitti, phone, tum, video
 from vislam.datasets.stream import FileRecording, Survey
 
@@ -46,7 +46,7 @@ def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Reco
         DataError: the path holds no recording of the format, or one that cannot be replayed.
     """
     found = survey(uri)
-    return FileRecording(found if calibration is None else calibrated(found, calibration))
+    return FileRecording(with_imu_rate(found if calibration is None else calibrated(found, calibration)))
 
 
 def survey(uri: str) -> Survey:

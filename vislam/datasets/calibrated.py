@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from vislam.core.errors import DataError
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.stream import KnownCamera, Survey
+from vislam.datasets.tables import Problems
 
 _OFFSET_WIDER = 3.0  # sigmas of a calibrated time offset that a later day may be off
 _LEAST_OFFSET_SIGMA_S = 0.001
+_RATE_SAMPLES = 400  # from which the usual rate of an IMU is taken
 
 
 def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
@@ -39,6 +42,21 @@ def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
     if files.mag is not None:
         found = replace(found, mag_calibration=read_mag_calibration(Path(files.mag)))
     return found
+
+
+def with_imu_rate(found: Survey) -> Survey:
+    """Return what a recording holds, with the usual rate of its first inertial samples where no file tells it.
+
+    Raises DataError where there are not two of them.
+    """
+    if found.imu_noise is None or found.imu_noise.rate_hz > 0.0 or not found.has_imu:
+        return found
+    stamps = [t_ns for t_ns, _ in islice(found.imu_rows(Problems()), _RATE_SAMPLES)]
+    steps_ns = np.diff(np.array(stamps, dtype=np.int64))
+    steps_ns = steps_ns[steps_ns > 0]
+    if len(steps_ns) == 0:
+        raise DataError(f"{found.root}: no file tells the IMU's rate, and it has {len(stamps)} samples; write rate_hz")
+    return replace(found, imu_noise=replace(found.imu_noise, rate_hz=1e9 / float(np.median(steps_ns))))
 
 
 def joined_rig(known: Sequence[KnownCamera], has_depth: bool) -> Rig | None:

@@ -242,9 +242,7 @@ def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock, senso
         _look_at_imu(notes, source, name, seconds, clock)
 
 
-def _examine_both(
-    notes: _Notes, imu: str, camera: str, seconds: float, clock: Clock, sensors: SensorsConfig
-) -> None:
+def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: Clock, sensors: SensorsConfig) -> None:
     """Open a camera with the IMU inside it, once, and measure what each gives."""
     try:
         images, inertial = open_with_imu(camera, sensors)
