@@ -56,7 +56,7 @@ def test_the_rig_is_that_of_the_factory(world: World) -> None:
 
 def test_a_rational_model_is_taken_and_a_tilted_sensor_refused(world: World) -> None:
     world.coeffs[5] = 0.3
-    lens = factory_rig("oak", SENSORS).cameras[0]
+    lens = factory_rig("oak", SENSORS)[0].cameras[0]
     assert (lens.distortion, lens.coefficients) == ("rational", tuple(world.coeffs[:8]))
     world.coeffs[12] = 0.01
     with pytest.raises(DataError, match=r"of which vislam has the first 8; calibrate it.*--calibration\.camera"):

@@ -16,7 +16,6 @@ from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import Config, dump, load
 from vislam.core.errors import UsageError
-from vislam.core.up import told_up
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,8 @@ def main(arguments: list[str]) -> int:
     if options.dry_run:
         print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
         return 0
+    from vislam.core.up import told_up
+
     told_up(options.settings.up)
     if options.localize_only and options.map is None:
         raise UsageError("--localize-only needs a map; give --map OLD/session.db")
