@@ -1,6 +1,7 @@
 """Runs without an IMU: what is final of them stands upright, or says why not."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,12 @@ from needs import missing
 from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
 from vislam.core.errors import UsageError
-from vislam.core.up import angle_deg, told_up, turn_to_z
+from vislam.core.up import Up, angle_deg, told_up, turn_to_z
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.levelled import onto_map
+from vislam.run.folder import MapChoice, prepare
+from vislam.run.levelled import onto_map, with_planes
 from vislam.run.offline.rebuild import map_settings, rebuild
 from vislam.run.report import write_report
 from vislam.run.sources import open_source
@@ -177,3 +178,48 @@ def test_recordings_stand_upright(name, up, data_root, tmp_path):
     assert metrics["up"]["source"] == ("accelerometer" if name == "tum_fr1_desk" else "planes")
     assert lean_deg(tmp_path, up=up) < 2.0
     assert metrics["up"]["from_planes_deg"] is None or metrics["up"]["from_planes_deg"] < 3.0
+
+
+# --- two who say it, and runs that go on
+
+
+def said(source, lean_deg, sigma_deg):
+    angle = np.deg2rad(lean_deg)
+    return Up(source, np.array([np.sin(angle), 0.0, np.cos(angle)]), sigma_deg, 1.0, f"{source} says so")
+
+
+def test_an_accelerometer_and_surfaces_that_agree_are_weighted_by_their_sigmas():
+    both = with_planes(said("accelerometer", 1.0, 1.0), said("planes", -1.0, 0.5))
+    assert both.source == "accelerometer"
+    assert angle_deg(both.direction, np.array([0.0, 0.0, 1.0])) == pytest.approx(0.6, abs=0.01)
+    assert both.direction[0] < 0.0
+    assert both.sigma_deg == 0.5  # not smaller: both go by one trajectory
+    assert "agree to 2.0 deg" in both.reason
+
+
+def test_surfaces_that_contradict_the_accelerometer_move_nothing():
+    first = said("accelerometer", 0.0, 1.0)
+    assert with_planes(first, said("planes", 20.0, 0.5)) is first
+    assert with_planes(first, Up.unknown("no surfaces")) is first
+
+
+def test_a_run_in_the_map_of_another_takes_its_up(auto, source, tmp_path):
+    old, out = auto
+    prepare(tmp_path / "run", False)
+    begin = MapChoice(out, False)
+    metrics = execute(open_source(source, 0), CONFIG, tmp_path / "run", source=source, command=["test"], base=begin)
+    assert metrics["map"]["found_t_s"] is not None
+    assert metrics["up"]["source"] == "map"
+    np.testing.assert_array_equal(metrics["up"]["direction"], old["up"]["direction"])
+    assert lean_deg(tmp_path / "run") < 2.0
+
+
+def test_what_is_optimized_later_stands_upright_too(auto, tmp_path):
+    _, out = auto
+    copy = tmp_path / "run"
+    shutil.copytree(out, copy)
+    assert run_verb(["optimize", str(copy)]) == 0
+    assert lean_deg(copy, "batch") < 2.0
+    R = [read_tum(copy / f"trajectory_{name}.tum").T_world_body[:, :3, :3] for name in ("batch", "graph")]
+    turned = [angle_deg(a[:, 2], b[:, 2]) for a, b in zip(*R, strict=False)]
+    assert max(turned) < 2.0

@@ -109,11 +109,16 @@ def test_tilt_ignores_heading_and_measures_the_rest(yaw: float, tilt: float, axi
         ({"sigma_m": 0.5}, None, LoopDecision.REJECTED, "sigma 50 cm"),
         ({"sigma_m": float("nan")}, None, LoopDecision.REJECTED, "sigma nan"),
         ({}, 12.0, LoopDecision.REJECTED, "12.0 deg off gravity"),
-        ({"reverse_agreement": 0.2}, None, LoopDecision.REJECTED, "20% agree the other way round"),
-        ({"depth_agreement": 0.1}, None, LoopDecision.REJECTED, "10% agree in depth"),
-        ({"T_a_b": None, "reason": "5 matches, needs 12"}, None, LoopDecision.REJECTED, "5 matches, needs 12"),
+        ({"reverse_agreement": 0.2}, None, LoopDecision.REJECTED, "agree the other way round: 20%"),
+        ({"depth_agreement": 0.1}, None, LoopDecision.REJECTED, "agree in depth: 10%"),
+        (
+            {"T_a_b": None, "reason": "too few matches: 5, needs 12"},
+            None,
+            LoopDecision.REJECTED,
+            "too few matches: 5, needs 12",
+        ),
         ({"has_scale": False}, None, LoopDecision.ACCEPTED, "direction good to 1.1 deg"),
-        ({"has_scale": False, "sigma_m": 0.3}, None, LoopDecision.REJECTED, "17.2 deg only"),
+        ({"has_scale": False, "sigma_m": 0.3}, None, LoopDecision.REJECTED, "17.2 deg,"),
     ],
 )
 def test_each_rule_decides_with_its_reason(

@@ -40,11 +40,11 @@ class Levelled:
 
     Attributes:
         up: None where gravity is known.
-        check: what the surfaces say, where somebody else says it first; None where nobody was asked.
+        asked: what each of those says who were asked; surfaces are the last.
     """
 
     up: Up | None = None
-    check: Up | None = None
+    asked: tuple[Up, ...] = ()
 
     @property
     def is_level(self) -> bool:
@@ -83,14 +83,14 @@ class Levelled:
 
     @property
     def _apart_deg(self) -> float | None:
-        if self.up is None or self.up.direction is None or self.check is None or self.check.direction is None:
-            return None
-        return angle_deg(self.up.direction, self.check.direction)
+        """By how much surfaces differ from who was believed before them."""
+        *others, planes = self.asked or (Up.unknown("nobody was asked"),)
+        first = next((up.direction for up in others if up.direction is not None), None)
+        return None if first is None or planes.direction is None else angle_deg(first, planes.direction)
 
     @property
     def _allowed_deg(self) -> float:
-        squares = [(one.sigma_deg or 0.0) ** 2 for one in (self.up, self.check) if one is not None]
-        return max(_APART_DEG, _APART_SIGMAS * float(np.sqrt(sum(squares))))
+        return max(_APART_DEG, _APART_SIGMAS * _together_deg([up for up in self.asked if up.is_known]))
 
     def entry(self, path: Trajectory, rig: Rig) -> dict[str, Any]:
         """Return it as `{"up": ...}`, as metrics.json has it; empty with gravity. `path` [N] is as estimated."""
@@ -101,7 +101,8 @@ class Levelled:
             R_map_cam = path.T_world_body[0, :3, :3] @ rig.T_body_cams[0][:3, :3]
             direction = (R_map_cam.T @ self.up.direction).tolist()
         told = {**self.up.entry(), "direction_cam0": direction, "R_map_odom": self.T_level_map[:3, :3].tolist()}
-        return {"up": {**told, "from_planes_deg": self._apart_deg}}
+        asked = {up.source: up.entry() for up in self.asked if up.is_known}
+        return {"up": {**told, "from_planes_deg": self._apart_deg, "asked": asked}}
 
     def trajectory(self, path: Trajectory) -> Trajectory:
         """Return a trajectory in the level frame."""
@@ -161,10 +162,32 @@ def _found(recording: Recording, known: Known) -> Levelled:
     """Return which way is up by what was measured."""
     planes = Up.unknown("there is no map to look at") if known.mapper is None else up_of_planes(known.mapper.views())
     others = [_by_forces(recording, known.path), _by_floor(known, recording.rig)]
-    found = [up for up in others if up is not None]
-    if (first := next((up for up in found if up.is_known), None)) is not None:
-        return Levelled(first, planes)
-    return Levelled(planes if planes.is_known else Up.unknown("; ".join(up.reason for up in (*found, planes))))
+    asked = (*(up for up in others if up is not None), planes)
+    first = next((up for up in asked if up.is_known), None)
+    if first is None:
+        return Levelled(Up.unknown("; ".join(up.reason for up in asked)))
+    return Levelled(first if first is planes else with_planes(first, planes), asked)
+
+
+def with_planes(first: Up, planes: Up) -> Up:
+    """Return both as one, weighted by their sigmas, where they agree; the first alone where they do not.
+
+    Sigma is that of the surer one: both go by one trajectory, so their errors are not independent.
+    """
+    if first.direction is None or planes.direction is None or not first.sigma_deg or not planes.sigma_deg:
+        return first
+    apart_deg = angle_deg(first.direction, planes.direction)
+    if apart_deg > _APART_SIGMAS * _together_deg([first, planes]):
+        return first
+    up = first.direction / first.sigma_deg**2 + planes.direction / planes.sigma_deg**2
+    reason = f"{first.reason}; surfaces agree to {apart_deg:.1f} deg, both weighted by their sigmas"
+    sigma_deg = min(first.sigma_deg, planes.sigma_deg)
+    return replace(first, direction=up / np.linalg.norm(up), sigma_deg=sigma_deg, reason=reason)
+
+
+def _together_deg(ups: Sequence[Up]) -> float:
+    """Return the sigma of the angle between directions."""
+    return float(np.sqrt(sum((up.sigma_deg or 0.0) ** 2 for up in ups)))
 
 
 def up_sentence(entry: dict[str, Any]) -> str:

@@ -267,7 +267,8 @@ class LoopSet:
         chi2 = model.chi2(*self._ends(model), relative(record.from_id, record.to_id))
         inside = bool(chi2 <= model.threshold)
         decision = LoopDecision.ACCEPTED if inside else LoopDecision.PENDING
-        reason = f"chi2 {chi2:.1f} {'within' if inside else 'beyond'} {model.threshold:.1f}"
+        says, side = ("odometry allows it", "within") if inside else ("odometry speaks against it", "beyond")
+        reason = f"{says}: chi2 {chi2:.1f} {side} {model.threshold:.1f}"
         self._set_report(EdgeReport(record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason))
         return inside
 
@@ -285,7 +286,7 @@ class LoopSet:
                 contradicted.append(model)
                 decision = LoopDecision.REJECTED if reviewed else LoopDecision.PENDING
                 weight = model.weight(*self._ends(model))
-                self.report(model, decision, f"contradicted by the graph, weight {weight:.3f}")
+                self.report(model, decision, f"contradicted by the rest of the graph: weight {weight:.3f}")
             else:
                 way = "" if model.tie is None else f", by way of keyframe {model.tie.from_id}"
                 self.report(model, LoopDecision.ACCEPTED, reason + way)

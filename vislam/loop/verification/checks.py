@@ -29,7 +29,7 @@ def judge(found: Verification, tilt_rad: float | None, config: LoopConfig) -> tu
     seen = f"{found.inliers} inliers, {found.supporters} with guided matching"
     against = objection(found, tilt_rad, config)
     if against:
-        return LoopDecision.REJECTED, f"{seen}, but {against}"
+        return LoopDecision.REJECTED, f"{against} ({seen})"
     if found.has_scale:
         return LoopDecision.ACCEPTED, f"{seen}, sigma {100.0 * found.sigma_m:.1f} cm"
     return LoopDecision.ACCEPTED, f"{seen}, direction good to {np.rad2deg(found.sigma_m):.1f} deg"
@@ -38,17 +38,18 @@ def judge(found: Verification, tilt_rad: float | None, config: LoopConfig) -> tu
 def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -> str:
     """Return what speaks against a verified pose whatever the neighbours say, or an empty string."""
     if tilt_rad is not None and not np.rad2deg(tilt_rad) <= config.max_tilt_deg:
-        return f"{np.rad2deg(tilt_rad):.1f} deg off gravity, limit {config.max_tilt_deg:g}"
+        return f"its pose leans: {np.rad2deg(tilt_rad):.1f} deg off gravity, limit {config.max_tilt_deg:g}"
     for name, share in (("the other way round", found.reverse_agreement), ("in depth", found.depth_agreement)):
         if share < config.min_agreement_share:
-            return f"only {share:.0%} agree {name}, needs {config.min_agreement_share:.0%}"
+            return f"too few matches agree {name}: {share:.0%}, needs {config.min_agreement_share:.0%}"
     if found.has_scale and not found.sigma_m <= config.max_sigma_any_m:
-        return f"sigma {100.0 * found.sigma_m:.0f} cm, limit {100.0 * config.max_sigma_any_m:g}"
+        limit_cm = 100.0 * config.max_sigma_any_m
+        return f"its place is too uncertain: sigma {100.0 * found.sigma_m:.0f} cm, limit {limit_cm:g}"
     if not found.has_scale and found.covariance is not None:
         worst = np.rad2deg(np.sqrt([np.linalg.eigvalsh(found.covariance[:3, :3])[-1], found.sigma_m**2]))
         if not (worst[0] <= config.max_rotation_sigma_deg and worst[1] <= config.max_direction_sigma_deg):
             return (
-                f"rotation and direction good to {worst[0]:.1f} and {worst[1]:.1f} deg only, "
+                f"its rotation and direction are too uncertain: {worst[0]:.1f} and {worst[1]:.1f} deg, "
                 f"limits {config.max_rotation_sigma_deg:g} and {config.max_direction_sigma_deg:g}"
             )
     return ""

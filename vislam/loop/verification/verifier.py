@@ -68,16 +68,16 @@ class Verifier:
         config = self._config
         pairs = (known or self.compare(a, b)).pairs
         if len(pairs) < config.min_inliers:
-            return Verification(f"{len(pairs)} matches, needs {config.min_inliers}", len(pairs), pairs=pairs)
+            return Verification(f"too few matches: {len(pairs)}, needs {config.min_inliers}", len(pairs), pairs=pairs)
         if not a.has_points and not b.has_points:
             if len(pairs) < config.min_inliers_direction:
-                reason = f"{len(pairs)} matches, needs {config.min_inliers_direction} without depth"
+                reason = f"too few matches: {len(pairs)}, needs {config.min_inliers_direction} without depth"
                 return Verification(reason, len(pairs), has_scale=False, pairs=pairs)
             return self._verify_direction(a, b, pairs)
         found = self._pnp(a, b, pairs)
         if found is None or found[1] < config.min_inliers:
             count = 0 if found is None else found[1]
-            reason = f"{count} PnP inliers of {len(pairs)} matches, needs {config.min_inliers}"
+            reason = f"too few matches fit one pose: {count} of {len(pairs)}, needs {config.min_inliers}"
             return Verification(reason, len(pairs), count, pairs=pairs)
         return self._refine(a, b, found[0], len(pairs), found[1])
 
@@ -120,7 +120,7 @@ class Verifier:
             agreeing = _agreeing(T_a_b, matched, limit)
             support = matched.take(agreeing)
         if len(support) < config.min_inliers or refined is None:
-            reason = f"{len(support)} matches support the refined pose, needs {config.min_inliers}"
+            reason = f"too few matches fit the refined pose: {len(support)}, needs {config.min_inliers}"
             return Verification(reason, matches, inliers, len(support), pairs=pairs)
         covariance_cam = self._covariance(refined.information, refined.variance_scale)
         adjoint = se3_adjoint(self._T_body_cam)
@@ -154,14 +154,17 @@ class Verifier:
         count = 0 if found is None else int(np.count_nonzero(found.inliers))
         if found is None or count < config.min_inliers_direction:
             reason = (
-                f"{count} epipolar inliers of {len(pairs)} matches, needs {config.min_inliers_direction} without depth"
+                f"too few matches fit one direction: {count} of {len(pairs)}, "
+                f"needs {config.min_inliers_direction} without depth"
             )
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         if found.parallax < config.min_parallax_px * self._px:
-            reason = f"parallax {found.parallax / self._px:.1f} px, the direction needs {config.min_parallax_px:g}"
+            reason = (
+                f"the views are too near: parallax {found.parallax / self._px:.1f} px, needs {config.min_parallax_px:g}"
+            )
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         if found.plane_share > config.max_plane_share:
-            reason = f"one plane explains {found.plane_share:.0%} of the matches, so that two directions fit"
+            reason = f"two directions fit, all is on one plane: {found.plane_share:.0%} of the matches"
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         R = self._T_body_cam[:3, :3]
         T_a_b = np.eye(4)

@@ -181,12 +181,15 @@ def _refined(up: Array, normals: Array) -> Array | None:
 
 
 def _sigma_deg(up: Array, views: Sequence[View]) -> float:
-    """Return how far parts of the run scatter about what all of them say, as the error of their mean."""
+    """Return how far parts of the run scatter about what all of them say.
+
+    Not divided by their number: what bends a map is odometry's drift, which neighbouring parts share.
+    """
     found = []
     for part in np.array_split(np.arange(len(views)), min(_BLOCKS, len(views))):
         normals = _gathered([views[i] for i in part]).normals
         one = _refined(up, normals) if len(normals) >= _LEAST_NORMALS else None
         if one is not None:
             found.append(angle_deg(one, up))
-    scatter = float(np.sqrt(np.mean(np.square(found)) / 2.0 / len(found))) if found else _CAP_DEG
+    scatter = float(np.sqrt(np.mean(np.square(found)) / 2.0)) if found else _CAP_DEG
     return float(np.hypot(scatter, _SYSTEMATIC_DEG))

@@ -89,11 +89,11 @@ def _loop_pictures(run: RunFiles) -> str:
 
 
 def _reasons(loops: list[LoopRow]) -> str:
-    """Return how often each reason occurred, and between which images; those that differ only in numbers are one."""
+    """Return how often each reason occurred, and between which images; the last word on it, without its numbers."""
     pairs: dict[str, list[str]] = {}
     for loop in loops:
         if loop.decision != "accepted":
-            reason = re.sub(r"\d+(\.\d+)?", "…", loop.reason)
+            reason = re.sub(r"\d+(\.\d+)?", "…", loop.reason.rpartition("; ")[2].partition(":")[0])
             pairs.setdefault(reason, []).append(f"{loop.from_id} and {loop.to_id}")
     if len(pairs) < 2:
         return ""
