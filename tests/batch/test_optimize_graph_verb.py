@@ -35,6 +35,8 @@ def test_a_file_gets_its_optimum_in_all_formats(tmp_path, capsys, d):
     assert sum(float(row["chi2_after"]) for row in edges) == pytest.approx(told["chi2_after"], rel=1e-6)
     page = (out / "report.html").read_text()
     assert page.count("<svg") == 3
+    assert told["chi2_file"] == pytest.approx(problem.chi2(problem.poses), rel=1e-9)
+    assert f"from {told['chi2_file']:.6g} of the file&#x27;s poses" in page
     unlike = (".html", ".json")  # hold times, as does log.txt
     first = {p.name: p.read_bytes() for p in out.iterdir() if p.suffix not in unlike and p.name != "log.txt"}
     assert run_verb(["posegraph", str(path), "--out", str(out)]) == 0

@@ -9,7 +9,7 @@ from test_statistics import trial
 from vislam.experiment.plan import Axis, Estimator, Plan, Sequence
 from vislam.experiment.report.exports import winners_csv
 from vislam.experiment.statistics import compare, groups
-from vislam.experiment.winners import of_plan, of_sequences, told
+from vislam.experiment.winners import of_plan, of_sequences, told, verdict
 
 SEQUENCES = [f"s{i}" for i in range(8)]
 
@@ -61,6 +61,29 @@ def test_causal_and_final_estimates_have_winners_of_their_own():
     final = [trial(n, 0.1 * f, s, output="graph") for n, f in (("a", 1.0), ("b", 3.0)) for s in SEQUENCES]
     found = of_plan(compare(over_sequences(a=2.0, b=1.0) + final, "ate_m"))
     assert [(w.kind, w.estimate) for w in found] == [("causal", "b filter, causal"), ("final", "a graph, final")]
+
+
+def test_the_verdict_names_winner_margin_and_test():
+    final = [trial(n, 0.1 + 0.001 * i, s, output="graph") for n in "ab" for i, s in enumerate(SEQUENCES)]
+    trials = over_sequences(a=1.0, b=0.8) + final
+    says = verdict([*of_plan(compare(trials, "ate_m")), *of_sequences(groups(trials), "ate_m")])
+    assert says.startswith("Of the final estimates none wins in ATE: ")
+    assert "Of the causal estimates b filter, causal wins, its ATE 20% below that of a filter, causal" in says
+    assert "Wilcoxon with Holm's correction, p 0.0156, 8 pairs" in says
+
+
+def test_a_plan_too_small_for_a_test_counts_its_sequences():
+    few = over_sequences(a=1.0, b=0.8)
+    few = [one for one in few if one.job.sequence in SEQUENCES[:2]]
+    says = verdict([*of_plan(compare(few, "ate_m")), *of_sequences(groups(few), "ate_m")])
+    assert "6 are the least" in says
+    assert "b filter, causal on 2 of 2 sequences and conditions" in says
+
+
+def test_a_winner_over_failures_has_no_margin():
+    trials = over_sequences(a=1.0) + [trial("b", None, s, failure="lost") for s in SEQUENCES]
+    says = verdict(of_plan(compare(trials, "ate_m")))
+    assert "a filter, causal wins (" in says and "nan" not in says
 
 
 def test_on_a_sequence_ensembles_must_not_overlap():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -75,6 +76,33 @@ def told(winner: Winner) -> str:
     if not winner.estimate:
         return f"{head}no winner, {winner.reason}"
     return f"{head}{winner.estimate}, {winner.margin:.0%} less than {winner.runner_up} ({winner.reason})"
+
+
+def verdict(winners: Sequence[Winner]) -> str:
+    """Return who wins, by how much and by which test, in a sentence for the final and one for the causal estimates.
+
+    Where the plan is too small for a test the sequences are counted, and that is said.
+    """
+    sentences = []
+    for kind in reversed(_KINDS):
+        whole = next((w for w in winners if w.kind == kind and not w.sequence), None)
+        if whole is None:
+            continue
+        error = BY_NAME[whole.metric].title.partition(" [")[0]
+        if whole.estimate:
+            # no margin: the runner-up failed, and a failure has no error
+            margin = (
+                "" if math.isnan(whole.margin) else f", its {error} {whole.margin:.0%} below that of {whole.runner_up}"
+            )
+            beats = f"{whole.estimate} wins{margin}"
+            sentences.append(f"Of the {kind} estimates {beats} (Wilcoxon with Holm's correction, {whole.reason}).")
+            continue
+        here = [w for w in winners if w.kind == kind and w.sequence and w.metric == whole.metric]
+        wins = Counter(w.estimate for w in here if w.estimate)
+        counted = ", ".join(f"{name} on {count} of {len(here)}" for name, count in wins.most_common())
+        on_parts = f" Trials without overlap: {counted} sequences and conditions." if wins else ""
+        sentences.append(f"Of the {kind} estimates none wins in {error}: {whole.reason}.{on_parts}")
+    return " ".join(sentences)
 
 
 def _on(sequence: str, variant: Variant, kind: str, metric: str, rivals: Sequence[Group]) -> Winner:

@@ -92,6 +92,19 @@ def optimize_pose_graph(
     )  # fmt: skip
 
 
+def as_stated(problem: PoseGraphProblem, weights: NDArray[np.float64]) -> tuple[Array, float] | None:
+    """Return the poses [N, d + 1, d + 1] that a file states, missing ones chained to them, and their cost.
+
+    The cost counts `weights` [E], so that it can be held against that of a solution; None where the file states no
+    poses, or these have no finite cost.
+    """
+    if not problem.has_pose.any():
+        return None
+    poses = file_start(problem)
+    cost = problem.chi2(poses, weights)
+    return (poses, cost) if np.isfinite(cost) else None
+
+
 def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress | None) -> Decision:
     """Return what the route that was asked for says about the edges."""
     from vislam.batch.posegraph.auto import decide, decide_by_kernel

@@ -64,9 +64,10 @@ def _optimize(options: PoseGraphOptions, out: Path) -> int:
         print(json.dumps(summary))
     else:
         landmarks = f"{summary['landmarks']} landmarks, " if summary["landmarks"] else ""
+        stated = "" if summary["chi2_file"] is None else f"{summary['chi2_file']:.9g} (the file's poses), "
         print(
             f"{summary['poses']} poses, {landmarks}{summary['edges']} edges ({len(summary['rejected'])} found false); "
-            f"chi2 {summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
+            f"chi2 {stated}{summary['chi2_before']:.9g} ({summary['start']} start) -> {summary['chi2_after']:.9g} in "
             f"{summary['iterations']} iterations, {summary['solve_s']:.3f} s"
         )
         if summary["robust"]:

@@ -13,7 +13,7 @@ from vislam.batch.posegraph.certificate import Certificate, certify
 from vislam.batch.posegraph.files import read_pose_graph
 from vislam.batch.posegraph.g2o import write_g2o
 from vislam.batch.posegraph.noise import NoiseOfKind, noise_of_kinds, rescaled
-from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
+from vislam.batch.posegraph.optimize import PoseGraphSolution, as_stated, optimize_pose_graph
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import Progress
 from vislam.batch.posegraph.uncertainty import Uncertainty
@@ -137,6 +137,7 @@ def make_folder(out: Path) -> None:
 
 def summarise(problem: PoseGraphProblem, solution: PoseGraphSolution) -> dict[str, Any]:
     """Return what an optimisation came to, for summary.json and --json."""
+    stated = as_stated(problem, solution.weights)
     return {
         "dimension": problem.dimension,
         "poses": int(problem.is_pose.sum()),
@@ -145,6 +146,7 @@ def summarise(problem: PoseGraphProblem, solution: PoseGraphSolution) -> dict[st
         "parts": solution.parts,
         "start": solution.start_name,
         "start_chi2": {name: cost if np.isfinite(cost) else None for name, cost in solution.start_costs.items()},
+        "chi2_file": None if stated is None else stated[1],
         "chi2_before": solution.costs[0],
         "chi2_after": solution.costs[-1],
         "iterations": len(solution.costs) - 1,

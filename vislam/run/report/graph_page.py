@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vislam.batch.posegraph.certificate import Certificate
-from vislam.batch.posegraph.optimize import PoseGraphSolution
+from vislam.batch.posegraph.optimize import PoseGraphSolution, as_stated
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
 from vislam.core.errors import DataError
@@ -29,13 +29,19 @@ def write_graph_report(
     certificate: Certificate | None = None,
 ) -> None:
     """Write report.html of an optimised pose graph. Raises StorageError."""
+    stated = as_stated(problem, solution.weights)
+    before, cost_before, of = (
+        (solution.start, solution.costs[0], f"the {solution.start_name} start")
+        if stated is None
+        else (*stated, "the file's poses")
+    )
     unit = "ms" if solution.solve_s < 1.0 else "s"
     took = solution.solve_s * (1000.0 if unit == "ms" else 1.0)
     tiles = (
         tile(number(int(problem.is_pose.sum()), 0), "", f"poses, {problem.dimension}D"),
         *([tile(number(int(problem.is_point.sum()), 0), "", "landmarks")] if problem.is_point.any() else []),
         tile(number(len(problem.edges), 0), "", "edges"),
-        tile(f"{solution.costs[-1]:.6g}", "", f"chi², from {solution.costs[0]:.6g}"),
+        tile(f"{solution.costs[-1]:.6g}", "", f"chi², from {cost_before:.6g} of {of}"),
         tile(number(took, 1), unit, f"to solve, {len(solution.costs) - 1} iterations"),
         tile(number(len(solution.rejected), 0), "", "edges found false"),
         *([tile(certificate.word, "", "global optimum")] if certificate is not None else []),
@@ -45,7 +51,7 @@ def write_graph_report(
     times = "" if enlarged == 1.0 else f", {enlarged:g} times as large"
     title = f"After, with 95 % regions of some poses{times}" if len(regions) else "After"
     pictures = grid(
-        card(_picture(problem, solution, solution.start), title=f"Before: start '{solution.start_name}'"),
+        card(_picture(problem, solution, before), title=f"Before: {of}"),
         card(after, title=title),
     )
     starts = table(("start", "chi²"), [(k, f"{v:.6g}") for k, v in solution.start_costs.items()])
@@ -66,7 +72,7 @@ def write_graph_report(
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(f'vislam: {name}')}</title><style>{stylesheet()}</style></head><body><main>{body}"
-        "<footer>Made by vislam optimize.</footer></main></body></html>\n"
+        "<footer>Made by vislam posegraph.</footer></main></body></html>\n"
     )
     write_text(path, page)
 
