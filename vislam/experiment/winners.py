@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,7 +103,8 @@ def verdict(winners: Sequence[Winner]) -> str:
         counted = ", ".join(f"{name} on {count} of {len(here)}" for name, count in wins.most_common())
         on_parts = f" Trials without overlap: {counted} sequences and conditions." if wins else ""
         sentences.append(f"Of the {kind} estimates none wins in {error}: {whole.reason}.{on_parts}")
-    return " ".join(sentences)
+    # which kind competes is said already
+    return re.sub(rf", (?:{'|'.join(_KINDS)})(?= )", "", " ".join(sentences))
 
 
 def _on(sequence: str, variant: Variant, kind: str, metric: str, rivals: Sequence[Group]) -> Winner:

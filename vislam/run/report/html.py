@@ -54,7 +54,10 @@ def percent(value: Any, digits: int = 1) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]], text_columns: Sequence[int] = (0,)) -> str:
-    """Return a table; columns in `text_columns` are left-aligned, the others hold numbers."""
+    """Return a table; columns in `text_columns` are left-aligned, the others hold numbers. Empty ones are left out."""
+    told = [k for k in range(len(head)) if not rows or any(_text_of(row[k]) for row in rows)]
+    head, rows = [head[k] for k in told], [[row[k] for k in told] for row in rows]
+    text_columns = [told.index(k) for k in text_columns if k in told]
 
     def kind(column: int) -> str:
         return "text" if column in text_columns else ""
@@ -68,6 +71,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]], text_column
             cells.append(f'<td class="{cell.kind or kind(k)}">{dot}{escape(cell.text)}</td>')
         lines.append("".join(cells))
     return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+
+
+def _text_of(value: str | Cell) -> str:
+    return value.text if isinstance(value, Cell) else value
 
 
 def tile(value: str, unit: str, label: str, kind: str = "plain") -> str:
