@@ -14,8 +14,9 @@ from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
 class SlowOctoMap:
     """OctoMap's insertion written from its paper and headers with sets and a dictionary, one voxel at a time."""
 
-    def __init__(self, resolution):
+    def __init__(self, resolution, miss_beside=None):
         self.resolution = resolution
+        self.miss_beside = miss_beside
         self.cells = {}
 
     def key(self, point):
@@ -62,8 +63,11 @@ class SlowOctoMap:
             else:
                 free.update(self.ray(origin, end))
                 hit.add(self.key(end))
+        offsets = [(a, b, c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)]
+        beside = {tuple(np.add(cell, d).tolist()) for cell in hit for d in offsets} if self.miss_beside else set()
         for cell in free - hit:
-            self.change(cell, 0.4)
+            grazed = cell in beside and self.cells.get(cell, np.float32(-1)) >= 0
+            self.change(cell, self.miss_beside if grazed else 0.4)
         for cell in hit:
             self.change(cell, 0.7)
 
@@ -84,10 +88,12 @@ def random_scan(rng, count, reach):
     st.sampled_from([0.05, 0.1, 0.13]),
     st.sampled_from([-1.0, 0.7]),
     st.sampled_from(["discretised", "full"]),
+    st.sampled_from([None, 0.46]),
 )
-def test_equals_a_slow_octomap_voxel_by_voxel(seed, resolution, max_range, insertion):
+def test_equals_a_slow_octomap_voxel_by_voxel(seed, resolution, max_range, insertion, miss_beside):
     rng = np.random.default_rng(seed)
-    fast, slow = OccupancyMap(resolution), SlowOctoMap(resolution)
+    fast = OccupancyMap(resolution, miss_beside_probability=miss_beside)
+    slow = SlowOctoMap(resolution, miss_beside)
     for _ in range(3):
         points, origin = random_scan(rng, 15, 1.0)
         fast.insert(points, origin, max_range, insertion)
@@ -114,6 +120,51 @@ def test_files_equal_those_of_octomap_byte_for_byte(tmp_path, resolution, insert
     assert encode_ot(ours.octree()) == (tmp_path / "a.ot").read_bytes()
     theirs.writeBinary(str(tmp_path / "a.bt"))
     assert encode_bt(ours.max_likelihood_octree()) == (tmp_path / "a.bt").read_bytes()
+
+
+def test_where_a_miss_beside_a_hit_counts_as_any_files_are_still_octomaps():
+    rng = np.random.default_rng(8)
+    octomaps, equal, spared = (OccupancyMap(0.05, miss_beside_probability=p) for p in (None, 0.4, 0.46))
+    for _ in range(3):
+        points, origin = random_scan(rng, 1500, 1.5)
+        for grid in (octomaps, equal, spared):
+            grid.insert(points, origin, 2.0)
+    assert encode_ot(equal.octree()) == encode_ot(octomaps.octree()) != encode_ot(spared.octree())
+
+
+def grazing_scans(grid, count):
+    """A floor seen once from above, then again and again from a place just above it: rays to its far end graze it."""
+    x, y = np.meshgrid(np.arange(0.3, 4.0, 0.02), np.arange(-0.5, 0.5, 0.02))
+    floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.012)])  # low in its voxels
+    grid.insert(floor, np.array([2.0, 0.0, 1.5]))
+    grid.insert(floor, np.array([2.0, 0.0, 1.5]))
+    for k in range(count):
+        # the floor of one scan is sparse, as far and grazed ones are: many voxels have no point of their own in it
+        grid.insert(floor[k::97], np.array([0.0, 0.0, 0.4]), -1.0, "full")
+    return (grid.state_at(floor) == Occupancy.FREE).mean()
+
+
+def test_a_floor_that_rays_graze_stays_where_a_miss_beside_a_hit_counts_less():
+    before = grazing_scans(OccupancyMap(0.05, 0.7, 0.32, 0.1192, 0.9), 12)
+    now = grazing_scans(OccupancyMap(0.05, 0.7, 0.32, 0.1192, 0.9, 0.46), 12)
+    assert before > 0.1
+    assert now < 0.5 * before
+
+
+def test_what_lay_on_a_floor_and_is_gone_is_cleared_in_the_end():
+    grid = OccupancyMap(0.05, 0.7, 0.32, 0.1192, 0.9, 0.46)
+    x, y = np.meshgrid(np.arange(1.0, 2.0, 0.02), np.arange(-0.5, 0.5, 0.02))
+    floor, origin = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.02)]), np.array([0.0, 0.0, 1.0])
+    lying = (abs(floor[:, 0] - 1.5) < 0.2) & (abs(floor[:, 1]) < 0.2)
+    thing = floor[lying] + [0.0, 0.0, 0.05]  # in the layer of voxels that touches the floor's
+    for _ in range(6):
+        grid.insert(np.vstack([floor[~lying], thing]), origin)
+    inside = thing[(abs(thing[:, :2] - [1.5, 0.0]) < 0.12).all(axis=1)]
+    assert (grid.state_at(inside) == Occupancy.OCCUPIED).all()
+    for _ in range(15):
+        grid.insert(floor, origin)
+    assert (grid.state_at(inside) == Occupancy.FREE).all()
+    assert (grid.state_at(floor) == Occupancy.OCCUPIED).all()
 
 
 def test_a_ray_frees_its_way_and_nothing_else():

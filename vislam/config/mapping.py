@@ -64,6 +64,8 @@ class MapConfig:
     hit_probability: Probability = 0.7  # OctoMap's
     # OctoMap's 0.4 is for 10 scans a second; of keyframes, at 2 Hz and more, with the
     miss_probability: Probability = 0.32
+    # of an occupied voxel that touches what the same scan hit: the ray grazes a surface; OctoMap's is the one above
+    miss_beside_probability: Probability = 0.46
     clamp_max_probability: Probability = 0.9  # clamping here, three clear a voxel: a person who left is gone within 1 s
     clamp_min_probability: Probability = 0.1192  # OctoMap's: what was free for long is occupied after three scans
     min_range_m: NonNegative = 0.3  # nearer, structured-light depth and stereo matching are not valid

@@ -224,4 +224,5 @@ def _new_map(config: MapConfig) -> OccupancyMap:
         config.miss_probability,
         config.clamp_min_probability,
         config.clamp_max_probability,
+        config.miss_beside_probability,
     )

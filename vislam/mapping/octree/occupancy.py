@@ -58,6 +58,10 @@ class OccupancyMap:
 
     Each scan changes a voxel once: by `hit_probability` if a point lies in it, else by `miss_probability` if a ray
     passes it. For the same points, the octree it exports is OctoMap's byte for byte.
+
+    Rays that graze a surface pass voxels which it goes through, and a few scans of that clear them. With a
+    `miss_beside_probability` above `miss_probability` (None: the same, as OctoMap's), a miss counts so much less where
+    the voxel is occupied and touches one that the same scan hit.
     """
 
     def __init__(
@@ -67,14 +71,16 @@ class OccupancyMap:
         miss_probability: float = 0.4,
         clamp_min_probability: float = 0.1192,
         clamp_max_probability: float = 0.971,
+        miss_beside_probability: float | None = None,
     ) -> None:
-        probabilities = (hit_probability, miss_probability, clamp_min_probability, clamp_max_probability)
+        beside = miss_probability if miss_beside_probability is None else miss_beside_probability
+        probabilities = (hit_probability, miss_probability, clamp_min_probability, clamp_max_probability, beside)
         if not (math.isfinite(resolution_m) and resolution_m > 0.0):
             raise DataError(f"the map's resolution must be a positive number of metres, got {resolution_m}")
         if not all(0.0 < p < 1.0 for p in probabilities) or clamp_min_probability >= clamp_max_probability:
             raise DataError(f"map probabilities must lie between 0 and 1 with min below max, got {probabilities}")
         self.resolution_m = float(resolution_m)
-        self._hit, self._miss, self._low, self._high = (log_odds(p) for p in probabilities)
+        self._hit, self._miss, self._low, self._high, self._beside = (log_odds(p) for p in probabilities)
         self.pool = BlockPool()  # of log-odds
         self._words = np.zeros(1 << 12, np.uint64)  # the scan's grid, kept between scans, all zero
 
@@ -127,7 +133,8 @@ class OccupancyMap:
         ends = points
         if insertion == "discretised":
             ends = end_voxels(points, self.resolution_m, base, nx, nxy, grid)
-        cast_rays(ends, origin, max_range_m, self.resolution_m, base, nx, nxy, grid)
+        beside = bool(self._beside != self._miss)
+        cast_rays(ends, origin, max_range_m, self.resolution_m, base, (nx, nxy), grid, beside)
         keys, bits = pack_marks(marked_blocks(words, blocks), words, blocks, base)
         return ScanMarks(len(points), keys, bits)
 
@@ -144,7 +151,7 @@ class OccupancyMap:
         pool = self.pool
         pool.count = apply_marks(
             marks.blocks, marks.bits, only_known, Voxels(pool.table, pool.rows, pool.keys, pool.values), pool.count,
-            LogOdds(self._hit, self._miss, self._low, self._high),
+            LogOdds(self._hit, self._miss, self._beside, self._low, self._high),
         )  # fmt: skip
 
     def with_pool(self, pool: BlockPool) -> OccupancyMap:

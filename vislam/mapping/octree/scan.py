@@ -19,6 +19,7 @@ from vislam.mapping.octree.blocks import KEY_ORIGIN, find_slot, pack_block
 
 FREE_MARK = 1
 END_MARK = 2
+BESIDE_MARK = 3  # free, and beside an end: the bits of both
 _FAR = 1.7976931348623157e308
 _Bytes = NDArray[np.uint8]
 _F32 = NDArray[np.float32]
@@ -40,6 +41,7 @@ class LogOdds(NamedTuple):
 
     hit: Any
     miss: Any
+    beside: Any  # a miss of an occupied voxel that touches what the same scan hit
     low: Any
     high: Any
 
@@ -133,9 +135,13 @@ def _bounds(points: _F32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @njit(cache=True, nogil=True)
-def cast_rays(points: _F32, origin: _F32, max_range_m: float, resolution: float, base: _I64, nx: int, nxy: int,
-              grid: _Bytes) -> None:  # fmt: skip
-    """Mark what one scan sees: free along the rays, occupied at ends within `max_range_m` (negative: no limit)."""
+def cast_rays(points: _F32, origin: _F32, max_range_m: float, resolution: float, base: _I64, strides: tuple[int, int],
+              grid: _Bytes, beside: bool) -> None:  # fmt: skip
+    """Mark what one scan sees: free along the rays, occupied at ends within `max_range_m` (negative: no limit).
+
+    With `beside`, free cells that touch an end, be it at a corner, have a mark of their own.
+    """
+    nx, nxy = strides
     ox, oy, oz = origin[0], origin[1], origin[2]
     ends = np.full(len(points), -1, np.int64)
     for i in range(len(points)):
@@ -150,8 +156,19 @@ def cast_rays(points: _F32, origin: _F32, max_range_m: float, resolution: float,
             point = ox + dx * reach, oy + dy * reach, oz + dz * reach
             _cast((ox, oy, oz), point, resolution, base, nx, nxy, grid)
     for i in range(len(points)):
-        if ends[i] >= 0:
+        if ends[i] >= 0 and grid[ends[i]] != END_MARK:
             grid[ends[i]] = END_MARK
+            if beside:
+                _mark_beside(ends[i], nx, nxy, grid)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mark_beside(end: int, nx: int, nxy: int, grid: _Bytes) -> None:
+    for z in range(-nxy, nxy + 1, nxy):
+        for y in range(-nx, nx + 1, nx):
+            for cell in range(end + z + y - 1, end + z + y + 2):
+                if grid[cell] == FREE_MARK:
+                    grid[cell] = BESIDE_MARK
 
 
 @njit(cache=True, nogil=True)
@@ -202,7 +219,8 @@ def marked_blocks(words: NDArray[np.uint64], blocks: _I64) -> _I64:
 def pack_marks(marked: _I64, words: NDArray[np.uint64], blocks: _I64, base: _I64) -> tuple[_I64, _Bytes]:
     """Return keys [B] and bits [B, 2, 64] of a scan's blocks, and clear its grid.
 
-    A byte is a row of 8 voxels along x, rows in order of y, then z; first those that rays passed, then those hit.
+    A byte is a row of 8 voxels along x, rows in order of y, then z; first those that rays passed, then those hit. A
+    voxel in both was passed beside one that was hit.
     """
     nbx, nby = blocks[0], blocks[1]
     keys, bits = np.empty(len(marked), np.int64), np.empty((len(marked), 2, 64), np.uint8)
@@ -225,7 +243,7 @@ def pack_marks(marked: _I64, words: NDArray[np.uint64], blocks: _I64, base: _I64
 def apply_marks(block_keys: _I64, bits: _Bytes, only_known: bool, known: Voxels, count: int, odds: LogOdds) -> int:
     """Update the map's blocks by a scan's marks, and return the new number of blocks; `only_known` adds none."""
     table, rows, keys, values = known
-    hit, miss, low, high = odds
+    hit, miss, miss_beside, low, high = odds
     for i in range(len(block_keys)):
         slot = find_slot(table, block_keys[i])
         if table[slot] < 0:
@@ -237,11 +255,14 @@ def apply_marks(block_keys: _I64, bits: _Bytes, only_known: bool, known: Voxels,
         voxels = values[rows[slot]]
         for row in range(64):
             ends = bits[i, 1, row]
+            beside = bits[i, 0, row] & ends
             seen = bits[i, 0, row] | ends
+            ends ^= beside
             if seen == 0:
                 continue
             for x in range(8):
                 old = voxels[row * 8 + x]
-                new = (np.float32(0.0) if np.isnan(old) else old) + (hit if (ends >> x) & 1 else miss)
+                missed = miss_beside if (beside >> x) & 1 and old >= 0.0 else miss
+                new = (np.float32(0.0) if np.isnan(old) else old) + (hit if (ends >> x) & 1 else missed)
                 voxels[row * 8 + x] = min(max(new, low), high) if (seen >> x) & 1 else old
     return count
