@@ -95,10 +95,11 @@ def grid(*cards: str) -> str:
     return f'<div class="grid">{"".join(present)}</div>' if present else ""
 
 
-def section(title: str, *content: str) -> str:
+def section(title: str, *content: str, kind: str = "") -> str:
     """Return a titled section, or nothing when it has no content."""
     body = "".join(content)
-    return f"<section><h2>{escape(title)}</h2>{body}</section>" if body else ""
+    classes = f' class="{escape(kind)}"' if kind else ""
+    return f"<section{classes}><h2>{escape(title)}</h2>{body}</section>" if body else ""
 
 
 def note(text: str) -> str:

@@ -34,6 +34,8 @@ from vislam.run.report.loop_section import loops_section
 from vislam.run.report.run_files import ESTIMATES, RunFiles, as_dict, as_list, read_run
 from vislam.run.report.scene import Scene, build_scene
 from vislam.run.report.sensor_section import sensors_section
+from vislam.run.report.view_data import view_data
+from vislam.run.report.view_page import view_elements, view_scripts, view_style
 from vislam.run.verdict import verdict_sentence
 
 
@@ -45,15 +47,19 @@ def write_report(run: Path) -> Path:
     """
     files = read_run(run)
     scene = build_scene(files)
+    data = view_data(files, scene)
+    scripts, policy = view_scripts(data)
     body = "".join(
         (
             _head(files),
+            view_elements(data),
+            _map(files),
             _tiles(files, scene),
+            _about(files),
             _problems(files, scene),
             _accuracy(files, scene),
             _trajectories(files, scene),
             _over_time(files, scene),
-            _map(files),
             loops_section(files, scene),
             _timing(files),
             _biases(files, scene),
@@ -66,8 +72,9 @@ def write_report(run: Path) -> Path:
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{stylesheet()}</style></head><body><main>{body}"
-        "<footer>Made by vislam from the files in this folder.</footer></main></body></html>\n"
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">'
+        f"<title>{title}</title><style>{stylesheet()}{view_style()}</style></head><body><main>{body}"
+        f"<footer>Made by vislam from the files in this folder.</footer></main>{scripts}</body></html>\n"
     )
     path = run / "report.html"
     write_text(path, page)
@@ -79,9 +86,16 @@ def _name(run: RunFiles) -> str:
 
 
 def _head(run: RunFiles) -> str:
+    """Return the name of the run and what it is worth, in one sentence."""
+    verdict = as_dict(run.metrics, "verdict")
+    said = f"{verdict_sentence(verdict)}." if verdict else ""
+    worth = f'<p class="verdict {escape(verdict.get("state", ""))}">{escape(said)}</p>' if said else ""
+    return f"<h1>{escape(_name(run))}</h1>{worth}"
+
+
+def _about(run: RunFiles) -> str:
     m = run.metrics
-    verdict = as_dict(m, "verdict")
-    parts = [f"{verdict_sentence(verdict)}."] if verdict else []
+    parts = []
     if m:
         parts.append(
             f"{number(m.get('frames'), 0)} frames and {number(m.get('keyframes'), 0)} keyframes, "
@@ -111,7 +125,7 @@ def _head(run: RunFiles) -> str:
     source = run.manifest.get("source")
     if source:
         parts.append(f"Source: {source}.")
-    return f'<h1>{escape(_name(run))}</h1><p class="lead">{escape(" ".join(parts))}</p>'
+    return f'<p class="lead">{escape(" ".join(parts))}</p>' if parts else ""
 
 
 def _track_noise(noise: dict[str, Any]) -> list[str]:
@@ -232,7 +246,7 @@ def _trajectories(run: RunFiles, scene: Scene) -> str:
     )
     tilted = not scene.has_gravity and scene.truth is None and not as_dict(run.metrics, "up").get("direction")
     text = "There is no IMU to tell what is up: z is that of the first camera." if tilted else ""
-    return section("Trajectories", views, note(text) if text else "")
+    return section("Trajectories", views, note(text) if text else "", kind="still of-map")
 
 
 def _over_time(run: RunFiles, scene: Scene) -> str:
@@ -240,7 +254,7 @@ def _over_time(run: RunFiles, scene: Scene) -> str:
     if not figure:
         return ""
     text = "Green strokes are accepted loops. State: green ok, yellow degraded, red lost."
-    return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), note(text))
+    return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), note(text), kind="still")
 
 
 def _map(run: RunFiles) -> str:
@@ -251,7 +265,7 @@ def _map(run: RunFiles) -> str:
             cards.append(picture(path, caption))
         except OSError as error:
             cards.append(card(note(f"{path.name} cannot be read: {error.strerror or error}")))
-    return section("Map", *cards) if len(cards) == 1 else section("Map", grid(*cards))
+    return section("Map", *cards if len(cards) == 1 else (grid(*cards),), kind="still of-map")
 
 
 def _timing(run: RunFiles) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import VislamError
 from vislam.core.geometry import invert, sim3_parts, transform
 from vislam.core.messages import Array
+from vislam.loop.table import LoopRow
 from vislam.run.folder import recorded_alignment
 from vislam.run.levelled import onto_map
 from vislam.run.report.run_files import RunFiles, as_dict
@@ -45,6 +46,7 @@ class Scene:
     notes: list[str] = field(default_factory=list)  # why something cannot be drawn
     has_gravity: bool = True
     labels: dict[str, str] = field(default_factory=lambda: dict(_LABELS))
+    S_scene_map: Array = field(default_factory=lambda: np.eye(4))  # where the files of the map stand; a similarity
 
     def seconds(self, t_ns: NDArray[np.int64] | Sequence[int]) -> Array:
         """Return times as seconds since the start of the run."""
@@ -68,6 +70,7 @@ def build_scene(run: RunFiles) -> Scene:
     alignment = recorded_alignment(run.metrics)
     aligned: dict[str, Trajectory] = {}
     base = np.eye(4)  # the truth's world as seen from the map
+    placed = np.eye(4)  # the map as seen from the truth's world
     for name, estimate in run.estimates.items():
         try:
             pairs = associate(estimate, run.truth)
@@ -80,10 +83,12 @@ def build_scene(run: RunFiles) -> Scene:
             scene.seconds(pairs.t_ns), moved.position_errors_m(), np.rad2deg(moved.rotation_errors_rad())
         )
         aligned[name] = estimate.transformed(S)
+        placed = S if name in ("graph", "batch") else placed
         _, R, t = sim3_parts(S)
         if scene.has_gravity:
             base = invert(transform(R, t))  # the last one, the graph's or the batch's, decides
     scene.paths = {name: trajectory.transformed(base) for name, trajectory in aligned.items()}
+    scene.S_scene_map = base @ placed
     if aligned:
         inside = (run.truth.t_ns >= zero) & (run.truth.t_ns <= end)
         scene.truth = Trajectory(run.truth.t_ns[inside], run.truth.T_world_body[inside]).transformed(base)
@@ -93,16 +98,21 @@ def build_scene(run: RunFiles) -> Scene:
 
 def loop_segments(run: RunFiles, scene: Scene, decision: str) -> Array:
     """Return the ends [L, 2, 3] of the loops with this decision within the run, on its best trajectory."""
+    rows, ends = loop_ends(run, scene)
+    return ends[[k for k, loop in enumerate(rows) if loop.decision == decision]]
+
+
+def loop_ends(run: RunFiles, scene: Scene) -> tuple[list[LoopRow], Array]:
+    """Return all loops within the run whose times are known, with their ends [L, 2, 3] on its best trajectory."""
     path = next((scene.paths[name] for name in ("batch", "graph", "live") if len(scene.paths.get(name, ()))), None)
     if path is None:
-        return np.empty((0, 2, 3))
+        return [], np.empty((0, 2, 3))
     of_map = as_dict(run.metrics, "map").get("keyframes", 0)  # the first ids: their stamps are of another clock
     first = of_map if isinstance(of_map, int) else 0
-    rows = [loop for loop in run.loops if loop.decision == decision and loop.from_id >= first]
-    rows = [loop for loop in rows if min(loop.from_t_ns, loop.to_t_ns) >= 0]
+    rows = [loop for loop in run.loops if loop.from_id >= first and min(loop.from_t_ns, loop.to_t_ns) >= 0]
     t_ns = np.array([[loop.from_t_ns, loop.to_t_ns] for loop in rows], dtype=np.int64).reshape(-1, 2)
     t_ns = np.clip(t_ns, path.t_ns[0], path.t_ns[-1])  # a keyframe may lie just outside the per-frame trajectory
-    return path.at(t_ns.ravel())[:, :3, 3].reshape(-1, 2, 3)
+    return rows, path.at(t_ns.ravel())[:, :3, 3].reshape(-1, 2, 3)
 
 
 def _add_nees(run: RunFiles, scene: Scene) -> None:

@@ -1,0 +1,94 @@
+// Joins the view, the plots and the details: one moment, one chosen loop.
+import { element, readData } from "./data.js";
+import { Details } from "./details.js";
+import { Plots } from "./plots.js";
+import { View } from "./view.js";
+
+const PLAY_MS = 50;
+
+function layerButtons(view, parent) {
+  for (const [name, layer] of view.layers) {
+    const label = element("label", "layer");
+    const box = element("input");
+    box.type = "checkbox";
+    box.checked = layer.node.visible;
+    box.name = name;
+    box.addEventListener("change", () => view.show(name, box.checked));
+    const swatch = element("i", "swatch");
+    swatch.style.background = `var(--${layer.swatch})`;
+    label.append(box, swatch, element("span", "", layer.label));
+    parent.append(label);
+  }
+}
+
+function player(slider, button, data, setTime) {
+  let timer = null;
+  const stop = () => {
+    clearInterval(timer);
+    timer = null;
+    button.textContent = "Play";
+  };
+  button.addEventListener("click", () => {
+    if (timer) return stop();
+    button.textContent = "Pause";
+    const step = Math.max(data.end_s / 400, PLAY_MS / 1000);
+    timer = setInterval(() => {
+      const t = Number(slider.value) + step;
+      if (t >= data.end_s) stop();
+      setTime(Math.min(t, data.end_s));
+    }, PLAY_MS);
+  });
+  slider.addEventListener("input", () => {
+    stop();
+    setTime(Number(slider.value));
+  });
+}
+
+function start() {
+  const at = (id) => document.getElementById(id);
+  const root = document.documentElement;
+  const data = readData();
+  let view = null;
+  try {
+    view = new View(at("view-canvas"), data);
+  } catch (error) {
+    root.classList.add("flat"); // no WebGL here: the pictures stay, the plots live
+  }
+  const plots = new Plots(at("view-plots"), data);
+  const details = new Details(at("view-details"), data);
+  const slider = at("view-time");
+  slider.max = String(data.end_s);
+  const setTime = (t) => {
+    slider.value = String(t);
+    at("view-now").textContent = `${t.toFixed(1)} s`;
+    if (view) view.setTime(t);
+    plots.setTime(t);
+    details.setTime(t);
+    root.dataset.time = t.toFixed(3);
+  };
+  const choose = (k) => {
+    if (view) view.choose(k);
+    details.choose(k);
+    if (k !== null) setTime(data.loops.rows[k].to_s);
+  };
+  for (const part of [view, plots, details]) if (part) Object.assign(part, { onTime: setTime, onLoop: choose });
+  player(slider, at("view-play"), data, setTime);
+  at("plots-whole").addEventListener("click", () => plots.whole());
+  if (view) {
+    layerButtons(view, at("view-layers"));
+    at("view-home").addEventListener("click", () => view.overview());
+    at("view-above").addEventListener("click", () => view.fromAbove());
+  }
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  dark.addEventListener("change", () => {
+    if (view) view.paint();
+    plots.paint();
+  });
+  setTime(Math.min(data.paths[data.best].t[0], data.end_s));
+  window.vislamReport = { view, plots, details, data };
+  root.dataset.ready = "yes";
+}
+
+// The words are seen at once; what takes longer comes after them.
+document.documentElement.classList.add("live");
+requestAnimationFrame(() => setTimeout(start, 0));

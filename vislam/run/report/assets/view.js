@@ -1,0 +1,317 @@
+// The map and the trajectories in 3-D. Draws only when something has changed; while it turns, only as many points as
+// the machine can draw 20 times a second.
+import { DECISIONS, color, nearest, shorts } from "./data.js";
+
+/* global THREE */
+
+const FRAME_MS = 45;
+const FEWEST = 20000;
+const FIRST = 100000; // points of the first picture
+const LOOP_COLORS = { accepted: "good", pending: "warn", rejected: "bad" };
+const CLICK_PX = 9;
+
+export class View {
+  constructor(canvas, data) {
+    THREE.ColorManagement.enabled = false; // colours as they are stored and as the page has them
+    this.data = data;
+    this.canvas = canvas;
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
+    this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(45, 1, 0.01, 1000);
+    this.camera.up.set(0, 0, 1);
+    this.layers = new Map(); // name: { node, label, swatch }
+    this.painted = []; // what takes a colour of the page: [material, name of the colour]
+    this.fraction = Math.min(1, FIRST / (data.cloud.count || 1));
+    this.frameMs = 0;
+    this.measure();
+    this.addGrid();
+    this.addCloud();
+    this.addPaths();
+    this.addLoops();
+    this.addMarker();
+    this.addControls();
+    this.paint();
+    this.overview();
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    this.resize();
+  }
+
+  measure() {
+    const { cloud, paths, best } = this.data;
+    const low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
+    const take = (p, k) => {
+      low[k] = Math.min(low[k], p);
+      high[k] = Math.max(high[k], p);
+    };
+    paths[best].xyz.forEach((value, k) => take(value, k % 3));
+    if (cloud.count) cloud.near.forEach((corner) => corner.forEach(take));
+    this.low = new THREE.Vector3(...low);
+    this.high = new THREE.Vector3(...high);
+    this.middle = this.low.clone().add(this.high).multiplyScalar(0.5);
+    this.reach = Math.max(this.low.distanceTo(this.high) / 2, 0.1);
+  }
+
+  add(name, node, label, swatch, visible = true) {
+    node.visible = visible;
+    this.layers.set(name, { node, label, swatch });
+    this.scene.add(node);
+  }
+
+  addGrid() {
+    const cell = 10 ** Math.floor(Math.log10(this.reach));
+    const count = 2 * Math.ceil((1.3 * this.reach) / cell);
+    const grid = new THREE.GridHelper(count * cell, count);
+    grid.material.dispose();
+    grid.material = new THREE.LineBasicMaterial({ transparent: true, opacity: 0.75, depthWrite: false });
+    grid.geometry.deleteAttribute("color");
+    this.painted.push([grid.material, "line"]);
+    grid.rotation.x = Math.PI / 2;
+    const snap = (value) => Math.round(value / cell) * cell;
+    grid.position.set(snap(this.middle.x), snap(this.middle.y), this.low.z - 0.01 * this.reach);
+    this.add("grid", grid, `Grid of ${cell >= 1 ? cell : cell.toPrecision(1)} m`, "line");
+  }
+
+  addCloud() {
+    const cloud = this.data.cloud;
+    if (!cloud.count) return;
+    const xyz = shorts(cloud.xyz);
+    const packed = shorts(cloud.rgb);
+    const position = new Float32Array(3 * cloud.count);
+    const rgb = new Uint8Array(4 * cloud.count);
+    for (let k = 0; k < position.length; k++) position[k] = cloud.low[k % 3] + cloud.step[k % 3] * xyz[k];
+    for (let k = 0; k < cloud.count; k++) {
+      rgb[4 * k] = ((packed[k] >> 11) * 255) / 31;
+      rgb[4 * k + 1] = (((packed[k] >> 5) & 63) * 255) / 63;
+      rgb[4 * k + 2] = ((packed[k] & 31) * 255) / 31;
+      rgb[4 * k + 3] = 255;
+    }
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
+    geometry.setAttribute("color", new THREE.BufferAttribute(rgb, 4, true));
+    // as large as points that lie evenly on surfaces of this extent would have to be to close them
+    this.pointSize = (3.1 * this.reach) / Math.sqrt(cloud.count);
+    const material = new THREE.PointsMaterial({ vertexColors: true, size: this.pointSize });
+    this.points = new THREE.Points(geometry, material);
+    this.points.frustumCulled = false;
+    this.add("map", this.points, "Map", "muted");
+  }
+
+  line(xyz, name, opacity, Kind = THREE.Line) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3));
+    const material = new THREE.LineBasicMaterial({ transparent: opacity < 1, opacity });
+    this.painted.push([material, name]);
+    const node = new Kind(geometry, material);
+    node.frustumCulled = false;
+    return node;
+  }
+
+  addPaths() {
+    const { paths, labels } = this.data;
+    for (const [name, path] of Object.entries(paths)) {
+      const shown = name !== "live" || !paths.graph;
+      this.add(name, this.line(path.xyz, name, 1), labels[name], name, shown);
+    }
+  }
+
+  addLoops() {
+    const { rows, ends } = this.data.loops;
+    this.loopNodes = {};
+    for (const decision of DECISIONS) {
+      const indices = rows.flatMap((row, k) => (row.decision === decision ? [k] : []));
+      if (!indices.length) continue;
+      const xyz = new Float32Array(6 * indices.length);
+      indices.forEach((k, place) => xyz.set(ends.subarray(6 * k, 6 * k + 6), 6 * place));
+      const node = this.line(xyz, LOOP_COLORS[decision], decision === "rejected" ? 0.5 : 0.9, THREE.LineSegments);
+      node.userData.indices = indices;
+      const label = `Loops ${decision}`;
+      this.add(`loops-${decision}`, node, label, LOOP_COLORS[decision], decision !== "rejected");
+      this.loopNodes[decision] = node;
+    }
+    this.chosen = this.line(new Float32Array(6), "accent", 1, THREE.LineSegments);
+    this.chosen.visible = false;
+    this.chosen.material.depthTest = false;
+    this.chosen.renderOrder = 3;
+    this.scene.add(this.chosen);
+  }
+
+  addMarker() {
+    const size = 0.07 * this.reach;
+    const depth = size;
+    const [w, h] = [0.62 * size, 0.46 * size];
+    const T = this.data.camera || [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]];
+    const place = (x, y, z) => [0, 1, 2].map((k) => T[k][0] * x + T[k][1] * y + T[k][2] * z + T[k][3]);
+    const eye = place(0, 0, 0);
+    const corners = [[-w, -h], [w, -h], [w, h], [-w, h]].map(([x, y]) => place(x, y, depth));
+    const segments = [];
+    corners.forEach((corner, k) => segments.push(...eye, ...corner, ...corner, ...corners[(k + 1) % 4]));
+    segments.push(...corners[0], ...place(0, -1.5 * h, depth), ...place(0, -1.5 * h, depth), ...corners[1]);
+    const frustum = this.line(new Float32Array(segments), "accent", 1, THREE.LineSegments);
+    const ball = new THREE.Mesh(new THREE.SphereGeometry(0.011 * this.reach, 16, 12), new THREE.MeshBasicMaterial());
+    this.painted.push([ball.material, "accent"]);
+    for (const node of [frustum, ball]) {
+      node.material.depthTest = false;
+      node.renderOrder = 4;
+    }
+    this.marker = new THREE.Group();
+    this.marker.matrixAutoUpdate = false;
+    this.marker.add(frustum, ball);
+    this.scene.add(this.marker);
+  }
+
+  addControls() {
+    this.controls = new THREE.OrbitControls(this.camera, this.canvas);
+    this.controls.enableDamping = false;
+    this.controls.maxDistance = 12 * this.reach;
+    this.controls.minDistance = 0.02 * this.reach;
+    this.controls.addEventListener("change", () => this.ask(true));
+    this.controls.addEventListener("end", () => this.rest());
+    let down = null;
+    this.canvas.addEventListener("pointerdown", (event) => (down = [event.clientX, event.clientY]));
+    this.canvas.addEventListener("pointerup", (event) => {
+      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 5) this.click(event);
+    });
+  }
+
+  // Look at all of it from above and aside.
+  overview(direction = [-0.62, -0.85, 0.95]) {
+    const way = new THREE.Vector3(...direction).normalize();
+    this.controls.target.copy(this.middle);
+    this.camera.position.copy(this.middle).addScaledVector(way, (2.15 * this.reach) / Math.min(this.camera.aspect || 1, 1.2));
+    this.camera.near = 0.005 * this.reach;
+    this.camera.far = 30 * this.reach;
+    this.controls.update();
+    this.resize();
+  }
+
+  fromAbove() {
+    this.overview([0, -0.001, 1]);
+  }
+
+  paint() {
+    this.scene.background = new THREE.Color(color("scene"));
+    for (const [material, name] of this.painted) material.color.set(color(name));
+    this.ask();
+  }
+
+  resize() {
+    const { clientWidth, clientHeight } = this.canvas.parentElement;
+    if (!clientWidth || !clientHeight) return;
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.camera.aspect = clientWidth / clientHeight;
+    this.camera.updateProjectionMatrix();
+    this.ask();
+  }
+
+  ask(moving = false) {
+    this.moving = this.moving || moving;
+    if (moving) {
+      clearTimeout(this.later);
+      this.later = setTimeout(() => this.rest(), 180);
+    }
+    if (this.asked) return;
+    this.asked = true;
+    requestAnimationFrame(() => {
+      this.asked = false;
+      this.draw();
+    });
+  }
+
+  rest() {
+    this.moving = false;
+    this.ask();
+  }
+
+  draw() {
+    const begun = performance.now();
+    if (this.points) {
+      const count = this.data.cloud.count;
+      const part = this.moving ? Math.max(this.fraction, Math.min(1, FEWEST / count)) : 1;
+      this.points.geometry.setDrawRange(0, Math.round(part * count));
+      this.points.material.size = this.pointSize / Math.sqrt(part); // fewer points, as much of the surface
+    }
+    this.renderer.render(this.scene, this.camera);
+    if (!this.moving) return;
+    // reading one pixel waits for the picture: what calls alone take says nothing about software rendering
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    this.frameMs = performance.now() - begun;
+    this.fraction = Math.min(1, Math.max(0.01, this.fraction * Math.min(1.3, Math.max(0.5, FRAME_MS / this.frameMs))));
+  }
+
+  // The time to draw everything once, in milliseconds, as a mean of several.
+  timeWhole(times) {
+    const gl = this.renderer.getContext();
+    const begun = performance.now();
+    for (let k = 0; k < times; k++) {
+      this.renderer.render(this.scene, this.camera);
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    }
+    return (performance.now() - begun) / times;
+  }
+
+  setTime(t) {
+    const path = this.data.paths[this.data.best];
+    const k = nearest(path.t, t);
+    const R = path.R.subarray(9 * k, 9 * k + 9);
+    const [x, y, z] = path.xyz.subarray(3 * k, 3 * k + 3);
+    this.marker.matrix.set(R[0], R[1], R[2], x, R[3], R[4], R[5], y, R[6], R[7], R[8], z, 0, 0, 0, 1);
+    this.marker.matrixWorldNeedsUpdate = true;
+    this.ask();
+  }
+
+  show(name, visible) {
+    this.layers.get(name).node.visible = visible;
+    this.ask();
+  }
+
+  choose(k) {
+    this.chosen.visible = k !== null;
+    if (k !== null) {
+      this.chosen.geometry.attributes.position.array.set(this.data.loops.ends.subarray(6 * k, 6 * k + 6));
+      this.chosen.geometry.attributes.position.needsUpdate = true;
+    }
+    this.ask();
+  }
+
+  // On the screen, in pixels of the page; null behind the camera.
+  project(x, y, z) {
+    const p = new THREE.Vector3(x, y, z).project(this.camera);
+    const { clientWidth, clientHeight } = this.canvas;
+    return p.z > 1 ? null : [((p.x + 1) / 2) * clientWidth, ((1 - p.y) / 2) * clientHeight];
+  }
+
+  click(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const [x, y] = [event.clientX - box.left, event.clientY - box.top];
+    let best = [CLICK_PX, null];
+    for (const node of Object.values(this.loopNodes)) {
+      if (!node.visible) continue;
+      for (const k of node.userData.indices) {
+        const e = this.data.loops.ends.subarray(6 * k, 6 * k + 6);
+        const [a, b] = [this.project(e[0], e[1], e[2]), this.project(e[3], e[4], e[5])];
+        if (!a || !b) continue;
+        const [dx, dy] = [b[0] - a[0], b[1] - a[1]];
+        const share = Math.min(1, Math.max(0, ((x - a[0]) * dx + (y - a[1]) * dy) / (dx * dx + dy * dy || 1)));
+        const away = Math.hypot(a[0] + share * dx - x, a[1] + share * dy - y);
+        if (away < best[0]) best = [away, k];
+      }
+    }
+    if (best[1] !== null && this.onLoop) this.onLoop(best[1]);
+    else this.clickPath(x, y);
+  }
+
+  clickPath(x, y) {
+    const path = this.data.paths[this.data.best];
+    let best = [2 * CLICK_PX, null];
+    for (let k = 0; k < path.t.length; k++) {
+      const p = this.project(path.xyz[3 * k], path.xyz[3 * k + 1], path.xyz[3 * k + 2]);
+      const away = p ? Math.hypot(p[0] - x, p[1] - y) : Infinity;
+      if (away < best[0]) best = [away, path.t[k]];
+    }
+    if (best[1] !== null && this.onTime) this.onTime(best[1]);
+  }
+}
