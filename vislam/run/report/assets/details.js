@@ -39,7 +39,7 @@ export class Details {
     const k = nearest(path.t, t);
     const facts = [["Time", `${t.toFixed(2)} s`]];
     const xyz = Array.from(path.xyz.subarray(3 * k, 3 * k + 3));
-    facts.push(["Position", `${xyz.map((v) => v.toFixed(2)).join(", ")} m`]);
+    facts.push(["x, y, z [m]", xyz.map((v) => v.toFixed(2)).join(", ")]);
     const R = path.R.subarray(9 * k, 9 * k + 9);
     facts.push(["Heading", `${((Math.atan2(R[3], R[0]) * 180) / Math.PI).toFixed(1)}°`]);
     for (const [name, curve] of Object.entries(data.errors)) {

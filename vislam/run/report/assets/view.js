@@ -91,7 +91,7 @@ export class View {
     geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
     geometry.setAttribute("color", new THREE.BufferAttribute(rgb, 4, true));
     // as large as points that lie evenly on surfaces of this extent would have to be to close them
-    this.pointSize = (3.1 * this.reach) / Math.sqrt(cloud.count);
+    this.pointSize = (4.4 * this.reach) / Math.sqrt(cloud.count);
     const material = new THREE.PointsMaterial({ vertexColors: true, size: this.pointSize });
     this.points = new THREE.Points(geometry, material);
     this.points.frustumCulled = false;
@@ -178,8 +178,10 @@ export class View {
   // Look at all of it from above and aside.
   overview(direction = [-0.62, -0.85, 0.95]) {
     const way = new THREE.Vector3(...direction).normalize();
-    this.controls.target.copy(this.middle);
-    this.camera.position.copy(this.middle).addScaledVector(way, (2.15 * this.reach) / Math.min(this.camera.aspect || 1, 1.2));
+    const target = this.middle.clone();
+    target.z = this.low.z; // what is near takes more of the picture than what is far
+    this.controls.target.copy(target);
+    this.camera.position.copy(target).addScaledVector(way, (2.15 * this.reach) / Math.min(this.camera.aspect || 1, 1.2));
     this.camera.near = 0.005 * this.reach;
     this.camera.far = 30 * this.reach;
     this.controls.update();
