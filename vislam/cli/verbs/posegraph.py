@@ -47,6 +47,7 @@ def main(arguments: list[str]) -> int:
 
 def _optimize(options: PoseGraphOptions, out: Path) -> int:
     with while_importing():  # it takes longer than solving most files
+        from vislam.batch.posegraph.optimize import as_stated
         from vislam.run.folder import check_writable
         from vislam.run.offline.optimize_graph import optimize_graph_file
         from vislam.run.report.graph_page import write_graph_report
@@ -58,7 +59,10 @@ def _optimize(options: PoseGraphOptions, out: Path) -> int:
             options.file, out, options.settings, lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}")
         )
     if options.report:
-        write_graph_report(result.problem, result.solution, options.file.stem, out / "report.html", result.certificate)
+        write_graph_report(
+            result.problem, result.solution, options.file.stem, out / "report.html", result.certificate,
+            as_stated(result.problem, result.solution.weights),
+        )  # fmt: skip
     summary = result.summary
     if options.json:
         print(json.dumps(summary))

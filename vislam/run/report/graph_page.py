@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vislam.batch.posegraph.certificate import Certificate
-from vislam.batch.posegraph.optimize import PoseGraphSolution, as_stated
+from vislam.batch.posegraph.optimize import PoseGraphSolution
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
 from vislam.core.errors import DataError
@@ -27,9 +27,13 @@ def write_graph_report(
     name: str,
     path: Path,
     certificate: Certificate | None = None,
+    stated: tuple[Array, float] | None = None,
 ) -> None:
-    """Write report.html of an optimised pose graph. Raises StorageError."""
-    stated = as_stated(problem, solution.weights)
+    """Write report.html of an optimised pose graph. Raises StorageError.
+
+    Where the problem came from a file, `stated` is what that says of the poses [N, d + 1, d + 1] and their cost, which
+    the page then shows as what was before; else it shows the start.
+    """
     before, cost_before, of = (
         (solution.start, solution.costs[0], f"the {solution.start_name} start")
         if stated is None
