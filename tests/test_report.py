@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import cv2
@@ -12,9 +13,15 @@ import pytest
 
 from run_folder import DEGRADED, LOST, make_run
 from vislam.core.errors import DataError, StorageError
+from vislam.core.memory import GraphNews, KeyframeEntry, PackedScan
+from vislam.core.messages import GraphUpdate
+from vislam.mapping.formats.ply import write_ply
 from vislam.run.report import write_report
 from vislam.run.report.run_files import read_run
 from vislam.run.report.scene import build_scene, loop_segments
+from vislam.run.session import SessionWriter
+from worlds.lap import RIG, World
+from worlds.parts import GRAVITY_M_S2
 
 
 class Page(HTMLParser):
@@ -114,9 +121,43 @@ def test_a_whole_run_becomes_one_self_contained_page(run):
     assert '"code_revision": "0123456789abcdef"' in page.text
 
 
+def add_map_and_session(run):
+    """Give a run folder a cloud and a session of two keyframes that keep their colours."""
+    world = World(5.0, seed=3)
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-5.0, 5.0, (3000, 3)).astype(np.float32)
+    write_ply(run / "map" / "cloud.ply", points, rng.integers(0, 255, (3000, 3), dtype=np.uint8))
+    writer = SessionWriter(run / "session.db", {"config": {}}, RIG, world.noise, GRAVITY_M_S2)
+    for k in range(2):
+        colors = cv2.imencode(".png", rng.integers(0, 255, (60, 80, 3), dtype=np.uint8))[1].tobytes()
+        scan = PackedScan(k, cv2.imencode(".png", np.full((60, 80), 1000, np.uint16))[1].tobytes(), b"", colors)
+        update = GraphUpdate(k + 1, np.array([k]), world.truth[k][None], np.eye(4), None)
+        writer.add(KeyframeEntry(world.packet(k), world.truth[k], update, GraphNews(), scans={k: scan}))
+    writer.close(finished=True)
+
+
 def test_the_same_folder_gives_the_same_bytes(run):
     first = write_report(run).read_bytes()
     assert write_report(run).read_bytes() == first
+
+
+def test_a_copied_folder_with_map_and_session_gives_the_same_bytes(copy, tmp_path):
+    add_map_and_session(copy)
+    shutil.copytree(copy, tmp_path / "elsewhere" / copy.name)
+    first = write_report(copy).read_bytes()
+    assert write_report(tmp_path / "elsewhere" / copy.name).read_bytes() == first
+    data = json.loads(re.search(rb'id="view-data">(.*?)</script>', first)[1])
+    assert data["cloud"]["count"] == 3000
+    assert [picture["id"] for picture in data["pictures"]] == [0, 1]
+
+
+def test_what_batch_made_of_the_run_is_among_the_tiles(copy):
+    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics["accuracy"]["batch"] = metrics["accuracy"]["graph"] | {"ate_rmse_m": 0.0123}
+    metrics["batch"] = {"batch": {"cost_before": 542.6, "cost_after": 321.2}}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    page = Page(write_report(copy).read_text())
+    assert {"ATE of the batch", "0.012", "321", "cost of the batch, 543 before"} <= set(page.texts)
 
 
 def test_errors_of_the_scene_are_those_of_the_metrics(run):
@@ -222,6 +263,17 @@ def test_damaged_files_are_named_and_the_rest_is_still_there(copy, damages):
     page = Page(write_report(copy).read_text())
     for _, _, says in damages:
         assert says in page.text
+    assert "Trajectories" in page.headings
+
+
+@pytest.mark.parametrize("damage", [_half, lambda data: data[:60], lambda data: b"", lambda data: data[::-1]])
+def test_a_damaged_map_and_session_are_named_and_the_rest_is_still_there(copy, damage):
+    add_map_and_session(copy)
+    for path in (copy / "map" / "cloud.ply", copy / "session.db"):
+        path.write_bytes(damage(path.read_bytes()))
+    page = Page(write_report(copy).read_text())
+    assert "map/cloud.ply left out: " in page.text
+    assert "session.db left out: " in page.text
     assert "Trajectories" in page.headings
 
 

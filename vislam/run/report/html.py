@@ -122,8 +122,11 @@ def folded(title: str, content: str) -> str:
     return f"<details><summary>{escape(title)}</summary><div>{content}</div></details>"
 
 
-def picture(path: Path, caption: str) -> str:
-    """Return an image embedded as data, made smaller where it is large; a reason when it cannot be read."""
+def picture(path: Path, caption: str, kind: str = "") -> str:
+    """Return an image embedded as data, made smaller where it is large; a reason when it cannot be read.
+
+    One of kind "plan" means the same on dark paper with its lightness turned round; others are as a camera saw them.
+    """
     import cv2
 
     from vislam.datasets.images import image_size
@@ -143,4 +146,4 @@ def picture(path: Path, caption: str) -> str:
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
         data, mime = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes(), "image/jpeg"
     encoded = base64.b64encode(data).decode("ascii")
-    return card(f'<img alt="{escape(caption)}" src="data:{mime};base64,{encoded}">', title=caption)
+    return card(f'<img alt="{escape(caption)}" src="data:{mime};base64,{encoded}">', title=caption, kind=kind)

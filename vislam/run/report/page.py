@@ -60,6 +60,7 @@ def write_report(run: Path) -> Path:
             _accuracy(files, scene),
             _trajectories(files, scene),
             _over_time(files, scene),
+            _free_space(files),
             loops_section(files, scene),
             _timing(files),
             _biases(files, scene),
@@ -148,6 +149,7 @@ def _tiles(run: RunFiles, scene: Scene) -> str:
         tiles.append(tile(number(graph.get("ate_rmse_m")), "m", "ATE of the final trajectory", "graph"))
     if ekf:
         tiles.append(tile(number(ekf.get("ate_rmse_m")), "m", f"ATE of the {scene.labels['ekf']}", "ekf"))
+    tiles += _batch_tiles(m)
     if graph:
         covered = graph.get("coverage")
         full = isinstance(covered, int | float) and covered >= 0.95
@@ -168,6 +170,16 @@ def _tiles(run: RunFiles, scene: Scene) -> str:
     if run.tracking is not None:
         tiles.append(tile(number(lost, 0), "", label, "good" if lost == 0 else "bad"))
     return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _batch_tiles(metrics: dict[str, Any]) -> list[str]:
+    """Return what `vislam optimize` made of the run, under the name that it gives by itself."""
+    accuracy, batch = as_dict(metrics, "accuracy", "batch"), as_dict(metrics, "batch", "batch")
+    tiles = [tile(number(accuracy.get("ate_rmse_m")), "m", "ATE of the batch", "batch")] if accuracy else []
+    if "cost_after" in batch:
+        label = f"cost of the batch, {number(batch.get('cost_before'), 0)} before"
+        tiles.append(tile(number(batch.get("cost_after"), 0), "", label, "batch"))
+    return tiles
 
 
 def _lost_frames(run: RunFiles) -> tuple[int, int]:
@@ -258,14 +270,23 @@ def _over_time(run: RunFiles, scene: Scene) -> str:
 
 
 def _map(run: RunFiles) -> str:
-    cards = []
-    for path in run.pictures:
-        caption = path.stem.removeprefix("picture").strip("-_ ").replace("_", " ") or "The map"
-        try:
-            cards.append(picture(path, caption))
-        except OSError as error:
-            cards.append(card(note(f"{path.name} cannot be read: {error.strerror or error}")))
+    cards = [_picture(path) for path in run.pictures if not _is_plan(path)]
     return section("Map", *cards if len(cards) == 1 else (grid(*cards),), kind="still of-map")
+
+
+def _free_space(run: RunFiles) -> str:
+    """Return what the view in 3-D does not have: where there is room, and what is in the way."""
+    cards = [_picture(path) for path in run.pictures if _is_plan(path)]
+    return section("Free space", *cards if len(cards) == 1 else (grid(*cards),), kind="of-map")
+
+
+def _is_plan(path: Path) -> bool:
+    return path.stem in ("picture_octree", "picture_where_to_drive")
+
+
+def _picture(path: Path) -> str:
+    caption = path.stem.removeprefix("picture").strip("-_ ").replace("_", " ") or "The map"
+    return picture(path, caption, kind="plan" if _is_plan(path) else "")
 
 
 def _timing(run: RunFiles) -> str:
