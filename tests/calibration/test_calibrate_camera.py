@@ -45,12 +45,20 @@ def size_of(camera: Camera) -> tuple[int, int]:
     return camera.width, camera.height
 
 
-@pytest.mark.parametrize(("camera", "model"), [(WEBCAM, "radtan"), (FISHEYE, "equidistant")])
-def test_errors_are_as_large_as_their_sigmas(camera: Camera, model: Model) -> None:
+SLANTED = replace(WEBCAM, skew_px=6.0)
+
+
+@pytest.mark.parametrize(
+    ("camera", "model", "skew"),
+    [(WEBCAM, "radtan", False), (FISHEYE, "equidistant", False), (SLANTED, "radtan", True), (WEBCAM, "radtan", True),
+     (replace(FISHEYE, skew_px=-4.0), "equidistant", True)],
+)  # fmt: skip
+def test_errors_are_as_large_as_their_sigmas(camera: Camera, model: Model, skew: bool) -> None:
     ratios = []
     for seed in range(12):
-        fit = fit_lens(seen(camera, np.random.default_rng(seed), 12), size_of(camera), model)
-        ratios.append((parameters_of(fit.camera) - parameters_of(camera)) / fit.sigmas)
+        fit = fit_lens(seen(camera, np.random.default_rng(seed), 12), size_of(camera), model, skew)
+        ratios.append((fit.values - parameters_of(camera, skew)) / fit.sigmas)
+        assert fit.names[4] == ("s" if skew else "k1")
         assert fit.rms_px == pytest.approx(np.sqrt(2.0) * SIGMA_PX, rel=0.1)
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.25
 
@@ -135,6 +143,21 @@ def test_the_verb_writes_files_of_three_kinds(
     assert len(answer["views"]) == len({*answer["views"]}) and all(v["rms_px"] < 1.0 for v in answer["views"].values())
     picture = cv2.imread(str(out / "camera.png"))
     assert picture is not None and picture.std() > 10.0
+
+
+def test_the_skew_is_found_where_it_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "slanted"
+    folder.mkdir()
+    rng = np.random.default_rng(4)
+    for k in range(12):
+        cv2.imwrite(str(folder / f"{k:02d}.png"), see(SLANTED, BOARD, pose(rng, SLANTED, BOARD), rng))
+    answer = calibrate(capsys, "camera", folder, "--out", tmp_path / "with", "--skew")
+    assert abs(answer["parameters"]["s"] - 6.0) < 4.0 * answer["sigmas"]["s"] < 3.0
+    assert any("differs from zero" in said for said in answer["statements"])
+    names = ("camchain.yaml", "camera.yaml", "camera_info.yaml")
+    assert {read_cameras(tmp_path / "with" / name)[0].camera.skew_px for name in names} == {answer["parameters"]["s"]}
+    with pytest.raises(AssertionError, match="focal length would be known to"):  # refused rather than told wrong
+        calibrate(capsys, "camera", folder, "--out", tmp_path / "without")
 
 
 def test_a_video_and_a_live_camera_do_as_well(

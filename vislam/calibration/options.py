@@ -55,6 +55,8 @@ class CameraOptions:
     board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
     model: Literal["radtan", "radtan5", "equidistant"] = "radtan"
     """radtan: k1 k2 p1 p2; radtan5: and k3, which Kalibr does not know; equidistant: lenses of over 100 degrees"""
+    skew: bool = False
+    """Estimate the skew s of K as well: 0 for nearly every sensor, not so for a film that was scanned aslant"""
     max_images: Count = 300
     """So many images, evenly spaced, are searched for the board"""
     max_views: Count = 40

@@ -75,7 +75,7 @@ def solve_camera(found: Found, options: CameraOptions) -> CameraResult:
     share = float(np.mean(covered > 0))
     refuse(what, [] if share >= _MIN_COVERED else [f"only {share:.0%} of the image has seen corners of the board; "
                                                   f"show it {_empty_parts(covered)}"])  # fmt: skip
-    fit = fit_lens(views, found.size, options.model)
+    fit = fit_lens(views, found.size, options.model, options.skew)
     tilts = np.array([_tilt_deg(T) for T in fit.T_cam_board])
     result = CameraResult(found, views, fit, covered, tilts)
     refuse(what, _doubts(result))
@@ -154,6 +154,10 @@ def _statements(result: CameraResult) -> list[str]:
             f"views contradict each other {np.sqrt(result.fit.grouping):.1f} times as much as their corners scatter (a "
             "board that is not flat, blur, a lens that moves); sigmas are widened by that"
         )
+    if result.fit.with_skew:
+        skew, sigma = result.fit.values[4], result.fit.sigmas[4]
+        known = "differs from zero" if abs(skew) > 3.0 * sigma else "may well be zero, as chips' is: leave --skew out"
+        said.append(f"the skew, {skew:+.2f} ± {sigma:.2f} px, {known}")
     share = float(np.mean(result.covered > 0))
     if share < 0.95:
         said.append(f"{1.0 - share:.0%} of the image never saw the board; there the lens is extrapolated")
@@ -162,7 +166,6 @@ def _statements(result: CameraResult) -> list[str]:
 
 def _report(result: CameraResult, options: CameraOptions) -> dict[str, Any]:
     fit = result.fit
-    values = [fit.camera.fx, fit.camera.fy, fit.camera.cx, fit.camera.cy, *fit.camera.coefficients]
     views = {
         view.name: {
             "corners": len(view.points_m),
@@ -175,7 +178,7 @@ def _report(result: CameraResult, options: CameraOptions) -> dict[str, Any]:
         "kind": "camera",
         "model": options.model,
         "size": list(result.found.size),
-        "parameters": dict(zip(fit.names, values, strict=True)),
+        "parameters": dict(zip(fit.names, fit.values.tolist(), strict=True)),
         "sigmas": dict(zip(fit.names, fit.sigmas.tolist(), strict=True)),
         "rms_px": fit.rms_px,
         "grouping": fit.grouping,
@@ -190,13 +193,12 @@ def _report(result: CameraResult, options: CameraOptions) -> dict[str, Any]:
 
 
 def _lines(result: CameraResult) -> list[str]:
-    fit, camera = result.fit, result.fit.camera
-    values = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients]
+    fit = result.fit
     rms = [float(np.sqrt(np.nanmean(np.sum(r**2, axis=1)))) for r in fit.residuals_px]
     worst = int(np.argmax(rms))
     numbers = [
-        f"{name} {value:.2f} ± {sigma:.2f} px" if name[0] in "fc" else f"{name} {value:+.5f} ± {sigma:.5f}"
-        for name, value, sigma in zip(fit.names, values, fit.sigmas, strict=True)
+        f"{name} {value:.2f} ± {sigma:.2f} px" if name[0] in "fcs" else f"{name} {value:+.5f} ± {sigma:.5f}"
+        for name, value, sigma in zip(fit.names, fit.values, fit.sigmas, strict=True)
     ]
     return [
         f"{len(result.views)} views of {len(result.found.views)} images with the board ({result.found.searched} "

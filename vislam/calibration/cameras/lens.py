@@ -36,18 +36,24 @@ class LensFit:
     """A calibrated camera and how well it is known."""
 
     camera: Camera
-    covariance: Array  # [P, P] of fx, fy, cx, cy, then the coefficients
+    covariance: Array  # [P, P] of fx, fy, cx, cy, the skew if it was estimated, then the coefficients
     T_cam_board: tuple[Array, ...]  # [4, 4] per view
     residuals_px: tuple[Array, ...]  # [N, 2] per view, NaN where left out as outlier
     rms_px: float  # over both coordinates of a corner together, as OpenCV tells it
     outliers: int
     grouping: float  # variance between views over that which independent corners explain; 1 when they are independent
+    with_skew: bool = False
 
     @property
     def names(self) -> list[str]:
         """The names of the parameters."""
         k = ["k1", "k2", "k3", "k4"] if self.camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
-        return ["fx", "fy", "cx", "cy", *k[: len(self.camera.coefficients)]]
+        return ["fx", "fy", "cx", "cy", *(["s"] if self.with_skew else []), *k[: len(self.camera.coefficients)]]
+
+    @property
+    def values(self) -> Array:
+        """The parameters [P]; focal lengths, principal point and skew in pixels."""
+        return parameters_of(self.camera, self.with_skew)
 
     @property
     def sigmas(self) -> Array:
@@ -55,12 +61,15 @@ class LensFit:
         return np.sqrt(np.diag(self.covariance))
 
 
-def fit_lens(views: list[View], size: tuple[int, int], model: Model) -> LensFit:
-    """Calibrate a camera of `size` (width, height); raises DataError when the views do not determine it at all."""
+def fit_lens(views: list[View], size: tuple[int, int], model: Model, with_skew: bool = False) -> LensFit:
+    """Calibrate a camera of `size` (width, height); raises DataError when the views do not determine it at all.
+
+    `with_skew` estimates s of K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]] as well, which is 0 else.
+    """
     camera, poses = _start(views, size, model)
     good = [np.ones(len(view.points_m), dtype=np.bool_) for view in views]
     for _ in range(2):
-        camera, poses = _refine(camera, poses, views, good)
+        camera, poses = _refine(camera, poses, views, good, with_skew)
         residuals = [_residuals(camera, T, view) for T, view in zip(poses, views, strict=True)]
         every = np.concatenate(residuals)
         scatter = max(1.4826 * float(np.nanmedian(np.abs(every))), _MIN_SIGMA_PX)
@@ -68,8 +77,8 @@ def fit_lens(views: list[View], size: tuple[int, int], model: Model) -> LensFit:
         if all(g.all() for g in good) or min(int(g.sum()) for g in good) < 4:
             break
     else:
-        camera, poses = _refine(camera, poses, views, good)
-    return _judge(camera, poses, views, good)
+        camera, poses = _refine(camera, poses, views, good, with_skew)
+    return _judge(camera, poses, views, good, with_skew)
 
 
 def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Camera, list[Array]]:
@@ -105,26 +114,28 @@ def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Came
     return camera, poses
 
 
-def parameters_of(camera: Camera) -> Array:
-    """Return fx, fy, cx, cy and the coefficients [P]."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients])
+def parameters_of(camera: Camera, with_skew: bool = False) -> Array:
+    """Return fx, fy, cx, cy, the skew if asked for, and the coefficients [P]."""
+    skew = [camera.skew_px] if with_skew else []
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *skew, *camera.coefficients])
 
 
-def with_parameters(camera: Camera, x: Array) -> Camera:
+def with_parameters(camera: Camera, x: Array, with_skew: bool = False) -> Camera:
     """Return the camera with other parameters [P]."""
     fx, fy, cx, cy, *k = x.tolist()
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(k))
+    skew_px = k.pop(0) if with_skew else camera.skew_px
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, skew_px=skew_px, coefficients=tuple(k))
 
 
-def by_parameters(camera: Camera, points_cam_m: Array) -> Array:
+def by_parameters(camera: Camera, points_cam_m: Array, with_skew: bool = False) -> Array:
     """Return the derivative [N, 2, P] of pixels by the camera's parameters at points [N, 3]."""
-    x = parameters_of(camera)
+    x = parameters_of(camera, with_skew)
     steps = _STEP * np.where(np.arange(len(x)) < 4, np.maximum(np.abs(x), 1.0), 1.0)
     out = np.empty((len(points_cam_m), 2, len(x)))
     for p, step in enumerate(steps):
         d = np.zeros(len(x))
         d[p] = step
-        ahead, behind = with_parameters(camera, x + d), with_parameters(camera, x - d)
+        ahead, behind = (with_parameters(camera, at, with_skew) for at in (x + d, x - d))
         out[:, :, p] = (ahead.project(points_cam_m) - behind.project(points_cam_m)) / (2.0 * step)
     return out
 
@@ -144,11 +155,11 @@ class _Block:
     r: Array  # [rows]
 
 
-def _blocks(camera: Camera, poses: list[Array], views: list[View], good: list[Bools]) -> list[_Block]:
+def _blocks(camera: Camera, poses: list[Array], views: list[View], good: list[Bools], with_skew: bool) -> list[_Block]:
     """Linearise all views; the cameras with other parameters are made once for all of them."""
     points = [v.points_m[g] @ T[:3, :3].T + T[:3, 3] for T, v, g in zip(poses, views, good, strict=True)]
     ends = np.cumsum([len(p) for p in points])[:-1]
-    every = np.split(by_parameters(camera, np.concatenate(points)), ends)
+    every = np.split(by_parameters(camera, np.concatenate(points), with_skew), ends)
     return [
         _block(camera, T, view, g, p, A) for T, view, g, p, A in zip(poses, views, good, points, every, strict=True)
     ]
@@ -172,15 +183,17 @@ def _block(camera: Camera, T: Array, view: View, good: Bools, points: Array, by_
     return _Block(reduced.T @ reduced, reduced.T @ r, solve_pose, A, r)
 
 
-def _refine(camera: Camera, poses: list[Array], views: list[View], good: list[Bools]) -> tuple[Camera, list[Array]]:
+def _refine(
+    camera: Camera, poses: list[Array], views: list[View], good: list[Bools], with_skew: bool
+) -> tuple[Camera, list[Array]]:
     for _ in range(_ITERATIONS):
-        blocks = _blocks(camera, poses, views, good)
+        blocks = _blocks(camera, poses, views, good, with_skew)
         H = np.sum([block.H for block in blocks], axis=0)
         g = np.sum([block.g for block in blocks], axis=0)
         scale = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         try:
             step = np.linalg.solve(H / np.outer(scale, scale) + _DAMPING * np.eye(len(g)), g / scale) / scale
-            camera = with_parameters(camera, parameters_of(camera) + step)
+            camera = with_parameters(camera, parameters_of(camera, with_skew) + step, with_skew)
         except (np.linalg.LinAlgError, DataError) as error:
             raise DataError("the views do not determine the camera; tilt the board to all sides") from error
         poses = [
@@ -191,8 +204,8 @@ def _refine(camera: Camera, poses: list[Array], views: list[View], good: list[Bo
     return camera, poses
 
 
-def _judge(camera: Camera, poses: list[Array], views: list[View], good: list[Bools]) -> LensFit:
-    blocks = _blocks(camera, poses, views, good)
+def _judge(camera: Camera, poses: list[Array], views: list[View], good: list[Bools], with_skew: bool) -> LensFit:
+    blocks = _blocks(camera, poses, views, good, with_skew)
     H = np.sum([block.H for block in blocks], axis=0)
     if np.linalg.matrix_rank(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) < len(H):
         raise DataError("the views do not determine the camera; tilt the board to all sides")
@@ -210,7 +223,7 @@ def _judge(camera: Camera, poses: list[Array], views: list[View], good: list[Boo
         residuals.append(r)
     outliers = int(sum((~g).sum() for g in good))
     rms = float(np.sqrt(squares / (rows / 2.0)))
-    return LensFit(camera, white * grouping, tuple(poses), tuple(residuals), rms, outliers, grouping)
+    return LensFit(camera, white * grouping, tuple(poses), tuple(residuals), rms, outliers, grouping, with_skew)
 
 
 def direction_sigma_px(fit: LensFit, columns: int, rows: int) -> Array:
@@ -223,7 +236,7 @@ def direction_sigma_px(fit: LensFit, columns: int, rows: int) -> Array:
     rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()]))
     seen = np.isfinite(rays).all(axis=1)
     out = np.full(len(rays), np.nan)
-    J = by_parameters(camera, rays[seen])
+    J = by_parameters(camera, rays[seen], fit.with_skew)
     by_point = camera.project_jacobian(rays[seen])
     x, y, z = rays[seen].T
     turn = np.zeros((len(x), 3, 3))
