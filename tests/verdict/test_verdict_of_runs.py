@@ -42,7 +42,7 @@ def test_the_verdict_is_the_first_line_printed_and_the_first_sentence_of_the_rep
     print_metrics(metrics, out, as_json=False)
     assert capsys.readouterr().out.splitlines()[0] == "Trusted: nothing in the run contradicts itself."
     page = write_report(out).read_text()
-    assert '<p class="lead">Trusted: nothing in the run contradicts itself.' in page
+    assert '<p class="verdict trusted">Trusted: nothing in the run contradicts itself.</p>' in page
 
 
 @pytest.mark.parametrize(
