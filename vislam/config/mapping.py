@@ -86,6 +86,7 @@ class MapConfig:
     cloud_min_points: Whole = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
     cloud_neighbours: Whole = 12  # statistical outlier removal: mean distance to so many neighbours
     cloud_outlier_sigma: NonNegative = 2.5  # may exceed the average by so many standard deviations
+    cloud_smooth_m: NonNegative = 0.0  # radius of moving least squares, three voxels or more; 0: points as measured
     grid_floor_m: Finite | None = None  # height of the floor in map; None: the lowest large horizontal surface
     grid_low_m: Finite = 0.10  # above the floor: lower things are driven over or are the floor's own noise
     grid_high_m: Finite = 1.60  # above the floor: higher things are driven under

@@ -15,6 +15,7 @@ from vislam.core.memory import PackedScan
 from vislam.core.messages import Array, GraphUpdate, Keyframe, Submaps
 from vislam.mapping.cloud.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
 from vislam.mapping.cloud.mesh import Mesh, fuse_mesh
+from vislam.mapping.cloud.smooth import smoothed
 from vislam.mapping.cloud.store import KeyframeStore, Scan
 from vislam.mapping.cloud.surfels import SurfelMap, Surfels
 from vislam.mapping.depth.extract import ScanExtractor
@@ -150,7 +151,8 @@ class Mapper:
         fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
-        return without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
+        kept = without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
+        return smoothed(kept, config.cloud_smooth_m)
 
     def coloured_octree(self) -> Octree:
         """Return the octree of log-odds; occupied leaves have the mean colour of what keyframes saw in them."""
