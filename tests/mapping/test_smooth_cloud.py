@@ -1,12 +1,15 @@
 """Moving least squares take the noise out of a cloud and leave its shape."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.smooth import smoothed
+from vislam.mapping.mapper import Mapper
+from worlds.box import CONFIG, RIG, keyframe, pose
 
 SIGMA_M = 0.004
 
@@ -90,3 +93,12 @@ def test_memory_is_that_of_a_chunk_not_of_the_cloud():
     few, all_of_them = peak_bytes(cloud.select(np.arange(60000) < 10000)), peak_bytes(cloud)
     assert few < 100e6
     assert all_of_them - few < 50000 * 120  # coordinates and normals in double precision, the answer; no neighbourhoods
+
+
+def test_a_map_smooths_its_cloud_when_asked():
+    measured, asked = (Mapper(replace(CONFIG, cloud_smooth_m=radius_m), RIG) for radius_m in (0.0, 0.1))
+    for k in range(4):
+        measured.add(keyframe(k), pose(k))
+        asked.add(keyframe(k), pose(k))
+    assert asked.cloud().points_m.tobytes() == smoothed(measured.cloud(), 0.1).points_m.tobytes()
+    assert asked.cloud().points_m.tobytes() != measured.cloud().points_m.tobytes()
