@@ -91,7 +91,8 @@ class MapConfig:
     grid_low_m: Finite = 0.10  # above the floor: lower things are driven over or are the floor's own noise
     grid_high_m: Finite = 1.60  # above the floor: higher things are driven under
     drive: DriveConfig = field(default_factory=DriveConfig)
-    mesh_voxel_m: Positive = 0.02  # about the noise of depth at 3 m
+    mesh_voxel_m: Positive = 0.01  # about the noise of depth at 2 m; farther views count less, by that noise
+    mesh_max_blocks: Count = 40_000  # of 8 x 8 x 8 voxels, 12 kB each; a mesh that takes more gets larger voxels
     mesh_min_views: Count = 2  # keyframes that must have seen a surface; with depth from one camera one is enough
     surfel_m: Positive = 0.02  # between surfels
     surfel_min_views: Count = 2  # keyframes that must have seen a surfel; what one alone saw may be noise

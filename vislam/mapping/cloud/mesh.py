@@ -1,31 +1,25 @@
-"""Coloured triangle mesh: truncated signed distances fused by Open3D's voxel block grid.
+"""Coloured triangle meshes: of signed distances that views are fused into, or of surfels.
 
-Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996; blocks and
-extraction as in Dong et al., "ASH: a modern framework for parallel spatial hashing", 2021. The order of Open3D's
-vertices depends on its threads, so they are sorted: same input, same bytes.
+The order of Open3D's vertices depends on its threads, so they are sorted: same input, same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vislam.core.geometry import invert
-from vislam.core.messages import Array
 from vislam.mapping._open3d import load_open3d
-from vislam.mapping.cloud.store import Scan
 from vislam.mapping.cloud.surfels import Surfels
-from vislam.mapping.depth.image import DepthView
+from vislam.mapping.mesh.views import PosedView
+from vislam.mapping.mesh.volume import Volume
 
-_BLOCK_VOXELS = 8
-_FIRST_BLOCKS = 4096  # grows by itself
-_TRUNCATION_VOXELS = 4.0
+_COARSER = 1.25  # a mesh that gets too large gets voxels larger by this
 _MIN_POISSON_POINTS = 100
 _NEAR_RADII = 4.0  # of the nearest surfel; a surface farther from any is a guess
 
@@ -40,33 +34,35 @@ class Mesh:
 
 
 def fuse_mesh(
-    scans: Iterable[tuple[Scan, Array]], view: DepthView, voxel_m: float, min_views: int
+    views: Callable[[], Iterable[PosedView]], voxel_m: float, min_views: int, max_blocks: int
 ) -> tuple[Mesh | None, str]:
-    """Return the mesh of scans with their T_map_body, and an empty string; or None and the reason there is none.
+    """Return the mesh of views, and an empty string; or None and the reason there is none.
 
-    A surface has to be seen by `min_views` scans.
+    A surface has to be seen by `min_views`. When it takes more than `max_blocks` of voxels, the views are asked for
+    again, and voxels are larger.
     """
     open3d, reason = load_open3d()
     if open3d is None:
         return None, reason
-    core = open3d.core
-    grid = open3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1), (1), (3)),
-        voxel_m, _BLOCK_VOXELS, _FIRST_BLOCKS, core.Device("CPU:0"),
-    )  # fmt: skip
-    K = core.Tensor(np.ascontiguousarray(view.K, dtype=np.float64))
-    count = 0
-    for scan, T_map_body in scans:
-        if scan.depth is not None and scan.depth.any():
-            _integrate(open3d, grid, K, scan, view, invert(T_map_body @ view.T_body_view))
-            count += 1
-    if count == 0:
+    while (volume := _fused(open3d, views(), voxel_m, max_blocks)) is None:
+        voxel_m *= _COARSER
+    if volume.blocks == 0:
         return None, "no keyframe has dense depth"
-    mesh = grid.extract_triangle_mesh(weight_threshold=min_views - 1.0)  # one per scan, and more than that is asked for
-    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+    surface = volume.triangles(min_views)
+    if surface is None:
         return None, f"no surface was seen by enough keyframes ({min_views})"
-    colors = np.clip(np.round(mesh.vertex.colors.numpy() * 255.0), 0, 255).astype(np.uint8)
-    return _sorted(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy()), ""
+    points, colors, triangles = surface
+    return _sorted(points, np.clip(np.round(colors * 255.0), 0, 255).astype(np.uint8), triangles), ""
+
+
+def _fused(open3d: Any, views: Iterable[PosedView], voxel_m: float, max_blocks: int) -> Volume | None:
+    """Return the volume of all views, None when it gets too large."""
+    volume = Volume(open3d, voxel_m)
+    for view in views:
+        volume.add(view.depth_m, view.colors, view.K, invert(view.T_map_view), view.max_range_m)
+        if volume.blocks > max_blocks:
+            return None
+    return volume
 
 
 def poisson_mesh(surfels: Surfels, depth: int) -> tuple[Mesh | None, str]:
@@ -89,21 +85,6 @@ def poisson_mesh(surfels: Surfels, depth: int) -> tuple[Mesh | None, str]:
     mesh.remove_vertices_by_mask(np.asarray(distance) > _NEAR_RADII * surfels.radius_m[nearest])
     colors = np.clip(np.round(np.asarray(mesh.vertex_colors) * 255.0), 0, 255).astype(np.uint8)
     return _sorted(np.asarray(mesh.vertices, dtype=np.float32), colors, np.asarray(mesh.triangles, dtype=np.int64)), ""
-
-
-def _integrate(open3d: Any, grid: Any, K: Any, scan: Scan, view: DepthView, T_view_map: Array) -> None:
-    depth, colors = scan.depth, scan.colors
-    if view.to_pinhole is not None:
-        depth = cv2.remap(depth, *view.to_pinhole, cv2.INTER_NEAREST)
-        colors = cv2.remap(colors, *view.to_pinhole, cv2.INTER_LINEAR)
-    depth_image = open3d.t.geometry.Image(open3d.core.Tensor(np.ascontiguousarray(depth, dtype=np.uint16)))
-    color_image = open3d.t.geometry.Image(open3d.core.Tensor(np.ascontiguousarray(colors, dtype=np.uint8)))
-    extrinsic = open3d.core.Tensor(np.ascontiguousarray(T_view_map, dtype=np.float64))
-    scale = 1.0 / view.unit_m
-    blocks = grid.compute_unique_block_coordinates(
-        depth_image, K, extrinsic, scale, view.max_range_m, _TRUNCATION_VOXELS
-    )
-    grid.integrate(blocks, depth_image, color_image, K, K, extrinsic, scale, view.max_range_m, _TRUNCATION_VOXELS)
 
 
 def _sorted(points: NDArray[np.float32], colors: NDArray[np.uint8], triangles: NDArray[np.int64]) -> Mesh:

@@ -1,0 +1,1 @@
+"""Meshes: signed distances of many views fused into one surface, and pictures laid on it."""
