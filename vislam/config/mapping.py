@@ -94,6 +94,7 @@ class MapConfig:
     mesh_voxel_m: Positive = 0.01  # about the noise of depth at 2 m; farther views count less, by that noise
     mesh_max_blocks: Count = 40_000  # of 8 x 8 x 8 voxels, 12 kB each; a mesh that takes more gets larger voxels
     mesh_min_views: Count = 2  # keyframes that must have seen a surface; with depth from one camera one is enough
+    mesh_atlas_px: Annotated[int, Range(0, 16384)] = 4096  # edge of the picture on mesh.glb; 0: colours of vertices
     surfel_m: Positive = 0.02  # between surfels
     surfel_min_views: Count = 2  # keyframes that must have seen a surfel; what one alone saw may be noise
     poisson_depth: Annotated[int, Range(1, 16)] = 9  # levels of Poisson's octree: cells of 2 cm in a room of 10 m

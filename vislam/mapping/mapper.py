@@ -23,7 +23,7 @@ from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.depth.mono import LateDepth
 from vislam.mapping.drive.drive import DriveGrid, DriveMap
 from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
-from vislam.mapping.mesh.views import PosedView, view_of_scan
+from vislam.mapping.mesh.posed import PosedView, posed_views
 from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
 from vislam.mapping.products import LEVEL, NotLevel, remove_products, write_products
 from vislam.mapping.upright import View, view_of
@@ -178,7 +178,11 @@ class Mapper:
         """Return the mesh of all keyframes with dense depth, or None and the reason there is none."""
         # depth from one camera is what several frames agree on: one keyframe is enough
         min_views = 1 if self._one_camera else self._config.mesh_min_views
-        return fuse_mesh(self._posed_views, self._config.mesh_voxel_m, min_views, self._config.mesh_max_blocks)
+        return fuse_mesh(self.posed_views, self._config.mesh_voxel_m, min_views, self._config.mesh_max_blocks)
+
+    def posed_views(self) -> Iterator[PosedView]:
+        """Return what keyframes with dense depth saw, at their poses."""
+        return posed_views(self._scans(), self._extractor.view)
 
     def surfels(self) -> Surfels:
         """Return the surfels that enough keyframes saw, without what lies in free space.
@@ -266,12 +270,6 @@ class Mapper:
     def _scans(self) -> Iterator[tuple[Scan, Array]]:
         for keyframe_id, T_map_body in self._occupancy.poses.items():
             yield self._store.scan(keyframe_id), T_map_body
-
-    def _posed_views(self) -> Iterator[PosedView]:
-        for scan, T_map_body in self._scans():
-            view = view_of_scan(scan, self._extractor.view, T_map_body)
-            if view is not None:
-                yield view
 
     def _averaged(self, voxel_m: float, max_points: int) -> tuple[VoxelAverage, bool]:
         """Return the average of all keyframes' points in each voxel, and whether none of them has dense depth."""

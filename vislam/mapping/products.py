@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -20,6 +20,8 @@ from vislam.mapping.drive.grid import Grid, write_grid
 from vislam.mapping.formats.mesh_files import write_glb, write_obj
 from vislam.mapping.formats.pcd import write_pcd
 from vislam.mapping.formats.ply import write_ply
+from vislam.mapping.mesh.atlas import textured
+from vislam.mapping.mesh.posed import PosedView
 from vislam.mapping.octree import OccupancyMap, Octree, encode_bt, encode_ot
 
 FILES = {
@@ -64,6 +66,9 @@ class MapSource(Protocol):
     def mesh(self) -> tuple[Mesh | None, str]:
         """Return the mesh or why there is none."""
 
+    def posed_views(self) -> Iterable[PosedView]:
+        """Return what keyframes with dense depth saw, at their poses, one at a time."""
+
     def surfels(self) -> Surfels:
         """Return the surfels."""
 
@@ -90,6 +95,7 @@ def write_products(
         "ot": lambda path: _write_octree(path, encode_ot(source.coloured_octree())),
         "grid": lambda _: write_grid(folder, source.grid()),
         "drive": lambda _: write_grid(folder, source.drive().navigation_grid(), "drive"),
+        "glb": lambda path: _write_glb(path, *mesh(), source, config.mesh_atlas_px),
         "surfels": lambda path: _write_surfels(path, surfels()),
         "poisson": lambda path: _write_mesh(path, *poisson_mesh(surfels(), config.poisson_depth)),
     }
@@ -150,11 +156,16 @@ def _write_mesh(path: Path, mesh: Mesh | None, reason: str) -> str | None:
     """Write a mesh in the format that the name asks for; return the reason if there is none."""
     if mesh is None:
         return reason
-    match path.suffix:
-        case ".glb":
-            write_glb(path, mesh)
-        case ".obj":
-            write_obj(path, mesh)
-        case _:
-            write_ply(path, mesh.points_m, mesh.colors, mesh.triangles)
+    if path.suffix == ".obj":
+        write_obj(path, mesh)
+    else:
+        write_ply(path, mesh.points_m, mesh.colors, mesh.triangles)
+    return None
+
+
+def _write_glb(path: Path, mesh: Mesh | None, reason: str, source: MapSource, atlas_px: int) -> str | None:
+    """Write a mesh as glTF, with pictures on it if they may take any pixels; return the reason if there is none."""
+    if mesh is None:
+        return reason
+    write_glb(path, mesh, textured(mesh, source.posed_views, atlas_px) if atlas_px else None)
     return None

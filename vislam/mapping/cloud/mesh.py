@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from vislam.core.geometry import invert
 from vislam.mapping._open3d import load_open3d
 from vislam.mapping.cloud.surfels import Surfels
-from vislam.mapping.mesh.views import PosedView
+from vislam.mapping.mesh.posed import PosedView
 from vislam.mapping.mesh.volume import Volume
 
 _COARSER = 1.25  # a mesh that gets too large gets voxels larger by this

@@ -1,4 +1,4 @@
-"""Meshes for other programs: binary glTF 2.0 and Wavefront OBJ, with vertex colours, written in pieces.
+"""Meshes for other programs: binary glTF 2.0 and Wavefront OBJ, written in pieces.
 
 Not Open3D's writers: a million vertices take 402 MB more memory (ours 0); its GLB of 48 MB (ours 28) lies on its side.
 """
@@ -8,63 +8,139 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.files import replacing
+from vislam.core.messages import ImageU8
 from vislam.mapping.cloud.mesh import Mesh
 from vislam.mapping.formats.ply import chunks
+from vislam.mapping.mesh.atlas import TexturedMesh
 
 _FLOAT, _UNSIGNED_INT, _UNSIGNED_BYTE = 5126, 5125, 5121  # glTF's component types
 _VERTICES, _INDICES = 34962, 34963  # and targets of buffer views
+_LINEAR, _CLAMP = 9729, 33071  # and of samplers
+_UNLIT = "KHR_materials_unlit"
+_JPEG_QUALITY = 92
 _Z_UP_TO_Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]  # columns; glTF's y is up
 
 
-def write_glb(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as binary glTF 2.0, its z axis up; raises StorageError when the file cannot be written."""
-    count, indices = len(mesh.points_m), 3 * len(mesh.triangles)
-    sizes = (12 * count, 4 * count, 4 * indices)
-    header = json.dumps(_gltf(mesh, sizes), separators=(",", ":")).encode()
+class _Part(NamedTuple):
+    """Rows of a buffer, as glTF calls them."""
+
+    rows: NDArray[Any]  # [n, k]
+    dtype: str  # of the file
+    component: int
+    shape: str
+    target: int
+
+
+def write_glb(path: Path, mesh: Mesh, textured: TexturedMesh | None = None) -> None:
+    """Write a mesh as binary glTF 2.0, its z axis up; raises StorageError when the file cannot be written.
+
+    With `textured`, its picture lies on the triangles that have a place in it, and only what is left has colours at
+    its vertices; `mesh` is then not looked at.
+    """
+    rest = mesh if textured is None else textured.rest
+    parts: list[_Part] = []
+    primitives: list[dict[str, object]] = []
+    if textured is not None:
+        uv = _Part(textured.uv, "<f4", _FLOAT, "VEC2", _VERTICES)
+        primitives.append(_primitive(parts, textured.points_m, "TEXCOORD_0", uv, textured.triangles, 1))
+    if textured is None or len(rest.triangles):
+        colors = _Part(rest.colors, "u1", _UNSIGNED_BYTE, "VEC4", _VERTICES)
+        primitives.append(_primitive(parts, rest.points_m, "COLOR_0", colors, rest.triangles, 0))
+    picture = b"" if textured is None else _jpeg(textured.atlas)
+    sizes = [len(part.rows) * _row_bytes(part) for part in parts] + ([len(picture)] if picture else [])
+    padding = b"\0" * (-sum(sizes) % 4)
+    header = json.dumps(_gltf(parts, primitives, sizes, len(padding)), separators=(",", ":")).encode()
     header += b" " * (-len(header) % 4)
+    length = sum(sizes) + len(padding)
     with replacing(path) as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(header) + 8 + sum(sizes)))
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(header) + 8 + length))
         file.write(struct.pack("<I4s", len(header), b"JSON") + header)
-        file.write(struct.pack("<I4s", sum(sizes), b"BIN\0"))
-        for chunk in chunks(count):
-            file.write(np.ascontiguousarray(mesh.points_m[chunk], dtype="<f4").tobytes())
-        for chunk in chunks(count):
-            rgba = np.full((chunk.stop - chunk.start, 4), 255, np.uint8)
-            rgba[:, :3] = mesh.colors[chunk]
-            file.write(rgba.tobytes())
-        for chunk in chunks(len(mesh.triangles)):
-            file.write(np.ascontiguousarray(mesh.triangles[chunk], dtype="<u4").tobytes())
+        file.write(struct.pack("<I4s", length, b"BIN\0"))
+        for part in parts:
+            for chunk in chunks(len(part.rows)):
+                file.write(_bytes(part, chunk))
+        file.write(picture + padding)
 
 
-def _gltf(mesh: Mesh, sizes: tuple[int, int, int]) -> dict[str, object]:
-    """Return the description of a file whose buffer holds points, colours and triangles one after the other."""
-    starts = (0, sizes[0], sizes[0] + sizes[1])
-    targets = (_VERTICES, _VERTICES, _INDICES)
-    kinds = ((_FLOAT, "VEC3"), (_UNSIGNED_BYTE, "VEC4"), (_UNSIGNED_INT, "SCALAR"))
-    counts = (len(mesh.points_m), len(mesh.points_m), 3 * len(mesh.triangles))
-    accessors: list[dict[str, object]] = [
-        {"bufferView": i, "componentType": kind, "type": shape, "count": counts[i]}
-        for i, (kind, shape) in enumerate(kinds)
+def _primitive(
+    parts: list[_Part], points_m: NDArray[np.float32], name: str, attribute: _Part, triangles: NDArray[np.int32],
+    material: int,
+) -> dict[str, object]:  # fmt: skip
+    """Add points, their attribute and triangles to the parts of a file, and return what glTF says of them."""
+    first = len(parts)
+    corners = _Part(triangles.reshape(-1, 1), "<u4", _UNSIGNED_INT, "SCALAR", _INDICES)
+    parts += [_Part(points_m, "<f4", _FLOAT, "VEC3", _VERTICES), attribute, corners]
+    return {"attributes": {"POSITION": first, name: first + 1}, "indices": first + 2, "material": material}
+
+
+def _row_bytes(part: _Part) -> int:
+    return {"SCALAR": 4, "VEC2": 8, "VEC3": 12, "VEC4": 4}[part.shape]
+
+
+def _bytes(part: _Part, chunk: slice) -> bytes:
+    rows = part.rows[chunk]
+    if part.shape == "VEC4":  # of bytes, RGBA: rows of a buffer begin at multiples of four bytes
+        rows = np.column_stack([rows, np.full(len(rows), 255, np.uint8)])
+    return np.ascontiguousarray(rows, dtype=part.dtype).tobytes()
+
+
+def _jpeg(image: ImageU8) -> bytes:
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+
+
+def _gltf(
+    parts: list[_Part], primitives: list[dict[str, object]], sizes: list[int], padding: int
+) -> dict[str, object]:  # fmt: skip
+    """Return the description of a file whose buffer holds the parts, and a picture if there is one more size."""
+    accessors: list[dict[str, object]] = []
+    for i, part in enumerate(parts):
+        accessor: dict[str, object] = {
+            "bufferView": i, "componentType": part.component, "type": part.shape, "count": len(part.rows),
+        }  # fmt: skip
+        if part.shape == "VEC3":
+            accessor |= {"min": part.rows.min(axis=0).tolist(), "max": part.rows.max(axis=0).tolist()}
+        if part.shape == "VEC4":
+            accessor["normalized"] = True
+        accessors.append(accessor)
+    starts = np.concatenate([[0], np.cumsum(sizes)]).tolist()
+    views: list[dict[str, object]] = [
+        {"buffer": 0, "byteOffset": start, "byteLength": size} for start, size in zip(starts, sizes, strict=False)
     ]
-    accessors[0] |= {"min": mesh.points_m.min(axis=0).tolist(), "max": mesh.points_m.max(axis=0).tolist()}
-    accessors[1]["normalized"] = True
+    for view, part in zip(views, parts, strict=False):
+        view["target"] = part.target
+    plain: dict[str, object] = {"metallicFactor": 0, "roughnessFactor": 1}
+    materials: list[dict[str, object]] = [{"doubleSided": True, "pbrMetallicRoughness": plain}]
+    pictures: dict[str, object] = {}
+    if len(sizes) > len(parts):
+        # light is in the pictures already; viewers that do not know the extension light them again
+        materials.append({
+            "doubleSided": True, "extensions": {_UNLIT: {}},
+            "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, **plain},
+        })  # fmt: skip
+        pictures = {
+            "extensionsUsed": [_UNLIT],
+            "images": [{"bufferView": len(parts), "mimeType": "image/jpeg"}],
+            "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+            "textures": [{"source": 0, "sampler": 0}],
+        }
     return {
         "asset": {"version": "2.0", "generator": "vislam"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "matrix": _Z_UP_TO_Y_UP}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}}],
+        "meshes": [{"primitives": primitives}],
+        "materials": materials,
+        **pictures,
         "accessors": accessors,
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": size, "target": target}
-            for start, size, target in zip(starts, sizes, targets, strict=True)
-        ],
-        "buffers": [{"byteLength": sum(sizes)}],
+        "bufferViews": views,
+        "buffers": [{"byteLength": sum(sizes) + padding}],
     }
 
 
