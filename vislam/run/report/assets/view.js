@@ -281,6 +281,8 @@ export class View {
 
   // On the screen, in pixels of the page; null behind the camera.
   project(x, y, z) {
+    // The camera may have moved since the last frame was drawn.
+    this.camera.updateMatrixWorld();
     const p = new THREE.Vector3(x, y, z).project(this.camera);
     const { clientWidth, clientHeight } = this.canvas;
     return p.z > 1 ? null : [((p.x + 1) / 2) * clientWidth, ((1 - p.y) / 2) * clientHeight];
