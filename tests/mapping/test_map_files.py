@@ -17,6 +17,7 @@ from vislam.mapping.formats.mesh_files import write_glb, write_obj
 from vislam.mapping.formats.pcd import read_pcd, write_pcd
 from vislam.mapping.formats.ply import read_ply, read_ply_mesh, write_ply
 from vislam.mapping.mapper import Mapper
+from vislam.mapping.mesh.atlas import TexturedMesh
 from vislam.mapping.octree.octomap_io import read_octree
 from vislam.mapping.pictures.of_map import write_pictures
 from worlds.box import CONFIG, RIG, keyframe, pose
@@ -214,6 +215,41 @@ def test_glb_holds_the_mesh_with_its_colours(tmp_path):
     np.testing.assert_array_equal(parts[2].reshape(-1, 3), mesh.triangles)
     matrix = np.array(text["nodes"][0]["matrix"]).reshape(4, 4).T
     assert (matrix @ [0, 0, 1, 0]).tolist() == [0, 1, 0, 0]  # up is up
+
+
+def test_glb_with_a_picture_holds_both_parts_and_the_picture(tmp_path):
+    mesh = square()
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)[: len(mesh.points_m)]
+    atlas = np.zeros((16, 32, 3), np.uint8)
+    atlas[..., 0] = 200  # red
+    rest = Mesh(mesh.points_m[:3], mesh.colors[:3], np.array([[0, 1, 2]], np.int32))
+    textured = TexturedMesh(mesh.points_m, uv, mesh.triangles, atlas, rest)
+    write_glb(tmp_path / "a.glb", mesh, textured)
+    data = (tmp_path / "a.glb").read_bytes()
+    json_length = struct.unpack("<I", data[12:16])[0]
+    text, binary = json.loads(data[20 : 20 + json_length]), data[28 + json_length :]
+    assert struct.unpack("<I", data[8:12])[0] == len(data)
+    assert text["buffers"][0]["byteLength"] == len(binary)
+    pictured, coloured = text["meshes"][0]["primitives"]
+    assert set(pictured["attributes"]) == {"POSITION", "TEXCOORD_0"}
+    assert set(coloured["attributes"]) == {"POSITION", "COLOR_0"}
+    assert "baseColorTexture" in text["materials"][pictured["material"]]["pbrMetallicRoughness"]
+    assert "baseColorTexture" not in text["materials"][coloured["material"]]["pbrMetallicRoughness"]
+
+    def rows(accessor, dtype, columns):
+        view = text["bufferViews"][text["accessors"][accessor]["bufferView"]]
+        part = np.frombuffer(binary, dtype, view["byteLength"] // np.dtype(dtype).itemsize, view["byteOffset"])
+        return part.reshape(-1, columns)
+
+    np.testing.assert_array_equal(rows(pictured["attributes"]["POSITION"], "<f4", 3), mesh.points_m)
+    np.testing.assert_array_equal(rows(pictured["attributes"]["TEXCOORD_0"], "<f4", 2), uv)
+    np.testing.assert_array_equal(rows(pictured["indices"], "<u4", 3), mesh.triangles)
+    np.testing.assert_array_equal(rows(coloured["indices"], "<u4", 3), rest.triangles)
+    view = text["bufferViews"][text["images"][0]["bufferView"]]
+    jpeg = np.frombuffer(binary, np.uint8, view["byteLength"], view["byteOffset"])
+    shown = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    assert shown.shape == atlas.shape
+    assert np.abs(shown[..., ::-1].astype(int) - atlas).max() < 8
 
 
 @pytest.mark.parametrize("name", ["a.glb", "a.obj"])
