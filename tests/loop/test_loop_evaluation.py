@@ -36,8 +36,9 @@ from vislam.loop.evaluation import (
     true_places,
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
+from vislam.loop.words import Vocabulary, seed_vocabulary
 from vislam.run.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
-from vislam.run.session import SessionWriter
+from vislam.run.session import Session, SessionWriter
 from vislam.trajectory import Trajectory, read_tum, write_tum
 from worlds.landmarks import LandmarkWorld, lap_poses, room
 
@@ -210,7 +211,7 @@ def test_a_run_is_judged_stage_by_stage(finished: Path) -> None:
     assert answer["keyframes"] == 2 * PER_LAP
     assert answer["revisits"] >= PER_LAP
     stages = answer["stages"]
-    assert list(stages) == ["appearance", "temporal", "geometry", "checks", "graph"]
+    assert list(stages) == ["appearance", "normalised", "temporal", "geometry", "checks", "graph"]
     assert all(0.0 <= stage["recall"] <= 1.0 for stage in stages.values())
     assert stages["temporal"]["answers"] <= stages["appearance"]["answers"]
     assert stages["graph"]["wrong"] == 0
@@ -223,6 +224,35 @@ def test_a_run_is_judged_stage_by_stage(finished: Path) -> None:
     assert lines[0] == "from_id,to_id,error_m,error_deg,gross,apart"
     assert len(lines) == 1 + answer["edges"]["accepted"]
     assert max(float(line.split(",")[2]) for line in lines[1:]) == pytest.approx(answer["edges"]["error_m"]["max"])
+
+
+def test_a_score_is_normalised_by_that_of_the_keyframe_before(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in finished.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    session = Session(tmp_path / "session.db")
+    words = seed_vocabulary() if (own := session.words()) is None else Vocabulary.from_bytes(own.data, "test")
+    bags = {keyframe.id: words.transform(keyframe.descriptors) for keyframe in session.keyframes()}
+    session.close()
+    retrieved = read_retrieved(tmp_path / "retrieved.csv")
+    best: dict[int, float] = {}
+    for found in retrieved:
+        ratio = bags[found.to_id].score(bags[found.from_id]) / bags[found.to_id].score(bags[found.to_id - 1])
+        best[found.to_id] = max(best.get(found.to_id, 0.0), ratio)
+    stages = judge_loops(tmp_path, RULE).stages
+    told = stages["normalised"].score
+    assert len(best) > PER_LAP // 2
+    for k, ratio in best.items():
+        assert np.isnan(told[k]) or told[k] <= ratio + 1e-12
+    assert np.isfinite(told).sum() == np.isfinite(stages["appearance"].score).sum()
+    assert np.nanmax(told) == pytest.approx(max(best[k] for k in np.flatnonzero(np.isfinite(told))))
+
+    expected = {k: bags[k].score(bags[k - 1]) for k in np.flatnonzero(np.isfinite(told))}
+    middle = float(np.median(list(expected.values())))
+    monkeypatch.setattr("vislam.run.offline.loop_evaluation._MIN_EXPECTED", middle)
+    kept = np.flatnonzero(np.isfinite(judge_loops(tmp_path, RULE).stages["normalised"].score))
+    assert kept.tolist() == [k for k, value in expected.items() if value >= middle]
 
 
 def test_what_was_proposed_is_compared_with_what_is_truly_near(finished: Path, tmp_path: Path) -> None:
@@ -314,7 +344,7 @@ def test_the_experiment_writes_what_came_out_and_what_failed(
     monkeypatch.setattr("sys.argv", [str(script), *arguments])
     runpy.run_path(str(script), run_name="__main__")
     table = (tmp_path / "table.md").read_text().splitlines()
-    assert len(table) == 2 + 5 + 1
+    assert len(table) == 2 + 6 + 1
     assert table[2].startswith("| made | 1 | ")
     assert table[6].endswith(" m |")
     assert "seed 1" in table[7] and "no true trajectory" in table[7]

@@ -6,15 +6,17 @@ docs/loops.md). So the index pays beyond 10,000 keyframes only: to be dropped fo
 smaller. The tree's transform (0.4 ms) has no measured peer.
 """
 
-from vislam.loop.words.database import PlaceDatabase, side_by_side
+from vislam.loop.words.database import PlaceDatabase, seed_vocabulary, side_by_side
 from vislam.loop.words.orbslam import read_orbslam
-from vislam.loop.words.vocabulary import Vocabulary, depth_for, train
+from vislam.loop.words.vocabulary import BagOfWords, Vocabulary, depth_for, train
 
 __all__ = [
+    "BagOfWords",
     "PlaceDatabase",
     "Vocabulary",
     "depth_for",
     "read_orbslam",
+    "seed_vocabulary",
     "side_by_side",
     "train",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from vislam.loop.evaluation import (
     true_places,
 )
 from vislam.loop.table import LoopRow, csv_text, read_loops, read_retrieved
+from vislam.loop.words import BagOfWords, Vocabulary, seed_vocabulary
 from vislam.run.session import Session, StoredKeyframe
 from vislam.trajectory import Trajectory, associate, read_trajectory
 
@@ -33,6 +34,7 @@ EVALUATION, EDGE_ERRORS = "loops_eval.json", "loops_eval.csv"
 _MAX_POINTS = 400  # of a curve that is stored
 _MAX_WORST = 20  # edges that are listed
 _TEMPORAL = 1  # keyframes before that must have pointed at the same place
+_MIN_EXPECTED = 0.005  # similarity to the keyframe before; below it, a ratio says nothing (Galvez-Lopez 2012)
 
 Answer = tuple[int, float, int]  # row of the keyframe, score, verdict
 
@@ -79,25 +81,28 @@ def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = No
 def judge_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> JudgedLoops:
     """Judge every stage of loop closing by the truth.
 
-    Stages: what retrieval alone answers (`appearance`), of that the places that persisted from the keyframe before
-    (`temporal`), verified relative poses (`geometry`), those that the detector accepted (`checks`), and those that are
-    in the graph at the end (`graph`). One answer per keyframe and stage: its best; scores are similarity for the first
-    two, inliers for the others. Raises DataError when the folder lacks what is needed.
+    Stages: what retrieval alone answers (`appearance`), the same by its similarity over that to the keyframe before
+    (`normalised`), of the first the places that persisted from the keyframe before (`temporal`), verified relative
+    poses (`geometry`), those that the detector accepted (`checks`), and those that are in the graph at the end
+    (`graph`). One answer per keyframe and stage: its best; scores are similarity or its ratio for the first three,
+    inliers for the others. Raises DataError when the folder lacks what is needed.
     """
     truth_path = reference or run / "trajectory_truth.tum"
     if not truth_path.is_file():
         raise DataError(f"{run} has no true trajectory; give --reference FILE")
     places = _places(run / "session.db", read_trajectory(truth_path), rule)
     rows = [row for row in read_loops(run / "loops.csv") if _rows_of(places, row) is not None]
+    retrieved = read_retrieved(run / "retrieved.csv")
     stages = {
-        "appearance": _retrieved(run / "retrieved.csv", places, 0),
-        "temporal": _retrieved(run / "retrieved.csv", places, _TEMPORAL),
+        "appearance": _retrieved(retrieved, places, 0),
+        "normalised": _retrieved(_normalised(run / "session.db", retrieved), places, 0),
+        "temporal": _retrieved(retrieved, places, _TEMPORAL),
         "geometry": _verified(rows, places, lambda row: True),
         "checks": _verified(rows, places, lambda row: row.was_offered or row.decision == LoopDecision.ACCEPTED),
         "graph": _verified(rows, places, lambda row: row.decision == LoopDecision.ACCEPTED),
     }
     tried = [row for row in rows if "not verified" not in row.reason]
-    found = _found(tried, read_retrieved(run / "retrieved.csv"), places)
+    found = _found(tried, retrieved, places)
     return JudgedLoops(places.revisits, stages, _judged_edges(rows, places), _proposals(tried, places), found)
 
 
@@ -177,15 +182,48 @@ def _rows_of(places: TruePlaces, pair: Any) -> tuple[int, int] | None:
     return None if a is None or b is None else (a, b)
 
 
-def _retrieved(path: Path, places: TruePlaces, persistence: int) -> Detections:
+def _retrieved(retrieved: Sequence[RetrievedKeyframe], places: TruePlaces, persistence: int) -> Detections:
     """Return the best answer of retrieval; with `persistence`, of the places that lasted for so many keyframes."""
     answers: list[Answer] = []
-    for found in read_retrieved(path):
+    for found in retrieved:
         pair = _rows_of(places, found)
         if pair is not None and places.apart[pair] and found.consistency >= persistence:
             score = found.score if persistence == 0 else found.island_score
             answers.append((pair[1], score, places.image_verdict(*pair)))
     return _best(answers, len(places.ids))
+
+
+def _normalised(session_path: Path, retrieved: Sequence[RetrievedKeyframe]) -> list[RetrievedKeyframe]:
+    """Return what retrieval answered, scored by the similarity over that of the keyframe to the one before it.
+
+    The score of Galvez-Lopez and Tardos 2012, eq. 2: what a view can reach at all depends on what it shows, and the
+    keyframe before tells it. Keyframes that do not even look like that one have no answer. Both similarities are in
+    the words that the run trained last (else in those that come with vislam), as each word of the run's own scores
+    was good for some keyframes only.
+    """
+    asked = {found.to_id for found in retrieved}
+    wanted = asked | {found.from_id for found in retrieved}
+    bags: dict[int, BagOfWords] = {}
+    expected: dict[int, float] = {}
+    session = Session(session_path)
+    try:
+        trained = session.words()
+        words = seed_vocabulary() if trained is None else Vocabulary.from_bytes(trained.data, f"of {session_path}")
+        before: BagOfWords | None = None
+        for keyframe in session.keyframes():
+            bag = words.transform(keyframe.descriptors)
+            if keyframe.id in wanted:
+                bags[keyframe.id] = bag
+            if keyframe.id in asked and before is not None:
+                expected[keyframe.id] = bag.score(before)
+            before = bag
+    finally:
+        session.close()
+    return [
+        replace(found, score=bags[found.from_id].score(bags[found.to_id]) / expected[found.to_id])
+        for found in retrieved
+        if found.from_id in bags and expected.get(found.to_id, 0.0) >= _MIN_EXPECTED
+    ]
 
 
 def _verified(rows: list[LoopRow], places: TruePlaces, chosen: Callable[[LoopRow], bool]) -> Detections:

@@ -12,9 +12,17 @@ from matplotlib.figure import Figure
 
 from vislam.run.report.style import CODE, RC, light, svg
 
-STAGES = {"appearance": "muted", "temporal": "warn", "geometry": "live", "checks": "ekf", "graph": "graph"}
+STAGES = {
+    "appearance": "muted",
+    "normalised": "bad",
+    "temporal": "warn",
+    "geometry": "live",
+    "checks": "ekf",
+    "graph": "graph",
+}
 _TITLES = {
     "appearance": "appearance",
+    "normalised": "normalised",
     "temporal": "+ temporal",
     "geometry": "+ geometry",
     "checks": "+ checks",

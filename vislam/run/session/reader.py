@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vislam.config import Config, from_data
 from vislam.core.database import connect
 from vislam.core.errors import DataError, UsageError
-from vislam.core.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, Tie
+from vislam.core.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, Tie, WordsMemory
 from vislam.core.messages import (
     Array,
     KeyframePacket,
@@ -210,6 +210,11 @@ class Session:
         """Return what the index found, in order."""
         rows = self.rows("SELECT from_id, to_id, score, island_score, consistency FROM retrieved ORDER BY number")
         return [RetrievedKeyframe(*row) for row in rows]
+
+    def words(self) -> WordsMemory | None:
+        """Return the words that the run trained last; None: it trained none."""
+        rows = self.rows("SELECT data, trained_at, trainings FROM vocabulary")
+        return next((WordsMemory(*row) for row in rows), None)
 
     def shifts(self) -> dict[int, tuple[float, float]]:
         """Return the rms and largest shift in metres of the update that took in each loop edge."""

@@ -18,7 +18,6 @@ from vislam.core.memory import (
     TagSighting,
     Tied,
     WindowRecord,
-    WordsMemory,
     at_pose,
 )
 from vislam.core.messages import Array, Frame, Keyframe, NavState
@@ -70,7 +69,7 @@ def recall(session: Session) -> SlamMemory | None:
                 for k in stored
             ],
             T_map_body=T_map_body,
-            words=_words(session),
+            words=session.words(),
             tags=_tags(session),
             next_edge_id=1 + max((loop.edge.id for loop in loops), default=-1),
         )
@@ -152,10 +151,6 @@ def _tags(session: Session) -> dict[int, tuple[TagSighting, ...]]:
         poses = maybe_numbers(T, "<f8", (4, 4)), maybe_numbers(covariance, "<f8", (6, 6))
         out[i] = (*out.get(i, ()), TagSighting(tag_id, side_px, *poses))
     return out
-
-
-def _words(session: Session) -> WordsMemory | None:
-    return next((WordsMemory(*row) for row in session.rows("SELECT data, trained_at, trainings FROM vocabulary")), None)
 
 
 def _scans(session: Session) -> dict[int, PackedScan]:
