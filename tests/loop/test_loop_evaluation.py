@@ -211,7 +211,7 @@ def test_a_run_is_judged_stage_by_stage(finished: Path) -> None:
     assert answer["keyframes"] == 2 * PER_LAP
     assert answer["revisits"] >= PER_LAP
     stages = answer["stages"]
-    assert list(stages) == ["appearance", "normalised", "temporal", "geometry", "checks", "graph"]
+    assert list(stages) == ["appearance", "hindsight", "normalised", "temporal", "geometry", "checks", "graph"]
     assert all(0.0 <= stage["recall"] <= 1.0 for stage in stages.values())
     assert stages["temporal"]["answers"] <= stages["appearance"]["answers"]
     assert stages["graph"]["wrong"] == 0
@@ -241,10 +241,11 @@ def test_a_score_is_normalised_by_that_of_the_keyframe_before(
         ratio = bags[found.to_id].score(bags[found.from_id]) / bags[found.to_id].score(bags[found.to_id - 1])
         best[found.to_id] = max(best.get(found.to_id, 0.0), ratio)
     stages = judge_loops(tmp_path, RULE).stages
-    told = stages["normalised"].score
+    told, alike = stages["normalised"].score, stages["hindsight"].score
     assert len(best) > PER_LAP // 2
     for k, ratio in best.items():
         assert np.isnan(told[k]) or told[k] <= ratio + 1e-12
+        assert np.isnan(told[k]) or told[k] == pytest.approx(alike[k] / bags[k].score(bags[k - 1]))
     assert np.isfinite(told).sum() == np.isfinite(stages["appearance"].score).sum()
     assert np.nanmax(told) == pytest.approx(max(best[k] for k in np.flatnonzero(np.isfinite(told))))
 
@@ -344,9 +345,9 @@ def test_the_experiment_writes_what_came_out_and_what_failed(
     monkeypatch.setattr("sys.argv", [str(script), *arguments])
     runpy.run_path(str(script), run_name="__main__")
     table = (tmp_path / "table.md").read_text().splitlines()
-    assert len(table) == 2 + 6 + 1
+    assert len(table) == 2 + 7 + 1
     assert table[2].startswith("| made | 1 | ")
-    assert table[6].endswith(" m |")
-    assert "seed 1" in table[7] and "no true trajectory" in table[7]
+    assert table[-2].endswith(" m |")
+    assert "seed 1" in table[-1] and "no true trajectory" in table[-1]
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "results.json").read_text())["made"]["runs"] == 1

@@ -81,11 +81,12 @@ def evaluate_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = No
 def judge_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None) -> JudgedLoops:
     """Judge every stage of loop closing by the truth.
 
-    Stages: what retrieval alone answers (`appearance`), the same by its similarity over that to the keyframe before
-    (`normalised`), of the first the places that persisted from the keyframe before (`temporal`), verified relative
-    poses (`geometry`), those that the detector accepted (`checks`), and those that are in the graph at the end
-    (`graph`). One answer per keyframe and stage: its best; scores are similarity or its ratio for the first three,
-    inliers for the others. Raises DataError when the folder lacks what is needed.
+    Stages: what retrieval alone answers (`appearance`), the same scored in the run's last words (`hindsight`), that
+    over the similarity to the keyframe before (`normalised`), of the first the places that persisted from the
+    keyframe before (`temporal`), verified relative poses (`geometry`), those that the detector accepted (`checks`),
+    and those that are in the graph at the end (`graph`). One answer per keyframe and stage: its best; scores are
+    similarity or its ratio for the first four, inliers for the others. Raises DataError when the folder lacks what is
+    needed.
     """
     truth_path = reference or run / "trajectory_truth.tum"
     if not truth_path.is_file():
@@ -93,9 +94,11 @@ def judge_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None)
     places = _places(run / "session.db", read_trajectory(truth_path), rule)
     rows = [row for row in read_loops(run / "loops.csv") if _rows_of(places, row) is not None]
     retrieved = read_retrieved(run / "retrieved.csv")
+    hindsight, normalised = _rescored(run / "session.db", retrieved)
     stages = {
         "appearance": _retrieved(retrieved, places, 0),
-        "normalised": _retrieved(_normalised(run / "session.db", retrieved), places, 0),
+        "hindsight": _retrieved(hindsight, places, 0),
+        "normalised": _retrieved(normalised, places, 0),
         "temporal": _retrieved(retrieved, places, _TEMPORAL),
         "geometry": _verified(rows, places, lambda row: True),
         "checks": _verified(rows, places, lambda row: row.was_offered or row.decision == LoopDecision.ACCEPTED),
@@ -193,13 +196,14 @@ def _retrieved(retrieved: Sequence[RetrievedKeyframe], places: TruePlaces, persi
     return _best(answers, len(places.ids))
 
 
-def _normalised(session_path: Path, retrieved: Sequence[RetrievedKeyframe]) -> list[RetrievedKeyframe]:
-    """Return what retrieval answered, scored by the similarity over that of the keyframe to the one before it.
+def _rescored(
+    session_path: Path, retrieved: Sequence[RetrievedKeyframe]
+) -> tuple[list[RetrievedKeyframe], list[RetrievedKeyframe]]:
+    """Return what retrieval answered with its similarity in the run's last words, and that normalised.
 
-    The score of Galvez-Lopez and Tardos 2012, eq. 2: what a view can reach at all depends on what it shows, and the
-    keyframe before tells it. Keyframes that do not even look like that one have no answer. Both similarities are in
-    the words that the run trained last (else in those that come with vislam), as each word of the run's own scores
-    was good for some keyframes only.
+    Normalised is the score of Galvez-Lopez and Tardos 2012, eq. 2: similarity over that of the keyframe to the one
+    before it, which tells what its view can reach at all. Keyframes that do not even look like that one have no such
+    answer. A run that trained no words is scored in those that come with vislam.
     """
     asked = {found.to_id for found in retrieved}
     wanted = asked | {found.from_id for found in retrieved}
@@ -219,10 +223,12 @@ def _normalised(session_path: Path, retrieved: Sequence[RetrievedKeyframe]) -> l
             before = bag
     finally:
         session.close()
-    return [
-        replace(found, score=bags[found.from_id].score(bags[found.to_id]) / expected[found.to_id])
-        for found in retrieved
-        if found.from_id in bags and expected.get(found.to_id, 0.0) >= _MIN_EXPECTED
+    known = [found for found in retrieved if found.from_id in bags and found.to_id in bags]
+    alike = [replace(found, score=bags[found.from_id].score(bags[found.to_id])) for found in known]
+    return alike, [
+        replace(found, score=found.score / expected[found.to_id])
+        for found in alike
+        if expected.get(found.to_id, 0.0) >= _MIN_EXPECTED
     ]
 
 

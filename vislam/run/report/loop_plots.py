@@ -14,6 +14,7 @@ from vislam.run.report.style import CODE, RC, light, svg
 
 STAGES = {
     "appearance": "muted",
+    "hindsight": "truth",
     "normalised": "bad",
     "temporal": "warn",
     "geometry": "live",
@@ -22,6 +23,7 @@ STAGES = {
 }
 _TITLES = {
     "appearance": "appearance",
+    "hindsight": "in hindsight",
     "normalised": "normalised",
     "temporal": "+ temporal",
     "geometry": "+ geometry",
