@@ -195,4 +195,4 @@ def test_on_paper_the_pictures_stand_and_it_is_short(browser, report):
         assert not page.locator("#view").is_visible()
         assert page.locator("section.still").first.is_visible()
         pages = page.pdf(format="A4").count(b"/Type /Page\n")
-        assert 1 <= pages <= 6
+        assert 1 <= pages <= 4

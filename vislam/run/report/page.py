@@ -332,7 +332,7 @@ def _cost(run: RunFiles) -> str:
         f"compilation; {number(cost.get('first_pose_cpu_s'), 1)} s of it until the first pose. "
         "Threads that read ahead are in “decode”, others (Rerun's, for one) and what lies between stages in “other”."
     )
-    return card(table(["stage", "CPU [ms/frame]", "share"], rows), title="CPU time") + note(text)
+    return card(table(["stage", "CPU [ms/frame]", "share"], rows), title="CPU time", kind="list") + note(text)
 
 
 def _biases(run: RunFiles, scene: Scene) -> str:
@@ -357,7 +357,7 @@ def _lost(run: RunFiles) -> str:
                 reasons[f"{state}: " + re.sub(r"\d+(\.\d+)?", "…", reason)] += 1
     why: list[list[str | Cell]] = [[Cell(reason, kind="text long"), str(n)] for reason, n in reasons.most_common(10)]
     cards = [
-        card(table(["room", "what", "count"], rows, text_columns=(0, 1)), title="Counters") if rows else "",
+        card(table(["room", "what", "count"], rows, text_columns=(0, 1)), title="Counters", kind="list") if rows else "",
         card(table(["why", "frames"], why), title="Frames that were not ok") if why else "",
     ]
     if not rows and not why:
