@@ -75,6 +75,8 @@ class FrontEndConfig:
     # of the spread of 1/z within 8x8 px: what a wrong registration by some pixels costs
     depth_spread: NonNegative = 0.5
     depth_now_factor: NonNegative = 2.0  # on the sigma of depth between keyframes, which is not averaged over time
+    # of depth images after colour beyond what stamps say, None estimates it while running
+    depth_delay_s: Finite | None = None
     depth_edge_rho: NonNegative = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
     stereo_window_px: Count = 15  # smaller than in time: depth edges hurt, blur is the same in both images
     stereo_levels: Whole = 3  # pyramid levels above the image

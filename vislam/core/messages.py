@@ -116,6 +116,7 @@ class Frame:
     color: ImageU8 | None = None  # [H, W, 3] BGR of cam0
     depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
     tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
+    depth_lag_s: float = 0.0  # how much later than the images depth was taken, as its own stamp says
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -268,8 +268,16 @@ class FileRecording:
                         self._counter.count(loaded.trouble.kind, self._place(loaded.trouble.path))
                     if loaded.images:
                         gaps.see(t_ns)
-                        yield Frame(t_ns, index, loaded.images, loaded.color, loaded.depth_m)
+                        lag_s = self._depth_lag_s(index)
+                        yield Frame(t_ns, index, loaded.images, loaded.color, loaded.depth_m, depth_lag_s=lag_s)
                         index += 1
+
+    def _depth_lag_s(self, index: int) -> float:
+        """Return how much later than the images of a frame its depth is stamped, in seconds; 0 without depth."""
+        row = int(self._frames.depth_rows[index])
+        if self._survey.depth is None or row < 0:
+            return 0.0
+        return int(self._survey.depth.t_ns[row] - self._frames.t_ns[index]) * 1e-9
 
     def _read_imu(self) -> Generator[ImuSample, None, None]:
         if not self._survey.has_imu:

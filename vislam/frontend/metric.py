@@ -14,6 +14,7 @@ from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 from vislam.frontend.agreement import confirmed, failure, weakness
 from vislam.frontend.depth import DepthReading
+from vislam.frontend.depth_lag import DepthLag
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
@@ -81,6 +82,7 @@ class MetricFrontEnd:
         self._noise = PixelNoise(config.track_sigma_px)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
         self._shutter = Shutter(self._camera, config.readout_s)
+        self._lag = DepthLag(self._camera, config.depth_delay_s)
         self._sigma_xy = config.track_sigma_px / self._camera.fx
         self._landmarks = Landmarks()
         self._life = KeyframeLife(config, has_scale=True)
@@ -131,6 +133,7 @@ class MetricFrontEnd:
         self._lost = False
         self._life.placed(frame.t_ns)
         self._learn_shutter(attempt)
+        self._learn_lag(frame, attempt, dt_s)
         self._learn_noise(attempt, keyframe)
         return self._report(frame, keyframe, attempt)
 
@@ -171,15 +174,20 @@ class MetricFrontEnd:
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
         depth_now = None
         if self._depth.every_frame and self._depth.available(frame):
-            depth_now = self._depth.measure(frame, pixels, seen, predicted[:, 2], self._tracker.ids)
+            depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist)
         estimate = self._search(T_guess, xy, depth_now)
         if estimate.converged:
             # once more with the velocity that was found instead of the predicted one, and without the outliers
             twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
             xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
+            if depth_now is not None:
+                depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist)
             estimate = self._polish(estimate, xy, depth_now)
         why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         return _Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, why_not)
+
+    def _measure(self, frame: Frame, pixels: Array, seen: Array, rho: Array, twist: Array) -> DepthReading:
+        return self._lag.measure(self._depth, frame, pixels, seen, rho, twist, self._tracker.ids)
 
     def _failure(self, estimate: PoseEstimate, followed: int) -> str:
         agree, least = int(estimate.inliers.sum()), self._config.min_inliers
@@ -239,6 +247,15 @@ class MetricFrontEnd:
             self._T_key_cam, mean, covariance, xy, self._sigma_xy, self._config.cauchy, self._shear(attempt, xy)
         )
         self._shutter.learn(*change)
+
+    def _learn_lag(self, frame: Frame, attempt: _Attempt, dt_s: float) -> None:
+        """Let the misfit of this frame's depth correct how much later it was taken."""
+        if attempt.depth_now is None or frame.depth_m is None or self._weakness(attempt):
+            return
+        rho = move(self._landmarks.mean, self._landmarks.covariance, self._T_key_cam)[0][:, 2]
+        seen, ids = np.column_stack([attempt.seen, rho]), self._tracker.ids
+        good = attempt.estimate.inliers & self._landmarks.known
+        self._lag.learn(self._depth, frame, seen, attempt.twist_per_s, ids, attempt.depth_now, good, dt_s)
 
     def _shear(self, attempt: _Attempt, xy: Array) -> Array:
         """Return the derivative [N, 2] of predicted minus measured directions `xy` [N, 2] by the readout time."""
@@ -470,9 +487,10 @@ class MetricFrontEnd:
     def _continue_from(self, frame: Frame, attempt: _Attempt) -> tuple[Keyframe, Observations]:
         """Carry the agreeing landmarks into this frame, improve them by what it measures, fill the gaps."""
         kept = attempt.estimate.inliers
-        reading = self._depth.measure(
-            frame, attempt.pixels[kept], attempt.seen[kept], attempt.expected_rho[kept], self._tracker.ids[kept]
-        )
+        reading = self._lag.measure(
+            self._depth, frame, attempt.pixels[kept], attempt.seen[kept], attempt.expected_rho[kept],
+            attempt.twist_per_s, self._tracker.ids[kept],
+        )  # fmt: skip
         landmarks = Landmarks()
         moved = move(self._landmarks.mean[kept], self._landmarks.covariance[kept], self._T_key_cam)
         landmarks.mean, landmarks.covariance = fuse(
@@ -497,7 +515,9 @@ class MetricFrontEnd:
         pixels = self._tracker.pixels[first:]
         seen = self._camera.normalise(pixels)
         expected_rho = self._landmarks.expected_rho(seen)
-        reading = self._depth.measure(frame, pixels, seen, expected_rho, self._tracker.ids[first:])
+        reading = self._lag.measure(
+            self._depth, frame, pixels, seen, expected_rho, twist_per_s, self._tracker.ids[first:]
+        )
         xy = self._shutter.to_instant(pixels, seen, np.nan_to_num(reading.rho), twist_per_s)
         # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy here as anywhere
         sigma_xy = self._sigma_xy if frame.tracks is not None else _CORNER_SIGMA * self._sigma_xy

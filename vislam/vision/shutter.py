@@ -106,6 +106,14 @@ class Shutter:
         return np.asarray((rows / (self._camera.height - 1.0) - 0.5) * readout_s)
 
 
+def later(points: Array, delay_s: float, twist_per_s: Array) -> Array:
+    """Return inverse-depth points [N, 3] as the camera sees them `delay_s` later; NaN behind it.
+
+    `twist_per_s` [6] is the velocity of the camera in its own frame, rotation first.
+    """
+    return np.asarray(_shift(points, np.full(len(points), delay_s), twist_per_s))
+
+
 @njit(cache=True, nogil=True)
 def _shift(points: Array, delay_s: Array, twist_per_s: Array) -> Array:
     """Return inverse-depth points [N, 3] as seen from where the camera is `delay_s` [N] later; NaN behind it.
