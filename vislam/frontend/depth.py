@@ -18,6 +18,7 @@ class DepthReading:
     rho: Array  # [N] in 1/m, NaN where unknown
     sigma_rho: Array  # [N] in 1/m
     right_px: Array | None = None  # [N, 2] in cam1 for stereo, NaN where not matched
+    by_delay: Array | None = None  # [N] derivative of `rho` by how much later depth was taken, 1/m/s; None: zero
 
     @property
     def depth_m(self) -> Array:
@@ -34,6 +35,11 @@ class DepthReading:
             right = np.vstack([self.right_px, other.right_px])
         rho, sigma = np.concatenate([self.rho, other.rho]), np.concatenate([self.sigma_rho, other.sigma_rho])
         return DepthReading(rho, sigma, right)
+
+    @property
+    def slope(self) -> Array:
+        """Return `by_delay` [N], zero where nothing is known."""
+        return np.zeros(len(self.rho)) if self.by_delay is None else np.nan_to_num(self.by_delay)
 
 
 class DepthSensor(Protocol):

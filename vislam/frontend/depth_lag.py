@@ -7,6 +7,8 @@ same for all images and learnt from how depth misfits the landmarks, along the g
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,9 +21,12 @@ _SIGMA_S = 0.01  # of the delay before anything is known
 _MAX_S = 0.05
 _TRUST = 0.1  # of a frame's information: successive frames share landmarks and their errors
 _FRAME_SIGMA_S = 0.01  # no single frame may claim to know it better
+_MEMORY_FRAMES = 60  # over which is averaged: a delay that is half undone shows as a smaller one
 _LEAST = 0.003  # s: a shorter delay moves nothing by a pixel ...
 _LEAST_SHARE = 0.1  # ... nor is one known that is a small part of the time over which velocity was measured
-_STEP_S = 2e-3  # for the derivative by the delay
+# for the derivative by the delay: some pixels, for depth has noise from one to the next, and to both sides, for that
+# noise must not be the same as that of what is measured
+_STEP_S = 0.01
 _GATE = 3.0  # standard deviations of a depth that tells of the delay
 
 
@@ -49,7 +54,7 @@ class DepthLag:
 
     def measure(
         self, sensor: DepthSensor, frame: Frame, pixels: Array, xy: Array, rho: Array, twist_per_s: Array,
-        ids: NDArray[np.int64],
+        ids: NDArray[np.int64], to_learn: bool = True,
     ) -> DepthReading:  # fmt: skip
         """Return the depth of raw pixels [N, 2] at the time of the image.
 
@@ -61,43 +66,44 @@ class DepthLag:
             rho: inverse depths [N] in 1/m that are expected; NaN: unknown.
             twist_per_s: velocity [6] of the camera in its own frame, rotation first.
             ids: tracks [N] that they belong to.
+            to_learn: say how it would change with the delay, too.
         """
         lag_s = self._lag_s(frame)
-        if lag_s == 0.0 or not twist_per_s.any():
+        if frame.depth_m is None or not twist_per_s.any():
             return sensor.measure(frame, pixels, xy, rho, ids)
-        return self._read(sensor, frame, np.column_stack([xy, np.nan_to_num(rho)]), twist_per_s, ids, lag_s)
+        seen = np.column_stack([xy, np.nan_to_num(rho)])
+        if lag_s == 0.0:
+            reading = sensor.measure(frame, pixels, xy, rho, ids)
+        else:
+            reading = self._read(sensor, frame, seen, twist_per_s, ids, lag_s)
+        if self._known or not to_learn:
+            return reading
+        before, after = (self._read(sensor, frame, seen, twist_per_s, ids, lag_s + s) for s in (-_STEP_S, _STEP_S))
+        return replace(reading, by_delay=(after.rho - before.rho) / (2.0 * _STEP_S))
 
-    def learn(
-        self, sensor: DepthSensor, frame: Frame, seen: Array, twist_per_s: Array, ids: NDArray[np.int64],
-        reading: DepthReading, good: Bools, dt_s: float,
-    ) -> None:  # fmt: skip
+    def learn(self, misfit: Array, slope: Array, sigma_rho: Array, good: Bools, dt_s: float) -> None:
         """Let the misfit of depth in one frame correct the delay.
 
         Args:
-            sensor: reads the depth image.
-            frame: with depth.
-            seen: inverse-depth points [N, 3]: directions as seen, inverse depths as the landmarks have them.
-            twist_per_s: velocity [6] of the camera in its own frame, rotation first.
-            ids: tracks [N].
-            reading: what was measured there.
+            misfit: inverse depths [N] in 1/m, measured minus expected by landmarks; NaN: unknown.
+            slope: derivative [N] of that by the delay. A landmark is made of depth that lagged as well: where a camera
+                turns evenly, both err alike and nothing is learnt.
+            sigma_rho: of the measured ones [N].
             good: which tracks [N] agree on the motion.
             dt_s: over which the velocity was measured.
         """
         self._interval_s = dt_s
         if self._known:
             return
-        after = self._read(sensor, frame, seen, twist_per_s, ids, self._lag_s(frame) + _STEP_S)
-        slope = (after.rho - reading.rho) / _STEP_S
-        misfit, sigma = reading.rho - seen[:, 2], reading.sigma_rho
         with np.errstate(invalid="ignore"):
-            use = good & np.isfinite(slope) & (np.abs(misfit) < _GATE * sigma)
-        weight = 1.0 / sigma[use] ** 2
+            use = good & np.isfinite(slope) & (np.abs(misfit) < _GATE * sigma_rho)
+        weight = 1.0 / sigma_rho[use] ** 2
         information = float(np.sum(weight * slope[use] ** 2))
         if not information > 0.0:
             return
         change_s = -float(np.sum(weight * slope[use] * misfit[use])) / information
         trusted = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)
-        self._information += trusted
+        self._information = min(self._information, _MEMORY_FRAMES / _FRAME_SIGMA_S**2) + trusted
         self._estimate_s += trusted / self._information * (self.delay_s + change_s - self._estimate_s)
         self._estimate_s = min(max(self._estimate_s, -_MAX_S), _MAX_S)
 

@@ -174,20 +174,22 @@ class MetricFrontEnd:
         xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
         depth_now = None
         if self._depth.every_frame and self._depth.available(frame):
-            depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist)
+            depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist, to_learn=False)
         estimate = self._search(T_guess, xy, depth_now)
         if estimate.converged:
             # once more with the velocity that was found instead of the predicted one, and without the outliers
             twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
             xy = self._shutter.to_instant(pixels, seen, predicted[:, 2], twist)
             if depth_now is not None:
-                depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist)
+                depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist, to_learn=True)
             estimate = self._polish(estimate, xy, depth_now)
         why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         return _Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, why_not)
 
-    def _measure(self, frame: Frame, pixels: Array, seen: Array, rho: Array, twist: Array) -> DepthReading:
-        return self._lag.measure(self._depth, frame, pixels, seen, rho, twist, self._tracker.ids)
+    def _measure(
+        self, frame: Frame, pixels: Array, seen: Array, rho: Array, twist: Array, to_learn: bool
+    ) -> DepthReading:
+        return self._lag.measure(self._depth, frame, pixels, seen, rho, twist, self._tracker.ids, to_learn)
 
     def _failure(self, estimate: PoseEstimate, followed: int) -> str:
         agree, least = int(estimate.inliers.sum()), self._config.min_inliers
@@ -253,9 +255,10 @@ class MetricFrontEnd:
         if attempt.depth_now is None or frame.depth_m is None or self._weakness(attempt):
             return
         rho = move(self._landmarks.mean, self._landmarks.covariance, self._T_key_cam)[0][:, 2]
-        seen, ids = np.column_stack([attempt.seen, rho]), self._tracker.ids
         good = attempt.estimate.inliers & self._landmarks.known
-        self._lag.learn(self._depth, frame, seen, attempt.twist_per_s, ids, attempt.depth_now, good, dt_s)
+        misfit = attempt.depth_now.rho - rho
+        slope = attempt.depth_now.slope - self._landmarks.by_delay
+        self._lag.learn(misfit, slope, attempt.depth_now.sigma_rho, good, dt_s)
 
     def _shear(self, attempt: _Attempt, xy: Array) -> Array:
         """Return the derivative [N, 2] of predicted minus measured directions `xy` [N, 2] by the readout time."""
@@ -293,6 +296,7 @@ class MetricFrontEnd:
         landmarks.covariance = np.zeros_like(landmarks.covariance)
         landmarks.covariance[:, 0, 0] = landmarks.covariance[:, 1, 1] = (_CORNER_SIGMA * self._sigma_xy) ** 2
         landmarks.covariance[:, 2, 2] = rho_variance
+        landmarks.by_delay = self._landmarks.by_delay
         self._landmarks = landmarks
         pixels = self._shutter.project(landmarks.mean, self._keyframe_twist)
         pixels[~view.camera.contains(pixels)] = np.nan
@@ -496,6 +500,10 @@ class MetricFrontEnd:
         landmarks.mean, landmarks.covariance = fuse(
             *moved, attempt.xy[kept], reading.rho, self._sigma_xy, reading.sigma_rho, _FUSE_GATE
         )
+        # depth that is measured again counts by what was not known before
+        weight = moved[1][:, 2, 2] / (moved[1][:, 2, 2] + reading.sigma_rho**2)
+        before = self._landmarks.by_delay[kept]
+        landmarks.by_delay = np.where(np.isfinite(reading.rho), before + weight * (reading.slope - before), before)
         self._landmarks = landmarks
         # the patch that is followed from now on is the one where the landmark is believed to be
         pixels = attempt.pixels.copy()
@@ -521,7 +529,7 @@ class MetricFrontEnd:
         xy = self._shutter.to_instant(pixels, seen, np.nan_to_num(reading.rho), twist_per_s)
         # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy here as anywhere
         sigma_xy = self._sigma_xy if frame.tracks is not None else _CORNER_SIGMA * self._sigma_xy
-        self._landmarks.append(xy, reading.rho, sigma_xy, reading.sigma_rho)
+        self._landmarks.append(xy, reading.rho, sigma_xy, reading.sigma_rho, reading.slope)
         return reading
 
     def _observations(self, pixels: Array, reading: DepthReading, xy: Array) -> Observations:

@@ -142,6 +142,7 @@ class Landmarks:
         """Start empty."""
         self.mean: Array = np.empty((0, 3))
         self.covariance: Array = np.empty((0, 3, 3))
+        self.by_delay: Array = np.empty(0)  # [N] derivative of rho by a delay of the depth it was made of, 1/m/s
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -155,15 +156,17 @@ class Landmarks:
     def keep(self, which: NDArray[np.bool_]) -> None:
         """Drop the rows that are not in `which` [N]."""
         self.mean, self.covariance = self.mean[which], self.covariance[which]
+        self.by_delay = self.by_delay[which]
 
-    def append(self, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array) -> None:
-        """Add landmarks seen at `xy` [M, 2] with inverse depths `rho` [M], NaN where unknown."""
+    def append(self, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array, by_delay: Array) -> None:
+        """Add landmarks seen at `xy` [M, 2] with inverse depths `rho` [M], NaN where unknown, and `by_delay` [M]."""
         known = np.isfinite(rho)
         covariance: Array = np.zeros((len(xy), 3, 3))
         covariance[:, 0, 0] = covariance[:, 1, 1] = sigma_xy**2
         covariance[:, 2, 2] = np.where(known, sigma_rho, UNKNOWN_RHO_SIGMA) ** 2
         self.mean = np.vstack([self.mean, np.column_stack([xy, np.where(known, rho, UNKNOWN_RHO)])])
         self.covariance = np.concatenate([self.covariance, covariance])
+        self.by_delay = np.concatenate([self.by_delay, by_delay])
 
     def expected_rho(self, xy: Array) -> Array:
         """Return the inverse depth [M] of the nearest known landmark to each direction [M, 2]; NaN without any."""
