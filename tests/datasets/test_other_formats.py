@@ -55,6 +55,7 @@ def test_tum_yields_every_color_frame_with_the_depth_that_is_near(tmp_path: Path
     assert all(isinstance(f, Frame) for f in frames)
     assert frames[0].t_ns == 1305031452791720000
     assert [None if f.depth_m is None else float(f.depth_m[7, 9]) for f in frames] == [1.0, None, 3.0, None]
+    assert [round(f.depth_lag_s, 6) for f in frames if isinstance(f, Frame)] == [0.01, 0.0, 0.01, 0.0]
     assert np.array_equal(frames[1].color, picture(1, SIZE, color=True))
     assert recording.problems == {"frame without depth": 2}
     truth = recording.truth()

@@ -101,6 +101,17 @@ def test_color_stereo_depth_and_calibration_come_back(tmp_path: Path) -> None:
     assert recorder.counts["frames"] == 3
 
 
+def test_depth_of_another_moment_comes_back_with_its_own_stamp(tmp_path: Path) -> None:
+    depth_m = np.ones((HEIGHT, WIDTH), dtype=np.float32)
+    with Recorder(tmp_path / "r", rig(depth=True), None) as recorder:
+        for i in range(3):
+            lag_s = 0.007 if i else -0.007
+            t_ns = 1_000_000_000 + i * 33_000_000
+            recorder.write(Frame(t_ns, i, (picture(i),), None, depth_m, depth_lag_s=lag_s))
+    frames = [event for event in open_dataset(str(tmp_path / "r")).events() if isinstance(event, Frame)]
+    assert [round(frame.depth_lag_s, 9) for frame in frames] == [-0.007, 0.007, 0.007]
+
+
 def test_a_copied_recording_plays_the_same(tmp_path: Path) -> None:
     root = write_asl(tmp_path / "a", frames=4)
     (root / "mocap0").mkdir()

@@ -229,6 +229,7 @@ class FrontNews:
     readout_s: float | None = None  # of a rolling shutter; None: not estimated
     filter_camera: Array | None = None  # [8] of the tight filter: time offset, sigma, rotation [3], sigmas [3]
     tilt: Array | None = None  # [6] of a camera over a floor: what the mount lacks [2] and its covariance [2, 2]
+    depth_delay_s: float | None = None  # of depth images, beyond their stamps; None: not estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

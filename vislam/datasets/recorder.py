@@ -237,7 +237,8 @@ class Recorder:
         for i, image in enumerate(images):
             self._write_image(f"cam{i}", frame.t_ns, image, self._image_format)
         if frame.depth_m is not None:
-            self._write_image("depth0", frame.t_ns, self._raw_depth(frame.depth_m), "png")
+            depth_ns = frame.t_ns + round(frame.depth_lag_s * 1e9)
+            self._write_image("depth0", depth_ns, self._raw_depth(frame.depth_m), "png")
         self._last_frame_ns = frame.t_ns
         self.counts["frames"] += 1
 

@@ -34,10 +34,14 @@ class DepthLag:
     """How much later than its image depth is taken, beyond what stamps say."""
 
     def __init__(self, camera: Camera, delay_s: float | None) -> None:
-        """Take the delay in seconds, None to estimate it."""
+        """Take the delay in seconds, None to estimate it.
+
+        Attributes:
+            estimate_s: what was learnt of it; see `delay_s` for what is applied.
+        """
         self._camera = camera
         self._known = delay_s is not None
-        self._estimate_s = delay_s or 0.0
+        self.estimate_s = delay_s or 0.0
         self._information = 1.0 / _SIGMA_S**2
         self._interval_s = 0.0
 
@@ -45,12 +49,18 @@ class DepthLag:
     def delay_s(self) -> float:
         """The delay that is applied, in seconds."""
         least = max(_LEAST, _LEAST_SHARE * self._interval_s)
-        return self._estimate_s if self._known or abs(self._estimate_s) > least else 0.0
+        return self.estimate_s if self._known or abs(self.estimate_s) > least else 0.0
 
     @property
     def learns(self) -> bool:
         """Whether the delay is estimated."""
         return not self._known
+
+    def start_at(self, delay_s: float) -> None:
+        """Take the delay that an earlier run had learned, to be learned further."""
+        if not self._known:
+            self.estimate_s = min(max(delay_s, -_MAX_S), _MAX_S)
+            self._information = 1.0 / _FRAME_SIGMA_S**2
 
     def measure(
         self, sensor: DepthSensor, frame: Frame, pixels: Array, xy: Array, rho: Array, twist_per_s: Array,
@@ -104,8 +114,8 @@ class DepthLag:
         change_s = -float(np.sum(weight * slope[use] * misfit[use])) / information
         trusted = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)
         self._information = min(self._information, _MEMORY_FRAMES / _FRAME_SIGMA_S**2) + trusted
-        self._estimate_s += trusted / self._information * (self.delay_s + change_s - self._estimate_s)
-        self._estimate_s = min(max(self._estimate_s, -_MAX_S), _MAX_S)
+        self.estimate_s += trusted / self._information * (self.delay_s + change_s - self.estimate_s)
+        self.estimate_s = min(max(self.estimate_s, -_MAX_S), _MAX_S)
 
     def _lag_s(self, frame: Frame) -> float:
         return 0.0 if frame.depth_m is None else frame.depth_lag_s + self.delay_s

@@ -143,11 +143,15 @@ class MetricFrontEnd:
         self._tracker.next_id = news.next_track_id
         if news.readout_s is not None:
             self._shutter.start_at(news.readout_s)
+        if news.depth_delay_s is not None:
+            self._lag.start_at(news.depth_delay_s)
 
     @property
     def news(self) -> FrontNews:
         """See FrontEnd.news."""
-        return FrontNews(self._tracker.next_id, readout_s=self._shutter.readout_s if self._shutter.learns else None)
+        readout_s = self._shutter.readout_s if self._shutter.learns else None
+        delay_s = self._lag.estimate_s if self._lag.learns and self._depth.every_frame else None
+        return FrontNews(self._tracker.next_id, readout_s=readout_s, depth_delay_s=delay_s)
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 

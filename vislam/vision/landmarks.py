@@ -158,7 +158,7 @@ class Landmarks:
         self.mean, self.covariance = self.mean[which], self.covariance[which]
         self.by_delay = self.by_delay[which]
 
-    def append(self, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array, by_delay: Array) -> None:
+    def append(self, xy: Array, rho: Array, sigma_xy: float, sigma_rho: Array, by_delay: Array | None = None) -> None:
         """Add landmarks seen at `xy` [M, 2] with inverse depths `rho` [M], NaN where unknown, and `by_delay` [M]."""
         known = np.isfinite(rho)
         covariance: Array = np.zeros((len(xy), 3, 3))
@@ -166,7 +166,7 @@ class Landmarks:
         covariance[:, 2, 2] = np.where(known, sigma_rho, UNKNOWN_RHO_SIGMA) ** 2
         self.mean = np.vstack([self.mean, np.column_stack([xy, np.where(known, rho, UNKNOWN_RHO)])])
         self.covariance = np.concatenate([self.covariance, covariance])
-        self.by_delay = np.concatenate([self.by_delay, by_delay])
+        self.by_delay = np.concatenate([self.by_delay, np.zeros(len(xy)) if by_delay is None else by_delay])
 
     def expected_rho(self, xy: Array) -> Array:
         """Return the inverse depth [M] of the nearest known landmark to each direction [M, 2]; NaN without any."""

@@ -115,13 +115,14 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
 
 
 def _front(data: dict[str, Any]) -> FrontNews:
-    camera, tilt = data["filter_camera"], data.get("tilt")
+    camera, tilt, delay = data["filter_camera"], data.get("tilt"), data.get("depth_delay_s")
     return FrontNews(
         int(data["next_track_id"]),
         float(data["time_offset_sigma_s"]),
         None if data["readout_s"] is None else float(data["readout_s"]),
         None if camera is None else np.array(camera, dtype=np.float64).reshape(8),
         None if tilt is None else np.array(tilt, dtype=np.float64).reshape(6),
+        None if delay is None else float(delay),
     )
 
 
