@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.datasets.images import (
+    DepthFormat,
     UnreadableImageError,
     decode_ahead,
     image_size,
@@ -90,12 +91,12 @@ def test_sixteen_bit_grey_as_in_tum_vi(tmp_path: Path) -> None:
 def test_depth_is_metres_and_must_be_sixteen_bit(tmp_path: Path) -> None:
     raw = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH)
     cv2.imwrite(str(tmp_path / "d.png"), raw)
-    depth_m = read_depth(tmp_path / "d.png", CAMERA, 5000.0)
+    depth_m = read_depth(tmp_path / "d.png", CAMERA, DepthFormat(5000.0))
     assert depth_m.dtype == np.float32
     np.testing.assert_allclose(depth_m, raw / 5000.0, rtol=1e-6)
     cv2.imwrite(str(tmp_path / "e.png"), picture(1))
     with pytest.raises(UnreadableImageError, match="not 16-bit"):
-        read_depth(tmp_path / "e.png", CAMERA, 5000.0)
+        read_depth(tmp_path / "e.png", CAMERA, DepthFormat(5000.0))
 
 
 def greedy(a: list[int], b: list[int], tolerance: int) -> dict[int, int]:

@@ -12,9 +12,10 @@ import numpy as np
 from vislam.config import CalibrationConfig, Config
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.datasets.calibration import DepthFile, load_yaml, parse_depth
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
-from vislam.datasets.stream import KnownCamera, Survey
+from vislam.datasets.stream import KnownCamera, Survey, with_depth_format
 from vislam.datasets.tables import Problems
 
 _OFFSET_WIDER = 3.0  # sigmas of a calibrated time offset that a later day may be off
@@ -31,6 +32,8 @@ def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
         found = replace(found, rig=_rig(found.rig, Path(files.camera)))
     elif files.camera is not None and found.known_cameras:
         found = replace(found, rig=_completed_rig(found, Path(files.camera)), lacking=_without(found, "camera"))
+    if files.camera is not None:
+        found = _with_depth(found, Path(files.camera))
     if files.imu is not None:
         found = replace(found, imu_calibration=read_imu_calibration(Path(files.imu)))
     if files.imu_noise is not None and found.imu_noise is not None:
@@ -79,6 +82,16 @@ def with_clock(config: Config) -> Config:
         sigma_s = max(_OFFSET_WIDER * first.time_offset_sigma_s, _LEAST_OFFSET_SIGMA_S)
         init = replace(init, time_offset_sigma_s=min(sigma_s, init.time_offset_sigma_s))
     return replace(config, init=init)
+
+
+def _with_depth(found: Survey, path: Path) -> Survey:
+    """Return what a recording holds, with its depth read as the camera's file says, where that says anything."""
+    said = parse_depth(load_yaml(path), path)
+    if said == DepthFile() or found.depth is None:
+        return found
+    if found.streams is not None:
+        raise DataError(f"{path} tells how depth is read, which a bag's messages say themselves; leave depth_... out")
+    return with_depth_format(found, said.over(found.depth_format))
 
 
 def _without(found: Survey, name: str) -> dict[str, DataError]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,14 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.core.reading import read_text
+from vislam.datasets.images import DepthFormat
 from vislam.datasets.tables import check_size
 from vislam.imu import ImuNoise
 
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
 _MAX_YAML_BYTES = 2**18
+_MOST_OFFSET_PX = 1000.0  # more is no camera's: a file that was damaged
+_MOST_TIME_OFFSET_S = 10.0
 MODELS: dict[str, Distortion] = {
     "radial-tangential": "radtan", "radtan": "radtan", "plumb_bob": "radtan",
     "equidistant": "equidistant", "fisheye": "equidistant", "none": "none", "rational_polynomial": "rational",
@@ -44,6 +47,21 @@ CAMERA_EXAMPLE = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class DepthFile:
+    """What a sensor file says of depth images; None where it says nothing."""
+
+    units_per_m: float | None = None
+    invalid: tuple[int, ...] | None = None
+    offset_px: tuple[float, float] | None = None
+    time_offset_s: float | None = None
+
+    def over(self, how: DepthFormat) -> DepthFormat:
+        """Return `how`, with what the file says in its place."""
+        said = {key: value for key, value in asdict(self).items() if value is not None}
+        return replace(how, **said)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFile:
     """What a camera's sensor file says."""
@@ -51,7 +69,7 @@ class CameraFile:
     camera: Camera
     T_body_cam: Array  # [4, 4]
     rate_hz: float | None = None
-    depth_units_per_m: float | None = None  # for a folder whose depth images share the camera's file
+    depth: DepthFile = field(default_factory=DepthFile)  # where depth images share the camera's file
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
@@ -80,7 +98,7 @@ def read_camera(path: Path) -> CameraFile:
             camera=parse_camera(data, path, "distortion_coefficients"),
             T_body_cam=read_pose(data, path),
             rate_hz=optional_positive(data, "rate_hz", path),
-            depth_units_per_m=optional_positive(data, "depth_units_per_m", path),
+            depth=parse_depth(data, path),
         )
     except DataError as error:
         raise DataError(f"{error}; a camera's file holds: {CAMERA_EXAMPLE}") from error
@@ -121,8 +139,25 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
     return T
 
 
-def depth_units(path: Path, camera: Camera) -> float:
-    """Return raw units per metre of a depth folder's sensor file; raises DataError unless it is registered to cam0."""
+def parse_depth(data: Mapping[str, Any], path: Path) -> DepthFile:
+    """Return what a sensor file says of depth images; raises DataError naming the key."""
+    invalid = offset_px = time_offset_s = None
+    if data.get("depth_invalid") is not None:
+        invalid = tuple(int(value) for value in numbers_in(data, "depth_invalid", path))
+    if data.get("depth_offset_px") is not None:
+        dx, dy = numbers_in(data, "depth_offset_px", path, 2)
+        offset_px = (dx, dy)
+        if max(abs(dx), abs(dy)) > _MOST_OFFSET_PX:
+            raise DataError(f"{path}: depth_offset_px must be within {_MOST_OFFSET_PX:.0f} px, got {[dx, dy]}")
+    if data.get("depth_time_offset_s") is not None:
+        [time_offset_s] = numbers_in({"s": [data["depth_time_offset_s"]]}, "s", path, 1)
+        if abs(time_offset_s) > _MOST_TIME_OFFSET_S:
+            raise DataError(f"{path}: depth_time_offset_s must be within {_MOST_TIME_OFFSET_S} s, got {time_offset_s}")
+    return DepthFile(optional_positive(data, "depth_units_per_m", path), invalid, offset_px, time_offset_s)
+
+
+def depth_format(path: Path, camera: Camera) -> DepthFormat:
+    """Return how to read a depth folder by its sensor file; raises DataError unless it is registered to cam0."""
     data = load_yaml(path)
     resolution = [int(x) for x in numbers_in(data, "resolution", path, 2)] if "resolution" in data else None
     if resolution is not None and resolution != [camera.width, camera.height]:
@@ -130,7 +165,7 @@ def depth_units(path: Path, camera: Camera) -> float:
             f"{path}: depth of {resolution} does not match cam0's {camera.width}x{camera.height}; "
             "depth must be registered to cam0, pixel by pixel"
         )
-    return optional_positive(data, "depth_units_per_m", path) or DEPTH_UNITS_PER_M
+    return parse_depth(data, path).over(DepthFormat(DEPTH_UNITS_PER_M))
 
 
 def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:

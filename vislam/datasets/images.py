@@ -25,6 +25,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 _MAX_PIXELS = 100_000_000  # of an image whose size nobody told; more is no camera's
+NO_DEPTH = 65535  # saturated: no sensor measures it, and several write it for "nothing measured"
 MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
 _SHORT_HEAD_BYTES = 2**12  # holds the size of most images
 _HEAD_BYTES = 2**18  # enough to reach the size in a JPEG with an embedded preview and profile
@@ -56,6 +57,33 @@ class ImageList:
     def path(self, i: int) -> Path:
         """Return the path of image `i`."""
         return self.folder / self.files[i]
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFormat:
+    """What the numbers in depth images mean, and where they lie in the colour image."""
+
+    units_per_m: float = 1.0
+    invalid: tuple[int, ...] = ()  # raw values that mean "nothing measured", besides 0 and the largest of 16 bits
+    offset_px: tuple[float, float] = (0.0, 0.0)  # by which depth lies right of and below what it belongs to
+    time_offset_s: float = 0.0  # its stamps plus this are by the clock of the colour image; the list has it already
+
+    def in_m(self, raw: NDArray[np.uint16]) -> ImageF32:
+        """Return depth in metres [H, W], 0 where invalid, shifted back by whole pixels."""
+        depth = raw.astype(np.float32) / np.float32(self.units_per_m)
+        for value in (NO_DEPTH, *self.invalid):
+            depth[raw == value] = 0.0
+        return moved_back(depth, self.offset_px)
+
+
+def moved_back(depth_m: ImageF32, offset_px: tuple[float, float]) -> ImageF32:
+    """Return depth [H, W] as it is without an offset, rounded to whole pixels; 0 comes in from outside."""
+    dx, dy = round(offset_px[0]), round(offset_px[1])
+    if dx == 0 and dy == 0:
+        return depth_m
+    shift = np.array([[1.0, 0.0, -dx], [0.0, 1.0, -dy]])
+    size = (depth_m.shape[1], depth_m.shape[0])
+    return np.asarray(cv2.warpAffine(depth_m, shift, size, flags=cv2.INTER_NEAREST), dtype=np.float32)
 
 
 def match_by_time(a_ns: Stamps, b_ns: Stamps, tolerance_ns: int) -> Stamps:
@@ -186,12 +214,17 @@ def read_any_size(path: Path) -> ImageU8 | None:
         return None
 
 
-def read_depth(path: Path, camera: Camera, units_per_m: float) -> ImageF32:
+def read_depth(path: Path, camera: Camera, how: DepthFormat) -> ImageF32:
     """Return depth in metres [H, W] of a 16-bit PNG, 0 where invalid; raises as `read_grey_or_color` does."""
+    return how.in_m(read_raw_depth(path, camera))
+
+
+def read_raw_depth(path: Path, camera: Camera) -> NDArray[np.uint16]:
+    """Return the numbers of a 16-bit PNG [H, W] as they are; raises as `read_grey_or_color` does."""
     raw = _decode(path, camera, _RAW_DEPTH)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise UnreadableImageError("depth image that is not 16-bit grey", path)
-    return raw.astype(np.float32) / np.float32(units_per_m)
+    return raw
 
 
 def decode_ahead(

@@ -14,7 +14,15 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding, Severity, worst
 from vislam.datasets import survey as survey_recording
-from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, probe, read_depth, read_grey_or_color
+from vislam.datasets.images import (
+    DepthFormat,
+    ImageList,
+    UnreadableImageError,
+    check_size_px,
+    probe,
+    read_depth,
+    read_grey_or_color,
+)
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.plausibility import (
     EpipolarFacts,
@@ -194,7 +202,7 @@ class _Inspector:
                 check_size_px(size, camera, path)
                 if i % stride == 0:
                     decoded += 1
-                    _ = read_depth(path, camera, 1.0) if is_depth else read_grey_or_color(path, camera)
+                    _ = read_depth(path, camera, DepthFormat()) if is_depth else read_grey_or_color(path, camera)
             except UnreadableImageError as error:
                 bad.setdefault(error.kind, []).append(path)
             except DataError as error:

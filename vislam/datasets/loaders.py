@@ -14,6 +14,7 @@ from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8
 from vislam.core.reading import check_file
 from vislam.datasets.images import (
+    DepthFormat,
     ImageList,
     Stamps,
     UnreadableImageError,
@@ -67,13 +68,13 @@ class FolderLoader:
         cameras: tuple[ImageList, ...],
         depth: ImageList | None,
         rig: Rig,
-        depth_units_per_m: float,
+        depth_format: DepthFormat,
     ) -> None:
         self._frames = frames
         self._cameras = cameras
         self._depth = depth
         self._rig = rig
-        self._depth_units_per_m = depth_units_per_m
+        self._depth_format = depth_format
 
     def load(self, i: int) -> LoadedImages:
         """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
@@ -89,7 +90,7 @@ class FolderLoader:
         if self._depth is None or depth_row < 0:
             return LoadedImages(tuple(images), color)
         try:
-            depth_m = read_depth(self._depth.path(depth_row), self._rig.cameras[0], self._depth_units_per_m)
+            depth_m = read_depth(self._depth.path(depth_row), self._rig.cameras[0], self._depth_format)
         except UnreadableImageError as error:
             return LoadedImages(tuple(images), color, trouble=error)
         return LoadedImages(tuple(images), color, depth_m)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -18,7 +18,15 @@ from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.datasets.formats.truth import Truth
-from vislam.datasets.images import ImageList, UnreadableImageError, check_size_px, decode_ahead, match_by_time, probe
+from vislam.datasets.images import (
+    DepthFormat,
+    ImageList,
+    UnreadableImageError,
+    check_size_px,
+    decode_ahead,
+    match_by_time,
+    probe,
+)
 from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoader
 from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
@@ -88,7 +96,7 @@ class Survey:
     root: Path
     cameras: tuple[ImageList, ...] = ()
     depth: ImageList | None = None
-    depth_units_per_m: float = 1.0
+    depth_format: DepthFormat = field(default_factory=DepthFormat)
     video: Path | None = None  # the frames come from here; the files of cam0 are frame numbers
     later_videos: tuple[tuple[Path, int], ...] = ()  # what follows it, and the numbers of their first frames
     rig: Rig | None = None
@@ -135,6 +143,15 @@ class Survey:
         return iter(()) if self.mag_file is None else read_numbers(self.mag_file, 3, problems)
 
 
+def with_depth_format(found: Survey, how: DepthFormat) -> Survey:
+    """Return what a recording holds, with its depth read in another way: stamps move by the difference of offsets."""
+    depth = found.depth
+    later_ns = round((how.time_offset_s - found.depth_format.time_offset_s) * 1e9)
+    if depth is not None and later_ns:
+        depth = replace(depth, t_ns=depth.t_ns + later_ns)
+    return replace(found, depth=depth, depth_format=how)
+
+
 def image_list(
     name: str, folder: Path, rows: Iterable[Row[str]], problems: Problems, rate_hz: float | None = None
 ) -> ImageList:
@@ -175,7 +192,7 @@ def open_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | Non
         return survey.streams.open_loader(rig, frames, cameras)
     if survey.video is not None:
         return VideoLoader(survey.video, survey.cameras[0].files, rig.cameras[0], survey.later_videos)
-    return FolderLoader(frames, survey.cameras[:cameras], survey.depth, rig, survey.depth_units_per_m)
+    return FolderLoader(frames, survey.cameras[:cameras], survey.depth, rig, survey.depth_format)
 
 
 class FileRecording:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Camera
 from vislam.core.messages import ImageF32, ImageU8
-from vislam.datasets.images import UnreadableImageError, check_size_px, decode_image, image_size
+from vislam.datasets.images import DepthFormat, UnreadableImageError, check_size_px, decode_image, image_size
 
 _DEPTH_UNITS_PER_M = 1000.0  # as ROS says of 16UC1
 _DEPTH_HEAD = struct.Struct("<iff")  # of `compressedDepth`: kind, and what turns its numbers into an inverse depth
@@ -89,7 +89,7 @@ def depth_m(message: Any, camera: Camera, path: Path) -> ImageF32:
     layout = ENCODINGS[message.encoding]
     pixels = _pixels(message, layout, camera, path)[:, :, 0]
     if layout.dtype == "u2":
-        return pixels.astype(np.float32) / np.float32(_DEPTH_UNITS_PER_M)
+        return DepthFormat(_DEPTH_UNITS_PER_M).in_m(pixels.astype(np.uint16))
     return np.where(np.isfinite(pixels) & (pixels > 0.0), pixels, np.float32(0.0)).astype(np.float32)
 
 
@@ -115,7 +115,7 @@ def unpacked_depth_m(message: Any, camera: Camera, path: Path) -> ImageF32:
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise UnreadableImageError("depth image that is not 16-bit grey", path)
     if not message.format.startswith("32FC1"):
-        return raw.astype(np.float32) / np.float32(_DEPTH_UNITS_PER_M)
+        return DepthFormat(_DEPTH_UNITS_PER_M).in_m(raw)
     numbers = raw.astype(np.float32)
     with np.errstate(all="ignore"):
         depth = np.float32(a) / (numbers - np.float32(b))

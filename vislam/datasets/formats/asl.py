@@ -17,9 +17,9 @@ from vislam.core.messages import Array
 from vislam.datasets import calibration as files
 from vislam.datasets.calibration import CAMERA_EXAMPLE, DEPTH_UNITS_PER_M, CameraFile
 from vislam.datasets.formats.truth import Truth, asl_truth
-from vislam.datasets.images import ImageList
+from vislam.datasets.images import DepthFormat, ImageList
 from vislam.datasets.imu_files import imu_calibration, mag_calibration
-from vislam.datasets.stream import Survey, image_list
+from vislam.datasets.stream import Survey, image_list, with_depth_format
 from vislam.datasets.tables import Problems, read_names
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
@@ -43,16 +43,15 @@ def survey(path: Path) -> Survey:
     errors: list[DataError] = []
     imu_file, imu_noise, T_body_imu, imu_calibration = _imu(root, errors)
     cameras, rig = _cameras(root, T_body_imu, problems, errors)
-    depth, units = _depth(root, rig, problems, errors)
+    depth, how = _depth(root, rig, problems, errors)
     if rig is not None and depth is not None:
         rig = Rig(rig.cameras, rig.T_body_cams, has_depth=True)
     mag_file, R_imu_mag, mag_calibration = _mag(root, T_body_imu, errors)
-    return Survey(
+    found = Survey(
         format="euroc",
         root=path,
         cameras=cameras,
         depth=depth,
-        depth_units_per_m=units,
         rig=rig,
         imu_file=imu_file,
         imu_noise=imu_noise,
@@ -64,6 +63,7 @@ def survey(path: Path) -> Survey:
         problems=problems,
         errors=tuple(errors),
     )
+    return with_depth_format(found, how)
 
 
 def _root(path: Path) -> Path | None:
@@ -133,17 +133,19 @@ def _kalibr(root: Path, name: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _depth(root: Path, rig: Rig | None, problems: Problems, errors: list[DataError]) -> tuple[ImageList | None, float]:
-    """Return the depth images and their raw units per metre."""
+def _depth(
+    root: Path, rig: Rig | None, problems: Problems, errors: list[DataError]
+) -> tuple[ImageList | None, DepthFormat]:
+    """Return the depth images, with their stamps as written, and how they are read."""
     folder = root / "depth0"
     if rig is None or not folder.is_dir():
-        return None, DEPTH_UNITS_PER_M
+        return None, DepthFormat(DEPTH_UNITS_PER_M)
     try:
-        units = files.depth_units(folder / "sensor.yaml", rig.cameras[0])
-        return image_list("depth0", folder / "data", read_names(folder / "data.csv", problems), problems), units
+        how = files.depth_format(folder / "sensor.yaml", rig.cameras[0])
+        return image_list("depth0", folder / "data", read_names(folder / "data.csv", problems), problems), how
     except DataError as error:
         errors.append(error)
-        return None, DEPTH_UNITS_PER_M
+        return None, DepthFormat(DEPTH_UNITS_PER_M)
 
 
 def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path | None, Array, MagCalibration | None]:

@@ -18,8 +18,8 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.datasets.calibration import CAMERA_EXAMPLE, CameraFile, read_camera
 from vislam.datasets.formats.truth import tum_truth
-from vislam.datasets.images import ImageList
-from vislam.datasets.stream import ForceRows, Survey, image_list
+from vislam.datasets.images import DepthFormat, ImageList
+from vislam.datasets.stream import ForceRows, Survey, image_list, with_depth_format
 from vislam.datasets.tables import Problems, Row, parse_seconds, read_names, read_numbers
 
 LOOKS_FOR = "rgb.txt"
@@ -60,18 +60,19 @@ def survey(path: Path) -> Survey:
     if calibration is not None:
         rig = Rig((calibration.camera,), (np.eye(4),), has_depth=depth is not None)
     truth = path / "groundtruth.txt"
-    return Survey(
+    found = Survey(
         format="tum",
         root=path,
         cameras=() if color is None else (color,),
         depth=depth,
-        depth_units_per_m=(calibration and calibration.depth_units_per_m) or _DEPTH_UNITS_PER_M,
         rig=rig,
         truth=tum_truth(truth) if truth.is_file() else None,
         forces=_forces(path / "accelerometer.txt") if (path / "accelerometer.txt").is_file() else None,
         problems=problems,
         errors=tuple(errors),
+        depth_format=DepthFormat(_DEPTH_UNITS_PER_M),
     )
+    return found if calibration is None else with_depth_format(found, calibration.depth.over(found.depth_format))
 
 
 def _forces(path: Path) -> ForceRows:
