@@ -37,6 +37,7 @@ from vislam.datasets.plausibility import (
     turn_disagreement,
     turning_pairs,
 )
+from vislam.datasets.rgbd import rgbd_findings
 from vislam.datasets.stream import Survey, TopicSummary, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
 from vislam.datasets.tables import Problems, Row, in_time_order
 from vislam.imu import ImuNoise
@@ -118,8 +119,8 @@ class _Inspector:
 
     def run(self, uri: str) -> Inspection:
         found = self._found
-        self._findings += found.findings
         frames = frame_table(found, self._problems) if found.cameras else None
+        self._findings += (*found.findings, *rgbd_findings(found, frames))
         self._check_cameras(frames)
         facts = self._check_imu()
         if frames is not None and facts is not None:
