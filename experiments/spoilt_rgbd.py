@@ -101,8 +101,8 @@ def told(facts: RgbdFacts) -> str:
     """Return the numbers in one line."""
     edges, focal = facts.edges, facts.focal
     place = "no edges" if edges is None else (
-        f"({edges.offset_px[0]:.1f}, {edges.offset_px[1]:.1f}) ± {np.linalg.norm(edges.offset_sigma_px):.1f} px, "
-        f"{1e3 * edges.lag_s:.0f} ± {1e3 * edges.lag_sigma_s:.0f} ms"
+        f"({facts.offset_px[0]:.1f}, {facts.offset_px[1]:.1f}) ± {np.linalg.norm(edges.offset_sigma_px):.1f} px, "
+        f"{1e3 * facts.lag_s:.0f} ± {1e3 * edges.lag_sigma_s:.0f} ms"
     )  # fmt: skip
     return f"{place}, f x {focal.factor:.4f} ± {focal.sigma:.4f}" if focal is not None else f"{place}, f unknown"
 
@@ -116,10 +116,10 @@ def is_right(facts: RgbdFacts, own: RgbdFacts, spoil: Spoil, accused: set[str]) 
         good &= abs(facts.focal.factor * spoil.focal - own.focal.factor) < 0.01
     if facts.edges is not None and own.edges is not None:
         if "offset" in accused:
-            beyond = facts.edges.offset_px - own.edges.offset_px - spoil.shift_px
+            beyond = facts.offset_px - own.offset_px - spoil.shift_px
             good &= float(np.abs(beyond).max()) < 1.5
         if "lag" in accused:
-            good &= abs(facts.edges.lag_s - own.edges.lag_s - 1e-3 * spoil.late_ms) < 0.006
+            good &= abs(facts.lag_s - own.lag_s - 1e-3 * spoil.late_ms) < 0.006
     return good
 
 

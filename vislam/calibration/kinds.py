@@ -48,6 +48,11 @@ KINDS = {
     "noise": Kind(
         o.NoiseOptions, "inertial.noise.calibrate_noise", "white noise and bias walk of an IMU that stands still"
     ),
+    "rgbd": Kind(
+        o.RgbdOptions,
+        "cameras.rgbd.calibrate_rgbd",
+        "place and lag of depth against colour, focal length, values that mean no depth",
+    ),
     "sensors": Kind(
         o.SensorsOptions,
         "extrinsics.run_sensors.calibrate_sensors",

@@ -169,6 +169,20 @@ class MagOptions:
 
 
 @dataclass(frozen=True)
+class RgbdOptions:
+    """Options of `vislam calibrate rgbd`."""
+
+    source: Positional[str]
+    """Recording with depth, as for `vislam run`: turned to all sides, before things that stand one behind the other"""
+    out: Path = Path("calibration")
+    """Folder for sensor.yaml (ASL, with our keys of depth), rgbd.png and rgbd.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print JSON instead of lines"""
+
+
+@dataclass(frozen=True)
 class SensorsOptions:
     """Options of `vislam calibrate sensors`."""
 

@@ -258,6 +258,15 @@ def depth_text(camera: Camera, units_per_m: float) -> str:
     )
 
 
+def depth_keys_text(how: DepthFormat) -> str:
+    """Return the keys of a sensor file that say how depth images are read."""
+    invalid = f"depth_invalid: [{', '.join(map(str, how.invalid))}]\n" if how.invalid else ""
+    return (
+        f"depth_units_per_m: {float(how.units_per_m)!r}\n{invalid}depth_offset_px: {list_text(how.offset_px)}\n"
+        f"depth_time_offset_s: {float(how.time_offset_s)!r}\n"
+    )
+
+
 def list_text(values: Iterable[float]) -> str:
     """Return numbers as a YAML list that reads back to the same bits."""
     return "[" + ", ".join(repr(float(value)) for value in values) + "]"

@@ -30,6 +30,7 @@ _FASTEST_PX_S = 1500.0
 _RESAMPLED = 60
 _LEAST_ENDS = 2000  # over all frames and per direction
 _LEAST_FRAMES = 8
+_LEAST_FALL = 0.1  # of what the peak stands out, to the worst lag
 _SEED = 7
 
 
@@ -49,9 +50,13 @@ class EdgeAlignment:
     offset_px: Array  # [2]
     offset_sigma_px: Array  # [2]
     lag_s: float  # depth shows what was so long before its stamp
-    lag_sigma_s: float
+    lag_sigma_s: float  # infinite where the image hardly moves
     ends: int
     contrast: float  # of the peak against the mean of the search
+    by_offset: Array  # [2, M] what was summed over its mean, at the lag found, for offsets of...
+    tried_px: Array  # [M]
+    by_lag: Array  # [L] the same at the best offsets, for lags of...
+    tried_s: Array  # [L]
 
 
 def frame_ends(depth_m: ImageF32, image: ImageU8, flow_px_s: ImageF32, delay_s: float) -> FrameEnds:
@@ -134,14 +139,29 @@ def align_edges(frames: Sequence[FrameEnds]) -> EdgeAlignment | None:
     generator = np.random.default_rng(_SEED)
     weights = generator.multinomial(len(frames), np.full(len(frames), 1.0 / len(frames)), size=_RESAMPLED)
     again = np.array([_peak(np.tensordot(weight, scores, axes=1))[0] for weight in weights])
-    found, contrast = _peak(scores.sum(axis=0))
+    summed = scores.sum(axis=0)
+    found, by_offset, by_lag = _peak(summed)
+    means = summed.mean(axis=(-1, -2)).sum(axis=1)
+    by_offset, by_lag = by_offset / means[:, None], by_lag / means.sum()
+    contrast = float(by_lag.max())
+    told = (
+        contrast - float(by_lag.min()) > _LEAST_FALL * (contrast - 1.0) and 0 < int(by_lag.argmax()) < len(by_lag) - 1
+    )
     step = np.array([_OFFSETS_PX[1] - _OFFSETS_PX[0]] * 2 + [_LAGS_S[1] - _LAGS_S[0]])
     sigma = np.hypot(again.std(axis=0), step / np.sqrt(12.0))
-    return EdgeAlignment(found[:2], sigma[:2], float(found[2]), float(sigma[2]), int(count.sum()), contrast)
+    if not told:  # the image hardly moves: any lag would do
+        found[2], sigma[2] = 0.0, np.inf
+    return EdgeAlignment(
+        found[:2], sigma[:2], float(found[2]), float(sigma[2]), int(count.sum()), contrast, by_offset, _OFFSETS_PX,
+        by_lag, _LAGS_S,
+    )  # fmt: skip
 
 
-def _peak(scores: Array) -> tuple[Array, float]:
-    """Return offset right and down and lag [3] of the highest of summed scores [2, 2, lags, offsets], and contrast."""
+def _peak(scores: Array) -> tuple[Array, Array, Array]:
+    """Return offset right and down and lag [3] of the highest of summed scores [2, 2, lags, offsets].
+
+    Also the scores [2, offsets] at that lag, and [lags] at the best offsets.
+    """
     per_step = round(1.0 / (_OFFSETS_PX[1] - _OFFSETS_PX[0]))
     best = np.full((2, len(_LAGS_S), len(_OFFSETS_PX)), -np.inf)
     for wider in range(-_MOST_WIDER_PX * per_step, _MOST_WIDER_PX * per_step + 1):
@@ -153,10 +173,9 @@ def _peak(scores: Array) -> tuple[Array, float]:
         best = np.maximum(best, both)
     along = best.max(axis=-1).sum(axis=0)  # by lag, which both directions share
     at = int(along.argmax())
-    mean = float(scores.mean(axis=(-1, -2)).sum())
     lag_s = _summit(_LAGS_S, along, at)
     offsets = [_summit(_OFFSETS_PX, best[axis, at], int(best[axis, at].argmax())) for axis in (0, 1)]
-    return np.array([*offsets, lag_s]), float(along[at]) / max(mean, 1e-12)
+    return np.array([*offsets, lag_s]), best[:, at], along
 
 
 def _summit(places: Array, values: Array, at: int) -> float:

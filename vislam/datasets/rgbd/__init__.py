@@ -1,6 +1,6 @@
 """Colour against depth of an RGB-D recording: does depth lie where it should, when it should, and fit the lens."""
 
 from vislam.datasets.rgbd.facts import RgbdFacts, rgbd_facts
-from vislam.datasets.rgbd.judgement import RgbdFault, rgbd_faults, rgbd_findings
+from vislam.datasets.rgbd.judgement import Known, RgbdFault, known, rgbd_faults, rgbd_findings
 
-__all__ = ["RgbdFacts", "RgbdFault", "rgbd_facts", "rgbd_faults", "rgbd_findings"]
+__all__ = ["Known", "RgbdFacts", "RgbdFault", "known", "rgbd_facts", "rgbd_faults", "rgbd_findings"]

@@ -20,7 +20,10 @@ from vislam.vision.depth_focal import FocalFit, SeenPoints, fit_focal
 
 _HISTOGRAMS = 24  # depth images whose numbers are counted
 _LEAST_SHARE = 0.005  # of the pixels: a wall never fills so many with one number that nothing is near
-_APART = 1.02  # of the next smaller number: a sensor that ends its range there would have some just below
+_NEAR = 0.15  # numbers that differ by less are neighbours: a surface has them as often
+_STANDS_OUT = 30.0  # over any of its neighbours
+_LEAST_OTHERS = 0.1  # of the pixels: with fewer, one flat face is all that there is
+_OFTEN = 0.5  # of the images: a face that is looked at stays for some only
 _REACH_PX = 4  # of the neighbourhood that must be flat
 _FLAT = 0.12  # of the inverse depth
 _SLOPE_PX = 3.0
@@ -74,17 +77,19 @@ def rgbd_facts(found: Survey, rig: Rig, frames: FrameTable) -> RgbdFacts:
 
 def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, float]:
     """Return numbers that are no depth, the share of pixels with depth, and its median in metres."""
-    counts = np.zeros(NO_DEPTH + 1, dtype=np.int64)
+    counts, images = np.zeros((2, NO_DEPTH + 1), dtype=np.int64)
+    read = 0
     depth = found.depth
     if depth is None or found.streams is not None or not depth.files:
         return (), float("nan"), float("nan")
     for i in np.unique(np.linspace(0, len(depth.files) - 1, _HISTOGRAMS).astype(int)):
         try:
-            counts += np.bincount(read_raw_depth(depth.path(int(i)), rig.cameras[0]).ravel(), minlength=NO_DEPTH + 1)
+            one = np.bincount(read_raw_depth(depth.path(int(i)), rig.cameras[0]).ravel(), minlength=NO_DEPTH + 1)
         except UnreadableImageError:
             continue
+        counts, images, read = counts + one, images + (one > 0), read + 1
     total = int(counts.sum())
-    odd = odd_values(counts, found.depth_format.invalid)
+    odd = odd_values(counts, images >= _OFTEN * max(read, 1), found.depth_format.invalid)
     for value in {0, NO_DEPTH, *found.depth_format.invalid, *(one.value for one in odd)}:
         if 0 <= value <= NO_DEPTH:
             counts[value] = 0
@@ -95,22 +100,27 @@ def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, floa
     return odd, valid / total, median / found.depth_format.units_per_m
 
 
-def odd_values(counts: Array, known: Sequence[int]) -> tuple[OddValue, ...]:
-    """Return the numbers that cannot be depths, by how often each of 65536 occurs: the largest, far from all others."""
-    total, counts = int(counts.sum()), counts.copy()
-    counts[0] = 0
-    out = []
-    while counts.any():
-        largest = int(np.flatnonzero(counts)[-1])
-        below = np.flatnonzero(counts[:largest])
-        is_known = largest == NO_DEPTH or largest in known
-        is_apart = len(below) == 0 or largest > _APART * below[-1]
-        if not is_known and not (is_apart and counts[largest] >= _LEAST_SHARE * total):
-            break
-        if len(below) == 0 and not is_known:  # all that there is: a wall
-            break
-        out.append(OddValue(largest, int(counts[largest]) / total, is_known))
-        counts[largest] = 0
+def odd_values(counts: Array, often: Array, known: Sequence[int]) -> tuple[OddValue, ...]:
+    """Return the numbers that cannot be depths: a lot of pixels, and nearly none at depths nearby.
+
+    Args:
+        counts: [65536] pixels with each number.
+        often: [65536] whether it occurs in many of the images.
+        known: numbers that are told to mean nothing.
+    """
+    total, out = int(counts.sum()), list[OddValue]()
+    for value in np.flatnonzero(counts).tolist():
+        share = int(counts[value]) / total
+        if value == 0:
+            continue
+        if value == NO_DEPTH or value in known:
+            out.append(OddValue(value, share, True))
+            continue
+        if share < _LEAST_SHARE or not often[value] or counts[1:].sum() - counts[value] < _LEAST_OTHERS * total:
+            continue
+        near = counts[max(1, int(value * (1.0 - _NEAR))) : int(value * (1.0 + _NEAR)) + 1]
+        if counts[value] > _STANDS_OUT * (np.sort(near)[-2] if len(near) > 1 else 0):
+            out.append(OddValue(value, share, False))
     return tuple(out)
 
 

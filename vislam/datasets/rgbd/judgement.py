@@ -78,16 +78,16 @@ def _place_faults(facts: RgbdFacts, width_px: int) -> list[RgbdFault]:
     sure, edges, out = known(facts), facts.edges, []
     if edges is None:
         return []
-    size_px = float(np.linalg.norm(edges.offset_px))
+    size_px = float(np.linalg.norm(facts.offset_px))
     sigma_px = float(np.linalg.norm(edges.offset_sigma_px))
     if sure.offset and size_px > max(_MOST_OFFSET * width_px, _SURE * sigma_px):
-        told = f"depth is not registered to colour: it lies {offset_words(edges.offset_px)} off, ± {sigma_px:.1f} px"
+        told = f"depth is not registered to colour: it lies {offset_words(facts.offset_px)} off, ± {sigma_px:.1f} px"
         out.append(RgbdFault("offset", size_px, sigma_px, told))
-    if sure.lag and abs(edges.lag_s) > max(_MOST_LAG_S, _SURE * edges.lag_sigma_s):
-        word = "late" if edges.lag_s > 0.0 else "early"
-        size_ms, sigma_ms = 1e3 * abs(edges.lag_s), 1e3 * edges.lag_sigma_s
+    if sure.lag and abs(facts.lag_s) > max(_MOST_LAG_S, _SURE * edges.lag_sigma_s):
+        word = "late" if facts.lag_s > 0.0 else "early"
+        size_ms, sigma_ms = 1e3 * abs(facts.lag_s), 1e3 * edges.lag_sigma_s
         told = f"depth is {size_ms:.0f} ± {sigma_ms:.0f} ms {word} against colour"
-        out.append(RgbdFault("lag", edges.lag_s, edges.lag_sigma_s, told))
+        out.append(RgbdFault("lag", facts.lag_s, edges.lag_sigma_s, told))
     return out
 
 
@@ -128,9 +128,9 @@ def rgbd_findings(found: Survey, frames: FrameTable | None) -> list[Finding]:
         if not is_known:
             unknown.append(what)
         elif what == "offset" and what not in wrong and edges is not None:
-            good.append(f"depth lies {offset_words(edges.offset_px)} of colour")
+            good.append(f"depth lies {offset_words(facts.offset_px)} of colour")
         elif what == "lag" and what not in wrong and edges is not None:
-            good.append(f"lags it by {1e3 * edges.lag_s:.0f} ± {1e3 * edges.lag_sigma_s:.0f} ms")
+            good.append(f"lags it by {1e3 * facts.lag_s:.0f} ± {1e3 * edges.lag_sigma_s:.0f} ms")
         elif what == "focal length" and what not in wrong and focal is not None:
             good.append(f"fits a focal length of {focal.factor:.3f} ± {focal.sigma:.3f} times the one told")
     out += [Finding("ok", ", ".join(good), "depth0")] if good else []
