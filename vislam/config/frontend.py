@@ -78,6 +78,10 @@ class FrontEndConfig:
     # of depth images after colour beyond what stamps say, None estimates it while running
     depth_delay_s: Finite | None = None
     depth_edge_rho: NonNegative = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
+    depth_alone: bool = True  # frames that vision cannot place are placed by their depth image, as degraded
+    depth_alone_sigma_m: Positive = 0.3  # of the place in the keyframe; beyond, depth may meet the wrong surfaces
+    depth_alone_overlap: Share = 0.4  # of its surface that falls on the keyframe's; less fits by chance
+    depth_alone_renew: Share = 0.6  # overlap below which a new keyframe begins; each costs drift
     stereo_window_px: Count = 15  # smaller than in time: depth edges hurt, blur is the same in both images
     stereo_levels: Whole = 3  # pyramid levels above the image
     stereo_sigma_px: Positive = 0.3  # noise of the disparity

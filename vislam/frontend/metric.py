@@ -11,8 +11,19 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import FrontNews
-from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.core.messages import (
+    Array,
+    Bools,
+    Frame,
+    ImuSpan,
+    Keyframe,
+    Observations,
+    Tracking,
+    VoMeasurement,
+    no_observations,
+)
 from vislam.frontend.agreement import confirmed, failure, weakness
+from vislam.frontend.by_depth import ByDepth, Moved
 from vislam.frontend.depth import DepthReading
 from vislam.frontend.depth_lag import DepthLag
 from vislam.frontend.intake import Intake
@@ -92,6 +103,8 @@ class MetricFrontEnd:
         self._now_sees = True  # and in this frame; only asked while another camera is looked through
         self._lost = False
         self._lacks_depth = False  # hardly a track of the keyframe was given depth when it began
+        alone = config.depth_alone and rig.has_depth and mode == "rgbd"
+        self._by_depth = ByDepth(config, self._camera) if alone else None
         self._blind = False  # the keyframe is the first and has no depth
         self._blind_px: Array = np.empty((0, 2))  # where its tracks were last seen
 
@@ -99,10 +112,14 @@ class MetricFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
     ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
-        result = self._track(frame, imu, T_last_now)
+        result = self._track(frame, imu, T_last_now, gyro_sigma_rad_s)
+        if self._by_depth is not None:
+            self._by_depth.note(result.vo, result.keyframe is not None, result.by_depth, self._T_body_cam)
         return result.with_scatter(self._noise.sigma_px, 1.0 if frame.tracks is not None else self._noise.over_usual)
 
-    def _track(self, frame: Frame, imu: ImuSpan | None, T_last_now: Array | None) -> TrackResult:
+    def _track(
+        self, frame: Frame, imu: ImuSpan | None, T_last_now: Array | None, gyro_sigma_rad_s: float
+    ) -> TrackResult:
         whole, dt_s = self._intake.accept(frame)
         keyframe = self._life.keyframe
         if keyframe is None:
@@ -125,8 +142,8 @@ class MetricFrontEnd:
             if T_found is not None:
                 attempt = self._attempt(frame, T_before, T_found, dt_s)
         if attempt.failure:
-            self._T_key_cam = T_guess
-            return self._lose(frame, attempt)
+            moved = Moved(T_before, T_guess, dt_s, None if imu is None else gyro_sigma_rad_s)
+            return self._place_by_depth(frame, keyframe, attempt, moved) or self._lose(frame, attempt, T_guess)
         self._T_key_cam = attempt.estimate.T_key_cam
         if not self._lost:
             self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
@@ -421,11 +438,34 @@ class MetricFrontEnd:
         moved = turned[:, :2] / turned[:, 2:] - self._landmarks.mean[good, :2]
         return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx)
 
-    def _lose(self, frame: Frame, attempt: _Attempt) -> TrackResult:
+    def _lose(self, frame: Frame, attempt: _Attempt, T_guess: Array) -> TrackResult:
+        self._T_key_cam = T_guess
         self._lost = True
         if self._life.is_given_up(frame.t_ns) and self._depth.available(frame):
             return self._start(frame, attempt.failure)
         return self._life.lost(frame.t_ns, attempt.failure, attempt.inliers)
+
+    def _place_by_depth(
+        self, frame: Frame, keyframe: Keyframe, attempt: _Attempt, moved: Moved
+    ) -> TrackResult | None:
+        """Return the result of a frame that only its depth image places; None where that does not either."""
+        placed = None if self._by_depth is None else self._by_depth.place(frame, keyframe, moved, len(self._tracker))
+        if placed is None:
+            return None
+        self._T_key_cam = placed.T_key_cam
+        if not self._lost:
+            self._predictor.observe(invert(moved.T_before) @ self._T_key_cam, moved.dt_s)
+        self._lost = False
+        self._life.placed(frame.t_ns)
+        vo = metric_motion(
+            frame.t_ns, keyframe.id, placed.T_key_cam, placed.covariance, self._T_body_cam, 0, is_weak=True
+        )
+        reason = f"{placed.reason or 'placed by depth alone'}: {attempt.failure}"
+        if not placed.reason:
+            return TrackResult(vo, no_observations(), None, 0.0, reason, by_depth=True)
+        none = np.zeros(len(attempt.xy), dtype=np.bool_)
+        new, observations = self._continue_from(frame, replace(attempt, estimate=replace(attempt.estimate, inliers=none)))
+        return TrackResult(vo, observations, new, 0.0, reason, by_depth=True)
 
     # -- a first keyframe without depth ------------------------------------------------------------------------------
 

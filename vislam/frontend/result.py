@@ -25,6 +25,7 @@ class TrackResult:
     median_parallax_px: float  # since the keyframe that `vo` refers to, rotation taken out; 0 when nothing was followed
     reason: str  # why tracking is not ok, or why the frame became a keyframe; empty otherwise
     sigma_px: float = float("nan")  # of a track's pixel, as this run showed it up to now; told until enough was seen
+    by_depth: bool = False  # vision failed, and the depth image alone places the frame
 
     def with_scatter(self, sigma_px: float, noise: float) -> TrackResult:
         """Return the result with what the run shows of its tracks; `noise` as in `Observations`."""

@@ -407,6 +407,8 @@ class Front:
             self.counters["longest_loss_ms"] = max(self.counters["longest_loss_ms"], lasted_ms)
         self.counters["frames_degraded"] += track.vo.tracking == Tracking.DEGRADED
         self.counters["frames_at_rest"] += at_rest
+        if track.by_depth:
+            self.counters["frames_by_depth"] = self.counters.get("frames_by_depth", 0) + 1
         self._rested_since_keyframe = self._rested_since_keyframe and at_rest
 
     def _seek_gravity(self, span: ImuSpan | None, track: TrackResult, still_image: bool) -> list[OdometryKeyframe]:

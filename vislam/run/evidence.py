@@ -39,6 +39,7 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         frames_lost=front.get("frames_lost", 0),
         longest_loss_s=1e-3 * front.get("longest_loss_ms", 0),
         frames_degraded=front.get("frames_degraded", 0),
+        frames_by_depth=front.get("frames_by_depth", 0),
         frames_missing=feed.get("missing", 0),
         frames_repeated=feed.get("repeated", 0),
         frames_offered=live.get("frames_offered", 0),

@@ -49,6 +49,7 @@ class Evidence:
     frames_lost: int = 0
     longest_loss_s: float = 0.0
     frames_degraded: int = 0
+    frames_by_depth: int = 0  # of those: placed by depth alone
     frames_missing: int = 0  # that an even rate would have brought
     frames_repeated: int = 0  # equal to the one before in motion
     coverage: float = 1.0  # share of the frames that have a pose

@@ -100,7 +100,11 @@ def _vision(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             "for when and why"
         )
     if e.frames_degraded > c.degraded_share * e.frames:
-        yield f"vision was weak in {e.frames_degraded} of {e.frames} frames: more light, texture or a sharper lens"
+        by_depth = f", {e.frames_by_depth} of them placed by depth alone" if e.frames_by_depth else ""
+        yield (
+            f"vision was weak in {e.frames_degraded} of {e.frames} frames{by_depth}: more light, texture or a sharper "
+            "lens"
+        )
     if e.frames_missing > c.missing_share * (e.frames + e.frames_missing) and not _is_slow(e, c):
         yield (
             f"{e.frames_missing} of {e.frames + e.frames_missing} frames never arrived: look at the camera's cable, "

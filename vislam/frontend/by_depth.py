@@ -1,0 +1,164 @@
+"""Frames that vision cannot place, by their depth image: against the keyframe's, from where motion predicts the camera.
+
+Dark rooms and bare walls leave a depth camera what it measures itself. What the shape of the room does not tell (a wall
+slides, a corridor in one direction) is kept from the prediction, with its growing uncertainty: where that becomes too
+large the frame is lost as before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.config import FrontEndConfig
+from vislam.core.camera import Camera
+from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.messages import Array, Frame, ImageF32, Keyframe, Tracking, VoMeasurement
+from vislam.frontend.view import sees
+from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
+from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
+
+_TURN_WALK, _SPEED_WALK = 2.0, 0.7  # rad/s and m/s per root of a second: 6 rad/s^2, 2 m/s^2 of a hand over 0.1 s
+_TURN_SIGMA, _SPEED_SIGMA = 0.3, 0.2  # rad/s and m/s, of what the last two frames that vision placed say
+_GYRO_SIGMA_RAD, _BIAS_RAD_S = 0.002, 0.2  # of a turn by the gyroscope, and of its bias where nobody knows it
+_WIDER = 3.0  # times the standard deviations of depth: errors of its calibration, the same in both images, stay
+_LEAST_SHARE = 0.15  # of the pixels have a surface, or there is nothing to align
+_AGREEMENT, _SEEN_THROUGH = 0.8, 0.1  # shares of what overlaps: more contradicts, and it is another place
+_CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A frame placed by its depth."""
+
+    T_key_cam: Array  # [4, 4]
+    covariance: Array  # [6, 6] of its right perturbation, rotation first
+    reason: str  # why it should become a keyframe, or an empty string
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """What is predicted of the camera since the last frame."""
+
+    T_before: Array  # [4, 4] in the keyframe
+    T_guess: Array  # [4, 4] now
+    dt_s: float
+    gyro_sigma_rad_s: float | None  # of its bias, where a gyroscope told the turn; infinite: not known
+
+
+class ByDepth:
+    """Follows the camera by depth while vision fails: pose in the keyframe and velocity with their covariance [12, 12].
+
+    A velocity that nothing measures walks at random, so what depth does not see grows unsure as it should.
+    """
+
+    def __init__(self, config: FrontEndConfig, camera: Camera) -> None:
+        """Take the camera that depth images are registered to."""
+        self._config = config
+        self._maker = SurfaceMaker(camera, config.min_depth_m, config.max_depth_m, config.depth_sigma_rho)
+        self._key: tuple[int, DepthSurface | None] = (-1, None)
+        self._covariance: Array | None = None  # [12, 12] pose and velocity; None while vision works
+        self._of_vision: Array = np.zeros((6, 6))  # the last frame that it placed
+
+    def note(self, vo: VoMeasurement, is_keyframe: bool, by_depth: bool, T_body_cam: Array) -> None:
+        """Take note of a frame's result; by vision, it ends what was followed by depth."""
+        if vo.tracking is not Tracking.LOST and not by_depth:
+            adjoint = se3_adjoint(np.asarray(invert(T_body_cam)))
+            self._of_vision, self._covariance = adjoint @ vo.covariance @ adjoint.T, None
+        elif is_keyframe and by_depth and self._covariance is not None:
+            self._covariance[:6, :] = self._covariance[:, :6] = 0.0
+        elif is_keyframe:
+            self._covariance = None
+        if is_keyframe and not by_depth:
+            self._of_vision = np.zeros((6, 6))
+
+    def place(self, frame: Frame, keyframe: Keyframe, moved: Moved, tracks: int) -> Placed | None:
+        """Return where depth puts a frame that vision could not place; None where that is not to be trusted.
+
+        `tracks` is with how many the keyframe is followed: a frame that could begin with more, ends it.
+        """
+        covariance = self._predicted(moved)
+        if frame.depth_m is None or not self._is_known(covariance):
+            return None
+        of_key, of_frame = self._surface(keyframe), self._made(frame.depth_m)
+        if of_key is None or of_frame is None:
+            return None
+        prior = Prior(moved.T_guess, covariance[:6, :6] + 1e-10 * np.eye(6))
+        sigma_rho = _WIDER * self._config.depth_sigma_rho
+        found = align_depth(of_frame, (SeenFrom(of_key, np.eye(4)),), prior, sigma_rho)
+        if not self._is_trusted(found, prior):
+            return None
+        self._covariance = _updated(covariance, found.covariance)
+        if not self._is_known(found.covariance):
+            return None
+        return Placed(found.T_model_cam, found.covariance, self._keyframe_reason(frame, keyframe, found, tracks))
+
+    def _predicted(self, moved: Moved) -> Array:
+        """Return the covariance [12, 12] after the motion, and keep it."""
+        before, dt = self._covariance, moved.dt_s
+        if before is None:
+            before = np.zeros((12, 12))
+            before[:6, :6] = self._of_vision
+            before[6:, 6:] = np.diag(np.repeat([_TURN_SIGMA**2, _SPEED_SIGMA**2], 3))
+        F = np.eye(12)
+        F[:6, :6] = se3_adjoint(np.asarray(invert(moved.T_guess) @ moved.T_before))
+        F[:6, 6:] = dt * np.eye(6)
+        walk = np.diag(np.repeat([_TURN_WALK**2, _SPEED_WALK**2], 3))
+        if moved.gyro_sigma_rad_s is not None:  # tells the turn itself: what was known of the rate is not asked
+            F[:3, 6:9] = 0.0
+            bias_rad_s = min(moved.gyro_sigma_rad_s, _BIAS_RAD_S)
+            walk[:3, :3] = 0.0
+            before = before.copy()
+            before[:3, :3] += (_GYRO_SIGMA_RAD**2 + (bias_rad_s * dt) ** 2) * np.eye(3)
+        after = F @ before @ F.T
+        after[:6, :6] += walk * dt**3 / 3.0
+        after[:6, 6:] += walk * dt**2 / 2.0
+        after[6:, :6] += walk * dt**2 / 2.0
+        after[6:, 6:] += walk * dt
+        self._covariance = 0.5 * (after + after.T)
+        return self._covariance
+
+    def _is_known(self, covariance: Array) -> bool:
+        """Return whether a pose is known well enough for depth to go on from it."""
+        turn, way = (float(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3))
+        most_m = self._config.depth_alone_sigma_m
+        return turn <= most_m**2 and way <= most_m**2  # a radian moves what is a metre away by one
+
+    def _made(self, depth_m: ImageF32) -> DepthSurface | None:
+        surface = self._maker.make(depth_m)
+        return surface if surface.share >= _LEAST_SHARE else None
+
+    def _surface(self, keyframe: Keyframe) -> DepthSurface | None:
+        if self._key[0] != keyframe.id:
+            depth_m = keyframe.frame.depth_m
+            self._key = (keyframe.id, None if depth_m is None else self._made(depth_m))
+        return self._key[1]
+
+    def _is_trusted(self, found: DepthAlignment, prior: Prior) -> bool:
+        change = se3_log(invert(prior.T_model_cam) @ found.T_model_cam)
+        chi2 = float(change @ np.linalg.solve(prior.covariance, change))
+        enough = found.overlap >= self._config.depth_alone_overlap and found.agreement >= _AGREEMENT
+        return found.converged and enough and found.seen_through <= _SEEN_THROUGH and chi2 <= _CHI2
+
+    def _keyframe_reason(self, frame: Frame, keyframe: Keyframe, found: DepthAlignment, tracks: int) -> str:
+        config = self._config
+        dt_s = (frame.t_ns - keyframe.t_ns) * 1e-9
+        if dt_s < config.keyframe_min_interval_s:
+            return ""
+        if tracks < config.min_start_corners and frame.images and sees(frame.images[0], config):
+            return "there is something to see again"
+        if found.overlap < config.depth_alone_renew:
+            return f"only {found.overlap:.0%} of the depth overlaps"
+        return f"{dt_s:.1f} s since the last keyframe" if dt_s >= config.keyframe_max_interval_s else ""
+
+
+def _updated(covariance: Array, of_pose: Array) -> Array:
+    """Return the covariance [12, 12] of pose and velocity where the pose has become known to `of_pose` [6, 6]."""
+    gain = np.linalg.solve(covariance[:6, :6] + 1e-10 * np.eye(6), covariance[:6, 6:]).T
+    out = covariance.copy()
+    out[:6, :6] = of_pose
+    out[6:, :6] = gain @ of_pose
+    out[:6, 6:] = out[6:, :6].T
+    out[6:, 6:] -= gain @ (covariance[:6, :6] - of_pose) @ gain.T
+    return 0.5 * (out + out.T)
