@@ -81,6 +81,8 @@ class FrontEndConfig:
     depth_alone: bool = True  # frames that vision cannot place are placed by their depth image, as degraded
     depth_alone_sigma_m: Positive = 0.3  # of the place in the keyframe; beyond, depth may meet the wrong surfaces
     depth_alone_overlap: Share = 0.4  # of its surface that falls on the keyframe's; less fits by chance
+    # between the exposures of depth and colour of a frame: TUM's pairs are up to 16 ms apart, and depth is stamped late
+    depth_apart_s: NonNegative = 0.03
     depth_alone_renew: Share = 0.6  # overlap below which a new keyframe begins; each costs drift
     stereo_window_px: Count = 15  # smaller than in time: depth edges hurt, blur is the same in both images
     stereo_levels: Whole = 3  # pyramid levels above the image

@@ -44,6 +44,7 @@ class Moved:
     T_before: Array  # [4, 4] in the keyframe
     T_guess: Array  # [4, 4] now
     dt_s: float
+    key_twist_per_s: Array  # [6] velocity of the camera at the keyframe
     gyro_sigma_rad_s: float | None  # of its bias, where a gyroscope told the turn; infinite: not known
 
 
@@ -84,15 +85,24 @@ class ByDepth:
         of_key, of_frame = self._surface(keyframe), self._made(frame.depth_m)
         if of_key is None or of_frame is None:
             return None
-        prior = Prior(moved.T_guess, covariance[:6, :6] + 1e-10 * np.eye(6))
+        off = self._exposed_apart(moved)
+        prior = Prior(moved.T_guess, covariance[:6, :6] + off + 1e-10 * np.eye(6))
         sigma_rho = _WIDER * self._config.depth_sigma_rho
         found = align_depth(of_frame, (SeenFrom(of_key, np.eye(4)),), prior, sigma_rho)
         if not self._is_trusted(found, prior):
             return None
-        self._covariance = _updated(covariance, found.covariance)
-        if not self._is_known(found.covariance):
+        of_pose = found.covariance + off
+        self._covariance = _updated(covariance, of_pose)
+        if not self._is_known(of_pose):
             return None
-        return Placed(found.T_model_cam, found.covariance, self._keyframe_reason(frame, keyframe, found, tracks))
+        return Placed(found.T_model_cam, of_pose, self._keyframe_reason(frame, keyframe, found, tracks))
+
+    def _exposed_apart(self, moved: Moved) -> Array:
+        """Return the covariance [6, 6] of what the camera moves between the exposures of colour and depth."""
+        now = se3_log(invert(moved.T_before) @ moved.T_guess) / moved.dt_s
+        at_key = se3_adjoint(np.asarray(invert(moved.T_guess))) @ moved.key_twist_per_s
+        apart_s = self._config.depth_apart_s
+        return apart_s**2 * (np.outer(now, now) + np.outer(at_key, at_key))
 
     def _predicted(self, moved: Moved) -> Array:
         """Return the covariance [12, 12] after the motion, and keep it."""

@@ -142,7 +142,7 @@ class MetricFrontEnd:
             if T_found is not None:
                 attempt = self._attempt(frame, T_before, T_found, dt_s)
         if attempt.failure:
-            moved = Moved(T_before, T_guess, dt_s, None if imu is None else gyro_sigma_rad_s)
+            moved = Moved(T_before, T_guess, dt_s, self._keyframe_twist, None if imu is None else gyro_sigma_rad_s)
             return self._place_by_depth(frame, keyframe, attempt, moved) or self._lose(frame, attempt, T_guess)
         self._T_key_cam = attempt.estimate.T_key_cam
         if not self._lost:
@@ -445,16 +445,15 @@ class MetricFrontEnd:
             return self._start(frame, attempt.failure)
         return self._life.lost(frame.t_ns, attempt.failure, attempt.inliers)
 
-    def _place_by_depth(
-        self, frame: Frame, keyframe: Keyframe, attempt: _Attempt, moved: Moved
-    ) -> TrackResult | None:
+    def _place_by_depth(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt, moved: Moved) -> TrackResult | None:
         """Return the result of a frame that only its depth image places; None where that does not either."""
         placed = None if self._by_depth is None else self._by_depth.place(frame, keyframe, moved, len(self._tracker))
         if placed is None:
             return None
         self._T_key_cam = placed.T_key_cam
+        T_before_now = invert(moved.T_before) @ placed.T_key_cam
         if not self._lost:
-            self._predictor.observe(invert(moved.T_before) @ self._T_key_cam, moved.dt_s)
+            self._predictor.observe(T_before_now, moved.dt_s)
         self._lost = False
         self._life.placed(frame.t_ns)
         vo = metric_motion(
@@ -463,8 +462,9 @@ class MetricFrontEnd:
         reason = f"{placed.reason or 'placed by depth alone'}: {attempt.failure}"
         if not placed.reason:
             return TrackResult(vo, no_observations(), None, 0.0, reason, by_depth=True)
-        none = np.zeros(len(attempt.xy), dtype=np.bool_)
-        new, observations = self._continue_from(frame, replace(attempt, estimate=replace(attempt.estimate, inliers=none)))
+        none = replace(attempt.estimate, inliers=np.zeros(len(attempt.xy), dtype=np.bool_))
+        attempt = replace(attempt, estimate=none, twist_per_s=se3_log(T_before_now) / moved.dt_s)
+        new, observations = self._continue_from(frame, attempt)
         return TrackResult(vo, observations, new, 0.0, reason, by_depth=True)
 
     # -- a first keyframe without depth ------------------------------------------------------------------------------

@@ -1,13 +1,13 @@
 """Where a camera is by its depth alone: point-to-plane alignment with surfaces that were seen before.
 
-Points are associated by projection and drawn to the planes they fall on, coarse to fine (KinectFusion: Newcombe et al.,
-ISMAR 2011; point to plane: Chen and Medioni 1992), under robust weights and noise that grows with z^2. A start has to be
-known: this does not search.
+Points are associated by projection and drawn to the planes they fall on, coarse to fine (KinectFusion: Newcombe et
+al., ISMAR 2011; point to plane: Chen and Medioni 1992), under robust weights and noise that grows with z^2. A start has
+to be known: this does not search.
 
-What depth does not tell is kept as the prior has it. A bare wall slides in two directions and turns in one; normals that
-are noisy look as if they held it (Gelfand et al., 3DIM 2003: unstable directions; Zhang et al., ICRA 2016: to be left
-alone). How much information noise alone would make up is summed up beside the information itself, so directions count as
-determined only where they hold several times as much.
+What depth does not tell is kept as the prior has it. A bare wall slides in two directions and turns in one; normals
+that are noisy look as if they held it (Gelfand et al., 3DIM 2003: unstable directions; Zhang et al., ICRA 2016: to be
+left alone). How much information noise alone would make up is summed up beside the information itself, so directions
+count as determined only where they hold several times as much.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ _FLOOR_M = 0.001  # of a distance's standard deviation: what calibration leaves 
 _NOISE_TIMES = 8.0  # the information that noise would make up: so much is needed for a direction to count
 _GROUPS = 4  # the image is cut into 4 x 4 regions whose residuals may err together
 _SETTLED = 2e-4  # norm of a step in rad and m, far below the noise of depth
+_SETTLED_CHI2 = 0.01  # and the same over how sure the pose is: a tenth of its standard deviation
 _MARGIN_M, _MARGIN = 0.05, 0.03  # a surface is seen through by more than this and this share of its depth
 _LEAST_POINTS = 50  # on surfaces, or nothing is said
 
@@ -65,11 +66,6 @@ class DepthAlignment:
     seen_through: float  # of the same, from both sides: the share that the other one looks through
     residual: float  # root mean square of the distances over what noise explains
     converged: bool
-
-    @property
-    def information_rank(self) -> int:
-        """Return how many directions depth determined."""
-        return self.determined
 
 
 class _Rows(NamedTuple):
@@ -120,7 +116,7 @@ def align_depth(frame: DepthSurface, model: Sequence[SeenFrom], prior: Prior, si
             if not size < 1.0:
                 return _nothing(prior)
             T = T @ se3_exp(step)
-            if size < _SETTLED:
+            if size < _SETTLED or float(step @ (H + information_0) @ step) < _SETTLED_CHI2:
                 converged = True
                 break
     H, _, basis = _determined(sums)
@@ -152,9 +148,7 @@ def _rows(frame: DepthSurface, stride: int) -> _Rows:
 
 
 def _no_sums() -> _Sums:
-    return _Sums(
-        np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros((_GROUPS * _GROUPS, 6)), np.zeros(3)
-    )
+    return _Sums(np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros((_GROUPS * _GROUPS, 6)), np.zeros(3))
 
 
 def _summed(rows: _Rows, model: Sequence[SeenFrom], T: Array, gate_m: float, sigma_rho: float) -> _Sums:
