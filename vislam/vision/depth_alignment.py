@@ -87,7 +87,9 @@ class _Sums(NamedTuple):
     totals: Array  # [3] weighted squares, weights, points
 
 
-def align_depth(frame: DepthSurface, model: Sequence[SeenFrom], prior: Prior, sigma_rho: float) -> DepthAlignment:
+def align_depth(
+    frame: DepthSurface, model: Sequence[SeenFrom], prior: Prior, sigma_rho: float, T_start: Array | None = None
+) -> DepthAlignment:
     """Align a depth image with surfaces that were seen from known places.
 
     Args:
@@ -95,12 +97,13 @@ def align_depth(frame: DepthSurface, model: Sequence[SeenFrom], prior: Prior, si
         model: surfaces in one frame, the one to be asked first in front.
         prior: where the camera is thought to be; the covariance must be positive definite.
         sigma_rho: standard deviation of an inverse depth in 1/m.
+        T_start: where to begin [4, 4]; None: where the prior is.
 
     Returns:
         The alignment. Where the surfaces say nothing (no depth, no overlap) it is the prior, not converged.
     """
     information_0 = np.linalg.inv(prior.covariance)
-    T, converged = prior.T_model_cam.copy(), False
+    T, converged = (prior.T_model_cam if T_start is None else T_start).copy(), False
     sums = _no_sums()
     for stride, gate_m, most in _LEVELS:
         rows = _rows(frame, stride)

@@ -1,0 +1,171 @@
+"""Where a camera is in a finished map by its depth alone, from a guess: "near the charging station".
+
+This does not search the map: rooms are full of corners that look alike to a depth camera. It aligns with the keyframes
+around the guess from several starts (`vision.depth_alignment`), and answers where nothing speaks against the pose: what
+overlaps fits, nothing is seen through, and no other start ends in another place that fits as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.core.camera import Camera
+from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
+from vislam.core.messages import Array, ImageF32
+from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
+from vislam.vision.depth_surface import SurfaceMaker
+
+_NEAREST_M, _FARTHEST_M, _SIGMA_RHO = 0.3, 8.0, 6e-3  # as frames are placed by depth in a run (`FrontEndConfig`)
+_PARTS = 4  # keyframes around a guess: more see the same
+_NEAR_M, _NEAR_RAD = 1.0, np.deg2rad(40.0)  # how far off a keyframe is as far as another is turned away
+_FAR = 2.0  # of those distances together: such a keyframe sees something else
+_LEAST_SHARE = 0.3  # of the pixels have depth
+_OVERLAP, _AGREEMENT, _SEEN_THROUGH, _RESIDUAL = 0.5, 0.9, 0.04, 1.5
+_SAME_M, _SAME_RAD = 0.03, np.deg2rad(1.5)  # two starts that end within this are at one place
+_RIVAL = 0.9  # of the best one's score: another place that fits as well as that
+_LEAST_STARTS = 3  # that end at the same place
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """Where the camera's body is thought to be in the map, and how far off that may be (standard deviations)."""
+
+    T_map_body: Array  # [4, 4]
+    sigma_m: float = 0.3
+    sigma_deg: float = 15.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthAnswer:
+    """What depth says of a guess."""
+
+    accepted: bool
+    reason: str  # why it was refused; empty otherwise
+    T_map_body: Array  # [4, 4]; the guess where nothing could be aligned
+    covariance: Array  # [6, 6] of its right perturbation, rotation first: the guess's in undetermined directions
+    determined: int  # directions, of six, that depth determines
+    undetermined: Array  # [6, 6 - determined] tangents of the body along which only the guess holds it
+    overlap: float  # share of the frame's surface that falls on the map's
+    agreement: float  # share of what could be compared that fits
+    seen_through: float  # share of what was compared that one side looks through
+
+
+class DepthLocaliser:
+    """Answers guesses by the depth of a map's keyframes."""
+
+    def __init__(self, camera: Camera, T_body_cam: Array, map_camera: Camera | None = None) -> None:
+        """Take the camera that depth is registered to, its place on the body, and that of the map's depth if other."""
+        self._T_body_cam = np.asarray(T_body_cam, dtype=np.float64)
+        self._maker = SurfaceMaker(camera, _NEAREST_M, _FARTHEST_M, _SIGMA_RHO)
+        other = camera if map_camera is None else map_camera
+        self._map_maker = SurfaceMaker(other, _NEAREST_M, _FARTHEST_M, _SIGMA_RHO)
+        self._parts: list[SeenFrom] = []
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def add(self, T_map_body: Array, depth_m: ImageF32) -> None:
+        """Add a keyframe of the map by its pose [4, 4] and depth image [H, W]; one without depth adds nothing.
+
+        Raises DataError for a pose that is not finite, or an image that has not the size of the map's camera.
+        """
+        T_map_cam = _checked(T_map_body) @ self._T_body_cam
+        seen = self._map_maker.make(depth_m)
+        if seen.share > 0.0:
+            self._parts.append(SeenFrom(seen, T_map_cam))
+
+    def localise(self, depth_m: ImageF32, guess: Guess) -> DepthAnswer:
+        """Return the pose of a depth image [H, W] near a guess, accepted or refused with the reason.
+
+        Raises DataError when the guess is not a finite pose or the image has not the size of the camera, UsageError
+        when the guess is not of positive uncertainty.
+        """
+        if not (0.0 < guess.sigma_m < np.inf and 0.0 < guess.sigma_deg < np.inf):
+            raise UsageError(
+                f"a guess may be off by {guess.sigma_m} m and {guess.sigma_deg} deg; both must be more than 0"
+            )
+        T_map_cam = _checked(guess.T_map_body) @ self._T_body_cam
+        sigmas = np.repeat([np.deg2rad(guess.sigma_deg), guess.sigma_m], 3)
+        prior = Prior(T_map_cam, np.diag(sigmas**2))
+        frame = self._maker.make(depth_m)
+        if frame.share < _LEAST_SHARE:
+            return self._refused(prior, None, f"only {frame.share:.0%} of the image has depth on surfaces")
+        parts = self._around(T_map_cam)
+        if not parts:
+            return self._refused(prior, None, "no keyframe of the map is near the guess")
+        found = [align_depth(frame, parts, prior, _SIGMA_RHO, T_map_cam @ se3_exp(start)) for start in _starts(sigmas)]
+        best = max(found, key=_score)
+        reason = _why_not(best, found)
+        return self._refused(prior, best, reason) if reason else self._answer(best, "")
+
+    def _around(self, T_map_cam: Array) -> Sequence[SeenFrom]:
+        """Return the keyframes whose views are most like that of a camera at T_map_cam [4, 4], the most alike first."""
+        apart = []
+        for part in self._parts:
+            T = invert(T_map_cam) @ part.T_model_cam
+            turned = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+            apart.append(float(np.linalg.norm(T[:3, 3])) / _NEAR_M + turned / _NEAR_RAD)
+        order = np.argsort(np.array(apart), kind="stable")[:_PARTS]
+        return [self._parts[k] for k in order if apart[k] <= _FAR]
+
+    def _refused(self, prior: Prior, found: DepthAlignment | None, reason: str) -> DepthAnswer:
+        if found is None:
+            found = DepthAlignment(prior.T_model_cam, prior.covariance, 0, np.eye(6), 0.0, 0.0, 0.0, np.inf, False)
+        return self._answer(found, reason)
+
+    def _answer(self, found: DepthAlignment, reason: str) -> DepthAnswer:
+        adjoint = se3_adjoint(self._T_body_cam)
+        basis = np.linalg.qr(adjoint @ found.undetermined)[0] if found.undetermined.size else np.empty((6, 0))
+        return DepthAnswer(
+            not reason, reason, found.T_model_cam @ invert(self._T_body_cam), adjoint @ found.covariance @ adjoint.T,
+            found.determined, basis, found.overlap, found.agreement, found.seen_through,
+        )  # fmt: skip
+
+
+def _checked(T_map_body: Array) -> Array:
+    T = np.asarray(T_map_body, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all() or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
+        raise DataError(f"a pose is a finite rigid transform [4, 4], got {T.shape}; see vislam.core.geometry.transform")
+    return T
+
+
+def _starts(sigmas: Array) -> Array:
+    """Return tangents [13, 6] to start from: the guess, and one standard deviation off it along each axis."""
+    return np.vstack([np.zeros(6), np.diag(sigmas), -np.diag(sigmas)])
+
+
+def _score(found: DepthAlignment) -> float:
+    return found.overlap * found.agreement * (1.0 - found.seen_through) if found.converged else 0.0
+
+
+def _why_not(best: DepthAlignment, found: Sequence[DepthAlignment]) -> str:
+    """Return why the best of several alignments is not to be trusted, or an empty string."""
+    if not best.converged:
+        return "the depth does not settle at any pose"
+    checks = (
+        (best.overlap < _OVERLAP, f"only {best.overlap:.0%} of the depth falls on the map"),
+        (best.agreement < _AGREEMENT, f"only {best.agreement:.0%} of what overlaps fits"),
+        (best.seen_through > _SEEN_THROUGH, f"{best.seen_through:.0%} of the surfaces are looked through"),
+        (best.residual > _RESIDUAL, f"surfaces lie apart by {best.residual:.1f} times what noise explains"),
+    )
+    reason = next((words for failed, words in checks if failed), "")
+    if reason:
+        return reason
+    same = [_is_same(best, other) for other in found]
+    if sum(same) < _LEAST_STARTS:
+        return f"only {sum(same)} of {len(found)} starts end there"
+    rivals = [o for o, is_same in zip(found, same, strict=True) if not is_same and _score(o) > _RIVAL * _score(best)]
+    return f"{len(rivals)} of {len(found)} starts end elsewhere and fit as well" if rivals else ""
+
+
+def _is_same(best: DepthAlignment, other: DepthAlignment) -> bool:
+    """Return whether two alignments are at one place, but for what depth does not determine."""
+    if not other.converged:
+        return False
+    change = se3_log(invert(best.T_model_cam) @ other.T_model_cam)
+    change = change - best.undetermined @ (best.undetermined.T @ change)
+    return bool(np.linalg.norm(change[:3]) <= _SAME_RAD and np.linalg.norm(change[3:]) <= _SAME_M)
