@@ -17,6 +17,7 @@ from vislam.frontend import FrontEnd, TrackResult, make_frontend
 from worlds.corner import FRAME_NS, T_BODY_CAM, World, path
 
 CONFIG = FrontEndConfig(track_sigma_px=0.1, readout_s=0.0, keyframe_parallax_px=12.0, described_features=300)
+VISION_ALONE = replace(CONFIG, depth_alone=False)
 COUNT = 50
 
 
@@ -157,7 +158,7 @@ def test_a_camera_at_rest_stays_where_it_is(kind: str) -> None:
 def test_blackout_is_lost_and_the_keyframe_is_found_again(kind: str) -> None:
     _, frames, poses = recording(kind)
     dark = [replace(f, images=tuple(np.full_like(i, 4) for i in f.images)) if 10 <= f.index < 14 else f for f in frames]
-    results = run(kind, dark[:20])
+    results = run(kind, dark[:20], VISION_ALONE)
     for result in results[10:14]:
         assert result.vo.tracking is Tracking.LOST and result.vo.T_keyframe_body is None and result.keyframe is None
         assert "tracks" in result.reason
@@ -176,7 +177,7 @@ def test_a_long_blackout_restarts_with_a_keyframe_that_is_lost(kind: str) -> Non
                  for f in dark[22:]]  # fmt: skip
     if kind == "stereo":  # turned images swap left and right
         dark[22:] = [replace(f, images=f.images[::-1]) for f in dark[22:]]
-    results = run(kind, dark[:30])
+    results = run(kind, dark[:30], VISION_ALONE)
     assert all(r.vo.tracking is Tracking.LOST for r in results[10:23])
     assert "corners" in results[20].reason and "grey 4" in results[20].reason
     first = results[22]

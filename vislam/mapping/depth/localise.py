@@ -19,7 +19,8 @@ from vislam.core.messages import Array, ImageF32
 from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
 from vislam.vision.depth_surface import SurfaceMaker
 
-_NEAREST_M, _FARTHEST_M, _SIGMA_RHO = 0.3, 8.0, 6e-3  # as frames are placed by depth in a run (`FrontEndConfig`)
+_NEAREST_M, _FARTHEST_M, _SIGMA_RHO = 0.3, 8.0, 2e-3  # as in a run (`FrontEndConfig`)
+_WIDER = 3.0  # times the standard deviations of depth, as frames are placed by it in a run
 _PARTS = 4  # keyframes around a guess: more see the same
 _NEAR_M, _NEAR_RAD = 1.0, np.deg2rad(40.0)  # how far off a keyframe is as far as another is turned away
 _FAR = 2.0  # of those distances together: such a keyframe sees something else
@@ -97,7 +98,10 @@ class DepthLocaliser:
         parts = self._around(T_map_cam)
         if not parts:
             return self._refused(prior, None, "no keyframe of the map is near the guess")
-        found = [align_depth(frame, parts, prior, _SIGMA_RHO, T_map_cam @ se3_exp(start)) for start in _starts(sigmas)]
+        found = [
+            align_depth(frame, parts, prior, _WIDER * _SIGMA_RHO, T_map_cam @ se3_exp(start))
+            for start in _starts(sigmas)
+        ]
         best = max(found, key=_score)
         reason = _why_not(best, found)
         return self._refused(prior, best, reason) if reason else self._answer(best, "")

@@ -68,7 +68,9 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
         mapper = Mapper(config, rig, one_camera)
         from_session = ran.map.enabled and (one_camera or _same_extraction(ran.map, config, rig))
-        nothing = GraphUpdate(0, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None, submaps=_submaps(session))
+        nothing = GraphUpdate(
+            0, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None, submaps=stored_submaps(session)
+        )
         mapper.move(nothing)
         total = len(placed) + len(config.products)
         tell = _teller(progress, total)
@@ -154,7 +156,7 @@ def _is_turn(T: Array) -> bool:
     return not np.array_equal(T, np.eye(4))
 
 
-def _submaps(session: Session) -> Submaps:
+def stored_submaps(session: Session) -> Submaps:
     """Return the submaps, and which of them the loops that the graph held at the end have joined."""
     submaps = Submaps()
     for packet in session.packets(light=True):
