@@ -1,4 +1,4 @@
-"""Depth images of made rooms, aligned with each other: what they tell is right, what they do not tell is not claimed."""
+"""Depth images of made rooms, aligned: what they tell is right, and what they do not tell is not claimed."""
 
 import numpy as np
 import pytest
