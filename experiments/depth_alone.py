@@ -4,11 +4,11 @@
     .venv/bin/python experiments/depth_alone.py --source tum:FOLDER --dark 1 2 4 --begin 4 --length 10
     .venv/bin/python experiments/depth_alone.py --imu
 
-The images of a recording are made black from `--begin` on, for so many seconds; depth stays as it is. `placed` is the share
-of the dark frames that have a pose relative to their keyframe, `drift` how far the keyframes just before and after the
-stretch are off relative to each other in the final graph, `ATE` that of all keyframes (SE(3)). `NEES` is the mean of
-e' P^-1 e over the frames that depth placed, six when the covariance is right; `by depth` says how far they are off from
-their keyframes (median).
+The images of a recording are made black from `--begin` on, for so many seconds; depth stays as it is. `placed` is the
+share of the dark frames that have a pose relative to their keyframe, `drift` how far the keyframes just before and after
+the stretch are off relative to each other in the final graph, `ATE` that of all keyframes (SE(3)). `NEES` is the mean of
+e' P^-1 e over the frames that depth placed, six when the covariance is right; "frames by depth off by" says how far they
+are off from their keyframes (median).
 """
 
 from __future__ import annotations
@@ -71,8 +71,9 @@ def values(recording: Recording, begin_s: float, dark_s: float, length_s: float,
         if since_s > length_s:
             return
         if begin_s <= since_s < begin_s + dark_s:
-            value = replace(value, images=tuple(np.full_like(image, BLACK) for image in value.images))
-        yield value
+            yield replace(value, images=tuple(np.full_like(image, BLACK) for image in value.images))
+        else:
+            yield value
 
 
 def outcome(recording: Recording, alone: bool, begin_s: float, dark_s: float, length_s: float, imu: bool) -> Outcome:
@@ -127,6 +128,7 @@ def of_frames(steps: list[Step], keyframes: dict[int, int], truth: Trajectory) -
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", nargs="+", default=SOURCES)
     parser.add_argument("--dark", nargs="+", type=float, default=(1.0, 3.0), help="lengths of the stretch in seconds")
