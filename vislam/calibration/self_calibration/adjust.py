@@ -19,7 +19,7 @@ from vislam.core.messages import Array, Bools
 
 _CAUCHY = 2.0  # standard deviations
 _MEDIAN_2 = 1.386  # of chi-square with two degrees of freedom
-_GATE = 4.0  # standard deviations beyond which an observation is no measurement
+_GATE = 6.0  # standard deviations beyond which an observation is no measurement
 _LEAST_SEEN = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-7, 1e6
 _CONVERGED = 1e-5  # relative change of the cost

@@ -60,7 +60,7 @@ def residuals(segment: Segment, at: Structure, camera: Camera, readout_s: float)
     """Return measured minus predicted pixels [n, m, 2]; NaN where not seen, or where no ray of the lens leads."""
     seen = np.einsum("nji,nmj->nmi", at.R, at.ray[None] - at.rho[None, :, None] * at.centre[:, None])
     predicted = camera.project(seen.reshape(-1, 3)).reshape(segment.pixels.shape)
-    return segment.pixels - predicted - readout_s * _lag(segment, camera)
+    return segment.pixels - predicted - readout_s * _lag(segment, camera, readout_s)
 
 
 def linearise(segment: Segment, at: Structure, camera: Camera, readout_s: float, kept: Bools) -> Linear:
@@ -79,7 +79,7 @@ def linearise(segment: Segment, at: Structure, camera: Camera, readout_s: float,
     by_ray = Rt @ _tangents(at.ray)[p]
     by_rho = -np.einsum("nij,nj->ni", Rt, centre)[:, :, None]
     by_point = A @ np.concatenate([by_ray, by_rho], axis=2)
-    lag = _lag(segment, camera)[k, p]
+    lag = _lag(segment, camera, readout_s)[k, p]
     by_shared = np.concatenate([by_lens(camera, seen), lag[:, :, None]], axis=2)
     return Linear(k, p, r[k, p], by_pose, by_point, by_shared)
 
@@ -104,10 +104,15 @@ def by_lens(camera: Camera, points: Array) -> Array:
     return np.stack([along_u, along_v], axis=1)
 
 
-def _lag(segment: Segment, camera: Camera) -> Array:
-    """Return by how much pixels [n, m, 2] lag for a second of readout."""
-    rows = segment.pixels[:, :, 1] / (camera.height - 1.0) - 0.5
-    return rows[:, :, None] * segment.velocity_px_s
+def _lag(segment: Segment, camera: Camera, readout_s: float) -> Array:
+    """Return by how much pixels [n, m, 2] lag for a second of readout.
+
+    A point that moves down is read later from frame to frame: more time has passed than between the stamps.
+    """
+    velocity, height = segment.velocity_px_s, camera.height - 1.0
+    rows = segment.pixels[:, :, 1] / height - 0.5
+    later = np.maximum(1.0 + velocity[:, :, 1] * readout_s / height, 0.5)
+    return np.asarray((rows / later)[:, :, None] * velocity)
 
 
 def _tangents(rays: Array) -> Array:
