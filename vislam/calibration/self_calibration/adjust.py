@@ -19,7 +19,8 @@ from vislam.core.messages import Array, Bools
 
 _CAUCHY = 2.0  # standard deviations
 _MEDIAN_2 = 1.386  # of chi-square with two degrees of freedom
-_GATE = 6.0  # standard deviations beyond which an observation is no measurement
+_GATE = 6.0  # standard deviations beyond which an observation is no measurement ...
+_GATE_SHARE = 0.001  # ... unless it is nearer than this of the image's width: gates that close on themselves bias
 _LEAST_SEEN = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-7, 1e6
 _CONVERGED = 1e-5  # relative change of the cost
@@ -143,7 +144,7 @@ def judged(piece: Piece, shared: Shared, sigma_px: float) -> Piece:
     """Return the piece with every observation that fits, of points that three keyframes or more see."""
     r = residuals(piece.segment, piece.at, shared.camera, shared.readout_s)
     with np.errstate(invalid="ignore"):
-        kept = np.linalg.norm(r, axis=2) < _GATE * sigma_px
+        kept = np.linalg.norm(r, axis=2) < max(_GATE * sigma_px, _GATE_SHARE * shared.camera.width)
         kept &= (piece.at.rho > -0.05) & (piece.at.rho < _MAX_RHO)
     kept &= kept.sum(axis=0) >= _LEAST_SEEN
     return replace(piece, kept=kept)

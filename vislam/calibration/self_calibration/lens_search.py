@@ -1,57 +1,121 @@
-"""From tracks to a lens: which focal length fits at all, then the whole lens, with what the stretches say against it."""
+"""From tracks to a lens: which focal length fits at all, then the whole lens with the readout."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vislam.calibration.self_calibration.adjust import (
-    Piece,
-    Prior,
-    Shared,
-    adjust,
-    judged,
-    scatter_px,
-)
+from vislam.calibration.self_calibration.adjust import Piece, Prior, Shared, adjust, judged, scatter_px
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.start import placed_points, start_structure
 from vislam.calibration.self_calibration.structure import READOUT, SHARED
 from vislam.core.camera import Camera
 from vislam.core.messages import Bools
 
-_FACTORS = (0.64, 0.8, 1.0, 1.25, 1.56)
-_SIGMA_PX = 0.5  # before residuals tell
-_LEAST_SIGMA_PX = 0.05
+_FACTORS = (1.0, 0.8, 1.25, 0.64, 1.56)  # of the focal length that is tried, the likeliest first
+_START_PX = 2.0  # noise while the lens is still wrong
+_LEAST_PX = 0.05
+_START_STEPS, _STEPS = 8, 15
+_ROUNDS = 3
+_LEAST_PIECES = 0.5  # share of the stretches that a focal length must let begin
+# What is taken of cameras in general, one sigma: principal point in the middle, square pixels, modest distortion
+_CENTRE = 0.04  # of the width
+_RADTAN = (0.5, 0.5, 0.01, 0.01)
+_EQUIDISTANT = (0.3, 0.3, 0.3, 0.3)
+_READOUT_S = 0.02
+_ASPECT = 0.01
+
+Rematch = Callable[[Sequence[Piece], Shared], list[Segment]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Structures and lens that fit what was seen."""
+
+    pieces: list[Piece]
+    shared: Shared
+    prior: Prior
+    sigma_px: float
 
 
 def prior_of(camera: Camera) -> Prior:
-    mean = np.array([0.0, 0.0, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0, 0.0])
-    centre = 0.04 * camera.width
-    k = [0.5, 0.5, 0.01, 0.01] if camera.distortion == "radtan" else [0.3, 0.3, 0.3, 0.3]
-    sigma = np.array([np.inf, np.inf, centre, centre, *k, 0.02])
-    return Prior(mean, 1.0 / sigma**2, 1.0 / 0.01**2)
+    """Return what is taken of cameras in general."""
+    centre = _CENTRE * camera.width
+    k = _EQUIDISTANT if camera.distortion == "equidistant" else _RADTAN
+    sigma = np.array([np.inf, np.inf, centre, centre, *k, _READOUT_S])
+    mean = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *np.zeros(5)])
+    return Prior(mean, sigma**-2.0, _ASPECT**-2.0)
 
 
-def only(*places: int) -> Bools:
-    free = np.zeros(SHARED, dtype=np.bool_)
-    free[list(places)] = True
-    return free
+def find_lens(segments: Sequence[Segment], camera: Camera, rematch: Rematch | None) -> Solution | None:
+    """Return the lens that explains the stretches, beginning at a guess; None where hardly any begins.
+
+    `rematch` finds observations again once structure and lens are roughly known.
+    """
+    prior = prior_of(camera)
+    shared = _swept(segments, camera, prior)
+    if shared is None:
+        return None
+    pieces = begun(segments, shared.camera)
+    pieces, shared, _ = adjust(pieces, shared, prior, _only(0, 1, 4, READOUT), _START_PX, _START_STEPS)
+    solution = refined(Solution(pieces, shared, prior, scatter_px(pieces, shared)))
+    if rematch is None:
+        return solution
+    matched = rematch(solution.pieces, solution.shared)
+    pieces = [replace(p, segment=s, kept=_seen(s)) for p, s in zip(solution.pieces, matched, strict=True)]
+    return refined(replace(solution, pieces=pieces))
+
+
+def refined(solution: Solution) -> Solution:
+    """Return the solution with all unknowns free, every point placed anew and judged, round after round."""
+    prior, sigma_px = solution.prior, solution.sigma_px
+    pieces, shared = solution.pieces, solution.shared
+    free = np.ones(SHARED, dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        pieces = [_placed(piece, shared.camera) for piece in pieces]
+        for _ in range(2):
+            pieces, shared, _ = adjust(pieces, shared, prior, free, max(sigma_px, _LEAST_PX), _STEPS)
+            sigma_px = scatter_px(pieces, shared)
+            pieces = [judged(piece, shared, sigma_px) for piece in pieces]
+    return Solution(pieces, shared, prior, max(sigma_px, _LEAST_PX))
 
 
 def begun(segments: Sequence[Segment], camera: Camera) -> list[Piece]:
-    pieces = []
-    for segment in segments:
-        found = start_structure(segment, camera)
-        if found is not None:
-            pieces.append(Piece(segment, found[0], np.isfinite(segment.pixels[:, :, 0]) & found[1]))
-    return pieces
+    """Return the stretches that a lens lets begin."""
+    starts = [(segment, start_structure(segment, camera)) for segment in segments]
+    return [Piece(segment, found[0], _seen(segment) & found[1]) for segment, found in starts if found is not None]
 
 
-def replaced(piece: Piece, camera: Camera) -> Piece:
+def _swept(segments: Sequence[Segment], camera: Camera, prior: Prior) -> Shared | None:
+    """Return the lens, of those that the focal lengths tried lead to, which leaves the least residuals."""
+    best, least = None, np.inf
+    for factor in _FACTORS:
+        start = Shared(replace(camera, fx=factor * camera.fx, fy=factor * camera.fy), 0.0)
+        pieces = begun(segments, start.camera)
+        if len(pieces) < max(_LEAST_PIECES * len(segments), 1):
+            continue
+        pieces, shared, _ = adjust(pieces, start, prior, _only(0, 1, 4), _START_PX, _START_STEPS)
+        left = scatter_px(pieces, shared)
+        if left < least:
+            best, least = shared, left
+    return best
+
+
+def _placed(piece: Piece, camera: Camera) -> Piece:
+    """Return the piece with all its points triangulated anew, also those that were left out."""
     found = placed_points(piece.segment, camera, piece.at.R, piece.at.centre, piece.at.origin)
     if found is None:
         return piece
-    at, known = found
-    return Piece(piece.segment, at, np.isfinite(piece.segment.pixels[:, :, 0]) & known)
+    return Piece(piece.segment, found[0], _seen(piece.segment) & found[1])
+
+
+def _seen(segment: Segment) -> Bools:
+    return np.isfinite(segment.pixels[:, :, 0])
+
+
+def _only(*places: int) -> Bools:
+    free = np.zeros(SHARED, dtype=np.bool_)
+    free[list(places)] = True
+    return free

@@ -52,7 +52,7 @@ def placed_points(segment: Segment, camera: Camera, R: Array, centre: Array, ori
     points, known = _triangulated(xy, np.concatenate([Rt, -(Rt @ centre[:, :, None])], axis=2))
     if known.sum() < _LEAST:
         return None
-    length = np.linalg.norm(points[:, :3], axis=1)
+    length = np.maximum(np.linalg.norm(points[:, :3], axis=1), 1e-12)
     rho = np.where(known, points[:, 3] / length, 1.0)
     scale = float(np.median(1.0 / rho[known]))
     ray = np.where(known[:, None], points[:, :3] / length[:, None], [0.0, 0.0, 1.0])
