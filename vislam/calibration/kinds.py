@@ -53,6 +53,11 @@ KINDS = {
         "cameras.rgbd.calibrate_rgbd",
         "place and lag of depth against colour, focal length, values that mean no depth",
     ),
+    "self": Kind(
+        o.SelfOptions,
+        "self_calibration.waving.calibrate_self",
+        "focal length, centre, distortion and readout without a board, from waving the camera about",
+    ),
     "sensors": Kind(
         o.SensorsOptions,
         "extrinsics.run_sensors.calibrate_sensors",

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from vislam.config import CalibrationConfig
-from vislam.config.ranges import Count, NonNegative, Positive, Share
+from vislam.config.ranges import Count, NonNegative, Positive, Range, Share
 
 
 @dataclass(frozen=True)
@@ -176,6 +176,28 @@ class RgbdOptions:
     """Recording with depth, as for `vislam run`: turned to all sides, before things that stand one behind the other"""
     out: Path = Path("calibration")
     """Folder for sensor.yaml (ASL, with our keys of depth), rgbd.png and rgbd.json"""
+    overwrite: bool = False
+    """Replace what an earlier calibration wrote"""
+    json: bool = False
+    """Print the report as JSON instead of a table"""
+
+
+@dataclass(frozen=True)
+class SelfOptions:
+    """Options of `vislam calibrate self`."""
+
+    source: Positional[str]
+    """Recording as for `vislam run`: 60 s of a camera waved about before a textured scene, turned to all sides"""
+    fov_deg: Annotated[float, Range(20.0, 200.0)] = 65.0
+    """Horizontal field of view, roughly: focal lengths from 0.6 to 1.6 times what it gives are tried"""
+    model: Literal["auto", "radtan", "equidistant"] = "auto"
+    """radtan: k1 k2 p1 p2; equidistant: lenses of over 100 degrees; auto: by the field of view"""
+    max_s: Positive = 120.0
+    """Only the first so many seconds"""
+    max_stretches: Count = 20
+    """So many stretches of some 20 keyframes, spread over the recording; more cost time and memory"""
+    out: Path = Path("calibration")
+    """Folder for camchain.yaml (Kalibr), self.png and self.json"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
     json: bool = False

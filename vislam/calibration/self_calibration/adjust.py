@@ -22,7 +22,8 @@ _MEDIAN_2 = 1.386  # of chi-square with two degrees of freedom
 _GATE = 6.0  # standard deviations beyond which an observation is no measurement ...
 _GATE_SHARE = 0.001  # ... unless it is nearer than this of the image's width: gates that close on themselves bias
 _LEAST_SEEN = 3
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-7, 1e6
+_LEAST_FLOWS = 12  # tracks of a keyframe that may tell how the camera moved
+_LEAST_DAMPING, _MOST_DAMPING = 1e-8, 1e6
 _CONVERGED = 1e-5  # relative change of the cost
 _RIDGE = 1e-9  # relative: keeps free scales and points that nobody places regular
 _MAX_RHO = 50.0  # in units of the usual distance
@@ -88,11 +89,16 @@ class Reduced:
 
 
 def adjust(
-    pieces: Sequence[Piece], shared: Shared, prior: Prior, free: Bools, sigma_px: float, iterations: int
+    pieces: Sequence[Piece],
+    shared: Shared,
+    prior: Prior,
+    free: Bools,
+    sigma_px: float,
+    iterations: int,
+    damping: float = 1e-3,
 ) -> tuple[list[Piece], Shared, float]:
     """Return pieces, shared unknowns and cost after so many steps at most; only `free` [SHARED] ones move."""
     pieces = list(pieces)
-    damping = _FIRST_DAMPING
     cost = _cost(pieces, shared, prior, sigma_px)
     for _ in range(iterations):
         reduced = [_reduced(piece, shared, sigma_px, damping) for piece in pieces]
@@ -136,8 +142,37 @@ def scatter_px(pieces: Sequence[Piece], shared: Shared) -> float:
         squares.append(np.sum(r[np.isfinite(r).all(axis=1)] ** 2, axis=1))
         numbers += 2 * len(r)
         unknowns += 3 * int(piece.kept.any(axis=0).sum()) + 6 * len(piece.at.R)
-    share = max(1.0 - unknowns / max(numbers, 1), 0.2)
+    if not numbers:
+        return float("inf")
+    share = max(1.0 - unknowns / numbers, 0.2)
     return float(np.sqrt(np.median(np.concatenate(squares)) / _MEDIAN_2 / share))
+
+
+def steadied(piece: Piece, shared: Shared) -> Piece:
+    """Return the piece with the velocities that one motion of the camera gives in each keyframe, fitted to the flow.
+
+    Noise of single velocities would hide a rolling shutter: most of what it does looks like motion and turning, and
+    what is left to see is less than that noise (errors in variables).
+    """
+    segment = piece.segment
+    seen = linearise(segment, piece.at, shared.camera, shared.readout_s, piece.kept)
+    velocity = segment.velocity_px_s.copy()
+    bounds = np.searchsorted(seen.keyframe, np.arange(len(piece.at.R) + 1))
+    for k, (a, b) in enumerate(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)):
+        if b - a < _LEAST_FLOWS:
+            continue
+        J, points = seen.by_pose[a:b], seen.point[a:b]
+        flow = segment.flow_px_s[k, points]
+        weight = np.ones(b - a)
+        for _ in range(4):
+            W = J * weight[:, None, None]
+            A = np.einsum("nij,nik->jk", W, J)
+            A += np.diag(1e-9 * np.diag(A) + 1e-12)  # of a pure turn the shift is free
+            left = flow - J @ np.linalg.solve(A, np.einsum("nij,ni->j", W, flow))
+            off = np.sum(left**2, axis=1)
+            weight = 1.0 / (1.0 + off / max(float(np.median(off)), 1e-6))
+        velocity[k, points] = flow - left
+    return replace(piece, segment=replace(segment, velocity_px_s=velocity))
 
 
 def judged(piece: Piece, shared: Shared, sigma_px: float) -> Piece:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vislam.calibration.self_calibration.adjust import Piece, Prior, Shared, adjust, judged, scatter_px
+from vislam.calibration.self_calibration.adjust import Piece, Prior, Shared, adjust, judged, scatter_px, steadied
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.start import placed_points, start_structure
 from vislam.calibration.self_calibration.structure import READOUT, SHARED
@@ -17,8 +17,11 @@ from vislam.core.messages import Bools
 _FACTORS = (1.0, 0.8, 1.25, 0.64, 1.56)  # of the focal length that is tried, the likeliest first
 _START_PX = 2.0  # noise while the lens is still wrong
 _LEAST_PX = 0.05
-_START_STEPS, _STEPS = 8, 15
-_ROUNDS = 3
+_START_STEPS, _STEPS = 8, 8
+_ROUNDS = 2
+_TRIED = 6  # stretches with which focal lengths are tried
+_DAMPING = 1e-6  # near the end: what is weakly determined would creep under more
+_WORST = 3.0  # times the usual scatter: such a stretch ended in a minimum of its own
 _LEAST_PIECES = 0.5  # share of the stretches that a focal length must let begin
 # What is taken of cameras in general, one sigma: principal point in the middle, square pixels, modest distortion
 _CENTRE = 0.04  # of the width
@@ -76,21 +79,31 @@ def refined(solution: Solution) -> Solution:
     for _ in range(_ROUNDS):
         pieces = [_placed(piece, shared.camera) for piece in pieces]
         for _ in range(2):
-            pieces, shared, _ = adjust(pieces, shared, prior, free, max(sigma_px, _LEAST_PX), _STEPS)
+            pieces, shared, _ = adjust(pieces, shared, prior, free, max(sigma_px, _LEAST_PX), _STEPS, _DAMPING)
             sigma_px = scatter_px(pieces, shared)
-            pieces = [judged(piece, shared, sigma_px) for piece in pieces]
+            pieces = [steadied(judged(piece, shared, sigma_px), shared) for piece in pieces]
+        pieces = _agreeing(pieces, shared)
     return Solution(pieces, shared, prior, max(sigma_px, _LEAST_PX))
+
+
+def _agreeing(pieces: list[Piece], shared: Shared) -> list[Piece]:
+    """Return the pieces that fit as well as others and keep as many of their observations."""
+    scatter = np.array([scatter_px([piece], shared) for piece in pieces])
+    share = np.array([piece.kept.sum() / max(_seen(piece.segment).sum(), 1) for piece in pieces])
+    good = (scatter < _WORST * np.median(scatter)) & (share > np.median(share) / _WORST)
+    return [piece for piece, fits in zip(pieces, good.tolist(), strict=True) if fits]
 
 
 def begun(segments: Sequence[Segment], camera: Camera) -> list[Piece]:
     """Return the stretches that a lens lets begin."""
-    starts = [(segment, start_structure(segment, camera)) for segment in segments]
-    return [Piece(segment, found[0], _seen(segment) & found[1]) for segment, found in starts if found is not None]
+    starts = [start_structure(segment, camera) for segment in segments]
+    return [Piece(found[0], found[1], _seen(found[0]) & found[2]) for found in starts if found is not None]
 
 
 def _swept(segments: Sequence[Segment], camera: Camera, prior: Prior) -> Shared | None:
     """Return the lens, of those that the focal lengths tried lead to, which leaves the least residuals."""
     best, least = None, np.inf
+    segments = segments[:: max(len(segments) // _TRIED, 1)]
     for factor in _FACTORS:
         start = Shared(replace(camera, fx=factor * camera.fx, fy=factor * camera.fy), 0.0)
         pieces = begun(segments, start.camera)

@@ -55,7 +55,7 @@ def _homes(piece: Piece) -> Array:
 
 
 def _warps(camera: Camera, at: Structure, seen: Array, home: Array, points: Array, k: int) -> Array:
-    """Return how pixels about a point in its home move [N, 2, 2] with those in keyframe k, were it flat, facing home."""
+    """Return how pixels about a point at home move [N, 2, 2] with those in keyframe k, if it is flat and faces home."""
     h = home[points]
     at_home = camera.project_jacobian(seen[h, points])[:, :, :2]
     turned = np.einsum("ji,njl->nil", at.R[k], at.R[h][:, :, :2])

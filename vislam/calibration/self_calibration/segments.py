@@ -6,6 +6,7 @@ out, and leaving out one at a time shows how far they contradict each other.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
-from vislam.core.messages import Array, Frame
+from vislam.core.messages import Array, Bools, Frame
 from vislam.frontend.tracker import Tracker
 
 _SPACING = 0.045  # of the image's width that tracks have moved at the next keyframe
@@ -21,7 +22,7 @@ _ALIVE = 0.6  # share of tracks below which there is a keyframe in any case
 _LONGEST_S = 1.0  # between keyframes: longer, and inertial dead reckoning says nothing
 _LINKED = 30  # tracks that keyframes must share to stand in one stretch
 _KEYFRAMES = 20  # of a stretch
-_LEAST_KEYFRAMES = 6
+LEAST_KEYFRAMES = 6
 _LEAST_SEEN = 3  # keyframes that must have seen a point
 _MOST_POINTS = 450  # of a stretch: those seen longest
 
@@ -32,7 +33,12 @@ class Segment:
 
     t_ns: NDArray[np.int64]  # [n]
     pixels: Array  # [n, m, 2]
-    velocity_px_s: Array  # [n, m, 2], from the frames before and after
+    flow_px_s: Array  # [n, m, 2], from the frames before and after
+    velocity_px_s: Array  # [n, m, 2], the same, or what is made of it
+
+    def of(self, keyframes: Bools) -> Segment:
+        """Return the stretch without the other keyframes."""
+        return Segment(*(table[keyframes] for table in (self.t_ns, self.pixels, self.flow_px_s, self.velocity_px_s)))
 
 
 @dataclass(slots=True)
@@ -125,7 +131,7 @@ def _groups(keyframes: list[_Keyframe]) -> list[list[_Keyframe]]:
     for run in runs:
         parts = max(round(len(run) / _KEYFRAMES), 1)
         edges = np.linspace(0, len(run), parts + 1).round().astype(int).tolist()
-        out += [run[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= _LEAST_KEYFRAMES]
+        out += [run[a:b] for a, b in itertools.pairwise(edges) if b - a >= LEAST_KEYFRAMES]
     return out
 
 
@@ -143,4 +149,4 @@ def _segment(group: list[_Keyframe]) -> Segment | None:
         moves = np.isfinite(key.velocity[there]).all(axis=1)  # one that is lost in the next frame is a bad one
         pixels[k, here[moves]] = key.pixels[there[moves]]
         velocity[k, here[moves]] = key.velocity[there[moves]]
-    return Segment(np.array([key.t_ns for key in group], dtype=np.int64), pixels, velocity)
+    return Segment(np.array([key.t_ns for key in group], dtype=np.int64), pixels, velocity, velocity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vislam.calibration.self_calibration.segments import Segment
+from vislam.calibration.self_calibration.segments import LEAST_KEYFRAMES, Segment
 from vislam.calibration.self_calibration.structure import Structure
 from vislam.core.camera import Camera
 from vislam.core.geometry import so3_exp
@@ -18,34 +18,52 @@ _GATE_PX = 4.0  # of a wrong lens: half a per cent of the image
 _TRIES = 200
 
 
-def start_structure(segment: Segment, camera: Camera) -> tuple[Structure, Bools] | None:
-    """Return poses and points as a lens sees them, and which [m] are placed; None where views do not fit together."""
+def start_structure(segment: Segment, camera: Camera) -> tuple[Segment, Structure, Bools] | None:
+    """Return poses and points as a lens sees them; None where the views do not fit together.
+
+    Returns:
+        The stretch with those of its keyframes that found a place, the structure, and which points [m] are placed.
+    """
     n, m = segment.pixels.shape[:2]
     xy = camera.normalise(segment.pixels.reshape(-1, 2)).reshape(n, m, 2)
     gate = _GATE_PX * camera.width / 640.0 / camera.fx
-    pair = _first_pair(xy)
-    if pair is None:
+    best: Array = np.full((n, 3, 4), np.nan)
+    origin = 0
+    for first, second in _first_pairs(xy):
+        T = _chained(xy, first, second, gate)
+        if np.isfinite(T[:, 0, 0]).sum() > np.isfinite(best[:, 0, 0]).sum():
+            best, origin = T, first
+        if np.isfinite(best[:, 0, 0]).all():
+            break
+    good = np.isfinite(best[:, 0, 0])
+    if good.sum() < LEAST_KEYFRAMES:
         return None
-    first, second = pair
+    R = best[good, :, :3].transpose(0, 2, 1)
+    centre = -np.einsum("nij,nj->ni", R, best[good, :, 3])
+    rest = segment.of(good)
+    found = placed_points(rest, camera, R, centre, int(good[:origin].sum()))
+    return None if found is None else (rest, *found)
+
+
+def _chained(xy: Array, first: int, second: int, gate: float) -> Array:
+    """Return poses [n, 3, 4] from the stretch to each camera, begun with two of them; NaN where one has no place."""
+    T = np.full((len(xy), 3, 4), np.nan)
     found = essential_ransac(None, xy[first], xy[second], gate, _LEAST)
     if found is None:
-        return None
-    T = np.full((n, 3, 4), np.nan)  # from the stretch to each camera
+        return T
     T[first] = np.eye(3, 4)
     T[second] = np.column_stack([found[0].T, -found[0].T @ found[1]])
     middle = (first + second) // 2
-    for k in sorted(range(n), key=lambda k: (abs(k - middle), k)):
-        if k in pair:
-            continue
-        points, known = _triangulated(xy, T)
-        T[k] = _resected(points, known, xy[k], gate)
-    if np.isnan(T[:, 0, 0]).any():
-        return None
-    R = T[:, :, :3].transpose(0, 2, 1)
-    return placed_points(segment, camera, R, -np.einsum("nij,nj->ni", R, T[:, :, 3]), first)
+    for _ in range(2):  # who did not see enough may do so once others have placed more
+        for k in sorted(range(len(xy)), key=lambda k: (abs(k - middle), k)):
+            if np.isnan(T[k, 0, 0]):
+                T[k] = _resected(*_triangulated(xy, T), xy[k], gate)
+    return T
 
 
-def placed_points(segment: Segment, camera: Camera, R: Array, centre: Array, origin: int) -> tuple[Structure, Bools] | None:
+def placed_points(
+    segment: Segment, camera: Camera, R: Array, centre: Array, origin: int
+) -> tuple[Structure, Bools] | None:
     """Return the structure of known poses, its usual distance 1, and which points [m] have a place; None: too few."""
     xy = camera.normalise(segment.pixels.reshape(-1, 2)).reshape(segment.pixels.shape)
     Rt = R.transpose(0, 2, 1)
@@ -59,15 +77,15 @@ def placed_points(segment: Segment, camera: Camera, R: Array, centre: Array, ori
     return Structure(R, centre / scale, ray, np.where(known, rho * scale, 1.0), origin), known
 
 
-def _first_pair(xy: Array) -> tuple[int, int] | None:
-    """Return the two keyframes about the middle that are furthest apart and still share enough tracks."""
+def _first_pairs(xy: Array) -> list[tuple[int, int]]:
+    """Return pairs of keyframes about the middle to begin with: far apart, but sharing enough tracks; then nearer."""
     n = len(xy)
     seen = np.isfinite(xy[:, :, 0])
-    for half in range(n // 2 - 1, 0, -1):
-        first, second = n // 2 - half, n // 2 + half
-        if int((seen[first] & seen[second]).sum()) >= _SHARED:
-            return first, second
-    return None
+    enough = min(_SHARED, 0.5 * float(np.median(seen.sum(axis=1))))
+    halves = [h for h in range(n // 2 - 1, 0, -1) if (seen[n // 2 - h] & seen[n // 2 + h]).sum() >= enough]
+    return [
+        (n // 2 - h, n // 2 + h) for h in dict.fromkeys([*halves[:1], *halves[len(halves) // 2 :][:1], *halves[-1:]])
+    ]
 
 
 def _triangulated(xy: Array, T: Array) -> tuple[Array, Array]:

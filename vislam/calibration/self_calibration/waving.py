@@ -1,0 +1,249 @@
+"""`vislam calibrate self`: a camera's lens from waving it about before anything with texture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vislam.calibration.options import SelfOptions
+from vislam.calibration.outcome import Folder, Outcome, refuse
+from vislam.calibration.self_calibration.adjust import Piece, Shared
+from vislam.calibration.self_calibration.certainty import Certainty, certainty
+from vislam.calibration.self_calibration.lens_search import Solution, find_lens
+from vislam.calibration.self_calibration.patches import found_again
+from vislam.calibration.self_calibration.segments import Segment, follow_segments
+from vislam.calibration.self_calibration.structure import READOUT
+from vislam.core.camera import Camera
+from vislam.core.geometry import so3_log
+from vislam.core.messages import Array, Frame
+from vislam.core.recording import Recording
+from vislam.datasets.camera_files import CameraCalibration, camchain_text
+from vislam.run.sources import open_source
+
+_FILES = ("camchain.yaml", "self.png", "self.json")
+_WIDE_DEG = 100.0  # a wider lens is no pinhole
+_LEAST_SEGMENTS = 4
+_MAX_FOCAL_SIGMA = 0.01  # relative
+_MAX_CENTRE_SIGMA = 0.02  # of the image's width
+_MAX_SIGMA_PX = 2.0  # noise of tracks: more, and what moves is the scene, or it is all blur
+_GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter
+_SAME = 3.0  # sigmas
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SelfResult:
+    """The lens and what it rests on."""
+
+    solution: Solution
+    known: Certainty
+    segments: int  # that were followed, whether or not they could be reconstructed
+
+    @property
+    def camera(self) -> Camera:
+        """The lens."""
+        return self.solution.shared.camera
+
+    @property
+    def focal_sigma(self) -> float:
+        """Relative sigma of the worse focal length."""
+        return float(max(self.known.sigmas[0] / self.camera.fx, self.known.sigmas[1] / self.camera.fy))
+
+
+def calibrate_self(options: SelfOptions) -> Outcome:
+    """Calibrate and write; raises DataError when the motion does not show the lens."""
+    folder = Folder(options.out, _FILES, options.overwrite)
+    result = solve_self(open_source(options.source), options)
+    report = _report(result, options)
+    comment = f"without a board, from {options.source}; focal length to {result.focal_sigma:.2%} (1 sigma)"
+    path = folder.write_text("camchain.yaml", camchain_text([CameraCalibration(result.camera)], comment))
+    folder.write_picture("self.png", (11.0, 3.8), lambda figure, colors: draw(figure, colors, result))
+    folder.write_report("self.json", report)
+    readout_s = result.solution.shared.readout_s
+    rolling = f" --frontend.readout-s {readout_s:.4f}" if readout_s > _GLOBAL_S else ""
+    lines = (*_lines(result), f"next: vislam run ... --calibration.camera {path}{rolling}")
+    return Outcome(report, lines, tuple(folder.files))
+
+
+def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
+    """Return the lens; raises DataError that says what the motion lacks."""
+    what = f"the camera of {options.source}"
+    start = _guess(recording.rig.cameras[0], options)
+    segments = follow_segments(_frames(recording, options.max_s), start.width, options.max_stretches)
+    refuse(what, [_too_few(len(segments))] if len(segments) < _LEAST_SEGMENTS else [])
+    solution = find_lens(segments, start, lambda pieces, shared: _rematched(recording, options, pieces, shared))
+    count = 0 if solution is None else len(solution.pieces)
+    if solution is None or count < _LEAST_SEGMENTS:
+        refuse(what, [
+            f"only {count} of {len(segments)} stretches can be reconstructed with any focal length near "
+            f"{start.fx:.0f} px; move sideways as well as turn, keep to a scene that stands still, and check --fov-deg"
+        ])  # fmt: skip
+        raise AssertionError  # refuse has raised
+    result = SelfResult(solution, certainty(solution), len(segments))
+    refuse(what, _doubts(result))
+    return result
+
+
+def _guess(told: Camera, options: SelfOptions) -> Camera:
+    """Return the camera to begin with: of what a recording says of its own only the size is used."""
+    wide = options.model == "equidistant" or (options.model == "auto" and options.fov_deg > _WIDE_DEG)
+    half = 0.5 * np.deg2rad(options.fov_deg)
+    focal = 0.5 * told.width / (half if wide else np.tan(half))
+    return Camera(
+        told.width, told.height, focal, focal, 0.5 * (told.width - 1), 0.5 * (told.height - 1), 0.0,
+        "equidistant" if wide else "radtan", (0.0,) * 4,
+    )  # fmt: skip
+
+
+def _frames(recording: Recording, max_s: float) -> Iterator[Frame]:
+    begin: int | None = None
+    for value in recording.events():
+        if isinstance(value, Frame):
+            begin = value.t_ns if begin is None else begin
+            if value.t_ns - begin > max_s * 1e9:
+                return
+            yield value
+
+
+def _rematched(recording: Recording, options: SelfOptions, pieces: Sequence[Piece], shared: Shared) -> list[Segment]:
+    """Read the images again, those of one stretch at a time, and match its observations anew."""
+    frames = _frames(recording, options.max_s)
+    out = []
+    for piece in pieces:
+        wanted = set(piece.segment.t_ns.tolist())
+        images = []
+        for frame in frames:
+            if frame.t_ns in wanted and frame.images:
+                images.append(frame.images[0])
+            if frame.t_ns >= piece.segment.t_ns[-1]:
+                break
+        out.append(found_again(piece, shared, images) if len(images) == len(wanted) else piece.segment)
+    return out
+
+
+def _too_few(count: int) -> str:
+    return (
+        f"only {count} stretches of it show the same points from several sides, {_LEAST_SEGMENTS} are needed; wave the "
+        "camera about for 60 s before something with texture, without blur"
+    )
+
+
+def _doubts(result: SelfResult) -> list[str]:
+    doubts = []
+    if result.solution.sigma_px > _MAX_SIGMA_PX:
+        doubts.append(
+            f"points are {result.solution.sigma_px:.1f} px from where a rigid scene has them; film what stands still, "
+            "slowly enough for sharp images"
+        )
+    turned, travelled = _motion(result)
+    moved = (
+        f"in a stretch it turns by {turned[0]:.0f}, {turned[1]:.0f} and {turned[2]:.0f} deg about its x, y and z and "
+        f"travels {travelled:.0%} of the distance of what it sees"
+    )
+    if not result.focal_sigma < _MAX_FOCAL_SIGMA:
+        doubts.append(
+            f"the focal length would be known to {result.focal_sigma:.1%} only: {moved}; turn it by 30 deg and more "
+            "up and down and to both sides while it moves: straight motion alone never shows a focal length"
+        )
+    centre = float(np.max(result.known.sigmas[2:4]))
+    if not centre < _MAX_CENTRE_SIGMA * result.camera.width:
+        doubts.append(
+            f"the principal point would be known to {centre:.0f} px only: {moved}; roll it about its optical axis by "
+            "30 deg and more"
+        )
+    return doubts
+
+
+def _motion(result: SelfResult) -> tuple[Array, float]:
+    """Return by how much a usual stretch turns about the camera's axes [3] in degrees, and travels over distance."""
+    turns, ways = [], []
+    for piece in result.solution.pieces:
+        middle = piece.at.R[len(piece.at.R) // 2]
+        vectors = np.array([so3_log(np.ascontiguousarray(middle.T @ R)) for R in piece.at.R])
+        turns.append(np.ptp(vectors, axis=0))
+        ways.append(float(np.linalg.norm(np.ptp(piece.at.centre, axis=0))))
+    return np.rad2deg(np.median(turns, axis=0)), float(np.median(ways))
+
+
+def _statements(result: SelfResult) -> list[str]:
+    said = []
+    if result.known.grouping > 2.0:
+        said.append(
+            f"stretches contradict each other {np.sqrt(result.known.grouping):.1f} times as much as single pixels "
+            "scatter; sigmas are widened by that"
+        )
+    readout_s, sigma_s = result.solution.shared.readout_s, float(result.known.sigmas[READOUT])
+    if readout_s > max(_GLOBAL_S, _SAME * sigma_s):
+        said.append(f"the shutter rolls: {1e3 * readout_s:.1f} ± {1e3 * sigma_s:.1f} ms from the first to the last row")
+    lost = result.segments - len(result.solution.pieces)
+    if lost:
+        said.append(f"{lost} of {result.segments} stretches could not be reconstructed")
+    return said
+
+
+def _names(camera: Camera) -> list[str]:
+    k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2"]
+    return ["fx", "fy", "cx", "cy", *k, "readout_s"]
+
+
+def _report(result: SelfResult, options: SelfOptions) -> dict[str, Any]:
+    pieces, names = result.solution.pieces, _names(result.camera)
+    turned, travelled = _motion(result)
+    return {
+        "kind": "self",
+        "model": result.camera.distortion,
+        "size": [result.camera.width, result.camera.height],
+        "fov_deg_told": options.fov_deg,
+        "parameters": dict(zip(names, result.solution.shared.values.tolist(), strict=True)),
+        "sigmas": dict(zip(names, result.known.sigmas.tolist(), strict=True)),
+        "sigma_px": result.solution.sigma_px,
+        "grouping": result.known.grouping,
+        "stretches": len(pieces),
+        "stretches_followed": result.segments,
+        "keyframes": sum(len(piece.at.R) for piece in pieces),
+        "points": sum(int(piece.kept.any(axis=0).sum()) for piece in pieces),
+        "observations": sum(int(piece.kept.sum()) for piece in pieces),
+        "turned_deg": turned.tolist(),
+        "travelled": travelled,
+        "statements": _statements(result),
+    }
+
+
+def _lines(result: SelfResult) -> list[str]:
+    values, sigmas = result.solution.shared.values, result.known.sigmas
+    pieces = result.solution.pieces
+    numbers = [
+        f"{name} {value:.2f} ± {sigma:.2f} px" if name[0] in "fc" else f"{name} {value:+.5f} ± {sigma:.5f}"
+        for name, value, sigma in zip(_names(result.camera), values, sigmas, strict=True)
+    ]
+    turned, travelled = _motion(result)
+    return [
+        f"{len(pieces)} stretches, {sum(len(p.at.R) for p in pieces)} keyframes, "
+        f"{sum(int(p.kept.sum()) for p in pieces)} observations, {result.solution.sigma_px:.2f} px noise; turned by "
+        f"{turned[0]:.0f}, {turned[1]:.0f}, {turned[2]:.0f} deg in each, travelled {travelled:.0%} of the distance",
+        ", ".join(numbers[:4]),
+        ", ".join(numbers[4:]),
+        *_statements(result),
+    ]
+
+
+def draw(figure: Figure, colors: Mapping[str, str], result: SelfResult) -> None:
+    """Draw where points were seen, how leaving out a stretch moves the focal length, and the sigmas."""
+    camera, known = result.camera, result.known
+    seen, move, sure = figure.subplots(1, 3)
+    for piece in result.solution.pieces:
+        pixels = piece.segment.pixels[piece.kept]
+        seen.plot(pixels[:, 0], pixels[:, 1], ".", markersize=0.8)
+    seen.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal", title="where points were seen")
+    moves = 100.0 * known.moves[:, :2] / [camera.fx, camera.fy]
+    places = np.arange(1, len(moves) + 1)
+    move.bar(places - 0.2, moves[:, 0], 0.4, color=colors["graph"], label="fx")
+    move.bar(places + 0.2, moves[:, 1], 0.4, color=colors["ekf"], label="fy")
+    move.legend()
+    move.set(xlabel="stretch left out", title="moves the focal length by [%]")
+    sure.barh(["fx", "fy", "cx", "cy"], known.sigmas[:4], color=colors["graph"])
+    sure.set(title="sigma [px]")
+    sure.invert_yaxis()
