@@ -7,15 +7,28 @@ the recording, and leaving a stretch out costs one more solution of a small syst
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
+from vislam.calibration.self_calibration.gyro import BIAS, OFFSET, SCALE, Gyro, TurnRows, turn_rows
 from vislam.calibration.self_calibration.segments import Segment
-from vislam.calibration.self_calibration.structure import LENS, READOUT, SHARED, Linear, Structure, linearise, residuals
+from vislam.calibration.self_calibration.structure import (
+    GYRO,
+    LENS,
+    READOUT,
+    SHARED,
+    Linear,
+    Structure,
+    linearise,
+    residuals,
+)
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
+from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, Bools
+from vislam.imu.gyro_turns import GyroTurns, integrated
 
 _CAUCHY = 2.0  # standard deviations
 _MEDIAN_2 = 1.386  # of chi-square with two degrees of freedom
@@ -29,24 +42,57 @@ _RIDGE = 1e-9  # relative: keeps free scales and points that nobody places regul
 _MAX_RHO = 50.0  # in units of the usual distance
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Shared:
     """What all stretches have in common."""
 
     camera: Camera
     readout_s: float
+    gyro: Gyro | None = None  # what follows is known with one only
+    R_cam_body: Array = field(default_factory=lambda: np.eye(3))
+    time_offset_s: float = 0.0  # to be added to the camera's stamps
+    gyro_bias_rad_s: Array = field(default_factory=lambda: np.zeros(3))
+    gyro_scale: float = 0.0  # rates are larger by this share
 
     def moved(self, step: Array) -> Shared:
         """Return it after a step [SHARED]; raises DataError where that is no camera."""
-        c = self.camera
-        fx, fy, cx, cy, *k = (np.array([c.fx, c.fy, c.cx, c.cy, *c.coefficients]) + step[:LENS]).tolist()
-        return Shared(replace(c, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(k)), self.readout_s + step[READOUT])
+        c, to = self.camera, step[GYRO:]
+        fx, fy, cx, cy, *k = (self.values[:LENS] + step[:LENS]).tolist()
+        return Shared(
+            replace(c, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(k)),
+            self.readout_s + float(step[READOUT]),
+            self.gyro,
+            so3_exp(to[:3].copy()) @ self.R_cam_body,
+            self.time_offset_s + float(to[OFFSET]),
+            self.gyro_bias_rad_s + to[BIAS],
+            self.gyro_scale + float(to[SCALE]),
+        )
 
     @property
     def values(self) -> Array:
-        """The unknowns [SHARED]."""
+        """The unknowns [SHARED]; the rotation, which is no vector, counts as zero."""
         c = self.camera
-        return np.array([c.fx, c.fy, c.cx, c.cy, *c.coefficients, self.readout_s])
+        lens = [c.fx, c.fy, c.cx, c.cy, *c.coefficients, self.readout_s]
+        return np.array([*lens, *np.zeros(3), self.time_offset_s, *self.gyro_bias_rad_s, self.gyro_scale])
+
+    @property
+    def free(self) -> Bools:
+        """Which unknowns [SHARED] there are."""
+        return np.arange(SHARED) < (GYRO if self.gyro is None else SHARED)
+
+    @cached_property
+    def turns(self) -> GyroTurns | None:
+        """What the gyroscope turned by, its bias and scale taken off."""
+        gyro = self.gyro
+        if gyro is None:
+            return None
+        return integrated(gyro.t_s, (1.0 + self.gyro_scale) * gyro.rate_rad_s, self.gyro_bias_rad_s)
+
+    def rows(self, piece: Piece) -> TurnRows | None:
+        """Return by what the turns of a piece differ from the gyroscope's; None without one."""
+        if self.gyro is None or self.turns is None:
+            return None
+        return turn_rows(piece.at.R, piece.segment.t_ns, self.gyro, self.turns, self.R_cam_body, self.time_offset_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,6 +237,9 @@ def _cost(pieces: Sequence[Piece], shared: Shared, prior: Prior, sigma_px: float
     for piece in pieces:
         r = residuals(piece.segment, piece.at, shared.camera, shared.readout_s)[piece.kept]
         chi2 = np.nan_to_num(np.sum(r**2, axis=1) / sigma_px**2, nan=1e6)
+        rows = shared.rows(piece)
+        if rows is not None:
+            chi2 = np.concatenate([chi2, rows.information * np.sum(rows.errors**2, axis=1)])
         total += float(_CAUCHY**2 * np.sum(np.log1p(chi2 / _CAUCHY**2)))
     return total
 
@@ -201,6 +250,9 @@ def _reduced(piece: Piece, shared: Shared, sigma_px: float, damping: float) -> R
     weight = 1.0 / sigma_px**2 / (1.0 + np.sum(seen.r**2, axis=1) / (_CAUCHY * sigma_px) ** 2)
     n, m = piece.kept.shape
     U, g, E, V, e = _equations(seen, weight, n, m)
+    rows = shared.rows(piece)
+    if rows is not None:
+        _add_turns(U, g, rows, n)
     free = np.ones(len(g), dtype=np.bool_)
     free[6 * piece.at.origin : 6 * piece.at.origin + 6] = False
     U, g, E = U[np.ix_(free, free)], g[free], E[free]
@@ -240,6 +292,18 @@ def _equations(seen: Linear, weight: Array, n: int, m: int) -> tuple[Array, Arra
     np.add.at(V, p, P @ seen.by_point)
     np.add.at(e, p, np.einsum("nij,nj->ni", P, seen.r))
     return U, g, E, V, e
+
+
+def _add_turns(U: Array, g: Array, rows: TurnRows, n: int) -> None:
+    """Add what the gyroscope says of successive keyframes."""
+    chi2 = rows.information * np.sum(rows.errors**2, axis=1)
+    weight = rows.information / (1.0 + chi2 / _CAUCHY**2)
+    shared = np.arange(6 * n + GYRO, 6 * n + SHARED)
+    for i in range(n - 1):
+        A = np.column_stack([np.eye(3), rows.by_second[i], rows.by_gyro[i]])
+        at = np.concatenate([6 * i + np.arange(3), 6 * i + 6 + np.arange(3), shared])
+        U[np.ix_(at, at)] += weight[i] * A.T @ A
+        g[at] += weight[i] * A.T @ rows.errors[i]
 
 
 def _damped(V: Array, damping: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t as student
@@ -16,7 +16,7 @@ _ONE_SIGMA = 0.8413  # of a normal distribution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certainty:
-    """Covariance of the shared unknowns, and what it rests on."""
+    """Covariance of the shared unknowns that there are (see `Shared.free`), and what it rests on."""
 
     covariance: Array  # [P, P]
     moves: Array  # [B, P] by which leaving out one stretch changes the answer
@@ -37,7 +37,9 @@ def certainty(solution: Solution) -> Certainty:
     """
     parts = reduce_all(solution.pieces, solution.shared, solution.sigma_px)
     n = len(parts)
-    H = solution.prior.equations(solution.shared)[0] + np.sum([part.H for part in parts], axis=0)
+    free = solution.shared.free
+    parts = [replace(part, H=part.H[np.ix_(free, free)], g=part.g[free]) for part in parts]
+    H = solution.prior.equations(solution.shared)[0][np.ix_(free, free)] + np.sum([part.H for part in parts], axis=0)
     nothing = Certainty(np.full(H.shape, np.inf), np.zeros((n, len(H))), np.inf)
     if n < 3 or not np.linalg.cond(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) < 1e12:
         return nothing

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vislam.calibration.extrinsics import RotationPair, solve_hand_eye
 from vislam.calibration.self_calibration.adjust import Piece, Prior, Shared, adjust, judged, scatter_px, steadied
+from vislam.calibration.self_calibration.gyro import SCALE, Gyro
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.start import placed_points, start_structure
-from vislam.calibration.self_calibration.structure import READOUT, SHARED
+from vislam.calibration.self_calibration.structure import GYRO, READOUT, SHARED
 from vislam.core.camera import Camera
 from vislam.core.messages import Bools
 
@@ -29,6 +31,10 @@ _RADTAN = (0.5, 0.5, 0.01, 0.01)
 _EQUIDISTANT = (0.3, 0.3, 0.3, 0.3)
 _READOUT_S = 0.02
 _ASPECT = 0.01
+_OFFSET_S = 0.1
+_BIAS = 1.0  # rad/s
+_PAIR_RAD = 2e-3  # of a keyframe's rotation; what is true of it the hand-eye solution finds
+_LEAST_CORRELATION = 0.5  # of the speeds of turning: less, and camera and gyroscope saw different things
 
 Rematch = Callable[[Sequence[Piece], Shared], list[Segment]]
 
@@ -47,8 +53,10 @@ def prior_of(camera: Camera) -> Prior:
     """Return what is taken of cameras in general."""
     centre = _CENTRE * camera.width
     k = _EQUIDISTANT if camera.distortion == "equidistant" else _RADTAN
-    sigma = np.array([np.inf, np.inf, centre, centre, *k, _READOUT_S])
-    mean = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *np.zeros(5)])
+    nothing = [np.inf] * 3  # of the rotation against the IMU
+    sigma = np.array([np.inf, np.inf, centre, centre, *k, _READOUT_S, *nothing, _OFFSET_S, *[_BIAS] * 3, 1.0])
+    mean = np.zeros(SHARED)
+    mean[2:4] = camera.cx, camera.cy
     return Prior(mean, sigma**-2.0, _ASPECT**-2.0)
 
 
@@ -71,11 +79,33 @@ def find_lens(segments: Sequence[Segment], camera: Camera, rematch: Rematch | No
     return refined(replace(solution, pieces=pieces))
 
 
+def with_gyro(solution: Solution, gyro: Gyro) -> Solution | None:
+    """Return the solution with rotation against the IMU and time offset; None where both do not turn alike."""
+    pairs = []
+    for piece in solution.pieces:
+        t_ns, R = piece.segment.t_ns.tolist(), piece.at.R
+        for gap in (1, 3):
+            for i in range(len(R) - gap):
+                pairs.append(RotationPair(t_ns[i], t_ns[i + gap], R[i].T @ R[i + gap], _PAIR_RAD**2 * np.eye(3)))
+    t_ns = gyro.zero_ns + np.round(gyro.t_s * 1e9).astype(np.int64)
+    pairs.sort(key=lambda pair: (pair.t_ns, pair.key_ns))
+    found = solve_hand_eye(pairs, t_ns, gyro.rate_rad_s) if len(t_ns) > 1 else None
+    if found is None or float(found.correlation[:, 1].max()) < _LEAST_CORRELATION:
+        return None
+    shared = replace(
+        solution.shared, gyro=gyro, R_cam_body=found.R_body_cam.T, time_offset_s=found.time_offset_s,
+        gyro_bias_rad_s=found.gyro_bias_rad_s,
+    )  # fmt: skip
+    information = solution.prior.information.copy()
+    information[GYRO + SCALE] = gyro.scale_sigma**-2.0
+    return refined(replace(solution, shared=shared, prior=replace(solution.prior, information=information)))
+
+
 def refined(solution: Solution) -> Solution:
     """Return the solution with all unknowns free, every point placed anew and judged, round after round."""
     prior, sigma_px = solution.prior, solution.sigma_px
     pieces, shared = solution.pieces, solution.shared
-    free = np.ones(SHARED, dtype=np.bool_)
+    free = shared.free
     for _ in range(_ROUNDS):
         pieces = [_placed(piece, shared.camera) for piece in pieces]
         for _ in range(2):

@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from vislam.calibration.self_calibration.gyro import UNKNOWNS
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.core.camera import Camera
 from vislam.core.messages import Array, Bools
 
 LENS = 8  # fx, fy, cx, cy and four coefficients
 READOUT = LENS  # place of the readout, in s, among the shared unknowns
-SHARED = LENS + 1
+GYRO = READOUT + 1  # place of the first of those of `gyro.py`
+SHARED = GYRO + UNKNOWNS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +82,7 @@ def linearise(segment: Segment, at: Structure, camera: Camera, readout_s: float,
     by_rho = -np.einsum("nij,nj->ni", Rt, centre)[:, :, None]
     by_point = A @ np.concatenate([by_ray, by_rho], axis=2)
     lag = _lag(segment, camera, readout_s)[k, p]
-    by_shared = np.concatenate([by_lens(camera, seen), lag[:, :, None]], axis=2)
+    by_shared = np.concatenate([by_lens(camera, seen), lag[:, :, None], np.zeros((len(k), 2, UNKNOWNS))], axis=2)
     return Linear(k, p, r[k, p], by_pose, by_point, by_shared)
 
 

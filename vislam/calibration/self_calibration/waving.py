@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,14 @@ from vislam.calibration.options import SelfOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.calibration.self_calibration.adjust import Piece, Shared
 from vislam.calibration.self_calibration.certainty import Certainty, certainty
-from vislam.calibration.self_calibration.lens_search import Solution, find_lens
+from vislam.calibration.self_calibration.gyro import BIAS, OFFSET, SCALE, Gyro
+from vislam.calibration.self_calibration.lens_search import Solution, find_lens, with_gyro
 from vislam.calibration.self_calibration.patches import found_again
 from vislam.calibration.self_calibration.segments import Segment, follow_segments
-from vislam.calibration.self_calibration.structure import READOUT
+from vislam.calibration.self_calibration.structure import GYRO, READOUT
 from vislam.core.camera import Camera
-from vislam.core.geometry import so3_log
-from vislam.core.messages import Array, Frame
+from vislam.core.geometry import so3_log, transform
+from vislam.core.messages import Array, Frame, ImuSample
 from vislam.core.recording import Recording
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
 from vislam.run.sources import open_source
@@ -32,6 +33,9 @@ _MAX_CENTRE_SIGMA = 0.02  # of the image's width
 _MAX_SIGMA_PX = 2.0  # noise of tracks: more, and what moves is the scene, or it is all blur
 _GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter
 _SAME = 3.0  # sigmas
+_GYRO_SCALE = 0.01  # of a gyroscope of which nothing is told
+_MAX_TURN_SIGMA_DEG = 0.5
+_MAX_OFFSET_SIGMA_S = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +45,8 @@ class SelfResult:
     solution: Solution
     known: Certainty
     segments: int  # that were followed, whether or not they could be reconstructed
+    told: Array  # [4, 4] T_body_cam of the recording
+    without_imu: str  # why nothing is said of the IMU; empty where there is something
 
     @property
     def camera(self) -> Camera:
@@ -59,7 +65,7 @@ def calibrate_self(options: SelfOptions) -> Outcome:
     result = solve_self(open_source(options.source), options)
     report = _report(result, options)
     comment = f"without a board, from {options.source}; focal length to {result.focal_sigma:.2%} (1 sigma)"
-    path = folder.write_text("camchain.yaml", camchain_text([CameraCalibration(result.camera)], comment))
+    path = folder.write_text("camchain.yaml", camchain_text([_calibration(result)], comment))
     folder.write_picture("self.png", (11.0, 3.8), lambda figure, colors: draw(figure, colors, result))
     folder.write_report("self.json", report)
     readout_s = result.solution.shared.readout_s
@@ -72,7 +78,8 @@ def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
     """Return the lens; raises DataError that says what the motion lacks."""
     what = f"the camera of {options.source}"
     start = _guess(recording.rig.cameras[0], options)
-    segments = follow_segments(_frames(recording, options.max_s), start.width, options.max_stretches)
+    samples: list[ImuSample] = []
+    segments = follow_segments(_frames(recording, options.max_s, samples), start.width, options.max_stretches)
     refuse(what, [_too_few(len(segments))] if len(segments) < _LEAST_SEGMENTS else [])
     solution = find_lens(segments, start, lambda pieces, shared: _rematched(recording, options, pieces, shared))
     count = 0 if solution is None else len(solution.pieces)
@@ -82,9 +89,45 @@ def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
             f"{start.fx:.0f} px; move sideways as well as turn, keep to a scene that stands still, and check --fov-deg"
         ])  # fmt: skip
         raise AssertionError  # refuse has raised
-    result = SelfResult(solution, certainty(solution), len(segments))
+    result = _with_imu(SelfResult(solution, certainty(solution), len(segments), recording.rig.T_body_cams[0], ""),
+                       recording, samples)  # fmt: skip
     refuse(what, _doubts(result))
     return result
+
+
+def _with_imu(result: SelfResult, recording: Recording, samples: list[ImuSample]) -> SelfResult:
+    """Return the result with rotation and offset against the IMU, or why there are none."""
+    if recording.imu_noise is None or len(samples) < 2:
+        return replace(result, without_imu="the recording has no IMU")
+    zero_ns, noise = samples[0].t_ns, recording.imu_noise
+    gyro = Gyro(
+        zero_ns,
+        np.array([(sample.t_ns - zero_ns) * 1e-9 for sample in samples]),
+        np.array([sample.gyro_rad_s for sample in samples]),
+        noise.gyro_noise_density,
+        noise.gyro_scale_sigma or _GYRO_SCALE,
+    )
+    joint = with_gyro(result.solution, gyro)
+    if joint is None:
+        return replace(result, without_imu="camera and gyroscope do not turn alike; check the stamps of both")
+    known = certainty(joint)
+    turn_deg, offset_s = np.rad2deg(known.sigmas[GYRO : GYRO + 3].max()), known.sigmas[GYRO + OFFSET]
+    if not (turn_deg < _MAX_TURN_SIGMA_DEG and offset_s < _MAX_OFFSET_SIGMA_S):
+        return replace(
+            result,
+            without_imu=f"rotation and time offset would be known to {turn_deg:.1f} deg and {1e3 * offset_s:.1f} ms "
+            "only; turn to and fro more briskly, about all axes",
+        )
+    return replace(result, solution=joint, known=known)
+
+
+def _calibration(result: SelfResult) -> CameraCalibration:
+    """Return what the chain says: the translation against the IMU is the recording's own."""
+    shared = result.solution.shared
+    if shared.gyro is None:
+        return CameraCalibration(result.camera)
+    T_body_cam = transform(np.ascontiguousarray(shared.R_cam_body.T), result.told[:3, 3].copy())
+    return CameraCalibration(result.camera, T_body_cam, shared.time_offset_s, float(result.known.sigmas[GYRO + OFFSET]))
 
 
 def _guess(told: Camera, options: SelfOptions) -> Camera:
@@ -98,9 +141,12 @@ def _guess(told: Camera, options: SelfOptions) -> Camera:
     )  # fmt: skip
 
 
-def _frames(recording: Recording, max_s: float) -> Iterator[Frame]:
+def _frames(recording: Recording, max_s: float, samples: list[ImuSample]) -> Iterator[Frame]:
+    """Yield the frames, and keep the inertial samples between them."""
     begin: int | None = None
     for value in recording.events():
+        if isinstance(value, ImuSample):
+            samples.append(value)
         if isinstance(value, Frame):
             begin = value.t_ns if begin is None else begin
             if value.t_ns - begin > max_s * 1e9:
@@ -110,7 +156,7 @@ def _frames(recording: Recording, max_s: float) -> Iterator[Frame]:
 
 def _rematched(recording: Recording, options: SelfOptions, pieces: Sequence[Piece], shared: Shared) -> list[Segment]:
     """Read the images again, those of one stretch at a time, and match its observations anew."""
-    frames = _frames(recording, options.max_s)
+    frames = _frames(recording, options.max_s, [])
     out = []
     for piece in pieces:
         wanted = set(piece.segment.t_ns.tolist())
@@ -197,8 +243,9 @@ def _report(result: SelfResult, options: SelfOptions) -> dict[str, Any]:
         "model": result.camera.distortion,
         "size": [result.camera.width, result.camera.height],
         "fov_deg_told": options.fov_deg,
-        "parameters": dict(zip(names, result.solution.shared.values.tolist(), strict=True)),
-        "sigmas": dict(zip(names, result.known.sigmas.tolist(), strict=True)),
+        "parameters": dict(zip(names, result.solution.shared.values.tolist(), strict=False)),
+        "sigmas": dict(zip(names, result.known.sigmas.tolist(), strict=False)),
+        "camera_imu": _imu_report(result),
         "sigma_px": result.solution.sigma_px,
         "grouping": result.known.grouping,
         "stretches": len(pieces),
@@ -212,12 +259,37 @@ def _report(result: SelfResult, options: SelfOptions) -> dict[str, Any]:
     }
 
 
+def _imu_report(result: SelfResult) -> dict[str, Any]:
+    shared, sigmas = result.solution.shared, result.known.sigmas[GYRO:]
+    if shared.gyro is None:
+        return {"reason_without": result.without_imu}
+    return {
+        "R_body_cam": shared.R_cam_body.T.tolist(),
+        "rotation_sigma_deg": np.rad2deg(sigmas[:3]).tolist(),  # about the camera's axes
+        "from_recording_deg": _difference_deg(result),
+        "time_offset_s": shared.time_offset_s,
+        "time_offset_sigma_s": float(sigmas[OFFSET]),
+        "gyro_bias_rad_s": shared.gyro_bias_rad_s.tolist(),
+        "gyro_bias_sigma_rad_s": sigmas[BIAS].tolist(),
+        "gyro_scale": shared.gyro_scale,
+        "gyro_scale_sigma": float(sigmas[SCALE]),
+        "translation_m": result.told[:3, 3].tolist(),
+        "translation_determined": False,
+    }
+
+
+def _difference_deg(result: SelfResult) -> float:
+    """Return by how much the rotation against the IMU differs from what the recording says."""
+    turn = so3_log(np.ascontiguousarray(result.solution.shared.R_cam_body @ result.told[:3, :3]))
+    return float(np.rad2deg(np.linalg.norm(turn)))
+
+
 def _lines(result: SelfResult) -> list[str]:
     values, sigmas = result.solution.shared.values, result.known.sigmas
     pieces = result.solution.pieces
     numbers = [
         f"{name} {value:.2f} ± {sigma:.2f} px" if name[0] in "fc" else f"{name} {value:+.5f} ± {sigma:.5f}"
-        for name, value, sigma in zip(_names(result.camera), values, sigmas, strict=True)
+        for name, value, sigma in zip(_names(result.camera), values, sigmas, strict=False)
     ]
     turned, travelled = _motion(result)
     return [
@@ -226,7 +298,22 @@ def _lines(result: SelfResult) -> list[str]:
         f"{turned[0]:.0f}, {turned[1]:.0f}, {turned[2]:.0f} deg in each, travelled {travelled:.0%} of the distance",
         ", ".join(numbers[:4]),
         ", ".join(numbers[4:]),
+        *_imu_lines(result),
         *_statements(result),
+    ]
+
+
+def _imu_lines(result: SelfResult) -> list[str]:
+    shared, sigmas = result.solution.shared, result.known.sigmas[GYRO:]
+    if shared.gyro is None:
+        return [f"nothing of the IMU: {result.without_imu}"]
+    rows = "; ".join(", ".join(f"{x:+.5f}" for x in row) for row in shared.R_cam_body.T)
+    return [
+        f"R_body_cam [{rows}], sigma about the camera's axes "
+        f"{', '.join(f'{x:.2f}' for x in np.rad2deg(sigmas[:3]))} deg; {_difference_deg(result):.2f} deg from what the "
+        "recording says; its translation is the recording's own",
+        f"time offset {1e3 * shared.time_offset_s:+.2f} ± {1e3 * sigmas[OFFSET]:.2f} ms, to be added to the stamps of "
+        "the camera",
     ]
 
 
