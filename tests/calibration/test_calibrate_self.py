@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from vislam.calibration.self_calibration.adjust import Shared, steadied
 from vislam.calibration.self_calibration.certainty import certainty
-from vislam.calibration.self_calibration.lens_search import Solution, find_lens
+from vislam.calibration.self_calibration.gyro import Gyro
+from vislam.calibration.self_calibration.lens_search import Solution, find_lens, with_gyro
 from vislam.calibration.self_calibration.patches import _aligned
 from vislam.calibration.self_calibration.segments import Segment
-from vislam.calibration.self_calibration.structure import SHARED, Structure, linearise, residuals
+from vislam.calibration.self_calibration.structure import GYRO, SHARED, Structure, linearise, residuals
 from vislam.core.camera import Camera
 from vislam.core.messages import Array
 from worlds.calibration import refusal
@@ -25,16 +26,22 @@ GUESS = Camera(640, 480, 564.0, 564.0, 319.5, 239.5, 0.0, "radtan", (0.0,) * 4) 
 NOISE_PX = 0.3
 
 
-def waved(seed: int, camera: Camera, readout_s: float = 0.0, turns: float = 0.35, points: int = 150) -> Segment:
-    """Return what a camera sees of a cloud of points as it is swung about it for 3 s, 14 keyframes."""
+def attitude(seed: int, t_s: Array, turns: float) -> tuple[Rotation, Array]:
+    """Return how a swung camera is turned and where it is [N, 3] at times [N]."""
+    rng = np.random.default_rng([seed, 1])
+    phase, speed = rng.uniform(0.0, 6.3, 6), rng.uniform(0.8, 1.6, 6)
+    way = np.sin(np.outer(t_s, speed) + phase)
+    return Rotation.from_rotvec(turns * way[:, :3]), 0.5 * way[:, 3:]
+
+
+def waved(seed: int, camera: Camera, readout_s: float = 0.0, turns: float = 0.35, points: int = 100) -> Segment:
+    """Return what a camera sees of a cloud of points as it is swung about it for 3 s, 12 keyframes."""
     rng = np.random.default_rng(seed)
     cloud = rng.uniform([-4.0, -3.0, 2.0], [4.0, 3.0, 6.0], (points, 3))
-    phase, speed = rng.uniform(0.0, 6.3, 6), rng.uniform(0.8, 1.6, 6)
 
     def project(t_s: Array) -> Array:
-        way = np.sin(np.outer(t_s, speed) + phase)
-        R = Rotation.from_rotvec(turns * way[:, :3]).as_matrix()
-        return camera.project(np.einsum("nji,nj->ni", R, cloud - 0.5 * way[:, 3:]))
+        turned, centre = attitude(seed, t_s, turns)
+        return camera.project(np.einsum("nji,nj->ni", turned.as_matrix(), cloud - centre))
 
     def seen(t_s: float) -> Array:
         pixels = project(np.full(points, t_s))
@@ -42,12 +49,12 @@ def waved(seed: int, camera: Camera, readout_s: float = 0.0, turns: float = 0.35
             pixels = project(t_s + (np.nan_to_num(pixels[:, 1]) / (camera.height - 1) - 0.5) * readout_s)
         return np.where(camera.contains(pixels)[:, None], pixels, np.nan) + rng.normal(0.0, NOISE_PX, (points, 2))
 
-    times = np.linspace(0.0, 3.0, 14)
+    times = np.linspace(0.0, 3.0, 12)
     pixels = np.stack([seen(t) for t in times])
     flow = np.stack([seen(t + 0.03) - seen(t - 0.03) for t in times]) / 0.06
     pixels[~np.isfinite(flow)] = np.nan
     pixels[:, np.isfinite(pixels[:, :, 0]).sum(axis=0) < 3] = np.nan
-    return Segment(np.round(times * 1e9).astype(np.int64), pixels, flow, flow)
+    return Segment(np.round((times + 10.0 * seed) * 1e9).astype(np.int64), pixels, flow, flow)
 
 
 def solved(seeds: range, camera: Camera, guess: Camera, readout_s: float = 0.0) -> Solution:
@@ -64,10 +71,10 @@ def rolling() -> Solution:
 
 def test_a_focal_length_is_found_from_a_fifth_too_much_with_the_readout(rolling: Solution) -> None:
     found = rolling
-    errors = found.shared.values - [470.0, 468.0, 325.0, 234.0, -0.21, 0.06, 0.0006, -0.0005, 0.02]
+    errors = found.shared.values[:9] - [470.0, 468.0, 325.0, 234.0, -0.21, 0.06, 0.0006, -0.0005, 0.02]
     known = certainty(found)
-    print(errors, known.sigmas)
-    assert np.all(np.abs(errors) < 4.0 * known.sigmas)
+    print(errors, known.sigmas[:9])
+    assert np.all(np.abs(errors) < 4.0 * known.sigmas[:9])
     assert np.all(np.abs(errors[:2]) < 0.005 * 470.0)
     assert np.all(known.sigmas[:2] < 0.01 * 470.0)
     assert abs(errors[8]) < 1e-3
@@ -78,12 +85,39 @@ def test_a_focal_length_is_found_from_a_fifth_too_much_with_the_readout(rolling:
 
 def test_a_wide_lens_is_found_as_an_equidistant_one() -> None:
     guess = replace(WIDE, fx=350.0, fy=350.0, cx=319.5, cy=239.5, coefficients=(0.0,) * 4)
-    found = solved(range(20, 26), WIDE, guess)
+    found = solved(range(20, 25), WIDE, guess)
     known = certainty(found)
     errors = found.shared.values[:4] - [290.0, 291.0, 316.0, 243.0]
-    print(errors, known.sigmas)
+    print(errors, known.sigmas[:9])
     assert np.all(np.abs(errors) < 4.0 * known.sigmas[:4])
     assert np.all(np.abs(errors[:2]) < 0.005 * 290.0)
+
+
+def test_a_gyroscope_joins_in(rolling: Solution) -> None:
+    """Rotation and offset against it come out, within what is told of them."""
+    R_body_cam, offset_s, bias = Rotation.from_rotvec([0.7, -1.1, 0.4]), 0.012, np.array([0.02, -0.01, 0.03])
+    rng = np.random.default_rng(8)
+    t_s, rates = [], []
+    for seed in range(6):
+        at = np.arange(-0.5, 3.5, 0.005)
+        before, after = attitude(seed, at - 0.001, 0.35)[0], attitude(seed, at + 0.001, 0.35)[0]
+        rates.append(R_body_cam.apply((before.inv() * after).as_rotvec() / 0.002) + bias)
+        t_s.append(at + 10.0 * seed + offset_s)
+    samples = np.vstack(rates)
+    gyro = Gyro(0, np.concatenate(t_s), samples + rng.normal(0.0, 2e-3, samples.shape), 2e-3 * 0.07, 0.01)
+    joint = with_gyro(rolling, gyro)
+    assert joint is not None
+    known = certainty(joint)
+    turn = Rotation.from_matrix(joint.shared.R_cam_body) * R_body_cam
+    errors = np.array(
+        [*turn.as_rotvec(), joint.shared.time_offset_s - offset_s, *(joint.shared.gyro_bias_rad_s - bias)]
+    )
+    print(errors, known.sigmas[9:])
+    assert np.all(np.abs(errors) < 4.0 * known.sigmas[9:16])
+    assert np.rad2deg(turn.magnitude()) < 0.3 and abs(errors[3]) < 1e-3
+    assert known.sigmas[0] <= 1.2 * certainty(rolling).sigmas[0]
+    still = replace(gyro, rate_rad_s=rng.normal(0.0, 0.1, samples.shape))
+    assert with_gyro(rolling, still) is None
 
 
 def test_without_turning_the_focal_length_stays_open() -> None:
@@ -120,7 +154,7 @@ def test_derivatives_are_those_of_the_prediction() -> None:
         by_point = np.zeros((m, 3))
         by_point[:, a] = step
         assert lines.by_point[:, :, a] == pytest.approx(change(np.zeros((n, 6)), by_point, np.zeros(SHARED)), abs=1e-3)
-    for a in range(9):
+    for a in range(GYRO):
         by_shared = step * np.eye(SHARED)[a]
         expected = change(np.zeros((n, 6)), np.zeros((m, 3)), by_shared)
         assert lines.by_shared[:, :, a] == pytest.approx(expected, abs=1e-3)

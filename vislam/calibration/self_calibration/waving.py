@@ -18,8 +18,8 @@ from vislam.calibration.self_calibration.lens_search import Solution, find_lens,
 from vislam.calibration.self_calibration.patches import found_again
 from vislam.calibration.self_calibration.segments import Segment, follow_segments
 from vislam.calibration.self_calibration.structure import GYRO, READOUT
-from vislam.core.camera import Camera
-from vislam.core.geometry import so3_log, transform
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
 from vislam.core.recording import Recording
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
@@ -45,7 +45,7 @@ class SelfResult:
     solution: Solution
     known: Certainty
     segments: int  # that were followed, whether or not they could be reconstructed
-    told: Array  # [4, 4] T_body_cam of the recording
+    told: Rig  # of the recording
     without_imu: str  # why nothing is said of the IMU; empty where there is something
 
     @property
@@ -65,7 +65,7 @@ def calibrate_self(options: SelfOptions) -> Outcome:
     result = solve_self(open_source(options.source), options)
     report = _report(result, options)
     comment = f"without a board, from {options.source}; focal length to {result.focal_sigma:.2%} (1 sigma)"
-    path = folder.write_text("camchain.yaml", camchain_text([_calibration(result)], comment))
+    path = folder.write_text("camchain.yaml", camchain_text(_chain(result), comment))
     folder.write_picture("self.png", (11.0, 3.8), lambda figure, colors: draw(figure, colors, result))
     folder.write_report("self.json", report)
     readout_s = result.solution.shared.readout_s
@@ -89,7 +89,7 @@ def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
             f"{start.fx:.0f} px; move sideways as well as turn, keep to a scene that stands still, and check --fov-deg"
         ])  # fmt: skip
         raise AssertionError  # refuse has raised
-    result = _with_imu(SelfResult(solution, certainty(solution), len(segments), recording.rig.T_body_cams[0], ""),
+    result = _with_imu(SelfResult(solution, certainty(solution), len(segments), recording.rig, ""),
                        recording, samples)  # fmt: skip
     refuse(what, _doubts(result))
     return result
@@ -121,13 +121,21 @@ def _with_imu(result: SelfResult, recording: Recording, samples: list[ImuSample]
     return replace(result, solution=joint, known=known)
 
 
-def _calibration(result: SelfResult) -> CameraCalibration:
-    """Return what the chain says: the translation against the IMU is the recording's own."""
-    shared = result.solution.shared
-    if shared.gyro is None:
-        return CameraCalibration(result.camera)
-    T_body_cam = transform(np.ascontiguousarray(shared.R_cam_body.T), result.told[:3, 3].copy())
-    return CameraCalibration(result.camera, T_body_cam, shared.time_offset_s, float(result.known.sigmas[GYRO + OFFSET]))
+def _chain(result: SelfResult) -> list[CameraCalibration]:
+    """Return the chain: translation against the IMU, and the second camera, as the recording has them."""
+    shared, rig = result.solution.shared, result.told
+    alone = shared.gyro is None
+    T_body_cam0 = rig.T_body_cams[0] if alone else _pose(result)
+    offset = () if alone else (shared.time_offset_s, float(result.known.sigmas[GYRO + OFFSET]))
+    first = CameraCalibration(result.camera, None if alone and not rig.is_stereo else T_body_cam0, *offset)
+    moved = T_body_cam0 @ invert(rig.T_body_cams[0])
+    rest = zip(rig.cameras[1:], rig.T_body_cams[1:], strict=True)
+    return [first, *(CameraCalibration(camera, moved @ T, *offset) for camera, T in rest)]
+
+
+def _pose(result: SelfResult) -> Array:
+    R_body_cam = np.ascontiguousarray(result.solution.shared.R_cam_body.T)
+    return transform(R_body_cam, result.told.T_body_cams[0][:3, 3].copy())
 
 
 def _guess(told: Camera, options: SelfOptions) -> Camera:
@@ -224,6 +232,8 @@ def _statements(result: SelfResult) -> list[str]:
     readout_s, sigma_s = result.solution.shared.readout_s, float(result.known.sigmas[READOUT])
     if readout_s > max(_GLOBAL_S, _SAME * sigma_s):
         said.append(f"the shutter rolls: {1e3 * readout_s:.1f} ± {1e3 * sigma_s:.1f} ms from the first to the last row")
+    if result.told.is_stereo:
+        said.append("of two cameras the first was calibrated; the second stands as the recording has it")
     lost = result.segments - len(result.solution.pieces)
     if lost:
         said.append(f"{lost} of {result.segments} stretches could not be reconstructed")
@@ -273,14 +283,14 @@ def _imu_report(result: SelfResult) -> dict[str, Any]:
         "gyro_bias_sigma_rad_s": sigmas[BIAS].tolist(),
         "gyro_scale": shared.gyro_scale,
         "gyro_scale_sigma": float(sigmas[SCALE]),
-        "translation_m": result.told[:3, 3].tolist(),
+        "translation_m": result.told.T_body_cams[0][:3, 3].tolist(),
         "translation_determined": False,
     }
 
 
 def _difference_deg(result: SelfResult) -> float:
     """Return by how much the rotation against the IMU differs from what the recording says."""
-    turn = so3_log(np.ascontiguousarray(result.solution.shared.R_cam_body @ result.told[:3, :3]))
+    turn = so3_log(np.ascontiguousarray(result.solution.shared.R_cam_body @ result.told.T_body_cams[0][:3, :3]))
     return float(np.rad2deg(np.linalg.norm(turn)))
 
 
