@@ -179,7 +179,7 @@ class RgbdOptions:
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
     json: bool = False
-    """Print the report as JSON instead of a table"""
+    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)

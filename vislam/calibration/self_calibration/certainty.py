@@ -28,12 +28,12 @@ class Certainty:
         return np.sqrt(np.diag(self.covariance))
 
 
-def certainty(solution: Solution) -> Certainty:
+def certainty(solution: Solution, widened: float = 1.0) -> Certainty:
     """Return how sure a solution is; infinite where nothing is determined.
 
     A jackknife of one step over the stretches (Efron 1982): tracks of one stretch share errors, so that pixels taken
     for independent promise too much. Each unknown is widened by what the stretches show of it, at least by the median
-    of all, and for few stretches by Student's t.
+    of all, for few stretches by Student's t, and `widened` times for what all stretches share.
     """
     parts = reduce_all(solution.pieces, solution.shared, solution.sigma_px)
     n = len(parts)
@@ -48,5 +48,5 @@ def certainty(solution: Solution) -> Certainty:
     moves -= moves.mean(axis=0)
     ratio = (n - 1) / n * np.sum(moves**2, axis=0) / np.diag(white)
     grouping = max(1.0, float(np.median(ratio)))
-    wider = np.sqrt(np.maximum(ratio, grouping)) * student.ppf(_ONE_SIGMA, n - 1)
+    wider = np.sqrt(np.maximum(ratio, grouping)) * student.ppf(_ONE_SIGMA, n - 1) * widened
     return Certainty(white * np.outer(wider, wider), moves, grouping)

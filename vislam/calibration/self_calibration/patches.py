@@ -12,12 +12,15 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.calibration.self_calibration.adjust import Piece, Shared
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.structure import Structure
 from vislam.core.camera import Camera
 from vislam.core.messages import Array, ImageU8
+
+Indices = NDArray[np.int64]
 
 _SIDE = 17  # px, of a patch
 _STEPS = 10
@@ -40,21 +43,21 @@ def found_again(piece: Piece, shared: Shared, images: Sequence[ImageU8]) -> Segm
             continue
         warp = _warps(camera, at, seen, home, points, k)
         here = segment.pixels[home[points], points]
-        templates = np.empty((len(points), _SIDE, _SIDE), dtype=np.float32)
-        for h in np.unique(home[points]):
+        templates = np.empty((len(points), _SIDE, _SIDE))
+        for h in np.unique(home[points]).tolist():
             of = home[points] == h
             templates[of] = _sampled(images[h], here[of], warp[of])
         pixels[k, points] = _aligned(templates, image, segment.pixels[k, points])
     return replace(segment, pixels=pixels)
 
 
-def _homes(piece: Piece) -> Array:
+def _homes(piece: Piece) -> Indices:
     """Return the keyframe in the middle of those that see a point [m]."""
     order = np.cumsum(piece.kept, axis=0)
     return np.asarray(np.argmax(order >= (order[-1] + 1) // 2, axis=0))
 
 
-def _warps(camera: Camera, at: Structure, seen: Array, home: Array, points: Array, k: int) -> Array:
+def _warps(camera: Camera, at: Structure, seen: Array, home: Indices, points: Indices, k: int) -> Array:
     """Return how pixels about a point at home move [N, 2, 2] with those in keyframe k, if it is flat and faces home."""
     h = home[points]
     at_home = camera.project_jacobian(seen[h, points])[:, :, :2]
@@ -70,16 +73,15 @@ def _sampled(image: ImageU8, centres: Array, warps: Array) -> Array:
     offsets = np.stack([u, v], axis=-1).astype(np.float64)
     at = (centres[:, None, None] + np.einsum("nij,vuj->nvui", warps, offsets)).astype(np.float32)
     flat = at.reshape(-1, _SIDE, 2)
-    return cv2.remap(image, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(
-        -1, _SIDE, _SIDE
-    )
+    patches = cv2.remap(image, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(patches, dtype=np.float64).reshape(-1, _SIDE, _SIDE)
 
 
 def _aligned(templates: Array, image: ImageU8, start: Array) -> Array:
     """Return where [N, 2] the image looks like templates [N, S, S], from a start [N, 2]; NaN where nowhere near."""
     window = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1])
     window /= window.sum()
-    T, scale = _normalised(templates.astype(np.float64), window)
+    T, scale = _normalised(templates, window)
     gradients = np.stack([np.gradient(T, axis=2), np.gradient(T, axis=1)], axis=1)
     H = np.einsum("niuv,njuv,uv->nij", gradients, gradients, window)
     flat = np.linalg.eigvalsh(H)[:, 0] * scale**2 < _FLATTEST
@@ -88,7 +90,7 @@ def _aligned(templates: Array, image: ImageU8, start: Array) -> Array:
     at = start.copy()
     likeness = np.zeros(len(T))
     for _ in range(_STEPS):
-        patch, _ = _normalised(_sampled(image, at, same).astype(np.float64), window)
+        patch, _ = _normalised(_sampled(image, at, same), window)
         likeness = np.einsum("nuv,nuv,uv->n", T, patch, window)
         step = np.linalg.solve(H, np.einsum("niuv,nuv,uv->ni", gradients, T - patch, window)[:, :, None])[:, :, 0]
         at = at + np.clip(step, -1.0, 1.0)

@@ -38,7 +38,9 @@ class Segment:
 
     def of(self, keyframes: Bools) -> Segment:
         """Return the stretch without the other keyframes."""
-        return Segment(*(table[keyframes] for table in (self.t_ns, self.pixels, self.flow_px_s, self.velocity_px_s)))
+        return Segment(
+            self.t_ns[keyframes], self.pixels[keyframes], self.flow_px_s[keyframes], self.velocity_px_s[keyframes]
+        )
 
 
 @dataclass(slots=True)
@@ -63,7 +65,8 @@ class _Follower:
     def take(self, frame: Frame) -> None:
         """Follow into one frame, and make it a keyframe if it is time."""
         if self._last is None:
-            return self._begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
+            self._begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
+            return
         pixels = self.tracker.follow(frame, self._last[1])
         if self._before is not None:
             self._set_velocity(frame.t_ns, pixels)
@@ -80,9 +83,9 @@ class _Follower:
         ):
             earlier = self._last[1][alive]
             self._before = (self._last[0], earlier[seen])
-            return self._begin(frame, seen, pixels)
+            self._begin(frame, seen, pixels)
+            return
         self._last = frame.t_ns, last
-        return None
 
     def _begin(self, frame: Frame, kept: NDArray[np.bool_], pixels: Array) -> None:
         fresh = self.tracker.begin(frame, kept, pixels)
