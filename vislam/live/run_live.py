@@ -6,7 +6,7 @@ import logging
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import connection, get_context
@@ -33,6 +33,7 @@ from vislam.live.processes import map as map_process
 from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded
 from vislam.live.processes.measured import measured
 from vislam.live.reading_source import ReadingSource, live_readings
+from vislam.live.web.news import WebEnds
 from vislam.live.wire.slot import remove
 from vislam.pipeline.settings import derived
 from vislam.run import imu_noise
@@ -87,6 +88,18 @@ class _Child:
     report: Connection
     is_ready: bool = False
 
+    def told(self) -> Iterator[Ready | Note | Failure]:
+        """Yield what the process told since; what it logged is logged here."""
+        try:
+            while not self.report.closed and self.report.poll():
+                message = self.report.recv()
+                if isinstance(message, logging.LogRecord):
+                    log.take_record(message)
+                else:
+                    yield message
+        except (EOFError, OSError):
+            self.report.close()
+
 
 Show = Callable[["LiveRun"], None]  # is called now and then
 
@@ -101,7 +114,7 @@ class LiveRun:
 
     def __init__(
         self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str],
-        base: MapChoice | None = None, beginning: Beginning | None = None,
+        base: MapChoice | None = None, beginning: Beginning | None = None, web: WebEnds | None = None,
     ) -> None:  # fmt: skip
         """Make the wires; nothing starts yet.
 
@@ -113,6 +126,7 @@ class LiveRun:
             command: as it was typed.
             base: the map of another run, to begin in.
             beginning: what `base` holds, or the run itself in `out` that is to be resumed; None: it begins anew.
+            web: wires of a page that shows the run, if there is one.
 
         Raises:
             UsageError: settings that only make sense with a recording, a bridge or a further sensor that cannot be.
@@ -139,11 +153,11 @@ class LiveRun:
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
         self._bias = KeptBias(config.power_up)
-        self._roles = self._wire(source, config, out, asked, command, noise, base, beginning)
+        self._roles = self._wire(source, config, out, asked, command, noise, base, beginning, web)
 
     def _wire(
         self, source: LiveSource, config: Config, out: Path, asked: str, command: list[str], noise: Any,
-        base: MapChoice | None, beginning: Beginning | None,
+        base: MapChoice | None, beginning: Beginning | None, web: WebEnds | None,
     ) -> dict[str, Callable[[Life], None]]:  # fmt: skip
         """Return what each process does, with its ends of the wires."""
         suite, open_readings = live_readings(config.sensors, source.readings)
@@ -157,7 +171,7 @@ class LiveRun:
         keyframes_out, keyframes = self._context.Pipe(duplex=False)[::-1]
         self._ends = [
             samples_in, samples_out, front_says, fast_hears_front, back_says, fast_hears_back, packets_out, packets,
-            frames_out, frames, keyframes_out, keyframes,
+            frames_out, frames, keyframes_out, keyframes, *(() if web is None else (web.frames, web.map)),
         ]  # fmt: skip
         rig = source.rig
         fast = replace(config, live=replace(config.live, send_to=send_to))
@@ -170,7 +184,7 @@ class LiveRun:
             "front": partial(
                 front_process.run, config=config, rig=rig, noise=noise, open_camera=source.cameras(),
                 open_readings=open_readings, suite=suite, samples=samples_out, to_fast=front_says, to_back=packets_out,
-                to_map=frames_out, beginning=beginning,
+                to_map=frames_out, beginning=beginning, to_web=None if web is None else web.frames,
             ),
             "back": partial(
                 back_process.run, config=config, rig=rig, noise=noise, keyframes=packets, to_fast=back_says,
@@ -179,6 +193,7 @@ class LiveRun:
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,
                 frames=frames, keyframes=keyframes, beginning=beginning, base=base, has_camera=source.has_camera,
+                web=None if web is None else web.map,
             ),
         }  # fmt: skip
         return {
@@ -315,27 +330,21 @@ class LiveRun:
             show(self)
 
     def _hear(self, role: str, child: _Child) -> None:
-        try:
-            while not child.report.closed and child.report.poll():
-                message = child.report.recv()
-                if isinstance(message, Ready):
-                    child.is_ready = True
-                    _LOG.info("the %s process is ready", role)
-                elif isinstance(message, logging.LogRecord):
-                    log.take_record(message)
-                elif isinstance(message, Note):
-                    self.notes[role] = {**self.notes.get(role, {}), **message.values}
-                    self.metrics = message.values.get("metrics", self.metrics)
-                    self._bias.take(message.values.get("power_up", {}))
+        for message in child.told():
+            if isinstance(message, Ready):
+                child.is_ready = True
+                _LOG.info("the %s process is ready", role)
+            elif isinstance(message, Note):
+                self.notes[role] = {**self.notes.get(role, {}), **message.values}
+                self.metrics = message.values.get("metrics", self.metrics)
+                self._bias.take(message.values.get("power_up", {}))
+            else:
+                raised = _raised(message)
+                _LOG.error("the %s process failed:\n%s", role, message.traceback)
+                if self._failure is None:
+                    self._failure = raised
                 else:
-                    raised = _raised(message)
-                    _LOG.error("the %s process failed:\n%s", role, message.traceback)
-                    if self._failure is None:
-                        self._failure = raised
-                    else:
-                        self._failure.add_note(f"then: {raised}")
-        except (EOFError, OSError):
-            child.report.close()
+                    self._failure.add_note(f"then: {raised}")
 
     @property
     def _doubts(self) -> list[str]:

@@ -56,7 +56,8 @@ _RUN_FILES = (
     "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
     "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
     *TABLES.values(), LINES, "map/grid.yaml",
-    "map/drive.yaml", "map/map.json", *(f"map/{name}" for name in MAP_FILES.values()),
+    "saved/cloud.ply", "saved/trajectory.tum", "map/drive.yaml", "map/map.json",
+    *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
 TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "submap", "reason")
 

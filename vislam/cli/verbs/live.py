@@ -13,12 +13,14 @@ from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import rewritten_line
+from vislam.cli.verbs.web_page import WebChoice, opened, take_web, wait_for_start
 from vislam.config import Config, SensorsConfig, load, load_cart
 from vislam.config.ranges import Positive
 from vislam.core.errors import UsageError
 
 if TYPE_CHECKING:
     from vislam.live.run_live import LiveRun
+    from vislam.live.web.station import Station
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,9 @@ TAKEN = {
     "--profile pi": "settings for a small computer; file and options go before it",
     "--sensors FILE": "TOML file of a cart's sensors, with tables [sensors.NAME] of further ones; options go before it",
     "--resume RUN": "go on with that run",
+    "--web [HOST:PORT]": "a page that shows and steers the run; 127.0.0.1:8765 where nothing else is said",
+    "--web-waits": "with --web: begin when the page says so; until then it can calibrate",
+    "--web-host NAME": "with --web: a further name that the page may be asked for by, such as that of a tunnel",
 }
 BRIEF = Brief(
     "--out RUN [options]",
@@ -69,6 +74,7 @@ BRIEF = Brief(
         "vislam live --source gy85+webcam --calibration.camera camera.yaml --out runs/cart",
         "vislam live --source serial:/dev/ttyUSB0+webcam --out runs/cart --map runs/hall --localize-only",
         "vislam live --resume runs/cart",
+        "vislam live --source gy85+webcam --calibration.camera camera.yaml --out runs/cart --web",
     ),
     (
         *COMMON, "live.send_to", "live.allow_remote", "live.ros2_domain", "live.mavlink", "live.realtime_priority",
@@ -81,9 +87,10 @@ BRIEF = Brief(
 def main(arguments: list[str]) -> int:
     """Run live until the time is over, the source ends or a signal comes."""
     command = ["vislam", "live", *arguments]
+    web = take_web(arguments)
     resumed = take_path(arguments, "--resume")
     if resumed is not None:
-        return _resume(resumed, arguments, command)
+        return _resume(resumed, arguments, command, web)
     settings = load(take_path(arguments, "--config"), profile_name=take_option(arguments, "--profile"))
     sensors, further = load_cart(take_path(arguments, "--sensors"))
     settings = settings if further.file is None else replace(settings, sensors=further)
@@ -96,16 +103,22 @@ def main(arguments: list[str]) -> int:
     from vislam.live.sources import open_live
     from vislam.run.folder import MapChoice, prepare
 
-    source, settings = open_live(options.source, options.settings, options.sensors)
     base = None if options.map is None else MapChoice(options.map, options.localize_only)
-    beginning = None if base is None else in_map(base, source, settings)
-    live = LiveRun(source, settings, options.out, options.source, command, base, beginning)
-    prepare(options.out, options.overwrite, base)
-    seconds = source.duration_s if options.seconds is None else options.seconds
-    return _execute(live, command, options.out, options.sensors, seconds, options.json)
+    with opened(web, options.settings.live.name, options.out) as station:
+        if web is not None and web.waits and station is not None:
+            prepare(options.out, options.overwrite, base)
+            wait_for_start(station, options)
+        source, settings = open_live(options.source, options.settings, options.sensors)
+        beginning = None if base is None else in_map(base, source, settings)
+        ends = None if station is None else station.ends
+        live = LiveRun(source, settings, options.out, options.source, command, base, beginning, ends)
+        if web is None or not web.waits:
+            prepare(options.out, options.overwrite, base)
+        seconds = source.duration_s if options.seconds is None else options.seconds
+        return _execute(live, command, options.out, options.sensors, seconds, options.json, station)
 
 
-def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
+def _resume(out: Path, arguments: list[str], command: list[str], web: WebChoice | None) -> int:
     """Go on with the run in a folder, whatever ended it."""
     from vislam.live.beginning import in_map, resumed
     from vislam.live.run_live import LiveRun
@@ -113,6 +126,8 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     from vislam.run.folder import prepare, read_setup
 
     options = parse(ResumeOptions, arguments, "live")
+    if web is not None and web.waits:
+        raise UsageError("--web-waits is for new runs; leave it off with --resume")
     asked, config, base = read_setup(out)
     sensors = stored_sensors(out)
     source, settings = open_live(asked, config, sensors)
@@ -120,27 +135,38 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     is_new = beginning is None  # there was nothing yet to go on from
     if is_new and base is not None:
         beginning = in_map(base, source, settings)
-    live = LiveRun(source, settings, out, asked, command, base, beginning)
-    if is_new:
-        prepare(out, overwrite=True)
-    seconds = source.duration_s if options.seconds is None else options.seconds
-    return _execute(live, command, out, sensors, seconds, options.json)
+    with opened(web, settings.live.name, out) as station:
+        ends = None if station is None else station.ends
+        live = LiveRun(source, settings, out, asked, command, base, beginning, ends)
+        if is_new:
+            prepare(out, overwrite=True)
+        seconds = source.duration_s if options.seconds is None else options.seconds
+        return _execute(live, command, out, sensors, seconds, options.json, station)
 
 
 def _execute(
-    live: LiveRun, command: list[str], out: Path, sensors: SensorsConfig, seconds: float | None, as_json: bool
-) -> int:
+    live: LiveRun, command: list[str], out: Path, sensors: SensorsConfig, seconds: float | None, as_json: bool,
+    station: Station | None,
+) -> int:  # fmt: skip
     from vislam.core.files import write_json
     from vislam.live.status import status_line
 
     with written_up(out, command, lambda: live.is_brief), rewritten_line() as show:
         write_json(out / "sensors.json", asdict(sensors))
+
+        def follow(run: LiveRun) -> None:
+            show(status_line(run))
+            if station is not None:
+                station.follow(run)
+
         try:
-            metrics = live.execute(lambda run: show(status_line(run)), seconds)
+            metrics = live.execute(follow, seconds)
         except KeyboardInterrupt:
             if live.is_brief:  # there was no time for more than the session
                 print(f"vislam: to go on from there: vislam optimize {out}, or live --resume {out}", file=sys.stderr)
             raise
+    if station is not None and not live.is_brief:
+        station.end(metrics)
     print_metrics(metrics, out, as_json)
     if live.is_brief and not as_json:
         print(f"left out, for Ctrl-C does not wait: vislam map {out}; vislam report {out}", flush=True)

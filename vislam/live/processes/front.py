@@ -32,6 +32,7 @@ from vislam.live.pace import Pace
 from vislam.live.processes.child import Life
 from vislam.live.reading_source import ReadingSource
 from vislam.live.rehearsal import rehearse_front
+from vislam.live.web.frame_share import FrameShare
 from vislam.live.wire.mail import Outbox
 from vislam.live.wire.publisher import PoseReader
 from vislam.live.wire.stream import SampleReceiver, Value
@@ -64,6 +65,7 @@ def run(
     to_back: Connection,
     to_map: Connection,
     beginning: Beginning | None,
+    to_web: Connection | None = None,
 ) -> None:
     """Process frames until the samples end; then tell the back and the map process that there are no more.
 
@@ -80,6 +82,7 @@ def run(
         to_back: `KeyframeOut`.
         to_map: `Seen`, then `FrontEnded`.
         beginning: the session that the run goes on from.
+        to_web: small pictures for the page that shows the run; None: there is none.
     """
     cv2.setNumThreads(1)
     rehearse_front(config, rig, noise)
@@ -87,7 +90,8 @@ def run(
         camera = devices.enter_context(closing(open_camera()))
         readings = devices.enter_context(closing(open_readings()))
         back, follower = Outbox(to_back, config.live.keyframe_queue), Outbox(to_map, _STEPS)
-        process = FrontProcess(life, config, rig, noise, suite, to_fast, back, follower)
+        share = None if to_web is None else FrameShare(to_web)
+        process = FrontProcess(life, config, rig, noise, suite, to_fast, back, follower, share)
         if beginning is not None:
             process.front.begin_in_map(beginning.first_id, beginning.next_track_id)
         if life.ready():
@@ -101,12 +105,12 @@ class FrontProcess:
 
     def __init__(
         self, life: Life, config: Config, rig: Rig, noise: ImuNoise, suite: Suite, to_fast: Connection,
-        to_back: Outbox, to_map: Outbox,
+        to_back: Outbox, to_map: Outbox, share: FrameShare | None = None,
     ) -> None:  # fmt: skip
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock, suite)
         self._life, self._config = life, config
-        self._to_fast, self._to_back, self._to_map = to_fast, to_back, to_map
+        self._to_fast, self._to_back, self._to_map, self._share = to_fast, to_back, to_map, share
         self._frames: deque[Frame] = deque()
         self._told_start: Initialisation | None = None
         self._begins_back = True
@@ -185,6 +189,8 @@ class FrontProcess:
         self._counters["back_late_ms"] = max(self._counters["back_late_ms"], round(1e3 * self._to_back.age_s))
         step = self.front.process(frame)
         self._correct(step)
+        if self._share is not None:
+            self._share.show(step)
         self._judge(frame.t_ns)
         for odometry in step.keyframes:
             self._put_keyframe(KeyframeOut(odometry, *self._first()))

@@ -24,6 +24,7 @@ from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, S
 from vislam.live.map_rehearsal import rehearse_map
 from vislam.live.pace import MapPace
 from vislam.live.processes.child import Life
+from vislam.live.web.map_share import MapShare
 from vislam.live.wire.mail import Inbox
 from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
@@ -45,6 +46,7 @@ _WAIT_S = 0.05
 def run(
     life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
     keyframes: Connection, beginning: Beginning | None, base: MapChoice | None, has_camera: bool,
+    web: Connection | None = None,
 ) -> None:  # fmt: skip
     """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
 
@@ -60,6 +62,7 @@ def run(
         beginning: the session that the run goes on from.
         base: the map among them, if it is that of another run.
         has_camera: False where no frame can come, and none is asked for.
+        web: the wire of the page that shows the run; None: there is none.
     """
     rehearse_map(config, recording.rig)
     clock = StageClock()
@@ -68,7 +71,8 @@ def run(
     pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes), pace)
     if beginning is not None:
         pipeline.wait_for_back()
-    make = partial(_LiveRun, recording, config, out, pipeline, has_camera)
+    share = None if web is None else MapShare(web, out)
+    make = partial(_LiveRun, recording, config, out, pipeline, has_camera, share)
     live: Run
     if beginning is not None and beginning.is_own:
         live = resumed = make(SessionWriter.reopen(out / "session.db"))
@@ -85,10 +89,10 @@ class _LiveRun(Run):
 
     def __init__(
         self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, has_camera: bool,
-        session: SessionWriter,
+        share: MapShare | None, session: SessionWriter,
     ) -> None:  # fmt: skip
         super().__init__(recording, config, out, session, followed)
-        self._followed = followed
+        self._followed, self._share = followed, share
         self.wants_frames = has_camera
         if not has_camera:
             self.warnings.append("there was no camera: attitude alone was published, and there is no trajectory")
@@ -110,6 +114,8 @@ class _LiveRun(Run):
         for step in self._followed.steps():
             was_found = self.joined_t_ns is not None
             self._take(step)
+            if self._share is not None:
+                self._share.take(step.keyframes, self._mapper)
             if self.joined_t_ns is not None and not was_found:
                 self._followed.life.note(found_in_map=True)
         self._followed.life.when_over()

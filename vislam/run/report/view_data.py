@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.loop.table import caption
 from vislam.mapping.formats.ply import read_ply
+from vislam.run.report.page_assets import floats, packed
 from vislam.run.report.run_files import RunFiles
 from vislam.run.report.scene import Scene, loop_ends
 from vislam.run.report.thumbnails import Thumbnails, read_thumbnails
@@ -50,9 +50,9 @@ def view_data(run: RunFiles, scene: Scene, most_points: int = MAX_POINTS) -> dic
         "paths": {name: _path(scene, path.t_ns, path.T_world_body, name == best) for name, path in paths.items()},
         "errors": {
             name: {
-                "t": _floats(_thin(curve.t_s)),
-                "position": _floats(_thin(curve.position_m)),
-                "rotation": _floats(_thin(curve.rotation_deg)),
+                "t": floats(_thin(curve.t_s)),
+                "position": floats(_thin(curve.position_m)),
+                "rotation": floats(_thin(curve.rotation_deg)),
             }
             for name, curve in scene.errors.items()
         },
@@ -69,22 +69,14 @@ def as_script(data: dict[str, Any]) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _packed(values: NDArray[Any], dtype: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode("ascii")
-
-
-def _floats(values: Array) -> str:
-    return _packed(values, "<f4")
-
-
 def _thin(values: NDArray[Any]) -> NDArray[Any]:
     return values[:: len(values) // _MAX_PATH + 1]
 
 
 def _path(scene: Scene, t_ns: NDArray[np.int64], T: Array, with_rotation: bool) -> dict[str, str]:
     t_ns, T = _thin(t_ns), _thin(T)
-    out = {"t": _floats(scene.seconds(t_ns)), "xyz": _floats(T[:, :3, 3])}
-    return {**out, "R": _floats(T[:, :3, :3])} if with_rotation else out
+    out = {"t": floats(scene.seconds(t_ns)), "xyz": floats(T[:, :3, 3])}
+    return {**out, "R": floats(T[:, :3, :3])} if with_rotation else out
 
 
 def _tracking(run: RunFiles, scene: Scene) -> dict[str, Any]:
@@ -99,10 +91,10 @@ def _tracking(run: RunFiles, scene: Scene) -> dict[str, Any]:
     reasons: dict[str, int] = {"": 0}
     index = [reasons.setdefault(rows.reason[k][:_MAX_TEXT], len(reasons)) for k in chosen.tolist()]
     return {
-        "t": _floats(scene.seconds(rows.t_ns[chosen])),
-        "inliers": _floats(rows.inliers[chosen]),
-        "state": _packed(states[chosen], "u1"),
-        "reason": _packed(np.array(index), "<u2"),
+        "t": floats(scene.seconds(rows.t_ns[chosen])),
+        "inliers": floats(rows.inliers[chosen]),
+        "state": packed(states[chosen], "u1"),
+        "reason": packed(np.array(index), "<u2"),
         "reasons": list(reasons),
     }
 
@@ -113,7 +105,7 @@ def _loops(run: RunFiles, scene: Scene) -> dict[str, Any]:
     rank = {"accepted": 0, "pending": 1, "rejected": 2}
     order = sorted(range(len(rows)), key=lambda k: (rank.get(rows[k].decision, 3), k))[:_MAX_LOOPS]
     return {
-        "ends": _floats(ends[order]),
+        "ends": floats(ends[order]),
         "rows": [
             {
                 "from": rows[k].from_id,
@@ -156,8 +148,8 @@ def _cloud(run: RunFiles, scene: Scene, most: int) -> dict[str, Any]:
         "low": low.tolist(),
         "step": step.tolist(),
         "near": near.tolist(),
-        "xyz": _packed(np.rint((placed - low) / step), "<u2"),
-        "rgb": _packed((red >> 3 << 11) | (green >> 2 << 5) | (blue >> 3), "<u2"),
+        "xyz": packed(np.rint((placed - low) / step), "<u2"),
+        "rgb": packed((red >> 3 << 11) | (green >> 2 << 5) | (blue >> 3), "<u2"),
     }
 
 
@@ -169,10 +161,5 @@ def _pictures(pictures: Thumbnails, scene: Scene) -> dict[str, Any]:
             for i, t_ns, jpeg in pictures.images
         ],
         "camera": None if T is None else T.tolist(),
-        "keyframes": _floats(scene.seconds(pictures.t_ns)),
+        "keyframes": floats(scene.seconds(pictures.t_ns)),
     }
-
-
-def assets(name: str) -> str:
-    """Return a text file that the page carries."""
-    return (Path(__file__).with_name("assets") / name).read_text(encoding="utf-8")

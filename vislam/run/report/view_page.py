@@ -8,9 +8,10 @@ import re
 from typing import Any
 
 from vislam.run.report.html import escape
-from vislam.run.report.view_data import as_script, assets
+from vislam.run.report.page_assets import assets
+from vislam.run.report.view_data import as_script
 
-_MODULES = ("data.js", "view.js", "plots.js", "details.js", "main.js")  # each may use those before it
+_MODULES = ("data.js", "view.js", "layers.js", "plots.js", "details.js", "main.js")  # each may use those before it
 _LIBRARIES = ("vendor/three.min.js", "vendor/uplot.min.js")
 
 

@@ -14,8 +14,32 @@ export const floats = (text) => new Float32Array(bytesOf(text));
 export const shorts = (text) => new Uint16Array(bytesOf(text));
 export const octets = (text) => new Uint8Array(bytesOf(text));
 
+export const steps = (text) => new Int16Array(bytesOf(text));
+export const numbers = (text) => new Uint32Array(bytesOf(text));
+
+// Colours of 5, 6 and 5 bits as bytes of red, green, blue and opacity.
+export function colorsOf(packed, rgb, from = 0) {
+  for (let k = 0; k < packed.length; k++) {
+    const at = 4 * (from + k);
+    rgb[at] = ((packed[k] >> 11) * 255) / 31;
+    rgb[at + 1] = (((packed[k] >> 5) & 63) * 255) / 63;
+    rgb[at + 2] = ((packed[k] & 31) * 255) / 31;
+    rgb[at + 3] = 255;
+  }
+}
+
+function unpackCloud(cloud) {
+  const xyz = shorts(cloud.xyz);
+  cloud.position = new Float32Array(3 * cloud.count);
+  for (let k = 0; k < cloud.position.length; k++) cloud.position[k] = cloud.low[k % 3] + cloud.step[k % 3] * xyz[k];
+  cloud.color = new Uint8Array(4 * cloud.count);
+  colorsOf(shorts(cloud.rgb), cloud.color);
+}
+
+// What a report carries; a live page makes the same of what it is sent.
 export function readData() {
   const data = JSON.parse(document.getElementById("view-data").textContent);
+  if (data.cloud.count) unpackCloud(data.cloud);
   for (const path of Object.values(data.paths)) {
     path.t = floats(path.t);
     path.xyz = floats(path.xyz);

@@ -1,25 +1,11 @@
 // Joins the view, the plots and the details: one moment, one chosen loop.
-import { element, readData } from "./data.js";
+import { readData } from "./data.js";
 import { Details } from "./details.js";
+import { layerButtons } from "./layers.js";
 import { Plots } from "./plots.js";
 import { View } from "./view.js";
 
 const PLAY_MS = 50;
-
-function layerButtons(view, parent) {
-  for (const [name, layer] of view.layers) {
-    const label = element("label", "layer");
-    const box = element("input");
-    box.type = "checkbox";
-    box.checked = layer.node.visible;
-    box.name = name;
-    box.addEventListener("change", () => view.show(name, box.checked));
-    const swatch = element("i", "swatch");
-    swatch.style.background = `var(--${layer.swatch})`;
-    label.append(box, swatch, element("span", "", layer.label));
-    parent.append(label);
-  }
-}
 
 function player(slider, button, data, setTime) {
   let timer = null;

@@ -30,17 +30,25 @@ export class Plots {
     this.parent = parent;
     this.data = data;
     this.plots = [];
-    this.spells = spells(data.tracking, data.end_s);
     this.closed = data.loops.rows.filter((row) => row.decision === "accepted").map((row) => row.to_s);
     const of = (key) => Object.entries(data.errors).map(([name, curve]) => ({ name, t: curve.t, values: curve[key] }));
     if (of("position").length) {
       this.add("position", "Position error [m]", of("position"), 3);
       this.add("rotation", "Rotation error [°]", of("rotation"), 2);
     }
-    if (data.tracking.t) {
-      this.add("inliers", "Inliers of vision", [{ name: "muted", t: data.tracking.t, values: data.tracking.inliers }], 0);
-    }
+    this.setTracking(data.tracking, data.end_s);
     new ResizeObserver(() => this.resize()).observe(parent);
+  }
+
+  // What vision saw up to an end; a live page gives it again and again.
+  setTracking(tracking, end) {
+    this.data.tracking = tracking;
+    this.data.end_s = end;
+    this.spells = spells(tracking, end);
+    if (!tracking.t) return;
+    const curves = [{ name: "muted", t: tracking.t, values: tracking.inliers }];
+    if (this.inliers) this.inliers.setData(joined(curves));
+    else this.inliers = this.add("inliers", "Inliers of vision", curves, 0);
   }
 
   add(key, title, curves, digits) {
@@ -86,6 +94,7 @@ export class Plots {
     plot.over.addEventListener("pointermove", (event) => this.touched(plot, event));
     plot.over.addEventListener("pointerdown", (event) => this.touched(plot, event));
     this.plots.push(plot);
+    return plot;
   }
 
   width() {

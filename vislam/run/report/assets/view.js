@@ -1,6 +1,6 @@
 // The map and the trajectories in 3-D. Draws only when something has changed; while it turns, only as many points as
 // the machine can draw 20 times a second.
-import { DECISIONS, color, nearest, shorts } from "./data.js";
+import { DECISIONS, color, nearest } from "./data.js";
 
 /* global THREE */
 
@@ -24,17 +24,41 @@ export class View {
     this.painted = []; // what takes a colour of the page: [material, name of the colour]
     this.fraction = Math.min(1, FIRST / (data.cloud.count || 1));
     this.frameMs = 0;
+    this.addControls();
+    this.fill();
+    this.paint();
+    this.overview();
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    this.resize();
+  }
+
+  // Everything that is drawn of the data.
+  fill() {
     this.measure();
     this.addGrid();
     this.addCloud();
     this.addPaths();
     this.addLoops();
     this.addMarker();
-    this.addControls();
+    this.controls.maxDistance = 12 * this.reach;
+    this.controls.minDistance = 0.02 * this.reach;
+  }
+
+  // Draw other data from where one looks now; what is hidden stays so.
+  replace(data) {
+    const hidden = new Map([...this.layers].map(([name, layer]) => [name, layer.node.visible]));
+    this.scene.traverse((node) => {
+      if (node.geometry) node.geometry.dispose();
+      if (node.material) node.material.dispose();
+    });
+    this.scene.clear();
+    this.layers.clear();
+    this.painted = [];
+    this.points = null;
+    this.data = data;
+    this.fill();
+    for (const [name, layer] of this.layers) if (hidden.has(name)) layer.node.visible = hidden.get(name);
     this.paint();
-    this.overview();
-    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
-    this.resize();
   }
 
   measure() {
@@ -76,22 +100,11 @@ export class View {
   addCloud() {
     const cloud = this.data.cloud;
     if (!cloud.count) return;
-    const xyz = shorts(cloud.xyz);
-    const packed = shorts(cloud.rgb);
-    const position = new Float32Array(3 * cloud.count);
-    const rgb = new Uint8Array(4 * cloud.count);
-    for (let k = 0; k < position.length; k++) position[k] = cloud.low[k % 3] + cloud.step[k % 3] * xyz[k];
-    for (let k = 0; k < cloud.count; k++) {
-      rgb[4 * k] = ((packed[k] >> 11) * 255) / 31;
-      rgb[4 * k + 1] = (((packed[k] >> 5) & 63) * 255) / 63;
-      rgb[4 * k + 2] = ((packed[k] & 31) * 255) / 31;
-      rgb[4 * k + 3] = 255;
-    }
     const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
-    geometry.setAttribute("color", new THREE.BufferAttribute(rgb, 4, true));
+    geometry.setAttribute("position", new THREE.BufferAttribute(cloud.position, 3));
+    geometry.setAttribute("color", new THREE.BufferAttribute(cloud.color, 4, true));
     // as large as points that lie evenly on surfaces of this extent would have to be to close them
-    this.pointSize = (4.4 * this.reach) / Math.sqrt(cloud.count);
+    this.pointSize = (4.4 * this.reach) / Math.sqrt(Math.max(cloud.count, cloud.usual || 0));
     const material = new THREE.PointsMaterial({ vertexColors: true, size: this.pointSize });
     this.points = new THREE.Points(geometry, material);
     this.points.frustumCulled = false;
@@ -164,8 +177,6 @@ export class View {
   addControls() {
     this.controls = new THREE.OrbitControls(this.camera, this.canvas);
     this.controls.enableDamping = false;
-    this.controls.maxDistance = 12 * this.reach;
-    this.controls.minDistance = 0.02 * this.reach;
     this.controls.addEventListener("change", () => this.ask(true));
     this.controls.addEventListener("end", () => this.rest());
     let down = null;
@@ -259,7 +270,10 @@ export class View {
     const path = this.data.paths[this.data.best];
     const k = nearest(path.t, t);
     const R = path.R.subarray(9 * k, 9 * k + 9);
-    const [x, y, z] = path.xyz.subarray(3 * k, 3 * k + 3);
+    this.setPose(R, path.xyz.subarray(3 * k, 3 * k + 3));
+  }
+
+  setPose(R, [x, y, z]) {
     this.marker.matrix.set(R[0], R[1], R[2], x, R[3], R[4], R[5], y, R[6], R[7], R[8], z, 0, 0, 0, 1);
     this.marker.matrixWorldNeedsUpdate = true;
     this.ask();

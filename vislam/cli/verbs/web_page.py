@@ -1,0 +1,91 @@
+"""The page of a live run, as the command line has it: its options, its beginning and its end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vislam.cli.verbs.arguments import take_option
+from vislam.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from vislam.cli.verbs.live import LiveOptions
+    from vislam.live.web.station import Station
+
+_TURN_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class WebChoice:
+    """What was asked for: where the page listens, names beside its own, and whether the run waits for it."""
+
+    at: str
+    hosts: tuple[str, ...]
+    waits: bool
+
+
+def take_web(arguments: list[str]) -> WebChoice | None:
+    """Remove `--web [HOST:PORT]`, `--web-waits` and `--web-host NAME` from the arguments; None without --web.
+
+    Raises UsageError for the others without it, and for what is no name.
+    """
+    from vislam.live.web.address import DEFAULT, is_name
+
+    hosts = []
+    while (name := take_option(arguments, "--web-host")) is not None:
+        if not is_name(name):
+            raise UsageError(f"--web-host '{name}' is no name of a host; write it without scheme and port")
+        hosts.append(name)
+    waits = "--web-waits" in arguments
+    while "--web-waits" in arguments:
+        arguments.remove("--web-waits")
+    at: str | None = None
+    for i, argument in enumerate(arguments):
+        name, equals, given = argument.partition("=")
+        if name != "--web":
+            continue
+        follows = not equals and i + 1 < len(arguments) and not arguments[i + 1].startswith("-")
+        at = given if equals else arguments[i + 1] if follows else DEFAULT
+        del arguments[i : i + 1 + follows]
+        break
+    if at is None and (hosts or waits):
+        raise UsageError("--web-waits and --web-host are options of the page; add --web")
+    return None if at is None else WebChoice(at, tuple(hosts), waits)
+
+
+@contextmanager
+def opened(web: WebChoice | None, pose_name: str, out: Path) -> Iterator[Station | None]:
+    """Serve the page meanwhile, and say where; None where none was asked for."""
+    if web is None:
+        yield None
+        return
+    from vislam.live.web.address import parsed
+    from vislam.live.web.station import Station
+
+    at = parsed(web.at)
+    station = Station(at, web.hosts, pose_name, out)
+    try:
+        print(f"vislam: the page of this run: {station.url}", file=sys.stderr, flush=True)
+        if not at.is_loopback:
+            print(
+                f"vislam: others can reach {station.address}; whoever has the token steers the run, and what is sent "
+                "can be read on the way: a tunnel is safer (docs/cart.md)", file=sys.stderr, flush=True,
+            )  # fmt: skip
+        with station.noticing():
+            yield station
+    finally:
+        station.close()
+
+
+def wait_for_start(station: Station, options: LiveOptions) -> None:
+    """Wait until the page says that the run shall begin."""
+    while True:
+        station.tell("waiting", source=options.source, can=["start"])
+        if any(command.do == "start" for command in station.asked()):
+            return
+        time.sleep(_TURN_S)

@@ -1,0 +1,268 @@
+// The page of a live run: asks for what is new, a few times a second, one request after the other.
+import { element, floats, octets } from "./data.js";
+import { layerButtons } from "./layers.js";
+import { LiveMap } from "./map.js";
+import { Plots } from "./plots.js";
+import { View } from "./view.js";
+import { Wizard } from "./wizard.js";
+
+const STATE_MS = 100;
+const DRAW_MS = 1000; // between two drawings of map and path; the pose moves in between
+const SEEN_MS = 1000;
+const LOST_MS = 1500; // between two tries where nothing answers
+const GROWN = 1.15; // so much larger and the whole is looked at again
+const SURE_MS = 4000;
+const LABELS = { start: "Start", stop: "Stop", save: "Save map" };
+
+const at = (id) => document.getElementById(id);
+const page = { map: new LiveMap(), view: null, plots: null, state: null, drawn: 0, reach: 0, touched: false, answers: 0 };
+
+async function asked(path) {
+  const answer = await fetch(path, { cache: "no-store" });
+  if (answer.status === 401) location.reload();
+  if (!answer.ok) throw new Error(`${path}: ${answer.status}`);
+  return answer.json();
+}
+
+export async function command(values) {
+  try {
+    const answer = await fetch("/command", {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify(values),
+    });
+    if (!answer.ok) at("line").textContent = (await answer.json()).error;
+  } catch (error) {
+    at("line").textContent = "Nothing answers: the command was not heard.";
+  }
+}
+
+function commandButtons(can) {
+  const parent = at("commands");
+  if (parent.dataset.can === can.join()) return;
+  parent.dataset.can = can.join();
+  parent.replaceChildren(...can.map((name) => {
+    const button = element("button", name, LABELS[name] || name);
+    button.type = "button";
+    button.addEventListener("click", () => {
+      if (name === "stop" && !button.classList.contains("sure")) {
+        button.classList.add("sure");
+        button.textContent = "Really stop?";
+        setTimeout(() => {
+          button.classList.remove("sure");
+          button.textContent = LABELS.stop;
+        }, SURE_MS);
+      } else command({ do: name });
+    });
+    return button;
+  }));
+}
+
+const fixed = (value, digits, unit) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)}${unit}`);
+
+function factsOf(state) {
+  const { pose, frame, map } = state;
+  const facts = [];
+  if (pose) {
+    facts.push(["Time", fixed(pose.t_s, 1, " s")]);
+    facts.push(["x, y, z [m]", pose.xyz.map((v) => fixed(v, 2, "")).join(", ")]);
+    const [heading] = [Math.atan2(pose.R[3] ?? 0, pose.R[0] ?? 1)];
+    facts.push(["Heading", fixed((heading * 180) / Math.PI, 1, "°")]);
+    facts.push(["Sigma", fixed(pose.sigma_m, 2, " m")]);
+    facts.push(["Speed", fixed(pose.speed_m_s, 2, " m/s")]);
+    facts.push(["Vision corrected", pose.vision_age_s === null ? "not yet" : `${pose.vision_age_s.toFixed(1)} s ago`]);
+  }
+  if (frame) facts.push(["Vision", `${frame.tracking}, ${frame.inliers} inliers`, `state-${frame.tracking}`]);
+  const late = state.latency_ms || {};
+  if ("p50" in late) facts.push(["Sample to pose", `${late.p50.toFixed(2)} ms, 99 %: ${late.p99.toFixed(1)} ms`]);
+  if (state.every > 1) facts.push(["Too slow", `one frame in ${state.every}`, "state-degraded"]);
+  if (state.map_left_out) facts.push(["Map too slow", `${state.map_left_out} left out`, "state-degraded"]);
+  for (const [name, word] of Object.entries(state.sensors || {})) facts.push([name, word, word === "well" ? "state-ok" : "state-lost"]);
+  if (map.keyframes) {
+    const closed = page.map.loops.filter((loop) => loop[2] === "accepted").length;
+    facts.push(["Keyframes", `${map.keyframes}, graph ${map.graph_revision}`]);
+    facts.push(["Loops", `${closed} of ${page.map.loops.length} candidates`]);
+  }
+  return facts;
+}
+
+function showFacts(state) {
+  at("facts").replaceChildren(...factsOf(state).flatMap(([name, value, mark]) => {
+    const term = element("dt", "", name);
+    if (mark) term.prepend(element("i", `dot ${mark}`));
+    return [term, element("dd", "", value)];
+  }));
+  at("reason").textContent = state.frame ? state.frame.reason : "";
+  const bad = new Set(["invalid", "gate_reject", "doubtful", "dead_reckoning"]);
+  const health = state.pose ? state.pose.health : [];
+  at("health").replaceChildren(...health.map((name) => {
+    const isBad = bad.has(name) || /missing|fault|gap|saturated|drift|step/.test(name);
+    return element("span", `flag ${isBad ? "bad" : "good"}`, name.replaceAll("_", " "));
+  }));
+}
+
+function showLists(state) {
+  at("processes").replaceChildren(...Object.entries(state.processes || {}).map(([role, word]) => {
+    const item = element("li", "", `${role}: ${word}`);
+    item.prepend(element("i", `dot state-${word === "runs" ? "ok" : word === "ended" ? "lost" : "degraded"}`));
+    return item;
+  }));
+  const said = [
+    ...(state.saved || []).map((saved) => [saved.is_well ? "saved" : "warning", saved.text]),
+    ...(state.notices || []).slice().reverse(),
+  ];
+  at("notices-card").hidden = !said.length;
+  at("notices").replaceChildren(...said.map(([level, text]) => {
+    const item = element("li", level, text);
+    item.prepend(element("b", "", level));
+    return item;
+  }));
+}
+
+function showVerdict(state) {
+  const verdict = state.verdict;
+  const line = at("verdict");
+  line.hidden = !verdict;
+  if (!verdict) return;
+  line.className = `verdict ${verdict.state}`;
+  const reasons = (verdict.reasons || []).join("; ") || "nothing in the run contradicts itself";
+  const state_ = verdict.state.charAt(0).toUpperCase() + verdict.state.slice(1);
+  line.textContent = `${state_}: ${reasons}.`;
+}
+
+function showPicture(frame) {
+  const image = at("picture");
+  if (!frame || !frame.has_picture || page.loading || frame.number === page.shown) return;
+  page.loading = true;
+  page.shown = frame.number;
+  const next = new Image();
+  next.onload = () => {
+    image.src = next.src;
+    image.hidden = false;
+    at("of-picture").textContent = `Camera at ${frame.t_s.toFixed(1)} s`;
+    page.loading = false;
+  };
+  next.onerror = () => (page.loading = false);
+  next.src = `/camera.jpg?n=${frame.number}`;
+}
+
+function show(state) {
+  page.state = state;
+  at("run-name").textContent = state.run ? `vislam live: ${state.run}` : "vislam live";
+  at("phase").textContent = state.phase;
+  at("phase").className = `badge ${state.phase.replaceAll(" ", "-")}`;
+  at("line").textContent = state.phase === "running" ? "" : state.line || "";
+  at("view").classList.toggle("idle", state.phase === "waiting");
+  commandButtons(state.can || []);
+  showVerdict(state);
+  showFacts(state);
+  showLists(state);
+  showPicture(state.frame);
+  page.wizard.show(state);
+  if (page.map.takePath(state.path)) page.stale = true;
+  if (page.view && state.pose && state.pose.R[0] !== null) page.view.setPose(state.pose.R, state.pose.xyz);
+  document.documentElement.dataset.phase = state.phase;
+  document.documentElement.dataset.answers = ++page.answers;
+}
+
+async function followMap(state) {
+  const { map } = page;
+  if (state.map.epoch === map.epoch && state.map.revision === map.revision) return;
+  let answer;
+  do {
+    answer = await asked(`/map?epoch=${map.epoch}&since=${map.revision}`);
+    map.take(answer);
+  } while (answer.more);
+  page.stale = true;
+}
+
+function draw() {
+  const now = performance.now();
+  if (!page.stale || now - page.drawn < DRAW_MS) return;
+  const data = page.map.data();
+  if (!Object.keys(data.paths).length && !data.cloud.count) return;
+  page.stale = false;
+  page.drawn = now;
+  if (!page.view) {
+    try {
+      page.view = new View(at("view-canvas"), data);
+    } catch (error) {
+      document.documentElement.classList.add("flat"); // no WebGL here: the rest of the page lives
+      page.view = null;
+      page.stale = false;
+      page.drawn = Infinity;
+      return;
+    }
+    page.view.controls.addEventListener("start", () => (page.touched = true));
+  } else page.view.replace(data);
+  const names = [...page.view.layers.keys()].join();
+  if (names !== page.layers) {
+    page.layers = names;
+    page.view.show("live", true);
+    at("view-layers").replaceChildren();
+    layerButtons(page.view, at("view-layers"));
+  }
+  if (!page.touched && (page.view.reach > GROWN * page.reach || page.reach > GROWN * page.view.reach)) {
+    page.reach = page.view.reach;
+    page.view.overview();
+  }
+  const { pose } = page.state;
+  if (pose && pose.R[0] !== null) page.view.setPose(pose.R, pose.xyz);
+  at("of-map").textContent = `Points: ${data.cloud.count}, of ${page.map.clouds.size} of ${page.map.poses.size} keyframes`;
+  document.documentElement.dataset.points = data.cloud.count;
+}
+
+async function followVision(state) {
+  const now = performance.now();
+  if (!state.frame || now - (page.seenAt || -SEEN_MS) < SEEN_MS) return;
+  page.seenAt = now;
+  const seen = await asked("/seen");
+  const tracking = { t: floats(seen.t), inliers: floats(seen.inliers), state: octets(seen.state) };
+  if (tracking.t.length < 2) return;
+  const end = tracking.t[tracking.t.length - 1];
+  if (!page.plots) {
+    page.plots = new Plots(at("view-plots"), { errors: {}, labels: {}, tracking, end_s: end, loops: { rows: [] } });
+  } else page.plots.setTracking(tracking, end);
+}
+
+async function turn() {
+  let wait = STATE_MS;
+  try {
+    const { map } = page;
+    const state = await asked(`/state?epoch=${map.pathEpoch}&path=${map.path.length / 3}`);
+    show(state);
+    await followMap(state);
+    draw();
+    await followVision(state);
+  } catch (error) {
+    if (!(error instanceof TypeError) && !/\d{3}$/.test(error.message)) throw error; // ours, not the network's
+    const isOver = page.state && ["ending", "ended"].includes(page.state.phase);
+    at("phase").textContent = isOver ? "ended" : "no connection";
+    at("phase").className = "badge";
+    document.documentElement.dataset.phase = isOver ? "ended" : "lost";
+    at("line").textContent = isOver
+      ? "The run has ended and its folder is written."
+      : "Nothing answers: the run has ended, or the way to it is cut.";
+    commandButtons([]);
+    wait = LOST_MS;
+  }
+  setTimeout(turn, wait);
+}
+
+document.documentElement.classList.add("live");
+page.wizard = new Wizard(at("wizard"), command);
+at("view-home").addEventListener("click", () => {
+  page.touched = false;
+  if (page.view) page.view.overview();
+});
+at("view-above").addEventListener("click", () => {
+  page.touched = true;
+  if (page.view) page.view.fromAbove();
+});
+window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  if (page.view) page.view.paint();
+  if (page.plots) page.plots.paint();
+});
+window.vislamLive = page;
+document.documentElement.dataset.ready = "yes";
+turn();

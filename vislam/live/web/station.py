@@ -1,0 +1,165 @@
+"""The page's side in the process that owns the run: it starts the server, tells it how things are, hears commands."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from vislam.core import log
+from vislam.core.files import plain
+from vislam.live.processes.child import Failure, Flag, Signals, guarded
+from vislam.live.run_live import LiveRun
+from vislam.live.status import status_line
+from vislam.live.web import web_process
+from vislam.live.web.address import WebAddress, listening
+from vislam.live.web.web_gate import Gate, new_token
+from vislam.live.web.news import Asked, Status, WebEnds
+from vislam.live.wire.mail import Inbox, Outbox
+
+_LOG = logging.getLogger(__name__)
+_TELL_S = 0.1
+_LINGER_S = 1.5  # that browsers have to hear of the end
+_NOTICES = 12
+_MAX_TEXT = 300
+_TOLD_OF_FRONT = ("verdict", "every", "sensors")
+_TOLD_OF_MAP = ("found_in_map", "map_left_out")
+
+
+class Station:
+    """Owns the process of the page. What goes wrong with it is said once; the run goes on without."""
+
+    def __init__(self, at: WebAddress, hosts: tuple[str, ...], pose_name: str, out: Path) -> None:
+        """Listen, and start the process; raises UsageError where nothing can listen there."""
+        listener = listening(at)
+        port = listener.getsockname()[1]
+        gate = Gate(new_token(), port, frozenset(name.lower() for name in (at.host, *hosts)))
+        host = f"[{at.host}]" if ":" in at.host else at.host
+        self.address = f"http://{host}:{port}/"
+        self.url = f"{self.address}#{gate.token}"  # a fragment is in no log: browsers do not send it
+        self._out, self._is_well, self._due_s = out, True, 0.0
+        self._notices: deque[tuple[str, str]] = deque(maxlen=_NOTICES)
+        context = get_context("spawn")
+        owner, to_owner = context.Pipe()
+        frames, to_frames = context.Pipe(duplex=False)
+        map_wire, to_map = context.Pipe()
+        self.ends = WebEnds(to_frames, to_map)
+        self._report, says = context.Pipe(duplex=False)
+        self._signals = Signals(Flag(), Flag())
+        self._signals.go.set()
+        body = partial(
+            web_process.run, listener=listener, gate=gate, owner=to_owner, frames=frames, map_wire=map_wire,
+            pose_name=pose_name,
+        )  # fmt: skip
+        self._process = context.Process(
+            target=guarded, args=("web", says, self._signals, body, log.level()), name="vislam web"
+        )
+        self._process.start()
+        for end in (says, to_owner, frames, map_wire):
+            end.close()
+        listener.close()
+        self._box, self._inbox = Outbox(owner, 1), Inbox(owner)
+
+    def tell(self, phase: str, **values: Any) -> None:
+        """Tell browsers how things are; what they were before is forgotten."""
+        self._watch()
+        status = {"phase": phase, "run": self._out.name, "notices": list(self._notices), **values}
+        self._box.put(Status(plain(status)))
+
+    def follow(self, run: LiveRun) -> None:
+        """Tell how a run is, a few times a second, and end it where the page asks for that."""
+        for command in self.asked():
+            if command.do == "stop":
+                _LOG.info("the web page asked for the end of the run")
+                run.stop()
+        if time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + _TELL_S
+            self.tell(_phase(run), **_told(run))
+
+    def asked(self) -> Iterator[Asked]:
+        """Yield the commands that have come since."""
+        while (command := self._inbox.get()) is not None:
+            if isinstance(command, Asked):
+                yield command
+
+    @contextmanager
+    def noticing(self) -> Iterator[None]:
+        """Show the page what is logged meanwhile."""
+        handler = _Notices(self._notices)
+        logging.getLogger().addHandler(handler)
+        try:
+            yield
+        finally:
+            logging.getLogger().removeHandler(handler)
+
+    def end(self, metrics: dict[str, Any]) -> None:
+        """Tell browsers that the run is over and what it is worth; they have a moment to hear of it."""
+        if self._is_well:
+            told = {name: metrics.get(name) for name in ("frames", "keyframes", "verdict")}
+            self.tell("ended", line="the run folder is written, with its report", **told)
+            time.sleep(_LINGER_S)
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        self._signals.stop.set()
+        self._process.join(1.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        for end in (self.ends.frames, self.ends.map):
+            end.close()
+
+    def _watch(self) -> None:
+        """Log what the process says, and that it died, once."""
+        with suppress(EOFError, OSError):
+            while self._report.poll():
+                message = self._report.recv()
+                if isinstance(message, logging.LogRecord):
+                    log.take_record(message)
+                elif isinstance(message, Failure):
+                    _LOG.error("the web process failed:\n%s", message.traceback)
+        if self._is_well and not self._process.is_alive() and not self._signals.stop.is_set():
+            self._is_well = False
+            _LOG.warning("the process of the web page died; the run goes on without the page")
+
+
+class _Notices(logging.Handler):
+    """Keeps the newest of what is logged."""
+
+    def __init__(self, kept: deque[tuple[str, str]]) -> None:
+        super().__init__(logging.INFO)
+        self._kept = kept
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the first line."""
+        said = record.getMessage().partition("\n")[0][:_MAX_TEXT]
+        self._kept.append((record.levelname.lower(), said))
+
+
+def _phase(run: LiveRun) -> str:
+    if run.is_ending:
+        return "ending"
+    return "running" if run.is_going else "getting ready"
+
+
+def _told(run: LiveRun) -> dict[str, Any]:
+    waits = {*run.waits_for}
+    fast, front, of_map = (run.notes.get(role, {}) for role in ("fast", "front", "map"))
+    states = {
+        role: "getting ready" if role in waits else "runs" if process.is_alive() else "ended"
+        for role, process in run.processes().items()
+    }
+    return {
+        "line": status_line(run).strip(),
+        "processes": states,
+        "latency_ms": fast.get("latency_ms", {}),
+        "can": [] if run.is_ending else ["stop", "save"] if run.is_going else ["stop"],
+        **{name: front[name] for name in _TOLD_OF_FRONT if name in front},
+        **{name: of_map[name] for name in _TOLD_OF_MAP if name in of_map},
+    }
