@@ -15,8 +15,8 @@ import pytest
 from vislam.core.errors import UsageError
 from vislam.live.web.address import listening, parsed
 from vislam.live.web.feed import Feed
-from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.web.server import WebServer, as_json
+from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.web.web_process import routes
 
 _TOKEN = new_token()

@@ -17,8 +17,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from vislam.live.web.web_gate import Gate
 from vislam.live.web.request_reader import MOST_BODY_BYTES, RequestReader, TooLarge
+from vislam.live.web.web_gate import Gate
 
 _LOG = logging.getLogger(__name__)
 _MOST_CONNECTIONS = 32

@@ -19,8 +19,8 @@ from vislam.live.run_live import LiveRun
 from vislam.live.status import status_line
 from vislam.live.web import web_process
 from vislam.live.web.address import WebAddress, listening
-from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.web.news import Asked, Status, WebEnds
+from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.wire.mail import Inbox, Outbox
 
 _LOG = logging.getLogger(__name__)

@@ -14,10 +14,10 @@ from typing import Any
 from vislam.core.errors import DataError
 from vislam.live.processes.child import Life
 from vislam.live.web.feed import Feed
-from vislam.live.web.web_gate import Gate
 from vislam.live.web.news import Asked, Save
 from vislam.live.web.pages import page, sign_in
 from vislam.live.web.server import Answer, Routes, WebServer, as_json
+from vislam.live.web.web_gate import Gate
 from vislam.live.wire.mail import Inbox, Outbox
 from vislam.live.wire.publisher import PoseReader
 
