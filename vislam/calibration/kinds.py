@@ -11,6 +11,7 @@ from vislam.calibration import options as o
 
 if TYPE_CHECKING:
     from vislam.calibration.outcome import Outcome
+    from vislam.calibration.watching import Watch
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,18 +21,31 @@ class Kind:
     options: type[Any]
     home: str  # of its function, below this package
     summary: str
+    watched_by: str | None = None  # what does it step by step, if anything does
 
     @property
     def calibrate(self) -> Callable[[Any], Outcome]:
         """What does it, imported now: --help needs none of it."""
-        module, _, name = self.home.rpartition(".")
-        return getattr(import_module(f"vislam.calibration.{module}"), name)
+        return _loaded(self.home)
+
+    @property
+    def watch(self) -> type[Watch] | None:
+        """What does it step by step, before a person; None: nothing does."""
+        return None if self.watched_by is None else _loaded(self.watched_by)
+
+
+def _loaded(home: str) -> Any:
+    module, _, name = home.rpartition(".")
+    return getattr(import_module(f"vislam.calibration.{module}"), name)
 
 
 KINDS = {
     "board": Kind(o.BoardFile, "cameras.board.print_board", "draw a calibration board to print"),
     "camera": Kind(
-        o.CameraOptions, "cameras.camera.calibrate_camera", "focal length, centre and distortion, from views of a board"
+        o.CameraOptions,
+        "cameras.camera.calibrate_camera",
+        "focal length, centre and distortion, from views of a board",
+        "cameras.board_watch.BoardWatch",
     ),
     "camera-imu": Kind(
         o.CameraImuOptions,

@@ -59,18 +59,19 @@ _RUN_FILES = (
     "saved/cloud.ply", "saved/trajectory.tum", "map/drive.yaml", "map/map.json",
     *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
+_CALIBRATIONS = "calibration"  # folder of those that were made before the run began
 TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "submap", "reason")
 
 
 def prepare(out: Path, overwrite: bool, base: MapChoice | None = None) -> None:
     """Make the folder of a new run; raises UsageError when it holds something else, StorageError when it cannot be.
 
-    What a run left that ended before its first frame is replaced without `overwrite`.
+    What a run left that ended before its first frame is replaced without `overwrite`; calibrations made there stay.
     `base` is the map in which the run begins: it must not lie there.
     """
     if base is not None and base.session.resolve().parent == out.resolve():
         raise UsageError(f"--map {base.path} is in --out {out}, where it would be replaced; choose a new folder")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and (not out.is_dir() or any(path.name != _CALIBRATIONS for path in out.iterdir())):
         files = _files_of_run(out)
         is_run = (out / "manifest.json").is_file()
         is_empty = _holds_nothing(out, files)
@@ -110,7 +111,8 @@ def _holds_nothing(out: Path, files: list[Path]) -> bool:
         frames = read_metrics(out).get("frames", 0)
     except DataError:
         return False
-    return frames == 0 and {*files} >= {path for path in out.rglob("*") if not path.is_dir()}
+    held = {path for path in out.rglob("*") if not path.is_dir() and path.relative_to(out).parts[0] != _CALIBRATIONS}
+    return frames == 0 and {*files} >= held
 
 
 def read_setup(out: Path) -> tuple[str, Config, MapChoice | None]:

@@ -101,6 +101,12 @@ def choose(views: list[View], size: tuple[int, int], at_most: int) -> list[View]
     return [views[i] for i in sorted(chosen)]
 
 
+def differing(view: View, others: list[View], size: tuple[int, int], least: float) -> bool:
+    """Return whether a view differs from all others by `least`, in place, size and slant in parts of the image."""
+    feature = _feature(view, size)
+    return all(np.linalg.norm(feature - _feature(other, size)) > least for other in others)
+
+
 def _feature(view: View, size: tuple[int, int]) -> Array:
     """Return where, how large and how slanted a board is seen [6], in parts of the image."""
     diagonal = float(np.hypot(*size))

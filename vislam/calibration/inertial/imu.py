@@ -99,6 +99,35 @@ def solve_imu(table: Table, moved: Movement, options: ImuOptions) -> ImuResult:
     return ImuResult(rests, _distinct(rests), accel, gyro)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuPoses:
+    """What a recording that still goes on has of poses."""
+
+    directions: int  # distinct ones
+    up: Array  # [M, 3] roughly, in raw axes, at every rest
+    lacking: list[str]  # for a calibration
+    unseen: str  # sides that were never up; empty while there are few poses
+    is_still: bool  # now
+    held_s: float  # since when
+    rest_s: float  # that a pose has to be held
+
+
+def poses_so_far(table: Table, options: ImuOptions) -> ImuPoses:
+    """Return which poses the samples up to now show; `solve_imu` has the last word on them."""
+    moved = movement(table, _QUIET_SHARE)
+    least = round(options.rest_s / table.period_s)
+    rests = [rest_of(table, span) for span in moved.rests(_FACTORS[2], max(least, 3))]
+    known = np.flatnonzero(np.isfinite(moved.spread[:, 0]))  # the window looks ahead: the newest are not known yet
+    still = np.all(moved.spread[known] <= _FACTORS[2] * moved.usual, axis=1)
+    moving = np.flatnonzero(~still)
+    held = len(still) if not len(moving) else len(still) - 1 - int(moving[-1])
+    directions = _distinct(rests)
+    unseen = _unseen(rests) if directions > 3 else ""
+    up = _raw_directions(rests)
+    lacking = _lacking(rests, options)
+    return ImuPoses(directions, up, lacking, unseen, held > 0, held * table.period_s, options.rest_s)
+
+
 def _lacking(rests: list[Rest], options: ImuOptions) -> list[str]:
     """Return what lacks for a fit: directions, or that they leave a plane."""
     wanted = _MIN_DIRECTIONS[options.model]

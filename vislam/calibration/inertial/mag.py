@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from vislam.calibration.inertial.field import IronFit, fit_iron
 from vislam.calibration.inertial.tables import Table, read_field, read_inertial
@@ -92,9 +93,7 @@ def solve_mag(field: Table, inertial: Table, options: MagOptions) -> MagResult:
 def _solve_3d(what: str, field: Table, tilt_deg: float, R_level: Array) -> MagResult:
     fit = fit_iron(field.values)
     centre = field.values.mean(axis=0) if fit is None else fit.centre
-    ways = field.values - centre
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    covered = float(np.mean((_sphere() @ ways.T).max(axis=1) > _NEAR_COS))
+    covered = float(np.mean(sphere_seen(field.values, centre)[1]))
     reasons = []
     if fit is None or covered < _MIN_SPHERE:
         reasons.append(f"only {covered:.0%} of all directions were seen; turn it about all axes, up to upside down")
@@ -103,6 +102,21 @@ def _solve_3d(what: str, field: Table, tilt_deg: float, R_level: Array) -> MagRe
     refuse(what, reasons)
     assert fit is not None
     return MagResult("3d", fit, R_level, field.values, 0.0, covered, 0.0, tilt_deg)
+
+
+def sphere_seen(values: Array, centre: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return directions over the sphere [M, 3], and which of them [M] a field [N, 3] about a centre came near to."""
+    ways = values - centre
+    ways = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+    sphere = _sphere()
+    return sphere, np.asarray((sphere @ ways.T).max(axis=1) > _NEAR_COS)
+
+
+def largest_gap_deg(values: Array, up: Array) -> float:
+    """Return the largest gap between neighbouring headings of a field [N, 3] on a sensor that turns about `up` [3]."""
+    level = values @ level_rotation(up)[:2].T
+    centre = 0.5 * (level.min(axis=0) + level.max(axis=0))
+    return _gap_deg(np.arctan2(*(level - centre).T[::-1]))
 
 
 def _solve_2d(what: str, field: Table, inertial: Table, up: Array, usual: Array, tilt_deg: float) -> MagResult:
@@ -129,11 +143,15 @@ def _solve_2d(what: str, field: Table, inertial: Table, up: Array, usual: Array,
 
 def _refuse_gap(what: str, heading_rad: Array) -> float:
     """Return the largest gap between neighbouring headings in degrees; raises DataError when a sector is missing."""
-    heading = np.sort(np.mod(heading_rad, 2.0 * np.pi))
-    gap = float(np.rad2deg(np.max(np.diff(heading, append=heading[0] + 2.0 * np.pi))))
+    gap = _gap_deg(heading_rad)
     reason = f"a sector of {gap:.0f} deg was never faced; turn the cart once around, slowly"
     refuse(what, [reason] if gap > _MAX_GAP_DEG else [])
     return gap
+
+
+def _gap_deg(heading_rad: Array) -> float:
+    heading = np.sort(np.mod(heading_rad, 2.0 * np.pi))
+    return float(np.rad2deg(np.max(np.diff(heading, append=heading[0] + 2.0 * np.pi))))
 
 
 def _doubts(fit: IronFit) -> list[str]:

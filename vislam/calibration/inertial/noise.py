@@ -20,9 +20,9 @@ from vislam.imu import ImuNoise, NoiseFloor, NoiseRatios
 
 _FILES = ("noise.yaml", "noise.png", "noise.json")
 _MOVED = 4.0  # times the usual spread: somebody touched it
-_MIN_STILL_S = 300.0  # shorter, the bias walk of no sensor shows
+LEAST_STILL_S = 300.0  # shorter, the bias walk of no sensor shows
 _MIN_SHARE = 0.5  # of the recording that must be still in one piece
-_ENOUGH_S = 3600.0
+ENOUGH_STILL_S = 3600.0
 _WHITE_SIGMA = 0.05  # relative: larger is no calibration
 _COLORS = ("axis-x", "axis-y", "axis-z")
 _NAMES = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
@@ -64,9 +64,9 @@ def fit_still(table: Table) -> NoiseCalibration:
     span_s = (len(still.t_ns) - 1) * still.period_s
     refuse(
         f"the noise in {table.path}",
-        [f"only {span_s:.0f} s in a row are still and without holes, {_MIN_STILL_S:.0f} s are the least and an hour is "
-         "good; put the sensor on something heavy, away from traffic, and record again"]
-        if span_s < _MIN_STILL_S or len(still.t_ns) < _MIN_SAMPLES else [],
+        [f"only {span_s:.0f} s in a row are still and without holes, {LEAST_STILL_S:.0f} s are the least and an hour "
+         "is good; put the sensor on something heavy, away from traffic, and record again"]
+        if span_s < LEAST_STILL_S or len(still.t_ns) < _MIN_SAMPLES else [],
     )  # fmt: skip
     refuse(
         f"the noise in {table.path}",
@@ -96,6 +96,12 @@ def driving_floor(table: Table, model: ImuNoise) -> NoiseFloor:
     return floor
 
 
+def longest_still_s(table: Table) -> float:
+    """Return how long a sensor stood still in one piece."""
+    still = _longest_still(table)
+    return (len(still.t_ns) - 1) * table.period_s
+
+
 def _longest_still(table: Table) -> Table:
     rests = movement(table, 0.5).rests(_MOVED, 2)
     longest = max(rests, key=lambda rest: rest.stop - rest.start, default=slice(0, 0))
@@ -116,7 +122,7 @@ def _statements(found: NoiseCalibration) -> list[str]:
     said = [f"{found.still_s:.0f} s still at {found.model.rate_hz:.1f} Hz; white noise to {_worst_white(found):.1%}"]
     limits = [name for name, fit in zip(_NAMES, found.fits, strict=True) if not fit.walk_determined]
     if limits:
-        advice = "" if found.still_s > _ENOUGH_S else f"; {_ENOUGH_S / 3600.0:.0f} h or more would tell"
+        advice = "" if found.still_s > ENOUGH_STILL_S else f"; {ENOUGH_STILL_S / 3600.0:.0f} h or more would tell"
         said.append(f"bias walk of {', '.join(limits)} does not stand out and counts with its upper limit{advice}")
     misfits = [name for name, fit in zip(_NAMES, found.fits, strict=True) if fit.misfit > 5.0]
     if misfits:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,8 +15,6 @@ from vislam.core.errors import UsageError
 if TYPE_CHECKING:
     from vislam.cli.verbs.live import LiveOptions
     from vislam.live.web.station import Station
-
-_TURN_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +80,18 @@ def opened(web: WebChoice | None, pose_name: str, out: Path) -> Iterator[Station
 
 
 def wait_for_start(station: Station, options: LiveOptions) -> None:
-    """Wait until the page says that the run shall begin."""
-    while True:
-        station.tell("waiting", source=options.source, can=["start"])
-        if any(command.do == "start" for command in station.asked()):
-            return
-        time.sleep(_TURN_S)
+    """Wait until the page says that the run shall begin; meanwhile it can calibrate."""
+    from vislam.cli.wizard.calibration_steps import STEPS, CalibrationSteps
+
+    steps = CalibrationSteps(station, options.source, options.settings, options.sensors, options.out)
+    try:
+        while True:
+            for command in station.asked():
+                if command.do == "start" and not steps.is_going:
+                    return
+                steps.obey(command.do, command.values)
+            can = ["start"] if not steps.is_going else []
+            station.tell("waiting", source=options.source, can=can, steps=STEPS, wizard=steps.shown)
+            steps.turn()
+    finally:
+        steps.close()

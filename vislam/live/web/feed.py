@@ -12,7 +12,7 @@ import numpy as np
 from vislam.core.files import plain
 from vislam.core.messages import Array
 from vislam.hw.health import Health
-from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Saved, Status
+from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Saved, Status, StepPicture
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.run.report.page_assets import floats, packed
 
@@ -40,7 +40,7 @@ class Feed:
         self._path = _Path()
         self._map = _Keyframes()
         self._frame: FrameNews | None = None
-        self._frames = 0
+        self._jpeg, self._pictures = b"", 0
         self._seen: deque[tuple[int, int, int]] = deque(maxlen=_MOST_FRAMES)  # time, inliers, state
         self._saved: deque[Saved] = deque(maxlen=4)
 
@@ -50,9 +50,12 @@ class Feed:
             if isinstance(news, Status):
                 self._status = news.values
             elif isinstance(news, FrameNews):
-                self._frame, self._frames = news, self._frames + 1
+                self._frame = news
+                self._jpeg, self._pictures = news.jpeg, self._pictures + 1
                 self._seen.append((news.t_ns, news.inliers, _STATES.index(news.tracking)))
                 self._begin(news.t_ns)
+            elif isinstance(news, StepPicture):
+                self._jpeg, self._pictures = news.jpeg, self._pictures + 1
             elif isinstance(news, MapNews):
                 self._map.take(news)
             elif isinstance(news, Saved):
@@ -78,6 +81,7 @@ class Feed:
             return {
                 **self._status,
                 "pose": None if self._pose is None else self._told_pose(self._pose),
+                "picture": self._pictures,
                 "path": self._path.told(query),
                 "map": self._map.summary(),
                 "frame": None if self._frame is None else self._told_frame(self._frame),
@@ -103,7 +107,7 @@ class Feed:
     def picture(self) -> bytes:
         """Return the newest picture as JPEG; empty where there is none."""
         with self._lock:
-            return b"" if self._frame is None else self._frame.jpeg
+            return self._jpeg
 
     def _begin(self, t_ns: int) -> None:
         self._zero_ns = t_ns if self._zero_ns is None else self._zero_ns
@@ -122,7 +126,6 @@ class Feed:
 
     def _told_frame(self, frame: FrameNews) -> dict[str, Any]:
         return {
-            "number": self._frames,
             "t_s": (frame.t_ns - (self._zero_ns or 0)) * _NS,
             "has_picture": bool(frame.jpeg),
             "tracking": frame.tracking,

@@ -38,6 +38,13 @@ class FrameNews:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class StepPicture:
+    """What a calibration step sees."""
+
+    jpeg: bytes
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeCloud:
     """Points of one keyframe in its body frame, in an order of which every beginning is an even sample."""

@@ -19,7 +19,7 @@ from vislam.live.run_live import LiveRun
 from vislam.live.status import status_line
 from vislam.live.web import web_process
 from vislam.live.web.address import WebAddress, listening
-from vislam.live.web.news import Asked, Status, WebEnds
+from vislam.live.web.news import Asked, Status, StepPicture, WebEnds
 from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.wire.mail import Inbox, Outbox
 
@@ -64,13 +64,17 @@ class Station:
         for end in (says, to_owner, frames, map_wire):
             end.close()
         listener.close()
-        self._box, self._inbox = Outbox(owner, 1), Inbox(owner)
+        self._box, self._inbox = Outbox(owner, 2), Inbox(owner)
 
     def tell(self, phase: str, **values: Any) -> None:
         """Tell browsers how things are; what they were before is forgotten."""
         self._watch()
         status = {"phase": phase, "run": self._out.name, "notices": list(self._notices), **values}
         self._box.put(Status(plain(status)))
+
+    def show(self, jpeg: bytes) -> None:
+        """Show a picture, if the one before was taken."""
+        self._box.put(StepPicture(jpeg))
 
     def follow(self, run: LiveRun) -> None:
         """Tell how a run is, a few times a second, and end it where the page asks for that."""

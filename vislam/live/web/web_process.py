@@ -24,6 +24,7 @@ from vislam.live.wire.publisher import PoseReader
 _TURN_S = 0.05
 _REOPEN_S = 0.5  # between two looks for the published pose
 _MOST_ASKED = 16  # commands that may wait
+_MOST_VALUES = 6
 _MOST_VALUE = 64  # letters of a word that comes with a command
 COMMANDS = ("start", "stop", "calibrate", "next", "cancel")  # for the process that owns the run
 
@@ -94,7 +95,9 @@ class _Commands:
 
 def _is_plain(said: dict[str, Any]) -> bool:
     """Return whether a command has a few short words and nothing else."""
-    return len(said) <= 4 and all(isinstance(value, str) and len(value) <= _MOST_VALUE for value in said.values())
+    return len(said) <= _MOST_VALUES and all(
+        isinstance(value, str) and len(value) <= _MOST_VALUE for value in said.values()
+    )
 
 
 class _Poses:

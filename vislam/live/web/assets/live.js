@@ -130,20 +130,23 @@ function showVerdict(state) {
   line.textContent = `${state_}: ${reasons}.`;
 }
 
-function showPicture(frame) {
-  const image = at("picture");
-  if (!frame || !frame.has_picture || page.loading || frame.number === page.shown) return;
+// The picture of the run, or of the step of a calibration.
+function showPicture(state) {
+  const { frame } = state;
+  const isStep = state.wizard && state.wizard.has_picture;
+  const image = isStep ? page.wizard.picture : at("picture");
+  if (!(isStep || (frame && frame.has_picture)) || page.loading || state.picture === page.shown) return;
   page.loading = true;
-  page.shown = frame.number;
+  page.shown = state.picture;
   const next = new Image();
   next.onload = () => {
     image.src = next.src;
     image.hidden = false;
-    at("of-picture").textContent = `Camera at ${frame.t_s.toFixed(1)} s`;
+    if (frame) at("of-picture").textContent = `Camera at ${frame.t_s.toFixed(1)} s`;
     page.loading = false;
   };
   next.onerror = () => (page.loading = false);
-  next.src = `/camera.jpg?n=${frame.number}`;
+  next.src = `/camera.jpg?n=${state.picture}`;
 }
 
 function show(state) {
@@ -157,8 +160,8 @@ function show(state) {
   showVerdict(state);
   showFacts(state);
   showLists(state);
-  showPicture(state.frame);
   page.wizard.show(state);
+  showPicture(state);
   if (page.map.takePath(state.path)) page.stale = true;
   if (page.view && state.pose && state.pose.R[0] !== null) page.view.setPose(state.pose.R, state.pose.xyz);
   document.documentElement.dataset.phase = state.phase;

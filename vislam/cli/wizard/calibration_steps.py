@@ -1,0 +1,165 @@
+"""Calibration steps as the page asks for them: begun, shown while they go, finished or left."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vislam.calibration.kinds import KINDS
+from vislam.calibration.options import BoardOptions
+from vislam.calibration.watching import Progress, Watch
+from vislam.cli.wizard.step_sensors import StepSensors, opened
+from vislam.config import Config, SensorsConfig, validated
+from vislam.core.errors import UsageError, VislamError
+from vislam.core.files import plain
+from vislam.live.web.station import Station
+
+_LOG = logging.getLogger(__name__)
+_READ_S = 0.1
+_TOLD_S = 0.5  # between two looks at the progress
+_FEWEST_SQUARES, _MOST_SQUARES = 3, 64
+FOLDER = "calibration"  # in the run folder
+STEPS = {name: kind.summary for name, kind in KINDS.items() if kind.watched_by is not None}
+_OPTIONS = {"camera": "--calibration.camera {}/camchain.yaml (once it has T_cam_imu: vislam calibrate camera-imu)",
+            "noise": "--calibration.imu-noise {}/noise.yaml",
+            "imu": "[calibration] of the chip in the sensors file (--sensors): imu = \"{}/imu.yaml\"",
+            "mag": "[calibration] of the chip in the sensors file (--sensors): mag = \"{}/mag.yaml\""}  # fmt: skip
+
+
+class CalibrationSteps:
+    """Owns the step that is going on, if any; everything it writes is below one folder."""
+
+    def __init__(self, station: Station, source: str, config: Config, sensors: SensorsConfig, out: Path) -> None:
+        """Begin with none.
+
+        Args:
+            station: the page.
+            source: of the run that waits.
+            config: of the run.
+            sensors: of the cart.
+            out: the run folder.
+        """
+        self._station, self._source, self._config, self._sensors = station, source, config, sensors
+        self._folder = out / FOLDER
+        self._kind = ""
+        self._watch: Watch | None = None
+        self._opened: StepSensors | None = None
+        self._told_s = 0.0
+        self.shown: dict[str, Any] = {}  # of the step, for the page
+
+    @property
+    def is_going(self) -> bool:
+        """Whether a step reads sensors."""
+        return self._watch is not None
+
+    def obey(self, do: str, values: Mapping[str, str]) -> None:
+        """Begin, finish or leave a step; what goes wrong is shown in the page."""
+        try:
+            if do == "calibrate":
+                self._begin(values)
+            elif do == "next":
+                self._finish()
+            elif do == "cancel":
+                self.close()
+                self.shown = {}
+        except VislamError as error:
+            self._fail(error)
+
+    def turn(self) -> None:
+        """Read sensors for a moment, and show how far the step is."""
+        if self._watch is None or self._opened is None:
+            time.sleep(_READ_S)
+            return
+        try:
+            for value in self._opened.read(_READ_S):
+                self._watch.take(value)
+            if time.monotonic() - self._told_s >= _TOLD_S or self._opened.is_over:
+                self._told_s = time.monotonic()
+                self._show(self._watch.progress())
+        except VislamError as error:
+            self._fail(error)
+            return
+        if self._opened.is_over:
+            time.sleep(_READ_S)
+
+    def close(self) -> None:
+        """Give the sensors back; may be called twice."""
+        if self._opened is not None:
+            self._opened.close()
+        self._watch = self._opened = None
+
+    def _begin(self, values: Mapping[str, str]) -> None:
+        self.close()
+        kind = KINDS.get(values.get("kind", ""))
+        watch = None if kind is None else kind.watch
+        if watch is None:
+            raise UsageError(f"there are steps for {', '.join(STEPS)}")
+        board = board_of(values)
+        self._kind = values["kind"]
+        self._watch = watch(self._folder, board)
+        try:
+            self._opened = opened(self._source, self._config, self._sensors, watch.has_images)
+        except BaseException:
+            self._watch = None
+            raise
+        _LOG.info("the web page began to calibrate: %s", self._kind)
+
+    def _finish(self) -> None:
+        """Calibrate as the command line does; the sensors are given back before."""
+        watch = self._watch
+        if watch is None:
+            return
+        if self._opened is not None:
+            self._opened.close()
+        self.shown = {"kind": self._kind, "stage": "computing", "advice": "computing; this may take a minute"}
+        self._station.tell("waiting", wizard=self.shown)
+        self._watch = self._opened = None
+        outcome = watch.calibrate()
+        files = [f"{FOLDER}/{path.name}" for path in outcome.files]
+        usage = _OPTIONS[self._kind].format(self._folder)
+        lines = [line for line in outcome.lines if not line.startswith("next: ")]
+        self.shown = {
+            "kind": self._kind,
+            "stage": "done",
+            "lines": [*lines, f"for the next run: {usage}"],
+            "files": files,
+        }
+        _LOG.info("calibrated: %s; %s", self._kind, ", ".join(files))
+
+    def _show(self, progress: Progress) -> None:
+        told = plain(asdict(progress))
+        jpeg = progress.jpeg
+        del told["jpeg"]
+        is_over = self._opened is not None and self._opened.is_over
+        advice = "the recording has ended: finish" if is_over else progress.advice
+        self.shown = {"kind": self._kind, "stage": "going", **told, "advice": advice, "has_picture": bool(jpeg)}
+        if jpeg:
+            self._station.show(jpeg)
+
+    def _fail(self, error: VislamError) -> None:
+        self.close()
+        _LOG.warning("not calibrated: %s", error)
+        self.shown = {"kind": self._kind, "stage": "failed", "lines": [str(error)]}
+
+
+def board_of(values: Mapping[str, str]) -> BoardOptions:
+    """Return the board that the page describes: pattern, size as "9x6" and the side of a square in millimetres.
+
+    Raises UsageError for what is no board.
+    """
+    described: dict[str, object] = {}
+    if "pattern" in values:
+        described["kind"] = values["pattern"]
+    if "size" in values:
+        columns, _, rows = values["size"].partition("x")
+        described |= {"columns": columns, "rows": rows}
+    if "square_mm" in values:
+        described["square_mm"] = values["square_mm"]
+    board = validated(BoardOptions, described, "the board")
+    if max(board.columns, board.rows) > _MOST_SQUARES or min(board.columns, board.rows) < _FEWEST_SQUARES:
+        raise UsageError(f"a board has {_FEWEST_SQUARES} to {_MOST_SQUARES} squares along a side")
+    return board

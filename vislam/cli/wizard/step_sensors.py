@@ -1,0 +1,137 @@
+"""The sensors of a calibration step: those that the run will have, raw, or a recording in real time."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from typing import Protocol
+
+import cv2
+
+from vislam.config import Config, SensorsConfig
+from vislam.core.errors import HardwareError, UsageError
+from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.hw.library_cameras import WITH_IMU, gives_frames, open_frame_camera, open_with_imu, reads_own_imu
+from vislam.hw.sensors import open_camera, open_inertial, with_raw_samples
+from vislam.hw.source import CapturedImage
+from vislam.run.sources import open_source
+
+Value = ImuSample | MagSample | Frame
+_NO_FRAMES_NS = 1 << 62
+_NS = 1e-9
+
+
+class StepSensors(Protocol):
+    """What a step reads."""
+
+    def read(self, timeout_s: float) -> list[Value]:
+        """Return what has come since, waiting at most so long for the first of it."""
+        ...
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more will come."""
+        ...
+
+    def close(self) -> None:
+        """Give the devices back; may be called twice."""
+        ...
+
+
+def opened(source: str, config: Config, sensors: SensorsConfig, has_images: bool) -> StepSensors:
+    """Return the cameras, or the IMU, of a live run's source.
+
+    Raises UsageError where it has none that a person could move, HardwareError where one is missing.
+    """
+    if source.startswith("replay:"):
+        return _Played(source.removeprefix("replay:"), config, has_images)
+    inertial, plus, camera = source.partition("+")
+    if not plus and inertial.partition(",")[0].partition(":")[0] in WITH_IMU:
+        inertial, camera = "", source
+    elif plus and reads_own_imu(inertial, camera):
+        inertial = ""
+    elif not plus:
+        raise UsageError(f"{source} has nothing that a hand could move; calibrate with a cart's sensors or a replay")
+    if has_images and camera == "none":
+        raise UsageError(f"{source} has no camera to calibrate")
+    return _Cart(inertial, camera, sensors, has_images)
+
+
+class _Cart:
+    """Devices of this machine."""
+
+    def __init__(self, inertial: str, camera: str, sensors: SensorsConfig, has_images: bool) -> None:
+        self._devices = ExitStack()
+        self._images = self._inertial = None
+        raw = with_raw_samples(sensors)
+        if not inertial and not has_images:
+            images, own = open_with_imu(camera, raw)
+            self._devices.enter_context(closing(images))
+            self._inertial = self._devices.enter_context(closing(own))
+        elif has_images:
+            images = open_frame_camera(camera, sensors) if gives_frames(camera) else open_camera(camera, sensors)
+            self._images = self._devices.enter_context(closing(images))
+        else:
+            self._inertial = self._devices.enter_context(closing(open_inertial(inertial, raw)))
+        self.is_over = False
+
+    def read(self, timeout_s: float) -> list[Value]:
+        """Return samples, or the newest image."""
+        if self._inertial is not None:
+            return list(self._inertial.read(timeout_s))
+        assert self._images is not None
+        captured = self._images.read(timeout_s)
+        return [] if captured is None else [_frame(captured)]
+
+    def close(self) -> None:
+        """Give the devices back."""
+        self._devices.close()
+
+
+class _Played:
+    """A recording in real time; frames that nobody took in time are left out."""
+
+    def __init__(self, uri: str, config: Config, has_images: bool) -> None:
+        recording = open_source(uri, config.seed, config.calibration)
+        self._values: Iterator[Value] = iter(recording.events(None if has_images else _NO_FRAMES_NS))
+        self._next = next(self._values, None)
+        if self._next is None:
+            raise HardwareError(f"{uri} has nothing to play")
+        self._zero_ns, self._begun_s = self._next.t_ns, time.monotonic()
+        self._has_images = has_images
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the recording has been played."""
+        return self._next is None
+
+    def read(self, timeout_s: float) -> list[Value]:
+        """Return the values whose time has come; of frames the newest."""
+        out: deque[Value] = deque(maxlen=1 if self._has_images else None)
+        deadline_s = time.monotonic() + timeout_s
+        while self._next is not None:
+            due_s = self._begun_s + (self._next.t_ns - self._zero_ns) * _NS
+            if due_s > min(time.monotonic(), deadline_s):
+                if out or due_s > deadline_s:
+                    break
+                time.sleep(max(0.0, due_s - time.monotonic()))
+            if isinstance(self._next, Frame) == self._has_images:
+                out.append(self._next)
+            self._next = next(self._values, None)
+        if not out:
+            time.sleep(max(0.0, deadline_s - time.monotonic()))
+        return list(out)
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._next = None
+
+
+def _frame(captured: CapturedImage | Frame) -> Frame:
+    if isinstance(captured, Frame):
+        return captured
+    image = captured.image
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return Frame(captured.t_ns, captured.index, (grey,))
