@@ -55,12 +55,23 @@ KINDS = {
     "floor": Kind(
         o.FloorOptions, "cameras.floor.calibrate_floor", "tilt and height of a cart's camera, from a short drive"
     ),
-    "imu": Kind(o.ImuOptions, "inertial.imu.calibrate_imu", "scale, axes and bias of an IMU, from poses held by hand"),
+    "imu": Kind(
+        o.ImuOptions,
+        "inertial.imu.calibrate_imu",
+        "scale, axes and bias of an IMU, from poses held by hand",
+        "inertial.sample_watches.PoseWatch",
+    ),
     "mag": Kind(
-        o.MagOptions, "inertial.mag.calibrate_mag", "hard and soft iron of a magnetometer, on the cart or by hand"
+        o.MagOptions,
+        "inertial.mag.calibrate_mag",
+        "hard and soft iron of a magnetometer, on the cart or by hand",
+        "inertial.sample_watches.TurnWatch",
     ),
     "noise": Kind(
-        o.NoiseOptions, "inertial.noise.calibrate_noise", "white noise and bias walk of an IMU that stands still"
+        o.NoiseOptions,
+        "inertial.noise.calibrate_noise",
+        "white noise and bias walk of an IMU that stands still",
+        "inertial.sample_watches.StillWatch",
     ),
     "rgbd": Kind(
         o.RgbdOptions,

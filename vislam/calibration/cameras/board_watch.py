@@ -24,7 +24,8 @@ _MOST_VIEWS = 60
 _WANTED_COVER = 0.9
 _STILL_PX = 2.0  # a board whose middle moved more since the last image would be blurred
 _NEW = 0.08  # of the image's diagonal, in place, size and slant: a view that differs less from one that is kept
-_SLANTED = 0.12  # share by which one side of the board is nearer than its middle
+_SLANTED = 0.25  # tangent of a slant that counts: 14 degrees
+_USUAL_FOCAL = 0.8  # of the image's width, before the camera is known
 _WIDTH_PX = 480
 
 
@@ -76,7 +77,7 @@ class BoardWatch:
         if not is_written:
             raise StorageError(f"{self._folder / view.name} cannot be written; is the disk full?")
         self._views.append(view)
-        self._slants |= _slants(view)
+        self._slants |= _slants(view, self._size[0])
         return "kept; " + self._lacking()
 
     def _lacking(self) -> str:
@@ -93,8 +94,7 @@ class BoardWatch:
 
     def progress(self) -> Progress:
         """Return which cells have seen corners, and which slants were shown."""
-        has_views = self._views and self._size is not None
-        counts = coverage(self._views, self._size) if has_views else np.zeros((4, 6))
+        counts = np.zeros((4, 6)) if not self._views or self._size is None else coverage(self._views, self._size)
         covered = float(np.mean(counts > 0))
         parts = (len(self._views) / _WANTED_VIEWS, covered / _WANTED_COVER, len(self._slants) / 4.0)
         return Progress(
@@ -117,18 +117,18 @@ class BoardWatch:
         return calibrate_camera(self._options)
 
 
-def _slants(view: View) -> set[str]:
+def _slants(view: View, width_px: int) -> set[str]:
     """Return which sides of the board are clearly nearer to the camera, as the image shows it.
 
     Over the image of a plane, inverse depth is affine in the pixel: the last row of the homography from image to plane.
+    Its relative slope, times the focal length, is about the tangent of the slant.
     """
     H = cv2.findHomography(view.pixels, view.points_m[:, :2])[0]
     if H is None:
         return set()
-    middle, half = view.pixels.mean(axis=0), 0.5 * np.ptp(view.pixels, axis=0)
-    slope = H[2, :2] * half / (H[2, :2] @ middle + H[2, 2])
-    found = {"right": slope[0] > _SLANTED, "left": slope[0] < -_SLANTED}
-    found |= {"bottom": slope[1] > _SLANTED, "top": slope[1] < -_SLANTED}
+    tangent = _USUAL_FOCAL * width_px * H[2, :2] / (H[2, :2] @ view.pixels.mean(axis=0) + H[2, 2])
+    found = {"right": tangent[0] > _SLANTED, "left": tangent[0] < -_SLANTED}
+    found |= {"bottom": tangent[1] > _SLANTED, "top": tangent[1] < -_SLANTED}
     return {name for name, is_so in found.items() if is_so}
 
 

@@ -13,9 +13,10 @@ import cv2
 from vislam.config import Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.library_cameras import WITH_IMU, gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import open_camera, open_inertial, with_raw_samples
-from vislam.hw.source import CapturedImage
+from vislam.hw.source import CapturedImage, ImageSource, InertialSource
 from vislam.run.sources import open_source
 
 Value = ImuSample | MagSample | Frame
@@ -64,15 +65,17 @@ class _Cart:
 
     def __init__(self, inertial: str, camera: str, sensors: SensorsConfig, has_images: bool) -> None:
         self._devices = ExitStack()
-        self._images = self._inertial = None
+        self._images: ImageSource | LibraryCamera[Frame] | None = None
+        self._inertial: InertialSource | None = None
         raw = with_raw_samples(sensors)
         if not inertial and not has_images:
-            images, own = open_with_imu(camera, raw)
-            self._devices.enter_context(closing(images))
+            device, own = open_with_imu(camera, raw)
+            self._devices.enter_context(closing(device))
             self._inertial = self._devices.enter_context(closing(own))
         elif has_images:
-            images = open_frame_camera(camera, sensors) if gives_frames(camera) else open_camera(camera, sensors)
-            self._images = self._devices.enter_context(closing(images))
+            is_rig = gives_frames(camera)
+            self._images = open_frame_camera(camera, sensors) if is_rig else open_camera(camera, sensors)
+            self._devices.enter_context(closing(self._images))
         else:
             self._inertial = self._devices.enter_context(closing(open_inertial(inertial, raw)))
         self.is_over = False
