@@ -24,10 +24,12 @@ _TOLD_S = 0.5  # between two looks at the progress
 _FEWEST_SQUARES, _MOST_SQUARES = 3, 64
 FOLDER = "calibration"  # in the run folder
 STEPS = {name: kind.summary for name, kind in KINDS.items() if kind.watched_by is not None}
-_OPTIONS = {"camera": "--calibration.camera {}/camchain.yaml (once it has T_cam_imu: vislam calibrate camera-imu)",
-            "noise": "--calibration.imu-noise {}/noise.yaml",
-            "imu": "[calibration] of the chip in the sensors file (--sensors): imu = \"{}/imu.yaml\"",
-            "mag": "[calibration] of the chip in the sensors file (--sensors): mag = \"{}/mag.yaml\""}  # fmt: skip
+_USES = {  # what to do with the file of each
+    "camera": "--calibration.camera {}/camchain.yaml, once vislam calibrate camera-imu has added T_cam_imu",
+    "imu": "biases and matrices of {}/imu.yaml go into [SENSOR.calibration] of the sensors file (--sensors)",
+    "mag": "bias and matrix of {}/mag.yaml go into [SENSOR.calibration] of the sensors file (--sensors)",
+    "noise": "--calibration.imu-noise {}/noise.yaml",
+}
 
 
 class CalibrationSteps:
@@ -120,7 +122,7 @@ class CalibrationSteps:
         self._watch = self._opened = None
         outcome = watch.calibrate()
         files = [f"{FOLDER}/{path.name}" for path in outcome.files]
-        usage = _OPTIONS[self._kind].format(self._folder)
+        usage = _USES[self._kind].format(self._folder)
         lines = [line for line in outcome.lines if not line.startswith("next: ")]
         self.shown = {
             "kind": self._kind,

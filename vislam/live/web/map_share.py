@@ -23,6 +23,7 @@ _MAP_S = 0.5  # between two words of the map
 _CLOUD_POINTS = 2000  # of one keyframe
 _STEP_M = 1e-3
 _MOST_WAITING = 64  # clouds that wait for the page; further ones are left out
+_MOST_LOOPS = 1000  # that wait
 _VOXEL_M = 0.04
 _MAX_REASON = 200
 SAVED = ("saved/cloud.ply", "saved/trajectory.tum")  # in the run folder; the next time replaces them
@@ -56,7 +57,8 @@ class MapShare:
             self._loops += [
                 LoopNews(c.from_id, c.to_id, str(c.decision), c.reason[:_MAX_REASON]) for c in step.candidates
             ]
-            for keyframe_id in {keyframe.id, *step.scans}:
+            self._loops = self._loops[-_MOST_LOOPS:]
+            for keyframe_id in sorted({keyframe.id, *step.scans}):
                 self._add_cloud(keyframe_id, keyframe, mapper)
         for keyframe_id, T in self._poses.items() if steps else ():
             t_ns = self._times[keyframe_id] if keyframe_id in self._times else self._path.get(keyframe_id, (-1,))[0]

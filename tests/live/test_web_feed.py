@@ -1,0 +1,216 @@
+"""What a page gets of a run: bounded however long the run is, and nobody waits for a page that takes nothing."""
+
+from __future__ import annotations
+
+import base64
+import json
+import multiprocessing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vislam.core.messages import Array, Tracking
+from vislam.hw.health import Health
+from vislam.live.web import feed as feed_module
+from vislam.live.web.feed import MOST_POINTS, Feed
+from vislam.live.web.frame_share import FrameShare, picture
+from vislam.live.web.map_share import MapShare, quantised
+from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Saved, Status, StepPicture
+from vislam.live.wire.mail import Inbox
+from vislam.live.wire.published_pose import NO_VISION_MS, PublishedPose
+
+
+def cloud(count: int) -> KeyframeCloud:
+    return KeyframeCloud(0.001, np.full((count, 3), 7, np.int16), np.zeros(count, np.uint16))
+
+
+def news(ids: range, points: int = 10, revision: int = 1) -> MapNews:
+    poses = {i: np.eye(4) for i in ids}
+    return MapNews(revision, poses, dict.fromkeys(ids, 0), {i: cloud(points) for i in ids}, [])
+
+
+def whole(feed: Feed) -> tuple[dict, int]:
+    """Ask as the page does until it has all; return the clouds and how many answers that took."""
+    clouds: dict = {}
+    epoch = since = answers = 0
+    while True:
+        told = feed.map({"epoch": str(epoch), "since": str(since)})
+        json.dumps(told, allow_nan=False)
+        clouds |= told["clouds"]
+        epoch, since, answers = told["epoch"], told["revision"], answers + 1
+        if not told["more"]:
+            return clouds, answers
+
+
+def points_of(clouds: dict) -> int:
+    return sum(len(base64.b64decode(entry["rgb"])) // 2 for entry in clouds.values())
+
+
+def pose_at(position: Array, health: Health = Health.LEVELLED, sigma: float = 0.1) -> PublishedPose:
+    T = np.eye(4)
+    T[:3, 3] = position
+    covariance = np.diag(np.full(6, sigma))
+    return PublishedPose(
+        10**9, 10**9, 1, health, T, np.zeros(3), np.zeros(3), covariance, np.eye(6), np.eye(4), 0, 0, NO_VISION_MS
+    )
+
+
+def test_what_changed_is_sent_and_nothing_else() -> None:
+    feed = Feed()
+    feed.take(news(range(3)))
+    first = feed.map({})
+    assert len(first["clouds"]) == 3
+    feed.take(MapNews(2, {1: np.eye(4) * 2}, {}, {}, []))
+    second = feed.map({"epoch": str(first["epoch"]), "since": str(first["revision"])})
+    assert np.frombuffer(base64.b64decode(second["ids"]), "<u4").tolist() == [1]
+    assert second["clouds"] == {}
+
+
+def test_points_are_bounded_however_many_keyframes_there_are() -> None:
+    feed = Feed()
+    for begin in range(0, 1024, 32):
+        feed.take(news(range(begin, begin + 32), 2000))
+    clouds, answers = whole(feed)
+    assert len(clouds) == 1024
+    assert points_of(clouds) <= MOST_POINTS
+    assert answers > 1
+    assert feed.state({})["map"]["points"] == points_of(clouds)
+
+
+def test_keyframes_are_thinned_when_there_are_too_many_and_the_page_begins_anew(monkeypatch) -> None:
+    monkeypatch.setattr(feed_module, "_MOST_KEYFRAMES", 100)
+    feed = Feed()
+    feed.take(news(range(100)))
+    before = feed.map({})
+    feed.take(news(range(100, 150)))
+    told = feed.map({"epoch": str(before["epoch"]), "since": str(before["revision"])})
+    assert told["epoch"] == before["epoch"] + 1
+    assert len(told["clouds"]) == 75
+
+
+def test_the_path_is_bounded_and_only_its_new_part_is_sent() -> None:
+    feed = Feed()
+    for k in range(5000):
+        feed.follow(pose_at(np.array([0.05 * k, 0.0, 0.0])))
+    path = feed.state({})["path"]
+    count = len(base64.b64decode(path["xyz"])) // 12
+    assert 1000 < count <= 4000
+    tail = feed.state({"epoch": str(path["epoch"]), "path": str(count - 2)})["path"]
+    assert len(base64.b64decode(tail["xyz"])) == 24
+
+
+@pytest.mark.parametrize("query", [{"path": "-1"}, {"path": "x"}, {"path": "9" * 15, "epoch": "0"}, {"since": "1e9"}])
+def test_numbers_that_are_none_are_taken_for_zero_or_ask_for_nothing(query: dict[str, str]) -> None:
+    feed = Feed()
+    feed.take(news(range(2)))
+    feed.follow(pose_at(np.zeros(3)))
+    json.dumps(feed.state(query), allow_nan=False)
+    json.dumps(feed.map(query), allow_nan=False)
+
+
+def test_a_pose_without_certainty_is_told_without_numbers_that_json_lacks() -> None:
+    feed = Feed()
+    feed.follow(pose_at(np.full(3, np.nan), Health(0), np.inf))
+    told = json.dumps(feed.state({}), allow_nan=False)
+    assert "NaN" not in told
+    assert base64.b64decode(feed.state({})["path"]["xyz"]) == b""  # not levelled: nowhere
+
+
+def test_the_newest_picture_is_shown_whether_of_the_run_or_of_a_step() -> None:
+    feed = Feed()
+    assert feed.picture() == b""
+    feed.take(StepPicture(b"step"))
+    assert (feed.picture(), feed.state({})["picture"]) == (b"step", 1)
+    feed.take(FrameNews(5, b"frame", "lost", 3, "dark"))
+    state = feed.state({})
+    assert (feed.picture(), state["picture"], state["frame"]["reason"]) == (b"frame", 2, "dark")
+    assert base64.b64decode(feed.seen()["state"]) == b"\x02"
+
+
+def test_loops_status_and_what_was_saved_are_told() -> None:
+    feed = Feed()
+    feed.take(Status({"phase": "running"}))
+    feed.take(Saved("saved/cloud.ply"))
+    feed.take(MapNews(1, {}, {}, {}, [LoopNews(1, 9, "pending", "waits"), LoopNews(1, 9, "accepted", "agrees")]))
+    state = feed.state({})
+    assert state["phase"] == "running"
+    assert feed.is_going
+    assert state["saved"][0]["text"] == "saved/cloud.ply"
+    assert feed.map({})["loops"] == [[1, 9, "accepted", "agrees"]]
+
+
+def test_a_cloud_is_the_same_every_time_and_never_wraps_around() -> None:
+    rng = np.random.default_rng(0)
+    points, colors = rng.uniform(-80.0, 80.0, (5000, 3)), rng.integers(0, 255, (5000, 3), dtype=np.uint8)
+    first, second = (quantised(4, points, colors) for _ in range(2))
+    assert np.array_equal(first.xyz, second.xyz)
+    assert len(first.xyz) == 2000
+    restored = first.xyz * first.step_m
+    nearest = np.abs(restored[:20, None] - points[None]).max(axis=2).min(axis=1)
+    assert nearest.max() <= first.step_m
+
+
+def test_a_picture_is_small_and_what_has_no_image_gives_none() -> None:
+    frame = SimpleNamespace(color=None, images=(np.zeros((960, 1280), np.uint8),))
+    jpeg = picture(frame, np.array([[3.0, 4.0], [np.nan, 0.0], [-1e9, 1e9]]))
+    assert jpeg[:2] == b"\xff\xd8"
+    assert len(jpeg) < 50_000
+    assert picture(SimpleNamespace(color=None, images=()), np.empty((0, 2))) == b""
+
+
+def seen_step(t_ns: int):
+    vo = SimpleNamespace(tracking=Tracking.OK, inliers=5)
+    track = SimpleNamespace(vo=vo, reason="", observations=SimpleNamespace(pixels_px=np.empty((0, 2))))
+    frame = SimpleNamespace(t_ns=t_ns, color=None, images=(np.zeros((48, 64), np.uint8),))
+    return SimpleNamespace(frame=frame, track=track)
+
+
+def keyframe_step(keyframe_id: int):
+    keyframe = SimpleNamespace(id=keyframe_id, t_ns=keyframe_id, points_body_m=np.ones((5, 3)), frame=SimpleNamespace(
+        color=None, images=()), keypoints_px=np.zeros((5, 2)))  # fmt: skip
+    update = SimpleNamespace(revision=1, ids=np.array([keyframe_id]), T_map_body=np.eye(4)[None], T_map_odom=np.eye(4))
+    odometry = SimpleNamespace(packet=SimpleNamespace(keyframe=keyframe), T_odom_body=np.eye(4))
+    return SimpleNamespace(odometry=odometry, update=update, candidates=[], scans={})
+
+
+@pytest.mark.parametrize("is_dead", [True, False])
+def test_nobody_waits_for_a_page_that_takes_nothing_and_no_memory_is_spent_on_it(
+    tmp_path, monkeypatch, is_dead
+) -> None:
+    monkeypatch.setattr("vislam.live.web.frame_share._FRAME_S", 0.0)
+    hears, says = multiprocessing.Pipe()
+    if is_dead:
+        hears.close()
+    frames = FrameShare(says)
+    for k in range(3000):  # more than a pipe holds
+        frames.show(seen_step(k))
+    hears_map, says_map = multiprocessing.Pipe()
+    if is_dead:
+        hears_map.close()
+    shared = MapShare(says_map, tmp_path)
+    for k in range(3000):
+        shared.take([keyframe_step(k)], None)
+    assert len(shared._clouds) <= 64
+
+
+def test_the_map_is_saved_where_the_program_says_and_errors_are_told(tmp_path) -> None:
+    from vislam.live.web.map_share import SAVED
+    from vislam.live.web.news import Save
+
+    page, wire = multiprocessing.Pipe()
+    shared = MapShare(wire, tmp_path)
+    shared.take([keyframe_step(1)], None)
+    inbox = Inbox(page)
+    page.send((0, Save()))
+    answers = []
+    for k in range(200):
+        shared.take([keyframe_step(2 + k)], None)
+        while (told := inbox.get(0.02)) is not None:
+            answers.append(told)
+        if any(isinstance(told, Saved) for told in answers):
+            break
+    saved = next(told for told in answers if isinstance(told, Saved))
+    assert saved.is_well
+    assert SAVED[1] in saved.text
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")} == {SAVED[1]}
