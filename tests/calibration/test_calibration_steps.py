@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vislam.calibration.cameras.board_watch import BoardWatch
 from vislam.calibration.inertial.sample_watches import PoseWatch, StillWatch, TurnWatch
@@ -56,6 +58,7 @@ def test_a_board_that_is_held_still_in_new_places_is_kept_and_calibrates(tmp_pat
     assert progress.can_finish
     assert int(progress.facts["Views"].split()[0]) >= 10
     assert np.shape(progress.cells) == (4, 6)
+    assert {"left", "right", "top", "bottom"} == {*progress.facts["Sides nearer once"].split(", ")}
     assert progress.jpeg[:2] == b"\xff\xd8"
     outcome = watch.calibrate()
     assert abs(outcome.report["parameters"]["fx"] - WEBCAM.fx) < 5.0 * outcome.report["sigmas"]["fx"]
@@ -74,13 +77,6 @@ def test_a_board_that_moves_or_is_not_there_or_stays_is_not_kept(tmp_path: Path)
         watch.calibrate()
 
 
-def test_slants_are_told_by_the_side_that_is_nearer(tmp_path: Path) -> None:
-    watch = BoardWatch(tmp_path, _BOARD)
-    fed(watch, frames(np.random.default_rng(2), 14))
-    seen = watch.progress().facts["Sides nearer once"]
-    assert {"left", "right", "top", "bottom"} <= {*seen.split(", ")}
-
-
 def test_poses_are_counted_while_the_sensor_is_held_and_the_file_is_that_of_the_command_line(tmp_path: Path) -> None:
     t_s, values = hand_held(1, ups(1), 3.0, 1.5)
     watch = PoseWatch(tmp_path, _BOARD)
@@ -91,7 +87,7 @@ def test_poses_are_counted_while_the_sensor_is_held_and_the_file_is_that_of_the_
             told.append(int(watch.progress().facts.get("Poses", "0 of").split()[0]))
     assert told == sorted(told)
     assert told[0] < 3
-    assert told[-1] == 12
+    assert watch.progress().facts["Poses"] == "12 of 12"
     assert watch.progress().can_finish
     watch.calibrate()
     found = read_imu_calibration(tmp_path / "imu.yaml")
@@ -112,13 +108,12 @@ def test_poses_that_lack_are_named_and_too_few_are_refused(tmp_path: Path) -> No
 def turned(count: int, spread: float):
     """Samples of a magnetometer and an IMU that are turned at random, as far as `spread` (1: to all sides)."""
     rng = np.random.default_rng(0)
-    from scipy.spatial.transform import Rotation
-
     turns = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.15, (count, 3)) * [spread, spread, 1.0], axis=0))
     for k, R in enumerate(turns):
         t_ns = T0_NS + k * 20_000_000
         yield ImuSample(t_ns, np.zeros(3), R.inv().apply([0.0, 0.0, 9.81]))
-        yield MagSample(t_ns, R.inv().apply([20.0, 0.0, -42.0]) + [12.0, -20.0, 30.0] + rng.normal(0.0, 0.3, 3))
+        field_ut = R.inv().apply(np.array([20.0, 0.0, -42.0]))
+        yield MagSample(t_ns, field_ut + np.array([12.0, -20.0, 30.0]) + rng.normal(0.0, 0.3, 3))
 
 
 def test_directions_of_the_field_fill_up_as_the_sensor_is_turned(tmp_path: Path) -> None:
@@ -161,20 +156,18 @@ def test_time_still_is_counted_and_five_minutes_are_the_least(tmp_path: Path) ->
 def test_samples_that_are_no_numbers_or_out_of_order_are_left(tmp_path: Path) -> None:
     watch = StillWatch(tmp_path, _BOARD)
     good = ImuSample(T0_NS, np.zeros(3), np.ones(3))
-    fed(
-        watch,
-        [
-            good,
-            good,
-            ImuSample(T0_NS - 5, np.zeros(3), np.ones(3)),
-            ImuSample(T0_NS + 9, np.full(3, np.nan), np.ones(3)),
-        ],
-    )
+    early, broken = replace(good, t_ns=T0_NS - 5), replace(good, t_ns=T0_NS + 9, gyro_rad_s=np.full(3, np.nan))
+    fed(watch, [good, good, early, broken])
     assert len(watch._log.inertial().t_ns) == 1
 
 
-@pytest.mark.parametrize("text", [{"size": "9"}, {"size": "9x0"}, {"size": "-3x4"}, {"size": "1000000x1000000"}, {"size": "axb"},
-                                  {"square_mm": "nan"}, {"square_mm": "0"}, {"pattern": "../x"}, {"size": "2x2"}])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        {"size": "9"}, {"size": "9x0"}, {"size": "-3x4"}, {"size": "1000000x1000000"}, {"size": "axb"}, {"size": "2x2"},
+        {"square_mm": "nan"}, {"square_mm": "0"}, {"pattern": "../x"},
+    ],
+)  # fmt: skip
 def test_what_is_no_board_is_refused(text: dict[str, str]) -> None:
     with pytest.raises(UsageError):
         board_of(text)
@@ -187,7 +180,7 @@ def test_a_board_is_what_the_page_says() -> None:
 
 @pytest.mark.parametrize("source", ["virtual-cart", "gy85+none"])
 def test_a_source_without_what_a_step_needs_is_told(source: str) -> None:
-    with pytest.raises(UsageError, match="nothing that a hand could move|no camera"):
+    with pytest.raises(UsageError, match=r"nothing that a hand could move|no camera"):
         opened(source, Config(), SensorsConfig(), has_images=True)
 
 

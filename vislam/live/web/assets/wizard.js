@@ -23,7 +23,7 @@ function sphere(ways) {
   [70, 210].forEach((x, half) => {
     picture.append(svg("circle", { cx: x, cy: 68, r: DISC, class: "half" }));
     const text = svg("text", { x, y: 146, "text-anchor": "middle" });
-    text.textContent = half ? "z down" : "z up";
+    text.textContent = half ? "−z" : "+z";
     picture.append(text);
   });
   for (const [x, y, z, seen] of ways) {
