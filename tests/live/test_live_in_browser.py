@@ -124,26 +124,3 @@ def test_a_run_is_begun_seen_saved_and_ended_in_a_browser(chromium, waiting) -> 
     assert waiting.ended() == 0
     assert {"metrics.json", "report.html", "trajectory_graph.tum"} <= {path.name for path in waiting.out.iterdir()}
     assert faults == phone_faults == []
-
-
-def test_a_page_that_is_killed_leaves_the_run_alone(tmp_path: Path) -> None:
-    live = Live(tmp_path / "drive", "--source", _WORLD.replace("600", "8"))
-    try:
-        children = Path(f"/proc/{live.process.pid}/task/{live.process.pid}/children").read_text().split()
-        pages = [int(child) for child in children if _listens(int(child))]
-        assert len(pages) == 1
-        os.kill(pages[0], signal.SIGKILL)
-        assert live.ended() == 0
-        assert "the process of the web page died" in (live.out / "log.txt").read_text()
-    finally:
-        live.kill()
-
-
-def _listens(pid: int) -> bool:
-    """Return whether a process has a socket that listens at a port of TCP."""
-    rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]]
-    listening = {f"socket:[{row[9]}]" for row in rows if row[3] == "0A"}
-    try:
-        return any(os.readlink(entry) in listening for entry in Path(f"/proc/{pid}/fd").iterdir())
-    except OSError:
-        return False

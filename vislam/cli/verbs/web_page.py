@@ -70,8 +70,9 @@ def opened(web: WebChoice | None, pose_name: str, out: Path) -> Iterator[Station
         print(f"vislam: the page of this run: {station.url}", file=sys.stderr, flush=True)
         if not at.is_loopback:
             print(
-                f"vislam: others can reach {station.address}; whoever has the token steers the run, and what is sent "
-                "can be read on the way: a tunnel is safer (docs/cart.md)", file=sys.stderr, flush=True,
+                f"vislam: others can reach {station.address} (with this machine's address where that is none); whoever "
+                "has the token steers the run, and what is sent can be read on the way: a tunnel is safer "
+                "(docs/cart.md)", file=sys.stderr, flush=True,
             )  # fmt: skip
         with station.noticing():
             yield station

@@ -99,8 +99,8 @@ class Feed:
             rows = np.array(self._seen, dtype=np.int64).reshape(-1, 3)
             zero = self._zero_ns or 0
         return {
-            "t": floats((rows[:, 0] - zero) * _NS),
-            "inliers": floats(rows[:, 1]),
+            "t": packed((rows[:, 0] - zero) * _NS, "<f4"),
+            "inliers": packed(rows[:, 1], "<f4"),
             "state": packed(rows[:, 2], "u1"),
         }
 

@@ -1,0 +1,145 @@
+"""The process of the page, real: commands reach the run, and the run outlives the page. And the options of both."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import logging
+import time
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import pytest
+
+from vislam.cli import run_verb
+from vislam.cli.verbs.web_page import WebChoice, take_web
+from vislam.core.errors import UsageError
+from vislam.live.web.address import parsed
+from vislam.live.web.station import Station
+from vislam.run.folder import prepare
+
+
+def ask(station: Station, method: str, path: str, body: dict | None = None) -> tuple[int, dict]:
+    split = urlsplit(station.url)
+    headers = {"Authorization": f"Bearer {split.fragment}", "Content-Type": "application/json"}
+    with closing(http.client.HTTPConnection(split.hostname, split.port, timeout=60)) as connection:
+        connection.request(method, path, None if body is None else json.dumps(body), headers)
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
+
+
+def until(is_so) -> None:
+    deadline = time.monotonic() + 60.0
+    while not is_so():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def station(tmp_path: Path):
+    made = Station(parsed("127.0.0.1:0"), (), "vislam-test-no-pose", tmp_path / "drive")
+    yield made
+    made.close()
+    made.close()
+
+
+def run_that_goes() -> SimpleNamespace:
+    """Stands for a live run."""
+    run = SimpleNamespace(is_going=True, is_ending=False, is_brief=False, waits_for=[], notes={}, stopped=0)
+    run.processes = dict
+    run.stop = lambda: setattr(run, "stopped", run.stopped + 1)
+    return run
+
+
+def test_a_run_is_told_of_and_ended_from_the_page_and_outlives_it(station: Station, caplog) -> None:
+    run = run_that_goes()
+    run.notes = {"front": {"verdict": {"state": "doubtful", "reasons": ["it is <b>dark</b>"]}}}
+
+    def told() -> dict:
+        station.follow(run)
+        return ask(station, "GET", "/state")[1]
+
+    until(lambda: told().get("phase") == "running")
+    assert told()["verdict"]["reasons"] == ["it is <b>dark</b>"]
+    assert {"stop", "save"} == {*told()["can"]}
+    assert ask(station, "POST", "/command", {"do": "stop"})[0] == 202
+    until(lambda: (station.follow(run), run.stopped)[1] == 1)
+
+    station._process.kill()
+    station._process.join()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(50):
+            station._due_s = 0.0
+            station.follow(run)
+    assert sum("the run goes on without the page" in record.message for record in caplog.records) == 1
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {}, {"do": "shell"}, {"do": ["stop"]}, {"do": None}, {"do": "calibrate", "kind": ["imu"]},
+        {"do": "calibrate", "kind": "x" * 65}, {"do": "calibrate", **{str(k): "x" for k in range(9)}},
+    ],
+)  # fmt: skip
+def test_what_is_no_command_is_refused_and_reaches_nobody(said: dict) -> None:
+    from vislam.live.web.web_process import _Commands
+
+    taken: list[object] = []
+    box = SimpleNamespace(put=lambda value: taken.append(value) or True)
+    assert _Commands(box, box).take(said).status == 400
+    assert taken == []
+
+
+def test_commands_that_nobody_takes_are_bounded() -> None:
+    from vislam.live.web.web_process import _Commands
+
+    full = SimpleNamespace(put=lambda value: False)
+    assert _Commands(full, full).take({"do": "stop"}).status == 503
+    assert _Commands(full, full).take({"do": "save"}).status == 503
+
+
+@pytest.mark.parametrize(
+    ("given", "left", "choice"),
+    [
+        (["--out", "x"], ["--out", "x"], None),
+        (["--web"], [], WebChoice("127.0.0.1:8765", (), False)),
+        (["--web", "--out", "x"], ["--out", "x"], WebChoice("127.0.0.1:8765", (), False)),
+        (["--out", "x", "--web", ":9000"], ["--out", "x"], WebChoice(":9000", (), False)),
+        (["--web=0.0.0.0:1", "--web-waits"], [], WebChoice("0.0.0.0:1", (), True)),
+        (["--web", "--web-host", "a.b", "--web-host", "c"], [], WebChoice("127.0.0.1:8765", ("a.b", "c"), False)),
+    ],
+)
+def test_options_of_the_page_are_taken_and_the_others_left(given, left, choice) -> None:
+    assert take_web(given) == choice
+    assert given == left
+
+
+@pytest.mark.parametrize(
+    "given", [["--web-waits"], ["--web-host", "a"], ["--web", "--web-host", "http://a"], ["--web", "--web-host"]]
+)
+def test_options_of_the_page_that_make_no_sense_are_refused(given) -> None:
+    with pytest.raises(UsageError):
+        take_web(given)
+
+
+@pytest.mark.parametrize("at", ["8765", "no such:1", "no-such-host.invalid:80", "203.0.113.7:80"])
+def test_an_address_that_cannot_be_listened_at_ends_with_code_2_and_leaves_no_folder(tmp_path, capsys, at: str) -> None:
+    out = tmp_path / "drive"
+    assert run_verb(["live", "--source", "virtual-cart", "--out", str(out), "--web", at]) == 2
+    assert "--web" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_folder_that_holds_calibrations_only_takes_a_run_and_keeps_them(tmp_path: Path) -> None:
+    out = tmp_path / "drive"
+    (out / "calibration").mkdir(parents=True)
+    (out / "calibration" / "camera.yaml").write_text("x")
+    prepare(out, overwrite=False)
+    (out / "log.txt").write_text("a sensor was missing\n")
+    prepare(out, overwrite=False)
+    assert (out / "calibration" / "camera.yaml").read_text() == "x"
+    (out / "other.txt").write_text("somebody's")
+    with pytest.raises(UsageError):
+        prepare(out, overwrite=False)
