@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import rewritten_line
-from vislam.cli.verbs.web_page import WebChoice, opened, take_web, wait_for_start
+from vislam.cli.verbs.web_page import WebChoice, begun_by_page, opened, take_web
 from vislam.config import Config, SensorsConfig, load, load_cart
 from vislam.config.ranges import Positive
 from vislam.core.errors import UsageError
@@ -21,6 +22,7 @@ from vislam.core.errors import UsageError
 if TYPE_CHECKING:
     from vislam.live.run_live import LiveRun
     from vislam.live.web.station import Station
+    from vislam.run.folder import MapChoice
 
 
 @dataclass(frozen=True)
@@ -98,24 +100,33 @@ def main(arguments: list[str]) -> int:
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
     if options.localize_only and options.map is None:
         raise UsageError("--localize-only needs a map; give --map OLD/session.db")
-    from vislam.live.beginning import in_map
-    from vislam.live.run_live import LiveRun
-    from vislam.live.sources import open_live
     from vislam.run.folder import MapChoice, prepare
 
     base = None if options.map is None else MapChoice(options.map, options.localize_only)
     with opened(web, options.settings.live.name, options.out) as station:
-        if web is not None and web.waits and station is not None:
+        make = partial(_made, options, command, base, station)
+        if station is not None and web is not None and web.waits:
             prepare(options.out, options.overwrite, base)
-            wait_for_start(station, options)
-        source, settings = open_live(options.source, options.settings, options.sensors)
-        beginning = None if base is None else in_map(base, source, settings)
-        ends = None if station is None else station.ends
-        live = LiveRun(source, settings, options.out, options.source, command, base, beginning, ends)
-        if web is None or not web.waits:
+            live, seconds = begun_by_page(station, options, command, make)
+        else:
+            live, seconds = make()
             prepare(options.out, options.overwrite, base)
-        seconds = source.duration_s if options.seconds is None else options.seconds
         return _execute(live, command, options.out, options.sensors, seconds, options.json, station)
+
+
+def _made(
+    options: LiveOptions, command: list[str], base: MapChoice | None, station: Station | None
+) -> tuple[LiveRun, float | None]:
+    """Return the run that the options describe, which has not begun, and how long it shall be."""
+    from vislam.live.beginning import in_map
+    from vislam.live.run_live import LiveRun
+    from vislam.live.sources import open_live
+
+    source, settings = open_live(options.source, options.settings, options.sensors)
+    beginning = None if base is None else in_map(base, source, settings)
+    ends = None if station is None else station.ends
+    live = LiveRun(source, settings, options.out, options.source, command, base, beginning, ends)
+    return live, source.duration_s if options.seconds is None else options.seconds
 
 
 def _resume(out: Path, arguments: list[str], command: list[str], web: WebChoice | None) -> int:

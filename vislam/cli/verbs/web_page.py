@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from vislam.cli.verbs.arguments import take_option
-from vislam.core.errors import UsageError
+from vislam.core.errors import UsageError, VislamError
+from vislam.core.log import log_to
 
 if TYPE_CHECKING:
     from vislam.cli.verbs.live import LiveOptions
     from vislam.live.web.station import Station
+
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,19 +83,27 @@ def opened(web: WebChoice | None, pose_name: str, out: Path) -> Iterator[Station
         station.close()
 
 
-def wait_for_start(station: Station, options: LiveOptions) -> None:
-    """Wait until the page says that the run shall begin; meanwhile it can calibrate."""
+def begun_by_page(station: Station, options: LiveOptions, command: list[str], make: Callable[[], Made]) -> Made:
+    """Wait until the page says that the run shall begin, and return what `make` makes; meanwhile it can calibrate.
+
+    Where it cannot be made, as where a sensor is missing, the page says why and it may be tried again.
+
+    Raises VislamError: the process of the page died.
+    """
     from vislam.cli.wizard.calibration_steps import STEPS, CalibrationSteps
 
     steps = CalibrationSteps(station, options.source, options.settings, options.sensors, options.out)
-    try:
-        while True:
-            for command in station.asked():
-                if command.do == "start" and not steps.is_going:
-                    return
-                steps.obey(command.do, command.values)
+    with log_to(options.out, command), closing(steps):
+        while station.is_well:
+            for asked in station.asked():
+                if asked.do == "start" and not steps.is_going:
+                    try:
+                        return make()
+                    except VislamError as error:
+                        steps.shown = {"kind": "run", "stage": "failed", "lines": [str(error)]}
+                else:
+                    steps.obey(asked.do, asked.values)
             can = ["start"] if not steps.is_going else []
             station.tell("waiting", source=options.source, can=can, steps=STEPS, wizard=steps.shown)
             steps.turn()
-    finally:
-        steps.close()
+    raise VislamError("the process of the web page died before the run began; start it again")

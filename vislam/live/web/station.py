@@ -33,7 +33,12 @@ _TOLD_OF_MAP = ("found_in_map", "map_left_out")
 
 
 class Station:
-    """Owns the process of the page. What goes wrong with it is said once; the run goes on without."""
+    """Owns the process of the page. What goes wrong with it is said once; the run goes on without.
+
+    Attributes:
+        url: where the page is, with the token.
+        is_well: whether the process lives.
+    """
 
     def __init__(self, at: WebAddress, hosts: tuple[str, ...], pose_name: str, out: Path) -> None:
         """Listen, and start the process; raises UsageError where nothing can listen there."""
@@ -43,7 +48,7 @@ class Station:
         host = f"[{at.host}]" if ":" in at.host else at.host
         self.address = f"http://{host}:{port}/"
         self.url = f"{self.address}#{gate.token}"  # a fragment is in no log: browsers do not send it
-        self._out, self._is_well, self._due_s = out, True, 0.0
+        self._out, self.is_well, self._due_s = out, True, 0.0
         self._notices: deque[tuple[str, str]] = deque(maxlen=_NOTICES)
         context = get_context("spawn")
         owner, to_owner = context.Pipe()
@@ -104,7 +109,7 @@ class Station:
 
     def end(self, metrics: dict[str, Any]) -> None:
         """Tell browsers that the run is over and what it is worth; they have a moment to hear of it."""
-        if self._is_well:
+        if self.is_well:
             told = {name: metrics.get(name) for name in ("frames", "keyframes", "verdict")}
             self.tell("ended", line="the run folder is written, with its report", **told)
             time.sleep(_LINGER_S)
@@ -128,8 +133,8 @@ class Station:
                     log.take_record(message)
                 elif isinstance(message, Failure):
                     _LOG.error("the web process failed:\n%s", message.traceback)
-        if self._is_well and not self._process.is_alive() and not self._signals.stop.is_set():
-            self._is_well = False
+        if self.is_well and not self._process.is_alive() and not self._signals.stop.is_set():
+            self.is_well = False
             _LOG.warning("the process of the web page died; the run goes on without the page")
 
 

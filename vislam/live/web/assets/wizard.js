@@ -1,7 +1,7 @@
 // Calibration step by step: what to do, what was seen so far, and what came of it.
 import { element } from "./data.js";
 
-const NAMES = { camera: "Camera", imu: "IMU", mag: "Magnetometer", noise: "Noise of the IMU" };
+const NAMES = { camera: "Camera", imu: "IMU", mag: "Magnetometer", noise: "Noise of the IMU", run: "The run" };
 const HOW = {
   camera: "Show the printed board to the camera from all sides, and hold it still each time.",
   imu: "Hold the sensor still for two seconds in twelve poses, up to upside down.",
@@ -61,7 +61,7 @@ export class Wizard {
     const wizard = state.wizard || {};
     this.parent.hidden = state.phase !== "waiting";
     if (this.parent.hidden) return;
-    const made = `${wizard.kind} ${wizard.stage} ${Object.keys(state.steps || {})}`;
+    const made = `${wizard.kind} ${wizard.stage} ${wizard.lines || ""} ${Object.keys(state.steps || {})}`;
     if (made !== this.made) {
       this.made = made;
       this.picture.hidden = true;
@@ -83,7 +83,8 @@ export class Wizard {
     if (wizard.stage) {
       const said = element("div", `said ${wizard.stage}`);
       const titles = { done: "calibrated", failed: "not calibrated", computing: "computing" };
-      said.append(element("h3", "", `${NAMES[wizard.kind] || "Calibration"}: ${titles[wizard.stage]}`));
+      const title = wizard.kind === "run" ? "not begun" : titles[wizard.stage];
+      said.append(element("h3", "", `${NAMES[wizard.kind] || "Calibration"}: ${title}`));
       for (const line of wizard.lines || [wizard.advice]) said.append(element("p", "", line));
       if (wizard.files) said.append(element("p", "note", `Written: ${wizard.files.join(", ")}`));
       parts.push(said);
