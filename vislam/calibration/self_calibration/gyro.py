@@ -47,7 +47,7 @@ def turn_rows(
     R: Array, t_ns: NDArray[np.int64], gyro: Gyro, turns: GyroTurns, R_cam_body: Array, offset_s: float
 ) -> TurnRows:
     """Return the rows of attitudes [n, 3, 3] at stamps [n] of the camera."""
-    t_s = (t_ns - gyro.zero_ns) * 1e-9
+    t_s = np.asarray((t_ns - gyro.zero_ns) * 1e-9, dtype=np.float64)
     between = R[:-1].transpose(0, 2, 1) @ R[1:]
     seen = SeenTurns(t_s[:-1].copy(), t_s[1:].copy(), np.ascontiguousarray(between))
     errors, J = turn_errors(turns, seen, np.ascontiguousarray(R_cam_body), offset_s, 0.0)

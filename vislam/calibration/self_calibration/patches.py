@@ -36,7 +36,7 @@ def found_again(piece: Piece, shared: Shared, images: Sequence[ImageU8]) -> Segm
     home = _homes(piece)
     pixels = np.full_like(segment.pixels, np.nan)
     for k, image in enumerate(images):
-        points = np.flatnonzero(piece.kept[k] & (home != k))
+        points = np.flatnonzero(piece.kept[k] & (home != k)).astype(np.int64)
         stay = np.flatnonzero(piece.kept[k] & (home == k))
         pixels[k, stay] = segment.pixels[k, stay]
         if not len(points):
@@ -54,7 +54,7 @@ def found_again(piece: Piece, shared: Shared, images: Sequence[ImageU8]) -> Segm
 def _homes(piece: Piece) -> Indices:
     """Return the keyframe in the middle of those that see a point [m]."""
     order = np.cumsum(piece.kept, axis=0)
-    return np.asarray(np.argmax(order >= (order[-1] + 1) // 2, axis=0))
+    return np.argmax(order >= (order[-1] + 1) // 2, axis=0).astype(np.int64)
 
 
 def _warps(camera: Camera, at: Structure, seen: Array, home: Indices, points: Indices, k: int) -> Array:

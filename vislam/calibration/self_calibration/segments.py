@@ -70,7 +70,7 @@ class _Follower:
         pixels = self.tracker.follow(frame, self._last[1])
         if self._before is not None:
             self._set_velocity(frame.t_ns, pixels)
-        seen = np.isfinite(pixels).all(axis=1)
+        seen = np.asarray(np.isfinite(pixels).all(axis=1))
         alive = self.tracker.judge(seen)
         pixels, seen = pixels[alive], seen[alive]
         last = np.where(seen[:, None], pixels, self._last[1][alive])

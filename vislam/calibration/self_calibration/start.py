@@ -88,7 +88,7 @@ def _first_pairs(xy: Array) -> list[tuple[int, int]]:
     ]
 
 
-def _triangulated(xy: Array, T: Array) -> tuple[Array, Array]:
+def _triangulated(xy: Array, T: Array) -> tuple[Array, Bools]:
     """Return homogeneous points [m, 4] in the stretch and which [m] two views or more place in front of themselves."""
     placed = np.isfinite(T[:, 0, 0])
     P = T[placed]
@@ -104,7 +104,7 @@ def _triangulated(xy: Array, T: Array) -> tuple[Array, Array]:
     return points, known
 
 
-def _resected(points: Array, known: Array, xy: Array, gate: float) -> Array:
+def _resected(points: Array, known: Bools, xy: Array, gate: float) -> Array:
     """Return the pose [3, 4] from which known points are seen at `xy` [m, 2]; NaN where too few agree."""
     used = known & np.isfinite(xy[:, 0])
     nothing = np.full((3, 4), np.nan)
