@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vislam.calibration.self_calibration import waving
 from vislam.calibration.self_calibration.adjust import Shared, steadied
 from vislam.calibration.self_calibration.certainty import certainty
 from vislam.calibration.self_calibration.gyro import Gyro
@@ -16,9 +17,10 @@ from vislam.calibration.self_calibration.lens_search import Solution, find_lens,
 from vislam.calibration.self_calibration.patches import _aligned
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.structure import GYRO, SHARED, Structure, linearise, residuals
-from vislam.core.camera import Camera
+from vislam.core.camera import Camera, Rig
 from vislam.core.messages import Array
-from worlds.calibration import refusal
+from vislam.datasets.camera_files import read_cameras
+from worlds.calibration import calibrate, refusal
 
 RADTAN = Camera(640, 480, 470.0, 468.0, 325.0, 234.0, 0.0, "radtan", (-0.21, 0.06, 0.0006, -0.0005))
 WIDE = Camera(640, 480, 290.0, 291.0, 316.0, 243.0, 0.0, "equidistant", (-0.01, 0.004, -0.003, 0.001))
@@ -115,6 +117,12 @@ def test_a_gyroscope_joins_in(rolling: Solution) -> None:
     print(errors, known.sigmas[9:])
     assert np.all(np.abs(errors) < 4.0 * known.sigmas[9:16])
     assert np.rad2deg(turn.magnitude()) < 0.3 and abs(errors[3]) < 1e-3
+    T_told = np.eye(4)
+    T_told[:3, 3] = 0.1, 0.2, 0.3
+    (entry,) = waving._chain(waving.SelfResult(joint, known, 6, Rig((RADTAN,), (T_told,)), "", 1.0))
+    assert entry.T_body_cam is not None and entry.T_body_cam[:3, 3].tolist() == [0.1, 0.2, 0.3]
+    assert entry.T_body_cam[:3, :3] == pytest.approx(joint.shared.R_cam_body.T)
+    assert entry.time_offset_s == joint.shared.time_offset_s
     assert known.sigmas[0] <= 1.2 * certainty(rolling).sigmas[0]
     still = replace(gyro, rate_rad_s=rng.normal(0.0, 0.1, samples.shape))
     assert with_gyro(rolling, still) is None
@@ -180,6 +188,24 @@ def test_a_patch_is_found_to_a_fraction_of_a_pixel() -> None:
     found = _aligned(templates, (0.7 * shifted + 20.0).astype(np.uint8), at)
     assert found - at == pytest.approx(np.array([[0.4, -0.7]] * 2), abs=0.06)
     assert np.isnan(_aligned(templates, np.full((120, 160), 90, dtype=np.uint8), at)).all()
+
+
+def test_the_verb_writes_what_a_run_takes(
+    rolling: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(waving, "follow_segments", lambda *_: [piece.segment for piece in rolling.pieces])
+    monkeypatch.setattr(waving, "find_lens", lambda *_: rolling)
+    out = tmp_path / "out"
+    answer = calibrate(capsys, "self", "points:still,duration_s=8,tracks=60,rig=stereo", "--out", out)
+    chain = read_cameras(out / "camchain.yaml")
+    assert [camera.camera.width for camera in chain] == [640, 752]
+    assert chain[0].camera.fx == answer["parameters"]["fx"]
+    assert chain[0].time_offset_s is None
+    assert answer["camera_imu"] == {"reason_without": "the recording has no IMU"}
+    assert any("the shutter rolls: 20." in said or "the shutter rolls: 19." in said for said in answer["statements"])
+    assert (out / "self.png").stat().st_size > 10_000
+    again = refusal(capsys, "self", "points:still,duration_s=8,tracks=60", "--out", out, code=2)
+    assert "already holds" in again
 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

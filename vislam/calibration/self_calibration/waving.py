@@ -30,7 +30,7 @@ _FILES = ("camchain.yaml", "self.png", "self.json")
 _WIDE_DEG = 100.0  # a wider lens is no pinhole
 _LEAST_SEGMENTS = 4
 # Real images mislead all stretches alike, which no jackknife shows: errors of focal lengths were 1 to 6 times, of the
-# rotation 7 times what it said (fr1_desk, MH_01); rendered ones with noise and blur are as good as it says
+# rotation 7 times what it said (fr1_desk, MH_01), in rendered images 1 to 4 times
 _IMAGES_WIDER = 4.0
 _MAX_FOCAL_SIGMA = 0.02  # relative
 _MAX_CENTRE_SIGMA = 0.02  # of the image's width
