@@ -40,7 +40,7 @@ class Live:
         self.out = out
         name = f"vislam-test-page-{os.getpid()}-{out.name}"
         command = [sys.executable, "-m", "vislam", "live", "--out", str(out), "--web", "127.0.0.1:0"]
-        command += ["--live.name", name, "--live.send-to", "unix", "--view.no-enabled", *options]
+        command += ["--live.name", name, "--live.send-to", "unix", "--view.no-enabled", "--map.no-enabled", *options]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
         assert self.process.stderr is not None
         found = None

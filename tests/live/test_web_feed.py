@@ -19,6 +19,7 @@ from vislam.live.web.map_share import MapShare, quantised
 from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Saved, Status, StepPicture
 from vislam.live.wire.mail import Inbox
 from vislam.live.wire.published_pose import NO_VISION_MS, PublishedPose
+from vislam.mapping.formats.ply import read_ply
 
 
 def cloud(count: int) -> KeyframeCloud:
@@ -214,3 +215,28 @@ def test_the_map_is_saved_where_the_program_says_and_errors_are_told(tmp_path) -
     assert saved.is_well
     assert SAVED[1] in saved.text
     assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")} == {SAVED[1]}
+
+
+def test_points_of_a_keyframe_come_from_its_depth_where_it_has_some_and_the_saved_map_is_that_of_all(tmp_path) -> None:
+    points, colors = np.full((4, 3), 0.5, np.float32), np.full((4, 3), 200, np.uint8)
+    cloud_ = SimpleNamespace(points_m=points, colors=colors)
+    mapper = SimpleNamespace(keyframe_cloud=lambda keyframe_id, voxel_m: cloud_, cloud=lambda: cloud_)
+    page, wire = multiprocessing.Pipe()
+    shared = MapShare(wire, tmp_path)
+    shared.take([keyframe_step(1)], mapper)
+    inbox = Inbox(page)
+    told = inbox.get(20.0)
+    assert told.clouds[1].xyz.tolist() == [[500, 500, 500]] * 4
+    saved = shared._saved(mapper)
+    assert saved.is_well
+    assert "4 points" in saved.text
+    assert len(read_ply(tmp_path / "saved" / "cloud.ply")[0]) == 4
+
+
+def test_before_the_first_keyframe_there_is_little_to_save_and_a_folder_that_cannot_be_is_told(tmp_path) -> None:
+    _, wire = multiprocessing.Pipe()
+    assert MapShare(wire, tmp_path)._saved(None).is_well
+    (tmp_path / "run").write_text("a file in its way")
+    failed = MapShare(wire, tmp_path / "run")._saved(None)
+    assert not failed.is_well
+    assert "not saved" in failed.text

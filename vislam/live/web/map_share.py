@@ -91,10 +91,12 @@ class MapShare:
 
     def _answer(self, mapper: Mapper | None) -> None:
         """Do what the page asks for, and tell it what became of that."""
+        is_asked = False
         with suppress(EOFError, OSError):
             while not self._box.is_broken and self._asks.poll():
-                if isinstance(self._asks.recv()[1], Save):
-                    self._answers.append(self._saved(mapper))
+                is_asked |= isinstance(self._asks.recv()[1], Save)  # once for all that came meanwhile
+        if is_asked:
+            self._answers = [self._saved(mapper)]
         if self._answers and self._box.put(self._answers[0]):
             self._answers.pop(0)
 

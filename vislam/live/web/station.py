@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from vislam.core import log
+from vislam.core import interrupts, log
 from vislam.core.files import plain
 from vislam.live.processes.child import Failure, Flag, Signals, guarded
 from vislam.live.run_live import LiveRun
@@ -65,7 +66,11 @@ class Station:
         self._process = context.Process(
             target=guarded, args=("web", says, self._signals, body, log.level()), name="vislam web"
         )
-        self._process.start()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)  # until it is ready for one
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for end in (says, to_owner, frames, map_wire):
             end.close()
         listener.close()

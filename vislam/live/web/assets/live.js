@@ -252,6 +252,7 @@ async function turn() {
   setTimeout(turn, wait);
 }
 
+if (location.hash) history.replaceState(null, "", "/"); // the token, where one had signed in before
 document.documentElement.classList.add("live");
 page.wizard = new Wizard(at("wizard"), command);
 at("view-home").addEventListener("click", () => {
