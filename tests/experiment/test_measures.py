@@ -259,3 +259,39 @@ def test_a_stated_scale_sigma_is_that_of_the_farthest_position_along_the_way():
         states.append(NavState(k, T, np.zeros(3), np.zeros(3), np.zeros(3), P))
     assert stated_scale_sigma(states) == pytest.approx(0.03)
     assert np.isnan(stated_scale_sigma(states[:1])) and np.isnan(stated_scale_sigma([]))
+
+
+def from_start(tmp_path, estimate, truth, metrics=RUN):
+    found = measured(tmp_path, estimate, truth, metrics)
+    return found, {name: np.array(values) for name, values in found["start_curve"].items()}
+
+
+def test_from_the_start_nothing_is_off_that_lies_in_another_world(tmp_path):
+    truth = walk()
+    turned = transform(Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.array([5.0, -3.0, 2.0]))
+    found, curve = from_start(tmp_path, Trajectory(truth.t_ns, turned @ truth.T_world_body), truth)
+    assert max(found[f"start_{axis}"] for axis in ("x_m", "y_m", "z_m", "yaw_deg")) < 1e-6
+    np.testing.assert_allclose(curve["at_x_m"], curve["true_x_m"], atol=1e-3)
+    tilted = transform(Rotation.from_euler("x", 5, degrees=True).as_matrix(), np.zeros(3))
+    leaning = Trajectory(truth.t_ns, tilted @ truth.T_world_body)
+    assert from_start(tmp_path, leaning, truth)[0]["start_z_m"] > 0.1  # gravity was there to be used
+    assert from_start(tmp_path, leaning, truth, {"has_imu": False, "mode": "rgbd"})[0]["start_z_m"] < 1e-6
+    larger = truth.T_world_body.copy()
+    larger[:, :3, 3] *= 1.3
+    mono = {"has_imu": False, "mode": "mono"}
+    assert from_start(tmp_path, Trajectory(truth.t_ns, larger), truth, mono)[0]["start_x_m"] < 1e-6
+
+
+def test_from_the_start_a_drift_grows_along_its_axis_and_is_not_spread_by_a_fit(tmp_path):
+    truth = walk()
+    seconds = (truth.t_ns - truth.t_ns[0]) * 1e-9
+    poses = truth.T_world_body.copy()
+    poses[:, 0, 3] += 0.02 * seconds
+    turn = Rotation.from_rotvec(np.outer(np.deg2rad(0.5) * seconds, [0.0, 0.0, 1.0])).as_matrix()
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    found, curve = from_start(tmp_path, Trajectory(truth.t_ns, poses), truth)
+    np.testing.assert_allclose(curve["x_m"], 0.02 * curve["t_s"], atol=1e-3)
+    np.testing.assert_allclose(curve["yaw_deg"], 0.5 * curve["t_s"], atol=1e-2)
+    assert found["start_x_m"] == pytest.approx(0.02 * np.sqrt(np.mean(seconds**2)), rel=1e-3)
+    assert max(found["start_y_m"], found["start_z_m"]) < 1e-6
+    assert found["ate_m"] < 0.6 * found["start_x_m"]

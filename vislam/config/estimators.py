@@ -13,7 +13,9 @@ class EkfConfig:
     # loose: motions of visual odometry; tight: the tracks themselves (MSCKF), ten times the time; auto: tight for one
     # camera, whose motions lack scale, loose with stereo or depth
     coupling: Literal["auto", "loose", "tight"] = "auto"
-    vision: Literal["relative", "accumulated"] = "relative"  # accumulated: vision's own sum of motions, taken as a pose
+    # accumulated: vision's own sum of motions, taken as a pose; none: inertial data alone from the first state on, for
+    # comparison
+    vision: Literal["relative", "accumulated", "none"] = "relative"
     odom: Literal["continuous", "corrected"] = "continuous"  # corrected: 3-30 % less error, 5 cm steps at a first turn
     history_s: Positive = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
     checkpoint_s: Positive = 0.05  # a rewind replays at most this much more than the delay, 4 kB each

@@ -10,7 +10,16 @@ import numpy as np
 
 from vislam.config import EkfConfig
 from vislam.core.geometry import invert
-from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, NavState, Observations, VoMeasurement
+from vislam.core.messages import (
+    AS_MODELLED,
+    Array,
+    GraphUpdate,
+    NavState,
+    Observations,
+    Tracking,
+    VoMeasurement,
+    no_observations,
+)
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import Ekf, make_ekf
 from vislam.ekf.correction import Correction, ToldReading
@@ -81,6 +90,9 @@ class Filtering:
         shows_scale: bool, noise: SeenNoise,
     ) -> None:  # fmt: skip
         """Take what was seen in a frame and what the IMU's noise is, and tell the filter what it is to know by now."""
+        if self._config.vision == "none":  # nor that the body rests: a camera has to agree to that
+            vo = replace(vo, T_keyframe_body=None, tracking=Tracking.LOST)
+            observations, at_rest, keyframe_id = no_observations(), False, None
         on_wheels = self._config.nonholonomic and not at_rest
         news = None
         if noise.scale != self._noise_told:

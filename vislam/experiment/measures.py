@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError, VislamError
 from vislam.trajectory import (
@@ -95,6 +97,7 @@ def _output(path: Path, truth: Trajectory, alignment: Alignment, span_ns: tuple[
         **{f"rpe_{length}m_percent": segments[str(length)]["percent"] for length in SEGMENTS_M},
         **{f"rpe_{length}m_deg_per_m": segments[str(length)]["deg_per_m"] for length in SEGMENTS_M},
         "curve": _curve(estimate, truth, alignment),
+        **from_start(estimate, truth, alignment),
     }
 
 
@@ -112,6 +115,43 @@ def _curve(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dic
         "error_m": pairs.position_errors_m(),
     }
     return {name: np.round(values[keep], 4).tolist() for name, values in columns.items()}
+
+
+def from_start(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dict[str, Any]:
+    """Return how an estimate leaves the truth from a common first pose: RMS by axis, and the way and errors over time.
+
+    Dead reckoning is not judged by the best fit over all of it, which hides how it grows. Moved is what no sensor can
+    know, as in `evaluate`, by the first pose that both have: yaw and position, or all of it without gravity; a scale is
+    that of the best fit. Axes are those of the truth's world.
+    """
+    pairs = associate(estimate, truth)
+    S = align(pairs, "first")
+    if alignment == "yaw":
+        S[:3, :3] = Rotation.from_euler("z", _yaw_rad(S[:3, :3])).as_matrix()
+    elif alignment == "sim3":
+        S[:3, :3] *= np.cbrt(np.linalg.det(align(pairs, "sim3")[:3, :3]))
+    S[:3, 3] = pairs.reference[0, :3, 3] - S[:3, :3] @ pairs.estimate[0, :3, 3]
+    moved = pairs.aligned(S)
+    way = moved.estimate[:, :3, 3]
+    errors_m = way - moved.reference[:, :3, 3]
+    turned = moved.estimate[:, :3, :3] @ moved.reference[:, :3, :3].transpose(0, 2, 1)
+    yaw_deg = np.rad2deg(np.unwrap(_yaw_rad(turned)))
+    keep = np.unique(np.linspace(0, len(pairs) - 1, _CURVE_POINTS).astype(int))
+    columns = {"t_s": (pairs.t_ns - truth.t_ns[0]) * 1e-9, "yaw_deg": yaw_deg}
+    columns |= {f"{axis}_m": errors_m[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"at_{axis}_m": way[:, i] for i, axis in enumerate("xy")}
+    columns |= {f"true_{axis}_m": pairs.reference[:, i, 3] for i, axis in enumerate("xy")}
+    rms = {f"start_{axis}_m": _rms(errors_m[:, i]) for i, axis in enumerate("xyz")} | {"start_yaw_deg": _rms(yaw_deg)}
+    return rms | {"start_curve": {name: np.round(values[keep], 4).tolist() for name, values in columns.items()}}
+
+
+def _yaw_rad(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the turn about z of rotations [..., 3, 3]."""
+    return np.arctan2(R[..., 1, 0], R[..., 0, 0])
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _consistency(states: Path, truth: Trajectory) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from vislam.experiment.identity import sha256_of
@@ -35,6 +35,10 @@ class Metric:
 METRICS: tuple[Metric, ...] = (
     Metric("ate_m", "ATE [m]", "error", 4),
     Metric("ate_max_m", "ATE max [m]", "error", 3),
+    Metric("start_x_m", "x from the start [m]", "error", 3),
+    Metric("start_y_m", "y from the start [m]", "error", 3),
+    Metric("start_z_m", "z from the start [m]", "error", 3),
+    Metric("start_yaw_deg", "yaw from the start [°]", "error", 2),
     Metric("rotation_deg", "rotation [°]", "error", 2),
     Metric("scale_error", "scale error [%]", "signed", 2, 100.0),
     Metric("start_scale_sigma", "scale sigma at the start [%]", "share", 2, 100.0),
@@ -64,6 +68,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("loops", "loops", "count", 0),
     Metric("injected_kept", "false loops kept", "count", 0),
 )
+FROM_START = ("start_x_m", "start_y_m", "start_z_m", "start_yaw_deg")
 BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 
 
@@ -78,16 +83,15 @@ class Trial:
     bounds: dict[str, tuple[float, float]]  # 95 % bounds of the ratios
     sha256: str  # of the trajectory file; empty after a failure
     curve: dict[str, list[float]]
+    start_curve: dict[str, list[float]] = field(default_factory=dict)  # from a common first pose
 
     @property
     def estimate(self) -> str:
-        """What is compared: estimator and output."""
-        return estimate_name(self.job.estimator, self.output)
-
-
-def estimate_name(estimator: str, output: str) -> str:
-    """Return the name of an estimator's output, as in tables."""
-    return f"{estimator} {OUTPUT_TITLES[output]}"
+        """What is compared: estimator and output; without an IMU the fast path is no filter."""
+        title = OUTPUT_TITLES[self.output]
+        if self.output == "ekf" and not self.job.config.get("imu", {}).get("enabled", True):
+            title = "odometry, causal"
+        return f"{self.job.estimator} {title}"
 
 
 def estimates(plan: Plan) -> list[tuple[str, str]]:
@@ -111,9 +115,10 @@ def table_sha256(found: Sequence[Trial]) -> str:
     """Return the SHA-256 of all that a plan's results say, whoever computed them, in whatever order.
 
     Every trajectory counts by its own SHA-256, and every number but what time and memory were used: those are never
-    twice the same.
+    twice the same. Nor do errors from the start count, which came later and follow from the trajectory: tables from
+    before them are still to be told.
     """
-    timed = {metric.name for metric in METRICS if metric.kind == "cost"}
+    timed = {metric.name for metric in METRICS if metric.kind == "cost"} | {*FROM_START}
     rows = [
         [
             t.job.sequence, t.job.variant, t.job.estimator, t.output, t.job.seed, t.job.member,
@@ -141,7 +146,16 @@ def _trial(job: Job, output: str, result: dict[str, Any]) -> Trial:
     failure = result["reason"] if result["status"] != "ok" else entry.get("failure", "" if entry else "no trajectory")
     if not failure and values.get("completeness", 0.0) < _MIN_COMPLETE:
         failure = f"covers {values.get('completeness', 0.0):.0%} of the recording"
-    return Trial(job, output, failure, values, bounds, entry.get("sha256", ""), entry.get("curve", {}))
+    return Trial(
+        job,
+        output,
+        failure,
+        values,
+        bounds,
+        entry.get("sha256", ""),
+        entry.get("curve", {}),
+        entry.get("start_curve", {}),
+    )
 
 
 def _is_number(value: Any) -> bool:

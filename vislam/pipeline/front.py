@@ -447,7 +447,8 @@ class Front:
         if after is None:
             return None, state
         last, self._last_state = self._last_state, state
-        if state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
+        is_blind = self.config.ekf.vision == "none"  # nothing corrects it, and the graph's bias is not to turn it
+        if is_blind or state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
         # a correction may enter with a later sample only, so what the filter was told is no measure of it
         walk = 0.0 if self.noise is None else self.noise.gyro_bias_walk

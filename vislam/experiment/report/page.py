@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from vislam.experiment.plan import Axis, Plan
-from vislam.experiment.report import plots
+from vislam.experiment.report import from_start, plots
 from vislam.experiment.report.exports import best, shown, shown_spread, variant_text
 from vislam.experiment.statistics import Comparison, Group
-from vislam.experiment.trials import BY_NAME, Trial
+from vislam.experiment.trials import BY_NAME, FROM_START, Trial
 from vislam.experiment.winners import Winner, verdict
 from vislam.run.report.html import (
     Cell,
@@ -44,6 +44,8 @@ _MEASURED = (
     "recording. They are compared among themselves only.",
     "ATE: RMS position error after alignment by yaw and position. Sim3 only for one camera without an IMU, SE3 for "
     "cameras with depth but no IMU; the scale error, s - 1 of the best Sim3 fit, is a column of its own.",
+    "From the same start: every estimate is laid on the truth at the first pose that both have, by yaw and position, "
+    "without gravity by all of it (and by the scale of the best fit for one camera). Axes are those of the truth.",
     "RPE: RMS error of the motion over all segments of 1, 5 and 10 m of the true path, relative to its length.",
     "Complete: share of the recording's time with a pose; holes above 1 s do not count. Below 50 % a trial failed.",
     "ANEES, NIS: averages per degree of freedom with the 95 % bounds for independent errors; 1 is consistent, above is "
@@ -83,7 +85,8 @@ def comparison_page(
             section("Over the conditions", *(_axis(groups, axis) for axis in plan.axes)),
             section("Relative errors", _picture(plots.over_segments(groups))),
             section("Is the difference real?", card(_tests(comparisons))),
-            section("Trajectories", *_shown_trials(plan, trials)),
+            section("Trajectories", *_shown_trials(plan, trials, (plots.paths, plots.errors_over_time))),
+            section("From the same start", *_from_start(plan, groups, trials)),
             section("Consistency", card(_consistency(groups))),
             section("Time, memory, counts", card(_cost(groups))),
             section("Failures", _failures(trials)),
@@ -220,14 +223,25 @@ def _axis(groups: Sequence[Group], axis: Axis) -> str:
     return "".join(_picture(picture, axis.name) for picture in pictures)
 
 
-def _shown_trials(plan: Plan, trials: Sequence[Trial]) -> list[str]:
+def _shown_trials(
+    plan: Plan, trials: Sequence[Trial], pictures: Sequence[Callable[[Sequence[Trial]], str]]
+) -> list[str]:
     """Return pictures of the first condition, seed and member, which stand for the others."""
     if not trials:
         return []
     variant = trials[0].job.variant
     first = [t for t in trials if t.job.variant == variant and t.job.seed == plan.seeds[0] and t.job.member == 0]
     caption = f"{variant_text(variant) or 'as configured'}, seed {plan.seeds[0]}, member 0"
-    return [_picture(plots.paths(first), caption), _picture(plots.errors_over_time(first), caption)]
+    return [_picture(picture(first), caption) for picture in pictures]
+
+
+def _from_start(plan: Plan, groups: Sequence[Group], trials: Sequence[Trial]) -> list[str]:
+    """Return what tells how an estimate drifts: way and errors from a common first pose, and their RMS by axis."""
+    if not any(trial.start_curve for trial in trials):
+        return []
+    table_ = card(_accuracy(groups, FROM_START), title="RMS error by axis: median [range]")
+    shown_ = _shown_trials(plan, trials, (from_start.paths, from_start.errors_over_time))
+    return [*shown_, _picture(from_start.errors_by_axis(groups), "RMS error by axis"), table_]
 
 
 def _failures(trials: Sequence[Trial]) -> str:

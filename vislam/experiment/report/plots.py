@@ -20,8 +20,8 @@ from vislam.run.report.style import CODE, RC, svg
 
 _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", ":", "-.")
-_MAX_PANELS = 24  # more cannot be compared by eye; the tables hold all
-_WIDTH = 11.2
+MAX_PANELS = 24  # more cannot be compared by eye; the tables hold all
+WIDTH = 11.2
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # 0.02 says more than 2 x 10^-2
 
 
@@ -31,7 +31,7 @@ def _by_condition(groups: Sequence[Group]) -> dict[str, list[Group]]:
     for group in groups:
         name = ", ".join(part for part in (group.sequence, variant_text(group.variant)) if part)
         panels.setdefault(name, []).append(group)
-    return dict(list(panels.items())[:_MAX_PANELS])
+    return dict(list(panels.items())[:MAX_PANELS])
 
 
 def errors_by_estimate(groups: Sequence[Group], metric: str = "ate_m") -> str:
@@ -45,12 +45,12 @@ def errors_by_estimate(groups: Sequence[Group], metric: str = "ate_m") -> str:
         axes.set_yticks(range(len(members)), [group.estimate for group in reversed(members)])
         axes.set_ylim(-0.6, len(members) - 0.4)
         axes.set_xscale("log")
-        _label_plainly(axes.xaxis)
+        label_plainly(axes.xaxis)
         axes.set_title(name, loc="left", fontsize=9)
         axes.grid(axis="y", visible=False)
 
     height = 0.26 * max(len(members) for members in chosen.values()) + 0.55
-    return _panels(list(chosen), draw, height, BY_NAME[metric].title, "errors")
+    return titled_panels(list(chosen), draw, height, BY_NAME[metric].title, "errors")
 
 
 def _draw_error(axes: Any, y: float, group: Group, metric: str) -> None:
@@ -77,7 +77,7 @@ def over_axis(groups: Sequence[Group], axis: Axis, metric: str = "ate_m") -> str
         others = tuple(pair for pair in group.variant if pair[0] != axis.name)
         name = ", ".join(part for part in (group.sequence, variant_text(others)) if part)
         panels.setdefault(name, []).append(group)
-    chosen = dict(list(panels.items())[:_MAX_PANELS])
+    chosen = dict(list(panels.items())[:MAX_PANELS])
 
     def draw(axes: Any, name: str) -> None:
         lines: dict[str, list[Group]] = {}
@@ -88,9 +88,9 @@ def over_axis(groups: Sequence[Group], axis: Axis, metric: str = "ate_m") -> str
         axes.set_title(name, loc="left", fontsize=9)
         axes.set_xlabel(axis.name)
         axes.set_yscale("log")
-        _label_plainly(axes.yaxis)
+        label_plainly(axes.yaxis)
 
-    return _panels(list(chosen), draw, 2.6, "", f"over-{metric}", BY_NAME[metric].title)
+    return titled_panels(list(chosen), draw, 2.6, "", f"over-{metric}", BY_NAME[metric].title)
 
 
 def _draw_line(axes: Any, axis: Axis, members: Sequence[Group], metric: str, label: str) -> None:
@@ -126,9 +126,9 @@ def over_segments(groups: Sequence[Group]) -> str:
         axes.set_xticks(SEGMENTS_M)
         axes.set_xlabel("segment [m]")
         axes.set_yscale("log")
-        _label_plainly(axes.yaxis)
+        label_plainly(axes.yaxis)
 
-    return _panels(list(chosen), draw, 2.4, "", "segments", "RPE [%]")
+    return titled_panels(list(chosen), draw, 2.4, "", "segments", "RPE [%]")
 
 
 def paths(trials: Sequence[Trial]) -> str:
@@ -171,10 +171,10 @@ def _by_sequence(
         draw(axes, panels[sequence])
         axes.set_title(sequence, loc="left", fontsize=9)
 
-    return _panels(list(panels)[:_MAX_PANELS], draw_titled, height, "", name, label)
+    return titled_panels(list(panels)[:MAX_PANELS], draw_titled, height, "", name, label)
 
 
-def _panels(
+def titled_panels(
     names: Sequence[str], draw: Callable[[Any, str], None], height: float, x_label: str, name: str, y_label: str = ""
 ) -> str:
     """Draw named panels, two in a row, with one legend for all; an empty string without panels."""
@@ -183,7 +183,7 @@ def _panels(
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     with mpl.rc_context(RC):
-        figure = Figure(figsize=(_WIDTH, height * rows + 0.5), layout="constrained")
+        figure = Figure(figsize=(WIDTH, height * rows + 0.5), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes, panel in zip(grid.flat, names, strict=False):
             draw(axes, panel)
@@ -202,7 +202,7 @@ def _panels(
         return svg(figure, f"compare-{name}")
 
 
-def _label_plainly(axis: Any) -> None:
+def label_plainly(axis: Any) -> None:
     """Label a logarithmic axis at 1, 2, 5 of each decade, or at a few round numbers where it holds less than one."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if high >= 10.0 * low else MaxNLocator(4))
