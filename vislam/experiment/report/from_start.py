@@ -9,8 +9,9 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
-from vislam.experiment.report.plots import MAX_PANELS, WIDTH, label_plainly, titled_panels
+from vislam.experiment.report.plots import MAX_PANELS, PLAIN, WIDTH, titled_panels
 from vislam.experiment.statistics import Group
 from vislam.experiment.trials import BY_NAME, FROM_START, Trial
 from vislam.run.report.style import CODE, RC, svg
@@ -49,7 +50,7 @@ def errors_over_time(trials: Sequence[Trial]) -> str:
     if not by_sequence:
         return ""
     with mpl.rc_context(RC):
-        figure = Figure(figsize=(WIDTH, 1.75 * len(by_sequence) + 0.5), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 1.9 * len(by_sequence) + 0.5), layout="constrained")
         grid = figure.subplots(len(by_sequence), len(_OVER_TIME), squeeze=False)
         for row, (sequence, members) in zip(grid, by_sequence.items(), strict=True):
             for axes, (column, label, linear) in zip(row, _OVER_TIME, strict=True):
@@ -83,8 +84,9 @@ def errors_by_axis(groups: Sequence[Group]) -> str:
                     row = len(rows) - 1 - rows.index((group.sequence, group.variant))
                     _draw_group(axes, row + _ROW / 2 - step * list(styles).index(group.estimate), group, name, styles)
             axes.set_xscale("log")
-            label_plainly(axes.xaxis)
-            axes.tick_params(axis="x", labelsize=7)
+            axes.xaxis.set_major_locator(LogLocator(numticks=5))
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.xaxis.set_major_formatter(PLAIN)
             axes.set_xlabel(BY_NAME[name].title)
             axes.grid(axis="y", visible=False)
             for line in range(1, len(rows)):

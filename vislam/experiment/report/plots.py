@@ -22,7 +22,7 @@ _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", ":", "-.")
 MAX_PANELS = 24  # more cannot be compared by eye; the tables hold all
 WIDTH = 11.2
-_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # 0.02 says more than 2 x 10^-2
+PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # 0.02 says more than 2 x 10^-2
 
 
 def _by_condition(groups: Sequence[Group]) -> dict[str, list[Group]]:
@@ -45,7 +45,7 @@ def errors_by_estimate(groups: Sequence[Group], metric: str = "ate_m") -> str:
         axes.set_yticks(range(len(members)), [group.estimate for group in reversed(members)])
         axes.set_ylim(-0.6, len(members) - 0.4)
         axes.set_xscale("log")
-        label_plainly(axes.xaxis)
+        _label_plainly(axes.xaxis)
         axes.set_title(name, loc="left", fontsize=9)
         axes.grid(axis="y", visible=False)
 
@@ -88,7 +88,7 @@ def over_axis(groups: Sequence[Group], axis: Axis, metric: str = "ate_m") -> str
         axes.set_title(name, loc="left", fontsize=9)
         axes.set_xlabel(axis.name)
         axes.set_yscale("log")
-        label_plainly(axes.yaxis)
+        _label_plainly(axes.yaxis)
 
     return titled_panels(list(chosen), draw, 2.6, "", f"over-{metric}", BY_NAME[metric].title)
 
@@ -126,7 +126,7 @@ def over_segments(groups: Sequence[Group]) -> str:
         axes.set_xticks(SEGMENTS_M)
         axes.set_xlabel("segment [m]")
         axes.set_yscale("log")
-        label_plainly(axes.yaxis)
+        _label_plainly(axes.yaxis)
 
     return titled_panels(list(chosen), draw, 2.4, "", "segments", "RPE [%]")
 
@@ -202,12 +202,12 @@ def titled_panels(
         return svg(figure, f"compare-{name}")
 
 
-def label_plainly(axis: Any) -> None:
+def _label_plainly(axis: Any) -> None:
     """Label a logarithmic axis at 1, 2, 5 of each decade, or at a few round numbers where it holds less than one."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if high >= 10.0 * low else MaxNLocator(4))
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(_PLAIN)
+    axis.set_major_formatter(PLAIN)
 
 
 def _color(output: str) -> str:
