@@ -23,6 +23,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
@@ -36,6 +37,7 @@ from numpy.typing import NDArray  # noqa: E402
 
 from vislam.config import MonoDepthConfig  # noqa: E402
 from vislam.core.camera import Rig  # noqa: E402
+from vislam.core.geometry import so3_exp  # noqa: E402
 from vislam.core.messages import Frame  # noqa: E402
 from vislam.mapping.depth.image import mono_camera  # noqa: E402
 from vislam.mapping.depth.mono import DepthFilter, MonoDepth, SeenFrame  # noqa: E402
@@ -43,14 +45,24 @@ from vislam.mapping.depth.mono.matching import LEAST_SCORE  # noqa: E402
 from vislam.run.session import Session  # noqa: E402
 from vislam.run.sources import open_source  # noqa: E402
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe  # noqa: E402
-from worlds.table import camera, frame, motion  # noqa: E402
+from worlds.table import camera, frame, motion, pose, view  # noqa: E402
 
 WIDTH = 640
 K = camera(WIDTH).K
 OURS = replace(MonoDepthConfig(), fusion="gaussian", converged=0.01, threads=1)
 PLAIN = replace(
-    OURS, uniqueness=1.0, min_gradient=0.0, max_sigma_ratio=np.inf, max_misses=255, min_matches=0, derotate_deg=180.0
+    OURS, uniqueness=1.0, min_gradient=0.0, max_sigma_ratio=np.inf, max_misses=255, min_matches=0, warp_px=None
 )  # what the peer does too
+PATHS = ("sideways", "rolls", "approaches", "recedes")
+PATH_FRAMES, PATH_STEP = 48, 4
+ROLL_DEG, NEARER_M = 40.0, 0.8  # in all of a path; the table is at about 2 m
+VARIANTS: dict[str, dict[str, Any]] = {
+    "derotation": {"warp_px": None, "derotate_deg": 1.5},
+    "warp": {},  # as by default
+    "warp and derotation": {"derotate_deg": 1.5},
+    "derotation, photometric": {"warp_px": None, "derotate_deg": 1.5, "model_sigma_px": 0.5},
+    "warp, photometric": {"model_sigma_px": 0.5},
+}
 STAMP_NS = 8_000_000  # a frame of the recording and one of the session this near are the same
 
 
@@ -115,6 +127,42 @@ def measure_accuracy(images: list[NDArray[np.uint8]], truth: NDArray[np.float32]
     print(f"  CPU per frame: first {times[0]:.0f} ms, mean {np.mean(times):.0f}, last ten {np.mean(times[-10:]):.0f}")
 
 
+def path(name: str, i: int) -> NDArray[np.float64]:
+    """Return T_world_cam of frame i: of the table's motion, rolled by up to 40 degrees, or going near as well."""
+    T = pose(i).copy()
+    if name == "rolls":
+        T[:3, :3] = T[:3, :3] @ so3_exp(np.array([0.0, 0.0, np.deg2rad(ROLL_DEG) * i / PATH_FRAMES]))
+    elif name == "approaches":
+        T[:3, 3] += NEARER_M * i / PATH_FRAMES * T[:3, 2]
+    elif name == "recedes":
+        T[:3, 3] -= NEARER_M * i / PATH_FRAMES * T[:3, 2]
+    return T
+
+
+def compare_variants(seed: int, paths: list[str], chosen: list[str]) -> None:
+    """Print what warped patches and photometric sigmas bring, on motions that turn and scale patches."""
+    for name in paths:
+        views = [view(path(name, i), WIDTH, seed + i) for i in range(0, PATH_FRAMES + 1, PATH_STEP)]
+        T_ref_world, truth = np.linalg.inv(path(name, 0)), views[0][1]
+        motions = [T_ref_world @ path(name, i) for i in range(0, PATH_FRAMES + 1, PATH_STEP)]
+        for variant in chosen:
+            config = replace(MonoDepthConfig(), threads=1, **VARIANTS[variant])
+            DepthFilter(views[0][0], K, config).update(views[1][0], motions[1])  # compiles
+            filter_, start = DepthFilter(views[0][0], K, config), time.process_time()
+            for (image, _), T in zip(views[1:], motions[1:], strict=True):
+                filter_.update(image, T)
+            cpu_ms = 1e3 * (time.process_time() - start) / (len(views) - 1)
+            known, rho = filter_.known, filter_.belief.rho
+            off = np.abs(1.0 / rho[known] - truth[known]) / truth[known]
+            sigmas = np.abs(rho[known] - 1.0 / truth[known]) / np.sqrt(filter_.belief.variance[known])
+            print(
+                f"{name:10s} {variant:22s} known {known.mean():6.1%}, median error {np.median(off):.3%}, "
+                f"off by more than 5 % {np.mean(off > 0.05):.2%}, within 1, 2, 3 sigma "
+                f"{' '.join(f'{np.mean(sigmas < n):.1%}' for n in (1, 2, 3))}, CPU {cpu_ms:.0f} ms",
+                flush=True,
+            )
+
+
 def compare_with_sensor(source: str, run: Path, config: MonoDepthConfig) -> None:
     """Print how depth from grey images and a run's poses compares with the depth images of the same recording."""
     session, recording = Session(run / "session.db"), open_source(source)
@@ -165,14 +213,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=12, help="against the peer")
     parser.add_argument("--accuracy-frames", type=int, default=60)
+    parser.add_argument(
+        "--variants", nargs="*", choices=list(VARIANTS), help="compare these, none: all; without a peer"
+    )
+    parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS, help="for --variants")
+    parser.add_argument("--seed", type=int, default=0, help="of the images' noise, for --variants")
     parser.add_argument("--tum", default="", help="a recording with depth: tum:PATH")
     parser.add_argument("--run", type=Path, help="a finished run of it")
     parser.add_argument("--fusion", choices=("gaussian", "beta"), default="beta", help="for --tum")
     args = parser.parse_args()
+    if args.variants is not None and not args.tum:
+        compare_variants(args.seed, args.paths, args.variants or list(VARIANTS))
+        return
     if args.tum:
         if args.run is None:
             parser.error("--tum needs --run, a finished RGB-D run of the recording, for its poses")
-        compare_with_sensor(args.tum, args.run, replace(MonoDepthConfig(), fusion=args.fusion))
+        for variant in args.variants or ["warp"]:
+            print(variant)
+            compare_with_sensor(args.tum, args.run, replace(MonoDepthConfig(), fusion=args.fusion, **VARIANTS[variant]))
         return
     count = max(args.frames, args.accuracy_frames) + 1
     images, depths = zip(*(frame(i, WIDTH) for i in range(count)), strict=True)

@@ -36,6 +36,11 @@ class MonoDepthConfig:
     least_score: Finite | None = None  # of a match; None: the measure's own, see mapping/monodepth/matching.py
     uniqueness: Share = 0.8  # most that the best match's cost may be of the next one's; 1 asks for nothing
     sigma_px: Positive = 1.0  # of a match along the epipolar line
+    # of a match, where noise and gradient tell the rest of its error (SVO, REMODE): what poses and lens leave; None: a
+    # match is `sigma_px` off whatever its texture
+    model_sigma_px: NonNegative | None = None
+    # a reference patch whose corners turn and zoom move by more than this is warped into the image; None: never
+    warp_px: NonNegative | None = 0.3
     min_gradient: NonNegative = 2.0  # grey levels per px, rms over the patch along the epipolar line; noise gives less
     max_sigma_ratio: NonNegative = 4.0  # of a measurement over what is known; beyond, it is not worth a search
     converged: Share = 0.02  # sigma of inverse depth over its mean; on TUM fr1_desk 0.01 finds a quarter less
@@ -44,7 +49,8 @@ class MonoDepthConfig:
     min_good: Share = 0.6  # share of good measurements (REMODE); half of it, and the pixel has failed
     min_depth_m: NonNegative = 0.3  # nearer, frames share too little
     max_depth_m: NonNegative = 20.0
-    derotate_deg: NonNegative = 1.5  # patches that are turned by more match worse than ones interpolated twice
+    # an image turned by more is turned back, which leaves out what does not fit; without warped patches 1.5 is good
+    derotate_deg: NonNegative = 180.0
     handover_sigma: NonNegative = 0.05  # of inverse depth that the next keyframe takes over; it measures anew
     smoothing: Whole = 10  # steps of smoothing inside surfaces; 0: none
     frames_per_keyframe: Count = 6  # used between two keyframes, the newer one included; bounds the time

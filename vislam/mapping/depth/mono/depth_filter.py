@@ -12,7 +12,7 @@ from vislam.config import MonoDepthConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, ImageF32, ImageU8
-from vislam.mapping.depth.mono.matching import CODES, LEAST_SCORE, MARGIN, gradient_sums
+from vislam.mapping.depth.mono.matching import CODES, LEAST_SCORE, MARGIN, gradient_sums, grey_noise
 from vislam.mapping.depth.mono.prior import carried_over, close_gaps, flat_prior
 from vislam.mapping.depth.mono.smoothing import smoothed, supported
 from vislam.mapping.depth.mono.update import CONVERGED, FLAT, SEARCHED, Belief, Rules, Views, update_rows
@@ -60,7 +60,7 @@ class DepthFilter:
             np.array(rho, np.float32), np.square(sigma, dtype=np.float32), start, start.copy(), state, count,
             count.copy(),
         )  # fmt: skip
-        self._rules = rules(config)
+        self._rules = rules(config, grey_noise(image))
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -139,13 +139,15 @@ class DepthFilter:
         return np.asarray(cv2.warpPerspective(image, H, image.shape[::-1], flags=flags, borderValue=np.nan), np.float32)
 
 
-def rules(config: MonoDepthConfig) -> Rules:
-    """Return the settings as compiled code takes them."""
+def rules(config: MonoDepthConfig, noise: float) -> Rules:
+    """Return the settings as compiled code takes them; `noise` is that of a pixel in grey levels."""
     least = LEAST_SCORE[config.measure] if config.least_score is None else config.least_score
     return Rules(
         CODES[config.measure], config.fusion == "beta", config.step_px, config.reach_px, config.search_sigmas, least,
         config.uniqueness, config.sigma_px, config.min_gradient, config.max_sigma_ratio, config.converged,
         config.min_matches, config.max_misses, config.min_good, 1.0 / config.max_depth_m, 1.0 / config.min_depth_m,
+        -1.0 if config.model_sigma_px is None else config.model_sigma_px, noise,
+        np.inf if config.warp_px is None else config.warp_px,
     )  # fmt: skip
 
 

@@ -25,7 +25,21 @@ CODES = {"sad": SAD, "ssd": SSD, "ncc": NCC, "zsad": ZSAD, "zssd": ZSSD, "zncc":
 LEAST_SCORE = {"sad": -14.0, "ssd": -350.0, "ncc": 0.99, "zsad": -14.0, "zssd": -350.0, "zncc": 0.85}
 _SMALLEST = np.float32(1e-3)  # grey levels^2, of a patch: keeps correlations of flat ones finite
 MARGIN = HALF + 3  # px from the border within which no patch with its padding fits
+_MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, in standard deviations
+_ROUNDING = math.sqrt(1.0 / 12.0)
 _FAST = {"reassoc", "contract", "nsz"}  # NaN and infinity keep their meaning
+
+
+def grey_noise(image: ImageU8) -> float:
+    """Return the standard deviation of an image's noise in grey levels (Immerkaer 1996), of rounding at least.
+
+    The median takes the place of the mean, so edges do not count. Texture that is everywhere and fine as the pixels
+    does, and passes for noise.
+    """
+    grey = image.astype(np.float32)
+    across = grey[:, :-2] - 2.0 * grey[:, 1:-1] + grey[:, 2:]
+    response = np.abs(across[:-2] - 2.0 * across[1:-1] + across[2:])  # noise of sigma 1 gives it 6
+    return max(float(np.median(response)) / (6.0 * _MEDIAN_OF_NORMAL), _ROUNDING)
 
 
 @njit(cache=True, nogil=True)
@@ -70,6 +84,42 @@ def load_patch(patch: ImageF32, image: ImageF32, y: int, x: int) -> tuple[np.flo
             off = weight * (image[row + np.uint64(dy), column + np.uint64(dx)] - mean)
             patch[dy, dx] = off
             squares += off * off
+    return mean, squares
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def load_warped(
+    patch: ImageF32, image: ImageF32, y: int, x: int, warp: tuple[float, float, float, float]
+) -> tuple[np.float32, np.float32]:
+    """Fill `patch` as `load_patch` does, from where `warp` takes the steps between its pixels in the image.
+
+    `warp` is a 2x2 matrix by rows, from steps in the other image to steps in this one. The sum of squares is negative
+    where the patch leaves the image, and it is not to be used then.
+    """
+    a, b, c, d = np.float32(warp[0]), np.float32(warp[1]), np.float32(warp[2]), np.float32(warp[3])
+    half, one = np.float32(HALF), np.float32(1.0)
+    wide, high = half * (abs(a) + abs(b)), half * (abs(c) + abs(d))
+    rows, columns = image.shape
+    if not (x - wide >= 0 and y - high >= 0 and x + wide < columns - 1 and y + high < rows - 1):
+        return np.float32(0.0), np.float32(-1.0)
+    total = np.float32(0.0)
+    for dy in range(SIDE):
+        for dx in range(SIDE):
+            right, down = np.float32(dx) - half, np.float32(dy) - half
+            u, v = np.float32(x) + a * right + b * down, np.float32(y) + c * right + d * down
+            column, row = np.uint64(u), np.uint64(v)
+            s, t = u - np.float32(column), v - np.float32(row)
+            upper = (one - s) * image[row, column] + s * image[row, column + np.uint64(1)]
+            lower = (one - s) * image[row + np.uint64(1), column] + s * image[row + np.uint64(1), column + np.uint64(1)]
+            patch[dy, dx] = (one - t) * upper + t * lower
+            total += patch[dy, dx]
+        patch[dy, SIDE] = 0.0
+    mean = total / PIXELS
+    squares = np.float32(0.0)
+    for dy in range(SIDE):
+        for dx in range(SIDE):
+            patch[dy, dx] -= mean
+            squares += patch[dy, dx] * patch[dy, dx]
     return mean, squares
 
 

@@ -10,12 +10,14 @@ import numpy as np
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageF32, ImageU8
 from vislam.mapping.depth.mono.fusion import fuse_beta, fuse_gaussian
-from vislam.mapping.depth.mono.matching import MARGIN, SIDE, load_patch, score_at
+from vislam.mapping.depth.mono.matching import HALF, MARGIN, PIXELS, SIDE, load_patch, load_warped, score_at
 from vislam.mapping.depth.mono.triangulation import Vector, inverse_depth_sigma
 
 SEARCHED, CONVERGED, FAILED, FLAT = range(4)  # what became of a pixel; only the searched ones cost time
 NO_MATCH, MATCH, NO_NEWS = range(3)  # of one pixel in one frame; no news: out of view, or nothing to be learned
 _NEAREST_Z = 0.05  # of a point's z in the other camera over that in the reference: nearer is behind or beside it
+_NO_WARP = (1.0, 0.0, 0.0, 1.0)
+_SMALLEST_WARP = 1e-6  # of a square of the reference that is seen in the image
 _PEAK_PX = 3.0  # a second maximum of the score nearer than this belongs to the first
 
 
@@ -50,12 +52,15 @@ class Rules(NamedTuple):
     min_good: float
     rho_min: float
     rho_max: float
+    model_sigma_px: float  # negative: matches are `sigma_px` off
+    grey_noise: float  # grey levels, of a pixel
+    warp_px: float  # infinite: no patch is warped
 
 
 class Line(NamedTuple):
     """Where a pixel may be in the other image; pixels count from the principal point."""
 
-    worthwhile: bool
+    expected: float  # sigma of inverse depth that a match would have, `sigma_px` off; infinite: it cannot be there
     um: float  # where the mean inverse depth projects to
     vm: float
     eu: float  # unit direction in which inverse depth grows
@@ -94,46 +99,98 @@ def update_rows(begin: int, end: int, belief: Belief, rules: Rules, views: Views
                 R[1, 0] * h + R[1, 1] * k + R[1, 2],
                 R[2, 0] * h + R[2, 1] * k + R[2, 2],
             )
-            line = epipolar_line(q, t, fx, fy, float(belief.rho[y, x]), math.sqrt(belief.variance[y, x]), rules)
+            sigma = math.sqrt(belief.variance[y, x])
+            line = epipolar_line(q, t, fx, fy, float(belief.rho[y, x]), sigma, rules)
+            if not line.expected < np.inf:
+                continue
+            eu, ev, warp = line.eu, line.ev, _NO_WARP
+            if rules.warp_px < np.inf:
+                warp = patch_warp(R, t, q, fx, fy, float(belief.rho[y, x]))
+                if not warp[0] * warp[3] > warp[1] * warp[2]:
+                    continue  # seen from behind
+                eu, ev = warp[0] * line.eu + warp[1] * line.ev, warp[2] * line.eu + warp[3] * line.ev
             g = gradients[y, x]
-            along = g[0] * line.eu**2 + 2.0 * g[1] * line.eu * line.ev + g[2] * line.ev**2
-            if not line.worthwhile or along < rules.min_gradient**2:
-                continue  # nothing to be learned, or the texture runs along the line
-            mean, squares = load_patch(patch, reference, y, x)
+            along = g[0] * eu**2 + 2.0 * g[1] * eu * ev + g[2] * ev**2
+            sigma_px = match_sigma_px(along, eu * eu + ev * ev, rules)
+            worthwhile = line.expected * (sigma_px / rules.sigma_px) < rules.max_sigma_ratio * sigma
+            if not worthwhile or along < rules.min_gradient**2:
+                continue  # too little parallax to tell more than is known, or the texture runs along the line
+            if HALF * max(abs(warp[0] - 1.0) + abs(warp[1]), abs(warp[2]) + abs(warp[3] - 1.0)) > rules.warp_px:
+                mean, squares = load_warped(patch, reference, y, x, warp)
+                if squares < 0.0:
+                    continue
+            else:
+                mean, squares = load_patch(patch, reference, y, x)
             found, place = _search(line, (cx, cy), rules, current, patch, mean, squares, scores)
             if found == MATCH:
                 u, v = (line.um + place * line.eu) / fx, (line.vm + place * line.ev) / fy
-                rho, sigma = inverse_depth_sigma(q, t, u, v, line.eu / fx, line.ev / fy, rules.sigma_px)
+                rho, sigma = inverse_depth_sigma(q, t, u, v, line.eu / fx, line.ev / fy, sigma_px)
                 matched += _accept(x, y, belief, rules, rho, sigma)
             elif found == NO_MATCH:
                 _miss(x, y, belief, rules)
     return matched
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def match_sigma_px(along: float, stretch: float, rules: Rules) -> float:
+    """Return how far a match may be off along the line: by image noise in both patches, and by the model.
+
+    `along` is the mean square of the gradient along the line, over the patch, in grey levels per pixel of the other
+    image; `stretch` how many squared pixels of the reference one of those is. Least squares over a patch of n pixels
+    place it to 2 sigma^2 / (n along), sigma of a grey value (Forster et al. 2014; Pizzoli et al. 2014). Of the gradient
+    sigma^2 / 2 is noise itself, by central differences.
+    """
+    if rules.model_sigma_px < 0.0:
+        return rules.sigma_px
+    noise = rules.grey_noise * rules.grey_noise
+    textured = max(along - 0.5 * noise * stretch, 0.5 * along)
+    return math.sqrt(rules.model_sigma_px**2 + 2.0 * noise / (PIXELS * textured + 1e-9))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def patch_warp(R: Array, t: Vector, q: Vector, fx: float, fy: float, rho: float) -> tuple[float, float, float, float]:
+    """Return the 2x2 matrix, by rows, that takes steps in the other image to steps in the reference.
+
+    For a surface that faces the reference camera at inverse depth `rho`, as SVO warps patches (Forster et al. 2014,
+    section V). Its determinant is not positive where the camera sees its back, or its edge; the identity where that
+    would be behind the other camera.
+    """
+    x, y, z = q[0] + rho * t[0], q[1] + rho * t[1], q[2] + rho * t[2]
+    if not z > _NEAREST_Z:
+        return _NO_WARP
+    h, k = x / z, y / z
+    a, b = (R[0, 0] - h * R[2, 0]) / z, (R[0, 1] - h * R[2, 1]) * fx / (fy * z)
+    c, d = (R[1, 0] - k * R[2, 0]) * fy / (fx * z), (R[1, 1] - k * R[2, 1]) / z
+    determinant = a * d - b * c
+    if not abs(determinant) > _SMALLEST_WARP:
+        return 0.0, 0.0, 0.0, 0.0
+    return d / determinant, -b / determinant, -c / determinant, a / determinant
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def epipolar_line(q: Vector, t: Vector, fx: float, fy: float, mean: float, sigma: float, rules: Rules) -> Line:
     """Return where to search for a point at q + rho t whose inverse depth is about `mean`.
 
-    Not worthwhile: behind the other camera, or too little parallax to tell more than is known.
+    Nowhere, where it would be behind the other camera.
     """
     low = max(mean - rules.search_sigmas * sigma, rules.rho_min)
     high = min(mean + rules.search_sigmas * sigma, rules.rho_max)
     mean = min(max(mean, low), high)
     za, zm, zb = q[2] + t[2] * low, q[2] + t[2] * mean, q[2] + t[2] * high
     if not (za > _NEAREST_Z and zb > _NEAREST_Z):
-        return Line(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return Line(np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     ua, va = fx * (q[0] + t[0] * low) / za, fy * (q[1] + t[1] * low) / za
     um, vm = fx * (q[0] + t[0] * mean) / zm, fy * (q[1] + t[1] * mean) / zm
     ub, vb = fx * (q[0] + t[0] * high) / zb, fy * (q[1] + t[1] * high) / zb
     du, dv = ub - ua, vb - va
     length = math.sqrt(du * du + dv * dv)
     if not length > 1e-9:
-        return Line(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return Line(np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     eu, ev = du / length, dv / length
     _, expected = inverse_depth_sigma(q, t, um / fx, vm / fy, eu / fx, ev / fy, rules.sigma_px)
     begin = max((ua - um) * eu + (va - vm) * ev, -rules.reach_px) - rules.step_px
     finish = min((ub - um) * eu + (vb - vm) * ev, rules.reach_px) + rules.step_px
-    return Line(expected < rules.max_sigma_ratio * sigma, um, vm, eu, ev, begin, finish)
+    return Line(expected, um, vm, eu, ev, begin, finish)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
