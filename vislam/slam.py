@@ -17,6 +17,7 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Frame, GraphUpdate, ImuSample, MagSample
 from vislam.core.readings import Reading
+from vislam.mapping.semantic.images import Labeller
 from vislam.pipeline.back import Back, KeyframeIntake
 from vislam.pipeline.front import Front
 from vislam.pipeline.in_map import InMap
@@ -28,11 +29,17 @@ from vislam.sensors import Suite
 class Slam:
     """Camera and IMU in, poses and map out; deterministic, one thread."""
 
-    def __init__(self, config: Config, rig: Rig, noise: ImuNoise | None = None, suite: Suite | None = None) -> None:
-        """Build the pipeline for a rig; without `noise` there is no IMU. `suite` are further sensors, if any."""
+    def __init__(
+        self, config: Config, rig: Rig, noise: ImuNoise | None = None, suite: Suite | None = None,
+        labeller: Labeller | None = None,
+    ) -> None:  # fmt: skip
+        """Build the pipeline for a rig; without `noise` there is no IMU. `suite` are further sensors, if any.
+
+        `labeller` tells the labels of keyframes, as a network does; None: `map.labels.folder` does, if there is one.
+        """
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock, suite)
-        self._intake = KeyframeIntake(rig, self.front, self.clock, suite)
+        self._intake = KeyframeIntake(rig, self.front, self.clock, suite, labeller)
         self._in_map = InMap(config.publish)
         self._frames: deque[Frame] = deque()
         self._silence = SilentCamera() if suite is not None and len(suite) and noise is not None else None

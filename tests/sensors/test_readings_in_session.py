@@ -130,6 +130,7 @@ def without_readings(path: Path) -> None:
     with closing(sqlite3.connect(path)) as db:
         db.execute("DROP TABLE readings")
         db.execute("DROP TABLE own_starts")
+        db.execute("DROP TABLE labels")
         db.execute("PRAGMA user_version=8")
 
 
@@ -158,6 +159,7 @@ def test_a_session_that_lacks_a_table_of_its_format_is_refused(tmp_path) -> None
     stored(tmp_path / "session.db", World(4.0, seed=5), end=5)
     with closing(sqlite3.connect(tmp_path / "session.db")) as db:
         db.execute("DROP TABLE own_starts")
+        db.execute("DROP TABLE labels")
     with pytest.raises(DataError, match="other tables"):
         Session(tmp_path / "session.db")
 

@@ -17,7 +17,7 @@ from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig
 from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig, VibrationConfig
 from vislam.config.live import LiveConfig, ViewConfig
 from vislam.config.loop import LoopConfig, LoopTruthConfig
-from vislam.config.mapping import DriveConfig, MapConfig, MapProduct, MonoDepthConfig
+from vislam.config.mapping import DriveConfig, LabelConfig, MapConfig, MapProduct, MonoDepthConfig
 from vislam.config.profiles import merged, profile
 from vislam.config.ranges import Whole, check_ranges
 from vislam.config.sensors import (
@@ -63,6 +63,7 @@ __all__ = [
     "ImuChip",
     "ImuConfig",
     "InitConfig",
+    "LabelConfig",
     "LibraryCameraConfig",
     "LiveConfig",
     "LoopConfig",

@@ -61,6 +61,17 @@ class MonoDepthConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LabelConfig:
+    """What things are, from label images; docs/mapping.md."""
+
+    # label images, named by the stamps of the colour images, beside labels.toml; None: no labels
+    folder: str | None = None
+    max_voxels: Count = 1_000_000  # that have labels, 40 MB; what is seen after that has none
+    thing_voxels: Count = 8  # connected voxels of one class that are a thing; fewer are stray
+    cloud_colors: bool = False  # the cloud and surfels have the colours of labels, not of images
+
+
+@dataclass(frozen=True, slots=True)
 class MapConfig:
     """Clouds, the occupancy octree, the navigation grid and the mesh."""
 
@@ -106,4 +117,5 @@ class MapConfig:
     poisson_depth: Annotated[int, Range(1, 16)] = 9  # levels of Poisson's octree: cells of 2 cm in a room of 10 m
     # what is written into map/; mesh, glb, obj and poisson need Open3D and take seconds, surfels too
     products: tuple[MapProduct, ...] = ("cloud", "octomap", "grid", "drive")
+    labels: LabelConfig = field(default_factory=LabelConfig)
     mono_depth: MonoDepthConfig = field(default_factory=MonoDepthConfig)

@@ -199,11 +199,12 @@ class PackedScan:
     depth_png: bytes
     points: bytes
     colors: bytes
+    labels_png: bytes = b""  # ids on the same rays, or of the same points; empty: none
 
     @property
     def nbytes(self) -> int:
         """Its size in bytes."""
-        return len(self.depth_png) + len(self.points) + len(self.colors)
+        return len(self.depth_png) + len(self.points) + len(self.colors) + len(self.labels_png)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,9 @@ from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh.posed import PosedView, posed_views
 from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
 from vislam.mapping.products import LEVEL, NotLevel, remove_products, write_products
+from vislam.mapping.semantic.classes import LabelClasses
+from vislam.mapping.semantic.fusion import LabelFusion
+from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.upright import View, view_of
 
 _RIGID_TOLERANCE = 1e-4
@@ -36,10 +40,13 @@ _MOST_VIEWS = 200  # keyframes that are asked for the directions of surfaces; 10
 class Mapper:
     """Keeps every keyframe's geometry in its own frame, and the maps made of it at the poses the graph gives."""
 
-    def __init__(self, config: MapConfig, rig: Rig, one_camera: bool = False) -> None:
+    def __init__(
+        self, config: MapConfig, rig: Rig, one_camera: bool = False, classes: LabelClasses | None = None
+    ) -> None:
         """Prepare for a rig; with `one_camera` only cam0 counts, and depth comes by `add_depth`.
 
-        Raises DataError when the settings or the rig cannot make a map.
+        `classes` say what the labels of keyframes mean, where they have some. Raises DataError when the settings or the
+        rig cannot make a map.
         """
         self._config = config
         self._rig = rig
@@ -49,6 +56,7 @@ class Mapper:
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
         self._drive = DriveMap(config)
         self._surfels = SurfelMap(config.surfel_m)
+        self._labels = LabelFusion(config.resolution_m, config.labels, classes or LabelClasses())
         self._submaps = Submaps()
         self._apart: dict[int, Array] = {}  # newest poses of keyframes in submaps that no loop has joined with the map
         self.notes: dict[str, str] = {}  # what was left out of an export, and why
@@ -73,16 +81,21 @@ class Mapper:
         """
         return self._occupancy.occupancy.copy()
 
-    def add(self, keyframe: Keyframe, T_map_body: Array) -> None:
+    def add(self, keyframe: Keyframe, T_map_body: Array, labels: NDArray[np.integer] | None = None) -> None:
         """Integrate a keyframe at its pose [4, 4], after the `move` that knows its submap.
 
+        `labels` are of its first image, ids [H, W] of what each pixel shows, 0 where that is unknown, as large or
+        smaller by a whole factor.
+
         Where no loop has joined that submap with the oldest one, it waits outside of the map, for its pose there means
-        nothing. Raises DataError on a pose that is not rigid, an id seen before, or images of another size than the
-        camera's.
+        nothing. Raises DataError on a pose that is not rigid, an id seen before, or images or labels of another size
+        than the camera's.
         """
         T = np.array(T_map_body, dtype=np.float64)
         _check_rigid(T[None], np.array([keyframe.id]))
-        scan = self._extractor.extract(keyframe)
+        scan = self._extractor.extract(keyframe, labels)
+        if self._one_camera and labels is not None:
+            self._labels.wait(keyframe.id, self._extractor.on_rays(labels))
         if scan is None:
             return
         self._store.add(keyframe.id, keyframe.t_ns, scan)
@@ -96,9 +109,20 @@ class Mapper:
         """
         T = np.array(late.T_map_body, dtype=np.float64)
         _check_rigid(T[None], np.array([late.keyframe_id]))
-        scan = self._extractor.late(late.depth_m, late.image)
+        scan = self._extractor.late(late.depth_m, late.image, self._labels.waited_for(late.keyframe_id))
         self._store.add(late.keyframe_id, late.t_ns, scan)
         self._place(late.keyframe_id, scan, T)
+
+    def label(self, keyframe_id: int, labels: NDArray[np.integer]) -> None:
+        """Give the depth image of a keyframe that is there other labels, as `add` takes them.
+
+        Raises DataError when it has no depth image, or labels are of another size than the camera's images.
+        """
+        if keyframe_id not in self._store or not self._store.has_depth(keyframe_id):
+            raise DataError(f"keyframe {keyframe_id} has no depth image that labels could be given to")
+        self._store.label(keyframe_id, self._extractor.on_rays(labels))
+        self._labels.forget()
+        self._surfels = SurfelMap(self._config.surfel_m)
 
     def packed(self, keyframe_id: int) -> PackedScan | None:
         """Return what is kept of a keyframe's geometry, None if there was none."""
@@ -191,10 +215,20 @@ class Mapper:
         """
         for keyframe_id in self._occupancy.poses:
             if keyframe_id not in self._surfels:
-                self._surfels.add(keyframe_id, self._store.scan(keyframe_id), self._extractor.view)
+                scan = replace(self._store.scan(keyframe_id), labels=self._store.labels(keyframe_id))
+                self._surfels.add(keyframe_id, scan, self._extractor.view)
         surfels = self._surfels.surfels(self._occupancy.poses)
         surfels = surfels.select(surfels.views >= self._config.surfel_min_views)
         return surfels.select(self.occupancy.state_at(surfels.points_m) != Occupancy.FREE)
+
+    def labels(self) -> LabelLayer | None:
+        """Return the labels of the occupied voxels at the newest poses; None where no keyframe has labels.
+
+        Only keyframes that are new since the last call are looked at, unless some were moved.
+        """
+        if not self._store.has_labels:
+            return None
+        return self._labels.layer(self._occupancy.poses, self._store, self._extractor.view, self.occupancy)
 
     def turned(self, T: Array) -> Mapper:
         """Return a map of the same keyframes with all poses moved by T [4, 4], made anew: voxels cannot be turned."""
@@ -230,6 +264,8 @@ class Mapper:
             self.notes[f"{name} in the map"] = (
                 f"no loop joined these {len(layer._store.ids)} keyframes with it; {folder.name}/{name} is their own"
             )
+        if refused := self._labels.refused:
+            self.notes[f"labels of {refused} votes"] = "there was no room for more voxels; raise labels.max_voxels"
         if left_out := self._occupancy.left_out:
             self.notes[f"occupancy of {len(left_out)} keyframes"] = next(iter(left_out.values()))
         return written
@@ -261,7 +297,7 @@ class Mapper:
 
     def _made_again(self, poses: dict[int, Array], submaps: Submaps) -> Mapper:
         """Return the complete map of some keyframes at other poses."""
-        other = Mapper(self._config, self._rig, self._one_camera)
+        other = Mapper(self._config, self._rig, self._one_camera, self._labels.classes)
         other._submaps = submaps
         other.restore({i: scan for i in poses if (scan := self._store.packed(i)) is not None}, poses)
         other.finish()

@@ -7,7 +7,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
 
 from vislam.config import MapConfig
 from vislam.core.errors import DataError, StorageError
@@ -23,11 +25,14 @@ from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mesh.atlas import textured
 from vislam.mapping.mesh.posed import PosedView
 from vislam.mapping.octree import OccupancyMap, Octree, encode_bt, encode_ot
+from vislam.mapping.semantic.files import CLASSES_NAME, VOXELS_NAME, write_layer
+from vislam.mapping.semantic.layer import LabelLayer
 
 FILES = {
     "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",
     "grid": "grid.pgm", "drive": "drive.pgm",
     "mesh": "mesh.ply", "glb": "mesh.glb", "obj": "mesh.obj", "poisson": "poisson.ply", "surfels": "surfels.ply",
+    "labels": VOXELS_NAME,
 }  # fmt: skip
 
 NEEDS_UP = ("grid", "drive")  # what means nothing in a map that is not level
@@ -72,12 +77,17 @@ class MapSource(Protocol):
     def surfels(self) -> Surfels:
         """Return the surfels."""
 
+    def labels(self) -> LabelLayer | None:
+        """Return the labels, None where there are none."""
+
 
 def write_products(
     source: MapSource, folder: Path, config: MapConfig, step: Callable[[str], None] | None = None,
     not_level: str | None = None,
 ) -> tuple[dict[str, Path], dict[str, str]]:  # fmt: skip
     """Write the configured products into a folder; return the files, and the reasons why some are missing.
+
+    Labels are written where the map has some.
 
     Where z of the map may not be up, `not_level` says why: what needs that is removed, if it is there, and not written.
 
@@ -88,20 +98,26 @@ def write_products(
     except OSError as error:
         raise StorageError(f"{folder} cannot be made: {error.strerror}; choose another folder") from error
     cloud, mesh, surfels = cache(source.cloud), cache(source.mesh), cache(source.surfels)
+    labels = source.labels()
+    in_colors = config.labels.cloud_colors
     writers: dict[str, Callable[[Path], object]] = {  # a text is the reason why nothing was written
-        "cloud": lambda path: write_ply(path, cloud().points_m, cloud().colors),
+        "cloud": lambda path: _write_cloud(path, cloud(), labels, in_colors),
         "pcd": lambda path: write_pcd(path, cloud().points_m, cloud().colors),
         "octomap": lambda path: _write_octree(path, encode_bt(source.occupancy.max_likelihood_octree())),
         "ot": lambda path: _write_octree(path, encode_ot(source.coloured_octree())),
         "grid": lambda _: write_grid(folder, source.grid()),
         "drive": lambda _: write_grid(folder, source.drive().navigation_grid(), "drive"),
         "glb": lambda path: _write_glb(path, *mesh(), source, config.mesh_atlas_px),
-        "surfels": lambda path: _write_surfels(path, surfels()),
+        "surfels": lambda path: _write_surfels(path, surfels(), labels, in_colors),
         "poisson": lambda path: _write_mesh(path, *poisson_mesh(surfels(), config.poisson_depth)),
     }
+    if labels is not None:
+        writers["labels"] = lambda _: write_layer(folder, labels)
+    else:
+        _remove_labels(folder)
     written: dict[str, Path] = {}
     notes: dict[str, str] = {}
-    for product in dict.fromkeys(config.products):
+    for product in (*dict.fromkeys(config.products), *(() if labels is None else ("labels",))):
         if step is not None:
             step(product)
         path = folder / FILES[product]
@@ -128,6 +144,7 @@ def remove_products(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
     for product in NEEDS_UP:
         _remove_grid(folder, product)
+    _remove_labels(folder)
     with suppress(OSError):
         folder.rmdir()
 
@@ -137,18 +154,36 @@ def _remove_grid(folder: Path, product: str) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
+def _remove_labels(folder: Path) -> None:
+    for name in (VOXELS_NAME, CLASSES_NAME):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _write_cloud(path: Path, cloud: Cloud, layer: LabelLayer | None, in_colors: bool) -> None:
+    """Write a cloud as a PLY, with the label of each point's voxel where there are labels."""
+    if layer is None:
+        write_ply(path, cloud.points_m, cloud.colors)
+        return
+    labels = layer.label_at(cloud.points_m)
+    write_ply(path, cloud.points_m, layer.colors_of(labels) if in_colors else cloud.colors, extra={"label": labels})
+
+
 def _write_octree(path: Path, content: bytes) -> None:
     with replacing(path) as file:
         file.write(content)
 
 
-def _write_surfels(path: Path, surfels: Surfels) -> str | None:
+def _write_surfels(path: Path, surfels: Surfels, layer: LabelLayer | None, in_colors: bool) -> str | None:
     """Write surfels as a PLY; return the reason if there are none."""
     if len(surfels) == 0:
         return "no surface was seen with dense depth by enough keyframes"
     normals = dict(zip(("nx", "ny", "nz"), surfels.normals.T, strict=True))
-    extra = {**normals, "radius": surfels.radius_m, "confidence": surfels.confidence}
-    write_ply(path, surfels.points_m, surfels.colors, extra=extra)
+    extra: dict[str, NDArray[Any]] = {**normals, "radius": surfels.radius_m, "confidence": surfels.confidence}
+    colors = surfels.colors
+    if layer is not None:
+        extra |= {"label": surfels.labels, "votes": surfels.label_votes, "total": surfels.label_total}
+        colors = layer.colors_of(surfels.labels) if in_colors else colors
+    write_ply(path, surfels.points_m, colors, extra=extra)
     return None
 
 

@@ -28,6 +28,7 @@ from vislam.loop.detector import LoopDetector
 from vislam.loop.injection import FalseLoops, as_candidate
 from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
+from vislam.mapping.semantic.images import Labeller
 from vislam.mapping.stage import MapStage
 from vislam.pipeline.front import Front
 from vislam.pipeline.settings import without_gravity
@@ -50,10 +51,12 @@ class Back:
         first_state: NavState | None,
         T_map_body: Array,
         suite: Suite | None = None,
+        labeller: Labeller | None = None,
     ) -> None:
         """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity.
 
-        `config` is as `settings.derived` gives it; `suite` has the sensors whose readings the graph takes.
+        `config` is as `settings.derived` gives it; `suite` has the sensors whose readings the graph takes; `labeller`
+        tells the labels of keyframes, None: the folder in the settings does, if there is one.
         """
         self._has_gravity = has_gravity = first_state is not None
         graph = config.graph if has_gravity else without_gravity(config.graph, rig)
@@ -65,7 +68,7 @@ class Back:
         self._false = None
         if config.loop.inject_share > 0.0:
             self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
-        self.map = map_stage(config, rig, clock)
+        self.map = map_stage(config, rig, clock, labeller)
         self.clock = clock
         self.T_map_odom = np.eye(4)
         self._words_revision = 0
@@ -159,10 +162,15 @@ class Back:
 class KeyframeIntake:
     """Hands keyframes to the stages of a run, which begin with the first one or with an earlier run."""
 
-    def __init__(self, rig: Rig, front: Front, clock: StageClock, suite: Suite | None = None) -> None:
-        """Wait for the first keyframe of `front`; `suite` has the sensors whose readings come with keyframes."""
+    def __init__(
+        self, rig: Rig, front: Front, clock: StageClock, suite: Suite | None = None, labeller: Labeller | None = None
+    ) -> None:
+        """Wait for the first keyframe of `front`; `suite` has the sensors whose readings come with keyframes.
+
+        `labeller` as for `Back`.
+        """
         self._front = front
-        self._make = partial(Back, front.config, rig, suite=suite)
+        self._make = partial(Back, front.config, rig, suite=suite, labeller=labeller)
         self._clock = clock
         self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # since the newest keyframe
         self._seen_again: int | None = None  # the keyframe at which an earlier run is resumed
@@ -220,9 +228,9 @@ class KeyframeIntake:
         return step
 
 
-def map_stage(config: Config, rig: Rig, clock: StageClock) -> MapStage | None:
+def map_stage(config: Config, rig: Rig, clock: StageClock, labeller: Labeller | None = None) -> MapStage | None:
     """Return the map of a pipeline; None where it is off."""
-    return MapStage(config.map, rig, makes_depth(config, rig), clock) if config.map.enabled else None
+    return MapStage(config.map, rig, makes_depth(config, rig), clock, labeller) if config.map.enabled else None
 
 
 def makes_depth(config: Config, rig: Rig) -> bool:

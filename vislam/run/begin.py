@@ -15,6 +15,7 @@ from vislam.core.memory import SlamMemory
 from vislam.core.recording import Recording
 from vislam.factors.factor_log import rig_data
 from vislam.imu import ImuNoise
+from vislam.mapping.semantic.images import LabelFolder
 from vislam.pipeline.settings import derived
 from vislam.run.drive import Progress, Run, imu_noise
 from vislam.run.folder import MapChoice, storage, write_setup
@@ -91,7 +92,7 @@ def begun(
     """
     noise = imu_noise(config.imu, recording.imu_noise)
     config = derived(config, recording.rig, noise)
-    info = {"source": source, "config": asdict(config)}
+    info = {"source": source, "config": asdict(config), **_label_names(config, recording)}
     path = out / "session.db"
     make = make or partial(Run, recording, config, out)
     if base is None:
@@ -111,6 +112,17 @@ def begun(
             f"{stored.path} brings no clouds, or of another shape (--map.*): the map holds new ones only"
         )
     return run
+
+
+def _label_names(config: Config, recording: Recording) -> dict[str, Any]:
+    """Return what labels mean, as an entry of a session; nothing where there are no label images.
+
+    Raises DataError when the label images cannot be used.
+    """
+    folder = config.map.labels.folder
+    if folder is None or not config.map.enabled:
+        return {}
+    return {"labels": LabelFolder(Path(folder), recording.rig.cameras[0]).classes.data()}
 
 
 def map_of(

@@ -39,6 +39,7 @@ from vislam.loop.injection import SOURCE as INJECTED
 from vislam.loop.injection import is_injected
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
 from vislam.mapping.products import FILES as MAP_FILES
+from vislam.mapping.semantic.files import CLASSES_NAME as LABEL_CLASSES
 from vislam.pipeline.steps import KeyframeStep, Step
 from vislam.run.geodetic_outputs import LINES, TABLES
 from vislam.run.session import Session, has_frames
@@ -56,8 +57,8 @@ _RUN_FILES = (
     "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
     "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
     *TABLES.values(), LINES, "map/grid.yaml",
-    "saved/cloud.ply", "saved/trajectory.tum", "map/drive.yaml", "map/map.json",
-    *(f"map/{name}" for name in MAP_FILES.values()),
+    "saved/cloud.ply", "saved/trajectory.tum",
+    "map/drive.yaml", "map/map.json", f"map/{LABEL_CLASSES}", *(f"map/{name}" for name in MAP_FILES.values()),
 )  # fmt: skip
 _CALIBRATIONS = "calibration"  # folder of those that were made before the run began
 TRACKING_COLUMNS = ("t_ns", "tracking", "inliers", "keyframe_id", "localisation", "submap", "reason")

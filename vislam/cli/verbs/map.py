@@ -23,7 +23,8 @@ class MapOptions:
     """Options of `vislam map`."""
 
     source: Positional[Path]
-    """Run folder, to make its maps again with these settings; or OctoMap file (.bt, .ot), to ask it"""
+    """Run folder, to make its maps again with these settings, or to ask its labels; or OctoMap file (.bt, .ot), to ask
+    it"""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
     out: Path | None = None
     """Folder for the maps of a run; None: in the place of those it has"""
@@ -33,6 +34,10 @@ class MapOptions:
     """Say how large the map is and what it holds; done too when nothing else is asked"""
     query: tuple[Finite, Finite, Finite] | None = None
     """Say what is at X Y Z (metres, map frame): occupied, free or unknown, and what is nearest"""
+    nearest: str | None = None
+    """Say where the nearest thing with this label is in the map of a run, which needs labels"""
+    from_m: Annotated[tuple[Finite, Finite, Finite], tyro.conf.arg(name="from")] = (0.0, 0.0, 0.0)
+    """Place X Y Z (metres, map frame) that is asked from; 0 0 0 is where a run began"""
     level: Annotated[int, Range(0, 16)] = 0
     """Query cubes of 2**level voxels"""
     window_m: Positive = 5.0
@@ -49,6 +54,8 @@ def main(arguments: list[str]) -> int:
     run = next((Path(argument) for argument in arguments if Path(argument).is_dir()), None)
     settings = MapConfig() if run is None or "--help" in arguments else _settings_of(run)
     options = parse(MapOptions, arguments, "map", MapOptions(source=tyro.MISSING, settings=settings))
+    if options.nearest is not None:
+        return _nearest(options, options.nearest)
     if not options.source.is_dir():
         return _describe(options)
     with log_in_run(options.source, ["vislam", "map", *arguments]):
@@ -74,6 +81,16 @@ def _describe(options: MapOptions) -> int:
     return 0
 
 
+def _nearest(options: MapOptions, name: str) -> int:
+    from vislam.mapping.semantic.files import read_layer
+    from vislam.mapping.semantic.query import describe_nearest
+
+    folder = options.source / "map"
+    answer = describe_nearest(read_layer(folder if folder.is_dir() else options.source), options.from_m, name)
+    print(json.dumps(answer) if options.json else "\n".join(f"{key}: {value}" for key, value in answer.items()))
+    return 0
+
+
 def _rebuild(options: MapOptions) -> int:
     from vislam.run.offline.rebuild import rebuild
     from vislam.run.report import write_report
@@ -88,6 +105,8 @@ def _rebuild(options: MapOptions) -> int:
     print(f"{answer['keyframes']} keyframes, depth from the {answer['depth']}, poses of {answer['poses']}")
     for name, path in answer["written"].items():
         print(f"{name}: {path}")
+    for name, count in answer.get("labels", {}).items():
+        print(f"{name}: {count}")
     for name, reason in answer["left_out"].items():
         print(f"warning: no {name}: {printable(reason)}")
     return 0

@@ -31,6 +31,7 @@ class Scan:
     depth: NDArray[np.uint16] | None  # [h, w] in the view's units, 0 where none
     points_body_m: NDArray[np.float32] | None  # [N, 3] where there is no depth image
     colors: ImageU8  # RGB [h, w, 3] of the depth image, or [N, 3] of the points
+    labels: NDArray[np.uint16] | None = None  # [h, w] of the depth image, or [N] of the points; 0: unknown
 
 
 class KeyframeStore:
@@ -57,6 +58,11 @@ class KeyframeStore:
         """Memory of the compressed scans, in bytes."""
         return sum(packed.nbytes for packed in self._packed.values())
 
+    @property
+    def has_labels(self) -> bool:
+        """Whether any stored keyframe has labels."""
+        return any(packed.labels_png for packed in self._packed.values())
+
     def t_ns(self, keyframe_id: int) -> int:
         """Return the time of a stored keyframe."""
         return self._packed[keyframe_id].t_ns
@@ -67,7 +73,7 @@ class KeyframeStore:
 
     def put(self, keyframe_id: int, packed: PackedScan) -> None:
         """Keep a scan that `packed` gave. Raises DataError when it is none."""
-        if not all(isinstance(part, bytes) for part in (packed.depth_png, packed.points, packed.colors)):
+        if not all(isinstance(part, bytes) for part in _parts(packed)):
             raise _damaged(keyframe_id, "it is no sequence of bytes")
         self._packed[keyframe_id] = packed
 
@@ -79,14 +85,43 @@ class KeyframeStore:
             depth_png = _encode(".png", scan.depth, _PNG_OPTIONS)
             bgr = np.ascontiguousarray(scan.colors[..., ::-1])
             colors = _encode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-            self._packed[keyframe_id] = PackedScan(t_ns, depth_png, b"", colors)
+            self._packed[keyframe_id] = PackedScan(t_ns, depth_png, b"", colors, _packed_labels(scan.labels))
         elif scan.points_body_m is not None:
             points = np.ascontiguousarray(scan.points_body_m[:_MAX_SPARSE_POINTS], dtype=np.float32)
             colors = np.ascontiguousarray(scan.colors[:_MAX_SPARSE_POINTS]).tobytes()
-            self._packed[keyframe_id] = PackedScan(t_ns, b"", zlib.compress(points.tobytes(), 1), colors)
+            labels = None if scan.labels is None else scan.labels[None, :_MAX_SPARSE_POINTS]
+            packed_points = zlib.compress(points.tobytes(), 1)
+            self._packed[keyframe_id] = PackedScan(t_ns, b"", packed_points, colors, _packed_labels(labels))
+
+    def has_depth(self, keyframe_id: int) -> bool:
+        """Return whether a stored keyframe has a depth image."""
+        return bool(self._packed[keyframe_id].depth_png)
+
+    def label(self, keyframe_id: int, labels: NDArray[np.uint16]) -> None:
+        """Give the depth image of a stored keyframe other labels [h, w]."""
+        self._packed[keyframe_id] = replace(self._packed[keyframe_id], labels_png=_packed_labels(labels))
+
+    def labels(self, keyframe_id: int) -> NDArray[np.uint16] | None:
+        """Return the labels [h, w] of a stored keyframe's depth image, or [N] of its points; None: it has none.
+
+        Raises DataError when what an earlier run stored is damaged.
+        """
+        packed = self._packed[keyframe_id]
+        if not packed.labels_png:
+            return None
+        geometry = self.geometry(keyframe_id)
+        points = geometry.points_body_m
+        shape = (1, 0 if points is None else len(points)) if geometry.depth is None else geometry.depth.shape
+        # the header tells the size, as for depth
+        is_right = len(packed.labels_png) >= 24 and struct.unpack(">II", packed.labels_png[16:24]) == shape[::-1]
+        labels = _decode(packed.labels_png, cv2.IMREAD_UNCHANGED) if is_right else None
+        if labels is None or labels.dtype not in (np.uint8, np.uint16) or labels.shape != shape:
+            raise _damaged(keyframe_id, "its labels are no image of the size of its depth")
+        ids = labels.astype(np.uint16)
+        return ids[0] if geometry.depth is None else ids
 
     def scan(self, keyframe_id: int) -> Scan:
-        """Return the scan of a stored keyframe; depth is exactly what was added.
+        """Return the scan of a stored keyframe, without labels; depth is exactly what was added.
 
         Raises DataError when what an earlier run stored is damaged.
         """
@@ -120,6 +155,17 @@ class KeyframeStore:
         if len(data) % 12:
             raise _damaged(keyframe_id, "its points are cut")
         return Scan(None, np.frombuffer(data, np.float32).reshape(-1, 3), none)
+
+
+def _parts(packed: PackedScan) -> tuple[object, ...]:
+    return packed.depth_png, packed.points, packed.colors, packed.labels_png
+
+
+def _packed_labels(labels: NDArray[np.uint16] | None) -> bytes:
+    """Return labels as a PNG, of 8 bits where that is enough; empty where there are none."""
+    if labels is None or not labels.any():
+        return b""
+    return _encode(".png", labels.astype(np.uint8) if labels.max() < 256 else labels, _PNG_OPTIONS)
 
 
 def _damaged(keyframe_id: int, why: str) -> DataError:

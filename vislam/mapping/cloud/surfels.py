@@ -26,6 +26,7 @@ from vislam.mapping.cloud.cloud import voxel_key
 from vislam.mapping.cloud.store import Scan
 from vislam.mapping.depth.image import DepthView
 from vislam.mapping.octree import find_slot
+from vislam.mapping.semantic.votes import Votes, vote
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
@@ -34,7 +35,8 @@ _STENCIL_PX = 2  # normals from neighbours this far away: nearer ones show the n
 _MIN_FACING = 0.2  # cosine to the ray; surfaces seen at a more grazing angle are measured badly
 _SAME_FACING = 0.7  # cosine between normals of one surface
 _THICKNESS = 1.5  # spacings across the surface, within which two measurements are one surface's
-_COLUMNS = 11  # position, normal, colour, radius, confidence
+_COLUMNS = 12  # position, normal, colour, radius, confidence, label
+_LABEL = 11
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +50,9 @@ class Surfels:
     confidence: F32  # [N] sum of 1 / range^4, that is of 1 / variance of depth in the units of one metre's
     views: NDArray[np.int32]  # [N] keyframes that saw it
     anchors: I64  # [N] id of the keyframe that it moves with
+    labels: NDArray[np.uint16]  # [N] that most keyframes saw there; 0: none saw any
+    label_votes: NDArray[np.int32]  # [N] keyframes that did
+    label_total: NDArray[np.int32]  # [N] keyframes that saw any label
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -57,6 +62,7 @@ class Surfels:
         return Surfels(
             self.points_m[chosen], self.normals[chosen], self.colors[chosen], self.radius_m[chosen],
             self.confidence[chosen], self.views[chosen], self.anchors[chosen],
+            self.labels[chosen], self.label_votes[chosen], self.label_total[chosen],
         )  # fmt: skip
 
 
@@ -65,7 +71,7 @@ class SurfelMap:
 
     def __init__(self, spacing_m: float) -> None:
         self._spacing_m = spacing_m
-        self._discs: dict[int, F32] = {}  # [M, 11] of each keyframe, in its body frame
+        self._discs: dict[int, F32] = {}  # [M, 12] of each keyframe, in its body frame
         self._merged = _Discs()
         self._merged_poses: dict[int, Array] = {}  # at which keyframes are in what was merged last
 
@@ -82,10 +88,15 @@ class SurfelMap:
         discs = _Discs()
         if scan.depth is not None:
             colors = np.ascontiguousarray(scan.colors.reshape(*scan.depth.shape, 3))
-            measured = _discs_of(scan.depth, view.unit_m, view.rays_body, colors, view.max_range_m, self._spacing_m)
+            labels = np.zeros_like(scan.depth) if scan.labels is None else scan.labels
+            measured = _discs_of(
+                scan.depth, view.unit_m, view.rays_body, colors, labels, view.max_range_m, self._spacing_m
+            )
             measured[:, :3] += view.T_body_view[:3, 3]
             discs.fuse(measured, keyframe_id, self._spacing_m)
-        self._discs[keyframe_id] = discs.values[: discs.count].astype(np.float32)
+        values = discs.values[: discs.count]
+        values[:, _LABEL] = discs.votes.winners()[0][: discs.count]  # its one vote
+        self._discs[keyframe_id] = values.astype(np.float32)
 
     def surfels(self, T_map_body: dict[int, Array]) -> Surfels:
         """Return the surfels [N] of all keyframes at their poses; those without a pose are left out.
@@ -117,10 +128,11 @@ class _Cells(NamedTuple):
 class _Kept(NamedTuple):
     """Surfels, and where each came from."""
 
-    values: Array  # [N, 11]
+    values: Array  # [N, 12]
     anchors: I64
     last: I64  # keyframe that saw it last
     views: I64  # keyframes that saw it
+    votes: Votes
 
 
 class _Discs:
@@ -130,13 +142,14 @@ class _Discs:
         self.count = 0
         self.values = np.empty((1 << 12, _COLUMNS))
         self.anchors, self._last, self._views = (np.empty(1 << 12, np.int64) for _ in range(3))
+        self.votes = Votes.none(1 << 12)
         self._table = np.full(1 << 14, -1, np.int64)
         self._heads = np.zeros(1 << 14, np.int64)
         self._next = np.empty(1 << 12, np.int64)  # surfel made before in the same cell; -1: none
         self._keys = np.empty(1 << 12, np.int64)
 
     def fuse(self, values: Array, keyframe_id: int, spacing_m: float) -> None:
-        """Merge measurements [M, 11] of a keyframe in."""
+        """Merge measurements [M, 12] of a keyframe in."""
         need = self.count + len(values)
         if need > len(self.anchors):
             size = max(need, 2 * len(self.anchors))
@@ -145,13 +158,14 @@ class _Discs:
                 np.concatenate([part, np.empty(size - len(part), np.int64)])
                 for part in (self.anchors, self._last, self._views, self._next, self._keys)
             )
+            self.votes = self.votes.grown(size)
         if 2 * need > len(self._table):
             size = 1 << int(np.ceil(np.log2(4 * need)))
             self._table, self._heads = np.full(size, -1, np.int64), np.zeros(size, np.int64)
             _link(self._table, self._heads, self._next, self._keys, self.count)
         self.count = _fuse(
             values, keyframe_id, spacing_m, _Cells(self._table, self._heads, self._next, self._keys),
-            _Kept(self.values, self.anchors, self._last, self._views), self.count,
+            _Kept(self.values, self.anchors, self._last, self._views, self.votes), self.count,
         )  # fmt: skip
 
     def surfels(self) -> Surfels:
@@ -165,13 +179,15 @@ class _Discs:
             values[:, 10].astype(np.float32),
             self._views[: self.count].astype(np.int32),
             self.anchors[: self.count].copy(),
+            *(part[: self.count] for part in self.votes.winners()),
+            self.votes.total[: self.count].copy(),
         )
 
 
 @njit(cache=True, nogil=True)
-def _discs_of(depth: NDArray[np.uint16], unit: float, rays: F32, colors: NDArray[np.uint8], max_range: float,
-              spacing: float) -> Array:  # fmt: skip
-    """Return the discs [M, 11] of a depth image, in the body frame's directions from the camera's centre."""
+def _discs_of(depth: NDArray[np.uint16], unit: float, rays: F32, colors: NDArray[np.uint8],
+              labels: NDArray[np.uint16], max_range: float, spacing: float) -> Array:  # fmt: skip
+    """Return the discs [M, 12] of a depth image, in the body frame's directions from the camera's centre."""
     rows, columns = depth.shape
     out = np.empty((rows * columns, _COLUMNS))
     count, gap = 0, _STENCIL_PX
@@ -202,6 +218,7 @@ def _discs_of(depth: NDArray[np.uint16], unit: float, rays: F32, colors: NDArray
             row[6], row[7], row[8] = colors[i, j, 0], colors[i, j, 1], colors[i, j, 2]
             row[9] = max(np.sqrt(area) / (2.0 * gap), spacing) * np.sqrt(0.5)  # half the diagonal of what it stands for
             row[10] = abs(facing) / distance**4
+            row[11] = labels[i, j]
             count += 1
     return out[:count].copy()
 
@@ -239,7 +256,7 @@ def _nearest(row: Array, spacing: float, table: I64, heads: I64, following: I64,
 @njit(cache=True, nogil=True)
 def _fuse(values: Array, keyframe_id: int, spacing: float, cells: _Cells, kept: _Kept, count: int) -> int:
     table, heads, following, keys = cells
-    out, out_anchors, out_last, out_views = kept
+    out, out_anchors, out_last, out_views, votes = kept
     for i in range(len(values)):
         row = values[i]
         key = voxel_key(row[0], row[1], row[2], spacing)
@@ -252,8 +269,12 @@ def _fuse(values: Array, keyframe_id: int, spacing: float, cells: _Cells, kept: 
             table[slot], heads[slot], keys[count] = key, count, key
             out[count] = row
             out_anchors[count], out_last[count], out_views[count] = keyframe_id, keyframe_id, 1
+            if row[11] > 0.0:
+                vote(votes, count, int(row[11]))
             count += 1
             continue
+        if row[11] > 0.0:
+            vote(votes, k, int(row[11]))
         there = out[k]
         share = row[10] / (row[10] + there[10])
         for c in range(9):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cached_property
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,7 @@ from vislam.core.messages import ImageF32, ImageU8, Keyframe
 from vislam.mapping.cloud.store import Scan
 from vislam.mapping.depth.image import DepthView, filter_depth, mono_view, rgbd_view
 from vislam.mapping.depth.stereo import DenseStereo
+from vislam.mapping.semantic.images import LabelRays, checked
 
 
 class ScanExtractor:
@@ -21,6 +25,7 @@ class ScanExtractor:
     def __init__(self, config: MapConfig, rig: Rig, one_camera: bool = False) -> None:
         """Prepare for a rig; with `one_camera`, depth comes late, from `late`, and no other depth is used."""
         self._config = config
+        self._rig = rig
         self._cameras = rig.cameras
         self._one_camera = one_camera
         stereo = rig.is_stereo and not rig.has_depth and not one_camera
@@ -29,26 +34,41 @@ class ScanExtractor:
         self.view: DepthView = self._stereo.view if self._stereo else one_camera_view
         self.counters = {"keyframes_dense": 0, "keyframes_sparse": 0, "keyframes_without_depth": 0}
 
-    def extract(self, keyframe: Keyframe) -> Scan | None:
+    def on_rays(self, labels: NDArray[np.integer]) -> NDArray[np.uint16]:
+        """Return labels [H, W] of a first image on the rays [h, w] of the view; raises DataError as `extract`."""
+        return self._label_rays.sample(checked(labels, self._cameras[0]))
+
+    @cached_property
+    def _label_rays(self) -> LabelRays:
+        return LabelRays(self.view, self._rig)
+
+    def extract(self, keyframe: Keyframe, labels: NDArray[np.integer] | None = None) -> Scan | None:
         """Return the keyframe's scan, or None when nothing of its geometry is known.
 
-        Raises DataError when an image or depth image does not have the size of its camera.
+        `labels` [H, W] are those of its first image, or of one that is smaller by a whole factor.
+
+        Raises DataError when an image, depth image or labels do not have the size of its camera.
         """
-        scan = self._dense(keyframe) or self._sparse(keyframe)
+        scan = self._dense(keyframe)
+        if scan is not None and labels is not None:
+            scan = replace(scan, labels=self.on_rays(labels))
+        scan = scan or self._sparse(keyframe, labels)
         if scan is None:
             self.counters["keyframes_without_depth"] += 1
         else:
             self.counters["keyframes_dense" if scan.depth is not None else "keyframes_sparse"] += 1
         return scan
 
-    def late(self, depth_m: ImageF32, image: ImageU8) -> Scan:
+    def late(self, depth_m: ImageF32, image: ImageU8, labels: NDArray[np.uint16] | None = None) -> Scan:
         """Return the scan of depth [h, w] that was made of several images, and of a grey or BGR image of that size.
+
+        `labels` [h, w] are on the view's rays.
 
         Raises DataError when they do not have the size of the view.
         """
         if image.shape[:2] != depth_m.shape:
             raise DataError(f"image is {image.shape[:2]} but its depth {depth_m.shape}; they must be alike")
-        scan = Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(image))
+        scan = Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(image), labels)
         self.counters["keyframes_dense"] += 1
         return scan
 
@@ -68,7 +88,7 @@ class ScanExtractor:
         depth = filter_depth(frame.depth_m, self._config.pixel_step, self.view, self._config)
         return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
 
-    def _sparse(self, keyframe: Keyframe) -> Scan | None:
+    def _sparse(self, keyframe: Keyframe, labels: NDArray[np.integer] | None) -> Scan | None:
         if keyframe.points_body_m is None:
             return None
         known = np.isfinite(keyframe.points_body_m).all(axis=1)
@@ -81,7 +101,8 @@ class ScanExtractor:
         pixels = np.nan_to_num(np.round(keyframe.keypoints_px[known])).astype(np.int64)
         rows = np.clip(pixels[:, 1], 0, image.shape[0] - 1)
         colors = _rgb(image)[rows, np.clip(pixels[:, 0], 0, image.shape[1] - 1)]
-        return Scan(None, keyframe.points_body_m[known].astype(np.float32), colors)
+        seen = None if labels is None else self._label_rays.at(checked(labels, self._cameras[0]), pixels)
+        return Scan(None, keyframe.points_body_m[known].astype(np.float32), colors, seen)
 
 
 def _rgb(image: NDArray[np.generic]) -> ImageU8:

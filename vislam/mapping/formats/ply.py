@@ -30,6 +30,7 @@ _TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
+_EXTRA = {"uint16": "ushort", "int32": "int"}
 
 
 def write_ply(
@@ -37,21 +38,22 @@ def write_ply(
     points_m: Points,
     colors: Colors,
     triangles: NDArray[np.int32] | None = None,
-    extra: Mapping[str, NDArray[np.float32]] | None = None,
+    extra: Mapping[str, NDArray[Any]] | None = None,
 ) -> None:
     """Write points [N, 3] with RGB colours [N, 3], and triangles [M, 3] of vertex indices if it is a mesh.
 
-    `extra` are further float properties [N] by name, such as `nx`, `ny`, `nz` or `radius`. Raises StorageError when the
-    file cannot be written.
+    `extra` are further properties [N] by name, such as `nx`, `ny`, `nz` or `radius`: uint16 as ushort, int32 as int,
+    all else as float. Raises StorageError when the file cannot be written.
     """
     extra = {} if extra is None else extra
-    vertex = np.dtype([*_VERTEX, *((name, "<f4") for name in extra)])
-    floats = "".join(f"property float {name}\n" for name in extra)
+    kinds = {name: _EXTRA.get(values.dtype.name, "float") for name, values in extra.items()}
+    vertex = np.dtype([*_VERTEX, *((name, _TYPES[kind]) for name, kind in kinds.items())])
+    further = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
     faces = "" if triangles is None else f"element face {len(triangles)}\n{_FACE_PROPERTY}\n"
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment vislam, metres in the map frame\n"
         f"element vertex {len(points_m)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"property uchar red\nproperty uchar green\nproperty uchar blue\n{floats}{faces}end_header\n"
+        f"property uchar red\nproperty uchar green\nproperty uchar blue\n{further}{faces}end_header\n"
     )
     with replacing(path) as file:
         file.write(header.encode())
@@ -80,11 +82,16 @@ def read_ply(path: Path) -> tuple[Points, Colors]:
     Raises DataError when it is something else or cut short; what a header promises is checked against the file's size
     before memory is taken.
     """
-    rows = read_rows(path, _read_header)
+    rows = read_ply_rows(path)
     points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float32)
     if not {"red", "green", "blue"} <= set(rows.dtype.names or ()):
         return points, np.full((len(rows), 3), 128, np.uint8)
     return points, np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
+
+
+def read_ply_rows(path: Path) -> NDArray[np.void]:
+    """Return all vertices [N] with their properties by name; raises DataError as `read_ply`."""
+    return read_rows(path, _read_header)
 
 
 def read_ply_mesh(path: Path) -> tuple[Points, Colors, NDArray[np.int32]]:

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.config import Config, MapConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.files import write_json
-from vislam.core.memory import LoopPlace, PackedScan
+from vislam.core.memory import LoopPlace
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
 from vislam.core.up import Up
 from vislam.factors.factor_log import rig_from
@@ -26,6 +27,8 @@ from vislam.frontend import mode_for
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.of_map import write_pictures
+from vislam.mapping.semantic.classes import LabelClasses
+from vislam.mapping.semantic.images import LabelFolder, camera_t_ns
 from vislam.mapping.upright import up_of_planes
 from vislam.run.folder import read_setup
 from vislam.run.levelled import Levelled, stored_level
@@ -66,7 +69,8 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
         one_camera = ran.map.mono_depth.enabled and mode_for(ran.frontend, rig) == "mono"
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
-        mapper = Mapper(config, rig, one_camera)
+        labels = _Labels(ran.map, config, info, rig)
+        mapper = Mapper(config, rig, one_camera, labels.classes)
         from_session = ran.map.enabled and (one_camera or _same_extraction(ran.map, config, rig))
         nothing = GraphUpdate(
             0, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None, submaps=stored_submaps(session)
@@ -75,9 +79,9 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         total = len(placed) + len(config.products)
         tell = _teller(progress, total)
         if from_session:
-            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, tell)
+            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, tell)
         else:
-            _from_recording(session, mapper, placed, read_setup(run)[0], ran, tell)
+            _from_recording(session, mapper, placed, read_setup(run)[0], ran, labels, tell)
     finally:
         session.close()
     mapper.finish()
@@ -96,6 +100,8 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         "pictures": [str(path) for path in pictures],
         "left_out": mapper.notes,
     }
+    if labels.folder is not None:
+        answer["labels"] = {"keyframes labelled": labels.used, **labels.folder.problems}
     if level.up is not None:
         answer["up"] = level.up.entry()
     write_json(folder / "map.json", {**answer, "settings": asdict(config)})
@@ -166,20 +172,56 @@ def stored_submaps(session: Session) -> Submaps:
     return submaps.joined_by((edge.from_id, edge.to_id) for edge in held)
 
 
+class _Labels:
+    """Where the labels of a run's keyframes are: in its session, or in a folder that is given now."""
+
+    def __init__(self, ran: MapConfig, config: MapConfig, info: dict[str, Any], rig: Rig) -> None:
+        """Choose. Raises DataError when label images or the session cannot be used."""
+        path = config.labels.folder
+        self.folder = None if path is None else LabelFolder(Path(path), rig.cameras[0])
+        self.is_new = path is not None and path != ran.labels.folder
+        self.classes = LabelClasses.of(info.get("labels") or {}, "the session")
+        if self.folder is not None:
+            self.classes = self.folder.classes
+        self.used = 0
+
+    def of(self, camera_t_ns: int) -> NDArray[np.uint16] | None:
+        """Return the labels of the image with a stamp, None where there are none."""
+        labels = None if self.folder is None else self.folder(None, camera_t_ns)
+        self.used += labels is not None
+        return labels
+
+
 def _from_session(
     session: Session,
     mapper: Mapper,
     placed: dict[int, Array],
     nothing: GraphUpdate,
     at_once: int,
+    labels: _Labels,
     tell: Callable[[int, str], None],
 ) -> None:
-    rows = session.rows("SELECT id, t_ns, depth_png, points, colors FROM scans ORDER BY id")
-    scans = {i: PackedScan(*row) for i, *row in rows if i in placed}
+    scans = {i: scan for i, scan in session.scans().items() if i in placed}
+    if labels.is_new:
+        scans = {i: replace(scan, labels_png=b"") for i, scan in scans.items()}
     mapper.restore(scans, placed)
+    if labels.is_new:
+        stamps_ns = _camera_stamps_ns(session)
+        for i, scan in scans.items():
+            found = labels.of(stamps_ns[i]) if scan.depth_png else None
+            if found is not None:
+                mapper.label(i, found)
+    else:
+        labels.used = sum(bool(scan.labels_png) for scan in scans.values())
     for done in range(0, len(scans), at_once):
         tell(done, "octree")
         mapper.move(nothing)
+
+
+def _camera_stamps_ns(session: Session) -> dict[int, int]:
+    """Return the stamps of keyframes by the camera's own clock, by id."""
+    offsets_s = {packet.keyframe.id: packet.time_offset_s for packet in session.packets(light=True)}
+    return {k.id: camera_t_ns(k.t_ns, offsets_s[k.id]) for k in session.keyframes()}
 
 
 def _from_recording(
@@ -188,18 +230,20 @@ def _from_recording(
     placed: dict[int, Array],
     source: str,
     ran: Config,
+    labels: _Labels,
     tell: Callable[[int, str], None],
 ) -> None:
     recording = open_source(source, ran.seed, ran.calibration)
-    offsets_ns = [round(packet.time_offset_s * 1e9) for packet in session.packets(light=True)]
-    stored = {k.t_ns - offsets_ns[k.id]: k for k in session.keyframes() if k.id in placed}  # by the camera's clock
+    stamps_ns = _camera_stamps_ns(session)
+    stored = {stamps_ns[k.id]: k for k in session.keyframes() if k.id in placed}
     count = 0
     for value in recording.events():
         if not isinstance(value, Frame) or value.t_ns not in stored:
             continue
         k = stored.pop(value.t_ns)
         frame = replace(value, t_ns=k.t_ns)
-        mapper.add(Keyframe(k.id, k.t_ns, frame, k.keypoints_px, k.descriptors, k.points_body_m), placed[k.id])
+        keyframe = Keyframe(k.id, k.t_ns, frame, k.keypoints_px, k.descriptors, k.points_body_m)
+        mapper.add(keyframe, placed[k.id], labels.of(value.t_ns))
         count += 1
         tell(count, "recording")
         if not stored:

@@ -14,11 +14,12 @@ from typing import Any
 from vislam.core.errors import DataError
 from vislam.run.session.schema import (
     APPLICATION_ID,
+    FIRST_WITH_LABELS,
+    FIRST_WITH_READINGS,
     OLDEST_VERSION,
-    READINGS_SCHEMA,
-    SCHEMA,
     SCHEMA_VERSION,
     readable,
+    schema,
 )
 
 # tables: which columns each of the checksums at the end of a row covers; what is changed alone has its own
@@ -42,6 +43,8 @@ _COVERED_READINGS: dict[str, tuple[tuple[int, ...], ...]] = {
     "readings": (tuple(range(7)),),
     "own_starts": (tuple(range(5)),),
 }
+_COVERED_LABELS: dict[str, tuple[tuple[int, ...], ...]] = {"labels": (tuple(range(2)),)}
+_COVERED_ALL = _COVERED | _COVERED_READINGS | _COVERED_LABELS
 _EXACT = 2**53  # whole numbers below are the same to SQLite, whether they were given as int or as float
 
 
@@ -55,7 +58,7 @@ def checksum(values: Iterable[Any]) -> int:
 
 def checksums(table: str, row: tuple[Any, ...]) -> tuple[int, ...]:
     """Return the checksums that end a row [columns, without checksums] of a table."""
-    return tuple(checksum(row[i] for i in columns) for columns in (_COVERED | _COVERED_READINGS)[table])
+    return tuple(checksum(row[i] for i in columns) for columns in _COVERED_ALL[table])
 
 
 def check_sound(db: sqlite3.Connection, path: Path) -> None:
@@ -75,6 +78,7 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
     """Raise DataError unless every record is what was written."""
     with readable(path):
         tables = _COVERED | (_COVERED_READINGS if has_readings(db) else {})
+        tables |= _COVERED_LABELS if has_labels(db) else {}
         for table, covered in tables.items():
             for number, row in enumerate(db.execute(f"SELECT * FROM {table}")):
                 count = len(row) - len(covered)
@@ -87,7 +91,12 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
 
 def has_readings(db: sqlite3.Connection) -> bool:
     """Return whether a session has the tables of readings of other sensors: not one of an older format."""
-    return bool(db.execute("PRAGMA user_version").fetchone()[0] > OLDEST_VERSION)
+    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_READINGS)
+
+
+def has_labels(db: sqlite3.Connection) -> bool:
+    """Return whether a session has the table of labels: not one of an older format."""
+    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_LABELS)
 
 
 def check_version(db: sqlite3.Connection, path: Path) -> int:
@@ -127,8 +136,7 @@ def _objects(db: sqlite3.Connection) -> set[tuple[Any, ...]]:
 def _known_objects(version: int) -> set[tuple[Any, ...]]:
     db = sqlite3.connect(":memory:")
     try:
-        whole = SCHEMA if version == OLDEST_VERSION else SCHEMA + READINGS_SCHEMA
-        for statement in whole.split(";"):
+        for statement in schema(version).split(";"):
             db.execute(statement)
         return _objects(db)
     finally:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vislam.config import Config, from_data
 from vislam.core.database import connect
 from vislam.core.errors import DataError, UsageError
-from vislam.core.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, Tie, WordsMemory
+from vislam.core.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, PackedScan, Tie, WordsMemory
 from vislam.core.messages import (
     Array,
     KeyframePacket,
@@ -30,7 +30,7 @@ from vislam.core.messages import (
 )
 from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
 from vislam.imu import ImuNoise
-from vislam.run.session.checks import check_records, check_sound, has_readings
+from vislam.run.session.checks import check_records, check_sound, has_labels, has_readings
 from vislam.run.session.packets import LIGHT_COLUMNS, packet_of
 from vislam.run.session.reading_rows import readings_of, starts_of
 from vislam.run.session.schema import (
@@ -215,6 +215,15 @@ class Session:
         """Return the words that the run trained last; None: it trained none."""
         rows = self.rows("SELECT data, trained_at, trainings FROM vocabulary")
         return next((WordsMemory(*row) for row in rows), None)
+
+    def scans(self) -> dict[int, PackedScan]:
+        """Return what the map keeps of keyframes, by their ids."""
+        rows = self.rows("SELECT id, t_ns, depth_png, points, colors FROM scans ORDER BY id")
+        scans = {i: PackedScan(*row) for i, *row in rows}
+        if not has_labels(self._db):
+            return scans
+        labels = dict(self.rows("SELECT id, png FROM labels"))
+        return {i: replace(scan, labels_png=labels[i]) if i in labels else scan for i, scan in scans.items()}
 
     def shifts(self) -> dict[int, tuple[float, float]]:
         """Return the rms and largest shift in metres of the update that took in each loop edge."""

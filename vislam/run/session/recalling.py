@@ -11,7 +11,6 @@ from vislam.core.memory import (
     FrontMemory,
     FrontNews,
     GraphMemory,
-    PackedScan,
     PlacesMemory,
     SlamMemory,
     StartFacts,
@@ -89,7 +88,7 @@ def recall(session: Session) -> SlamMemory | None:
             T_start=stored[0].T_odom_body,
             graph=graph,
             places=places,
-            scans=_scans(session),
+            scans=session.scans(),
             held=int(base["keyframes"]) if base.get("localize_only") else 0,
         )
 
@@ -152,8 +151,3 @@ def _tags(session: Session) -> dict[int, tuple[TagSighting, ...]]:
         poses = maybe_numbers(T, "<f8", (4, 4)), maybe_numbers(covariance, "<f8", (6, 6))
         out[i] = (*out.get(i, ()), TagSighting(tag_id, side_px, *poses))
     return out
-
-
-def _scans(session: Session) -> dict[int, PackedScan]:
-    rows = session.rows("SELECT id, t_ns, depth_png, points, colors FROM scans ORDER BY id")
-    return {i: PackedScan(*row) for i, *row in rows}

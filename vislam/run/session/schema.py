@@ -16,8 +16,9 @@ from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": tells our files from other SQLite files
-SCHEMA_VERSION = 9
-OLDEST_VERSION = 8  # read as well; it knows no readings of other sensors
+SCHEMA_VERSION = 10
+OLDEST_VERSION = 8  # read as well; it knows no readings of other sensors, and no labels
+FIRST_WITH_READINGS, FIRST_WITH_LABELS = 9, 10
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -97,6 +98,15 @@ CREATE TABLE own_starts (
     crc INTEGER NOT NULL, PRIMARY KEY (id, number)
 );
 """
+LABELS_SCHEMA = """
+CREATE TABLE labels (id INTEGER PRIMARY KEY, png BLOB NOT NULL, crc INTEGER NOT NULL);
+"""
+
+
+def schema(version: int) -> str:
+    """Return the tables of a session of a format that is read here."""
+    readings = READINGS_SCHEMA if version >= FIRST_WITH_READINGS else ""
+    return SCHEMA + readings + (LABELS_SCHEMA if version >= FIRST_WITH_LABELS else "")
 
 
 def to_bytes(values: NDArray[Any], dtype: str) -> bytes:

@@ -27,17 +27,18 @@ from vislam.core.memory import (
 from vislam.core.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
 from vislam.factors.factor_log import rig_data, state_data
 from vislam.imu import ImuNoise
-from vislam.run.session.checks import check_records, check_sound, checksum, checksums, has_readings
+from vislam.run.session.checks import check_records, check_sound, checksum, checksums, has_labels, has_readings
 from vislam.run.session.packets import packet_row
 from vislam.run.session.reader import Session
 from vislam.run.session.reading_rows import own_data, reading_rows, start_rows
 from vislam.run.session.schema import (
     APPLICATION_ID,
+    LABELS_SCHEMA,
     READINGS_SCHEMA,
-    SCHEMA,
     SCHEMA_VERSION,
     maybe_bytes,
     readable,
+    schema,
     state_bytes,
     storage,
     to_bytes,
@@ -57,7 +58,7 @@ class SessionWriter:
         sensors = {"rig": rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
         with storage(path), self._transaction():  # half of the tables would be a file that nobody can open again
             self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
-            for statement in (SCHEMA + READINGS_SCHEMA).split(";"):
+            for statement in schema(SCHEMA_VERSION).split(";"):
                 self._db.execute(statement)
             self._tell({**info, **sensors, "gravity_m_s2": gravity_m_s2, "finished": False})
             self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
@@ -106,11 +107,12 @@ class SessionWriter:
             writer._db = connect(part, isolation_level=None)
             base.copy_to(writer._db)
             with writer._transaction():
-                foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans",)))
+                writer._bring_up()
+                foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans", "labels")))
                 for table in foreign:
                     writer._db.execute(f"DELETE FROM {table}")
                 writer._db.execute("DELETE FROM states WHERE whose = 'filter'")
-                writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2')")
+                writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2', 'labels')")
                 count = writer._db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
                 origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only, **base.up()}
                 sensors = {"imu_noise": None if noise is None else asdict(noise)}
@@ -142,8 +144,9 @@ class SessionWriter:
 
     def _bring_up(self) -> None:
         """Give a session of an older format the tables that it lacks."""
-        if not has_readings(self._db):
-            for statement in READINGS_SCHEMA.split(";"):
+        lacking = ("" if has_readings(self._db) else READINGS_SCHEMA) + ("" if has_labels(self._db) else LABELS_SCHEMA)
+        if lacking:
+            for statement in lacking.split(";"):
                 self._db.execute(statement)
             self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
@@ -195,6 +198,7 @@ class SessionWriter:
                 self._put_states("filter", [(keyframe.id, entry.filter_state)])
             scans = entry.scans.items()
             self._insert("scans", [(i, scan.t_ns, scan.depth_png, scan.points, scan.colors) for i, scan in scans])
+            self._insert("labels", [(i, scan.labels_png) for i, scan in scans if scan.labels_png])
             if entry.words is not None:
                 words = entry.words
                 self._replace("vocabulary", [(1, words.data, words.trained_at, words.trainings)])

@@ -1,0 +1,194 @@
+"""Label images: which class each pixel of the colour image shows, from a folder or from any network."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from decimal import Decimal
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import DataError
+from vislam.core.messages import Frame
+from vislam.core.reading import read_bytes
+from vislam.mapping.depth.image import DepthView
+from vislam.mapping.semantic.classes import FILE_NAME, UNLABELLED, LabelClasses
+
+Labels = NDArray[np.uint16]
+
+_TOLERANCE_NS = 1_000_000  # between an image's stamp and that in the name of its labels
+_MAX_BYTES = 2**26  # of one label image
+_MAX_FILES = 2_000_000
+_MAX_DIGITS = 19  # of a stamp in nanoseconds
+_PNG_HEAD = b"\x89PNG\r\n\x1a\n"
+_GREY = 0  # colour type of a PNG
+_LOG = logging.getLogger(__name__)
+
+
+class Labeller(Protocol):
+    """What tells the labels of keyframes: a folder of images, or a network that looks at each."""
+
+    classes: LabelClasses
+
+    def __call__(self, frame: Frame, camera_t_ns: int) -> NDArray[np.integer] | None:
+        """Return the labels [H, W] of a frame's first image, 0 where unknown; None where there are none.
+
+        They are as large as the image, or smaller by a whole factor. `camera_t_ns` is the image's stamp by the camera's
+        own clock; `frame.t_ns` is by the IMU's.
+        """
+
+
+class LabelFolder:
+    """Label images as PNG files that are named by the stamps of the images, beside `labels.toml`.
+
+    What cannot be used is left out, counted in `problems` and said once of each kind.
+    """
+
+    def __init__(self, folder: Path, camera: Camera) -> None:
+        """List the folder. Raises DataError when there are no label images, or no names of their ids."""
+        self.classes = LabelClasses.read(folder / FILE_NAME)
+        self.problems: Counter[str] = Counter()
+        self._camera = camera
+        self._known = self.classes.known
+        stamps: dict[int, Path] = {}
+        try:
+            for path in sorted(folder.iterdir()):
+                stamp_ns = _stamp_ns(path.stem) if path.suffix == ".png" else None
+                if stamp_ns is not None:
+                    stamps[stamp_ns] = path
+                if len(stamps) > _MAX_FILES:
+                    raise DataError(f"{folder} has more than {_MAX_FILES} label images; give those of this recording")
+        except OSError as error:
+            raise DataError(f"{folder} cannot be listed: {error.strerror}") from error
+        if not stamps:
+            raise DataError(
+                f"{folder} has no label images; name them by the stamps of the colour images, such as "
+                "1403636579763555584.png (nanoseconds) or 1305031452.791720.png (seconds)"
+            )
+        self._t_ns = np.array(sorted(stamps), dtype=np.int64)
+        self._paths = [stamps[t_ns] for t_ns in self._t_ns.tolist()]
+
+    def __call__(self, frame: Frame | None, camera_t_ns: int) -> Labels | None:
+        """Return the labels [h, w] of the image with a stamp; None where there are none that can be used."""
+        i = int(np.searchsorted(self._t_ns, camera_t_ns))
+        nearest = min((k for k in (i - 1, i) if 0 <= k < len(self._t_ns)), key=lambda k: self._apart_ns(k, camera_t_ns))
+        if self._apart_ns(nearest, camera_t_ns) > _TOLERANCE_NS:
+            self._count("keyframes without a label image", f"the one at {camera_t_ns} ns is the first")
+            return None
+        path = self._paths[nearest]
+        try:
+            labels = checked(read_labels(path, self._camera), self._camera)
+        except DataError as error:
+            self._count("label images that cannot be used", str(error))
+            return None
+        unknown = ~self._known[labels]
+        if unknown.any():
+            self._count("label images with unknown ids", f"{path} has {labels[unknown][0]}; name it in {FILE_NAME}")
+            labels = np.where(unknown, np.uint16(UNLABELLED), labels)
+        return labels
+
+    def _apart_ns(self, k: int, t_ns: int) -> int:
+        return abs(int(self._t_ns[k]) - t_ns)
+
+    def _count(self, kind: str, what: str) -> None:
+        if kind not in self.problems:
+            _LOG.warning("%s: %s", kind, what)
+        self.problems[kind] += 1
+
+
+class LabelRays:
+    """Where the rays of a mapper's depth images lie in a label image."""
+
+    def __init__(self, view: DepthView, rig: Rig) -> None:
+        """Prepare for the view of a rig; labels are those of its first camera."""
+        self._camera = camera = rig.cameras[0]
+        rays = view.rays_body.reshape(-1, 3).astype(np.float64)
+        pixels = camera.project(rays @ rig.T_body_cams[0][:3, :3])  # they begin where the camera is
+        inside = camera.contains(np.round(pixels))
+        self._pixels = np.where(inside[:, None], np.round(np.nan_to_num(pixels)), -1.0).astype(np.int64)
+        self._shape = view.rays_body.shape[:2]
+
+    def sample(self, labels: Labels) -> Labels:
+        """Return the labels [h, w] on the view's rays of an image [H, W] that `checked` gave; 0 outside of it."""
+        return self.at(labels, self._pixels).reshape(self._shape)
+
+    def at(self, labels: Labels, pixels: NDArray[np.int64]) -> Labels:
+        """Return the labels [N] at whole pixels [N, 2] of the camera; 0 outside of it."""
+        factor = self._camera.height // labels.shape[0]
+        columns, rows = pixels[:, 0], pixels[:, 1]
+        inside = (columns >= 0) & (rows >= 0) & (columns < self._camera.width) & (rows < self._camera.height)
+        out = np.zeros(len(pixels), np.uint16)
+        out[inside] = labels[rows[inside] // factor, columns[inside] // factor]
+        return out
+
+
+def camera_t_ns(t_ns: int, time_offset_s: float) -> int:
+    """Return a keyframe's stamp by the camera's own clock; `t_ns` is by the IMU's, which is so much later."""
+    return t_ns - round(time_offset_s * 1e9)
+
+
+def checked(labels: NDArray[np.generic], camera: Camera) -> Labels:
+    """Return labels [h, w] as 16 bits; raises DataError unless they are whole numbers over a camera's image."""
+    array = np.asarray(labels)
+    if array.ndim != 2 or not np.issubdtype(array.dtype, np.integer):
+        raise DataError(f"labels must be whole numbers [H, W], got {array.dtype} of shape {array.shape}")
+    rows, columns = array.shape
+    _check_size((columns, rows), camera)
+    if array.dtype not in (np.uint8, np.uint16) and (array.min() < 0 or array.max() > np.iinfo(np.uint16).max):
+        raise DataError(f"labels must be ids from 0 to 65535, got {array.min()} to {array.max()}")
+    return array.astype(np.uint16)
+
+
+def read_labels(path: Path, camera: Camera) -> Labels:
+    """Return the ids [h, w] in a grey PNG of 8 or 16 bits.
+
+    Raises DataError when it is something else, cut, or not of the size of the camera's images or a whole fraction of
+    it; the size is compared before anything is decoded.
+    """
+    try:
+        data = read_bytes(path, _MAX_BYTES)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    if not data.startswith(_PNG_HEAD) or len(data) < 26 or data[12:16] != b"IHDR":
+        raise DataError(f"{path} is no PNG; ids must be stored without loss")
+    bits, kind = data[24], data[25]
+    if kind != _GREY or bits not in (8, 16):
+        raise DataError(f"{path} is no grey PNG of 8 or 16 bits: store the ids themselves, not colours or a palette")
+    try:
+        _check_size((int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")), camera)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+    except cv2.error:
+        image = None
+    if image is None or image.ndim != 2 or b"IEND" not in data[-1024:]:
+        raise DataError(f"{path} is damaged or cut")
+    return np.asarray(image, dtype=np.uint16)
+
+
+def _check_size(size: tuple[int, int], camera: Camera) -> None:
+    width, height = size
+    whole = width > 0 and height > 0 and camera.width % width == 0 and camera.height % height == 0
+    if not whole or camera.width // width != camera.height // height:
+        raise DataError(
+            f"labels are {width}x{height}, the camera's images {camera.width}x{camera.height}; "
+            "they must be as large, or smaller by a whole factor"
+        )
+
+
+def _stamp_ns(stem: str) -> int | None:
+    """Return the stamp that a name tells: whole nanoseconds, or seconds with a decimal point."""
+    whole, point, part = stem.partition(".")
+    if not (stem.isascii() and whole.isdecimal() and len(whole) <= _MAX_DIGITS):
+        return None
+    if not point:
+        return int(whole) if int(whole) < 2**63 else None
+    if not (part.isdecimal() and len(part) <= _MAX_DIGITS) or len(whole) > 10:
+        return None
+    stamp_ns = round(Decimal(stem) * 1_000_000_000)
+    return stamp_ns if stamp_ns < 2**63 else None
