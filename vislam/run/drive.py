@@ -26,6 +26,7 @@ from vislam.imu import ImuNoise
 from vislam.loop.table import LoopRow, caption
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.of_map import write_pictures
+from vislam.mapping.semantic.images import label_warnings
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.steps import KeyframeStep, Step
 from vislam.run.cost import CostMeter
@@ -253,6 +254,8 @@ class Run:
             with self.slam.clock.measure("map export"):
                 level_map = level.export(mapper, self.out / "map")
             self.warnings += [f"no {name}: {reason}" for name, reason in level_map.notes.items()]
+        if self.slam.back is not None:
+            self.warnings += label_warnings(self.slam.back.counters.get("map", {}))
         show_paths(self.viewer, final, truth, self.slam.front.report().alignment)
         is_level = self.slam.front.start is not None
         if mapper is not None and len(self.log):

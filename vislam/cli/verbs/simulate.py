@@ -35,6 +35,8 @@ class SimulateOptions:
     """Motion blur of this exposure; 0: none, None: what the world has"""
     readout_s: NonNegative = 0.0
     """Rolling shutter: time from the first to the last row"""
+    labels: bool = False
+    """Write what each pixel shows into OUT/labels, too, for --map.labels.folder of `run`"""
     workers: Count = 2
     """Threads that render; they change nothing but the time"""
     seed: Whole = 0
@@ -71,13 +73,17 @@ def main(arguments: list[str]) -> int:
 def _simulate_recording(options: SimulateOptions) -> int:
     from vislam.datasets.recorder import record
     from vislam.sim import open_world
+    from vislam.sim.worlds.label_images import write_labels
 
-    choices = {name: value for name, value in asdict(options).items() if name not in ("world", "out")}
+    choices = {name: value for name, value in asdict(options).items() if name not in ("world", "out", "labels")}
     world = open_world(options.world, **choices)
     with progress_bar(options.world) as progress:
         recorder = record(world, options.out, on_frame=lambda done: progress(done, world.frame_count, ""))
+        if options.labels:
+            write_labels(world, options.out / "labels", lambda done: progress(done, world.frame_count, "labels"))
     frames = recorder.counts["frames"]
-    print(f"{frames} frames in {options.out}; next: vislam run {options.out} --out RUN")
+    further = f" --map.labels.folder {options.out / 'labels'}" if options.labels else ""
+    print(f"{frames} frames in {options.out}; next: vislam run {options.out} --out RUN{further}")
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Protocol
@@ -27,6 +28,9 @@ _MAX_FILES = 2_000_000
 _MAX_DIGITS = 19  # of a stamp in nanoseconds
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 _GREY = 0  # colour type of a PNG
+_MISSING = "keyframes without a label image"
+_REFUSED = "label images that cannot be used"
+_UNKNOWN = "label images with ids that have no name"
 _LOG = logging.getLogger(__name__)
 
 
@@ -78,17 +82,17 @@ class LabelFolder:
         i = int(np.searchsorted(self._t_ns, camera_t_ns))
         nearest = min((k for k in (i - 1, i) if 0 <= k < len(self._t_ns)), key=lambda k: self._apart_ns(k, camera_t_ns))
         if self._apart_ns(nearest, camera_t_ns) > _TOLERANCE_NS:
-            self._count("keyframes without a label image", f"the one at {camera_t_ns} ns is the first")
+            self._count(_MISSING, f"the one at {camera_t_ns} ns is the first")
             return None
         path = self._paths[nearest]
         try:
             labels = checked(read_labels(path, self._camera), self._camera)
         except DataError as error:
-            self._count("label images that cannot be used", str(error))
+            self._count(_REFUSED, str(error))
             return None
         unknown = ~self._known[labels]
         if unknown.any():
-            self._count("label images with unknown ids", f"{path} has {labels[unknown][0]}; name it in {FILE_NAME}")
+            self._count(_UNKNOWN, f"{path} has {labels[unknown][0]}; name it in {FILE_NAME}")
             labels = np.where(unknown, np.uint16(UNLABELLED), labels)
         return labels
 
@@ -125,6 +129,12 @@ class LabelRays:
         out = np.zeros(len(pixels), np.uint16)
         out[inside] = labels[rows[inside] // factor, columns[inside] // factor]
         return out
+
+
+def label_warnings(counters: Mapping[str, int]) -> list[str]:
+    """Return what of a map's counters says that label images were missing or bad."""
+    found = [(kind, counters.get(kind, 0)) for kind in (_MISSING, _REFUSED, _UNKNOWN)]
+    return [f"{count} {kind}; log.txt names the first" for kind, count in found if count]
 
 
 def camera_t_ns(t_ns: int, time_offset_s: float) -> int:

@@ -5,11 +5,12 @@ no display, and gives exact depth and a pose per image row.
 """
 
 from vislam.sim.scene.bake import bake
+from vislam.sim.scene.names import NAMES, Hung
 from vislam.sim.scene.render import Renderer
 from vislam.sim.scene.scene import Painter, Scene, SceneBuilder
-from vislam.sim.scene.signs import Hung
 
 __all__ = [
+    "NAMES",
     "Hung",
     "Painter",
     "Renderer",

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageU8
+from vislam.sim.scene.names import labels_of
 from vislam.sim.scene.scene import Scene, SceneBuilder, Surface
 
 _LIGHT_GRID_M = 0.12
@@ -229,6 +230,7 @@ def _pack(surfaces: Sequence[Surface], images: list[list[ImageU8]]) -> Scene:
         [np.concatenate([s.origin, s.axis_u, s.axis_v, s.normal, s.size_m, s.size_m]) for s in surfaces]
     )
     geometry[:, 14:16] = levels[:, 0, 1:3] / geometry[:, 12:14]
+    labels, hung = labels_of(surfaces)
     return Scene(
         kind=np.array([surface.kind for surface in surfaces], dtype=np.int64),
         geometry=geometry,
@@ -237,4 +239,6 @@ def _pack(surfaces: Sequence[Surface], images: list[list[ImageU8]]) -> Scene:
         texels=texels,
         levels=levels,
         level_count=np.count_nonzero(levels[:, :, 1], axis=1).astype(np.int64),
+        labels=labels,
+        hung=hung,
     )

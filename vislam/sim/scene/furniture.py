@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vislam.sim.scene import paint, signs
+from vislam.sim.scene.names import named
 from vislam.sim.scene.paint import Color
 from vislam.sim.scene.scene import Lamp, Painter, SceneBuilder
 
@@ -17,6 +18,7 @@ def _at(centre: tuple[float, float], yaw: float, forward: float, left: float) ->
     return (float(centre[0] + cosine * forward - sine * left), float(centre[1] + sine * forward + cosine * left))
 
 
+@named("shelf")
 def shelf(
     world: SceneBuilder,
     rng: np.random.Generator,
@@ -90,6 +92,7 @@ def _fill_with_books(
         left += row + float(rng.uniform(0.02, 0.12))
 
 
+@named("table")
 def table(
     world: SceneBuilder,
     rng: np.random.Generator,
@@ -132,6 +135,7 @@ def table(
             )
 
 
+@named("pallet")
 def pallet(
     world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, float], yaw: float, layers: int = 2
 ) -> None:
@@ -150,6 +154,7 @@ def pallet(
         bottom += height
 
 
+@named("barrel")
 def barrel(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, float]) -> None:
     """Add a steel drum with a label."""
     color = paint.VIVID[int(rng.integers(0, 5))]
@@ -162,6 +167,7 @@ def barrel(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, f
     world.cylinder(centre, 0.0, 0.29, 0.86, signs.carrying(paint.plain(color), hung), paint.plain(color))
 
 
+@named("pillar")
 def pillar(
     world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, float], side_m: float, height_m: float
 ) -> None:
@@ -175,6 +181,7 @@ def pillar(
     world.box(centre, 0.0, (side_m, side_m, height_m), 0.0, face())
 
 
+@named("cupboard")
 def cupboard(
     world: SceneBuilder, centre: tuple[float, float], yaw: float, size_m: tuple[float, float, float], color: Color
 ) -> None:
@@ -182,6 +189,7 @@ def cupboard(
     world.box(centre, 0.0, size_m, yaw, paint.plain(color), front=signs.lockers(color), texels_per_m=240.0)
 
 
+@named("bench")
 def bench(world: SceneBuilder, centre: tuple[float, float], yaw: float, length_m: float, color: Color) -> None:
     """Add a wooden bench."""
     for left in (-0.42, 0.42):
@@ -189,6 +197,7 @@ def bench(world: SceneBuilder, centre: tuple[float, float], yaw: float, length_m
     world.box(centre, 0.4, (0.38, length_m, 0.05), yaw, paint.wood(color), show_bottom=True)
 
 
+@named("plant")
 def plant(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, float]) -> None:
     """Add a pot with a plant of upright leaves."""
     world.cylinder(centre, 0.0, 0.17, 0.36, paint.tiles((70, 95, 165), 0.07, 0.25), paint.concrete((45, 60, 75), 300.0))
@@ -201,6 +210,7 @@ def plant(world: SceneBuilder, rng: np.random.Generator, centre: tuple[float, fl
         )
 
 
+@named("lamp")
 def ceiling_lamp(
     world: SceneBuilder, centre: tuple[float, float, float], size_m: tuple[float, float], power: float
 ) -> None:

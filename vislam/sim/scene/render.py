@@ -92,6 +92,30 @@ class Renderer:
             BGR image [H, W, 3] in display encoding 0..255, not rounded, and exact z-depth [H, W] in metres at
             `T_world_cam`, 0 where nothing is.
         """
+        view, surfaces, met = self._meet(scene, T_world_cam, shutter)
+        shape = met.depth.shape
+        color = np.empty((*shape, 3), dtype=np.float32)
+        outline = np.zeros(shape, dtype=np.uint8)
+        _find_outlines(view, met, outline)
+        _shade(view, surfaces, met, outline, color)
+        _shade_outlines(view, surfaces, _AT_EDGES, outline, color)
+        return color, met.depth
+
+    def labels(self, scene: Scene, T_world_cam: Array) -> NDArray[np.uint8]:
+        """Return what the middle of each pixel [H, W] shows: 1 + its place in `names.NAMES`, 0 where nothing is.
+
+        `T_world_cam` as for `render`.
+        """
+        _, _, (surface, _, at) = self._meet(scene, T_world_cam, None)
+        out = np.where(surface >= 0, scene.labels[surface], 0).astype(np.uint8)
+        seen = np.unique(surface)
+        for p, u0, v0, u1, v1, label in scene.hung[np.isin(scene.hung[:, 0], seen)]:
+            u, v = at[..., 0], at[..., 1]
+            out[(surface == p) & (u >= u0) & (u < u1) & (v >= v0) & (v < v1)] = label
+        return out
+
+    def _meet(self, scene: Scene, T_world_cam: Array, shutter: Array | None) -> tuple[_View, _Surfaces, _Met]:
+        """Return what rays are cast, and what they meet at the stamp."""
         moments = T_world_cam[None] if shutter is None else np.concatenate([T_world_cam[None], shutter])
         poses = np.ascontiguousarray(moments.reshape(len(moments), -1, 4, 4)[:, :, :3, :])
         visible, lists, counts, nearest = fill_tiles(
@@ -101,13 +125,8 @@ class Renderer:
         met = _Met(np.empty(shape, np.int32), np.empty(shape, np.float32), np.empty((*shape, 2), np.float32))
         view = _View(self._rays, poses, visible, lists, counts, nearest, self._pixel_rad)
         surfaces = _Surfaces(scene.kind, scene.geometry, scene.texels, scene.levels, scene.level_count)
-        color = np.empty((*shape, 3), dtype=np.float32)
-        outline = np.zeros(shape, dtype=np.uint8)
         _cast(view, surfaces, met)
-        _find_outlines(view, met, outline)
-        _shade(view, surfaces, met, outline, color)
-        _shade_outlines(view, surfaces, _AT_EDGES, outline, color)
-        return color, met.depth
+        return view, surfaces, met
 
 
 @njit(cache=True, nogil=True)

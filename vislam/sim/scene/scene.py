@@ -33,6 +33,7 @@ class Surface:
     painter: Painter
     texels_per_m: float
     glow: float = 0.0  # light of its own, added to what falls on it: lamps, windows, screens
+    name: str = "thing"  # what it belongs to; see `names.py`
 
     @property
     def normal(self) -> Array:
@@ -84,6 +85,7 @@ class SceneBuilder:
     solids: list[tuple[Array, Array]] = field(default_factory=list)  # centre [3], half axes [3, 3]
     lamps: list[Lamp] = field(default_factory=list)
     ambient: float = 0.35
+    name: str = "thing"  # of what is added
 
     def rectangle(
         self,
@@ -100,7 +102,9 @@ class SceneBuilder:
         length_u, length_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
         origin = np.asarray(corner, dtype=np.float64)
         size = (length_u, length_v)
-        self.surfaces.append(Surface(kind, origin, u / length_u, v / length_v, size, painter, texels_per_m, glow))
+        self.surfaces.append(
+            Surface(kind, origin, u / length_u, v / length_v, size, painter, texels_per_m, glow, self.name)
+        )
 
     def box(
         self,
@@ -151,7 +155,7 @@ class SceneBuilder:
         top_centre = np.array([*centre_xy, bottom_m + height_m])
         size = (2.0 * np.pi * radius_m, height_m)
         frame_u, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
-        self.surfaces.append(Surface(CYLINDER, top_centre, frame_u, down, size, side, texels_per_m))
+        self.surfaces.append(Surface(CYLINDER, top_centre, frame_u, down, size, side, texels_per_m, name=self.name))
         corner = top_centre + radius_m * np.array([-1.0, 1.0, 0.0])
         across = 2.0 * radius_m
         self.rectangle(corner, (across, 0.0, 0.0), (0.0, -across, 0.0), top or side, texels_per_m, kind=DISC)
@@ -191,6 +195,8 @@ class Scene:
     texels: NDArray[np.uint32]  # [N] BGRX, display encoding, light included
     levels: NDArray[np.int64]  # [P, L, 3] offset into `texels`, width, height
     level_count: NDArray[np.int64]  # [P]
+    labels: NDArray[np.uint8]  # [P] what each surface belongs to: 1 + its place in `names.NAMES`
+    hung: Array  # [M, 6] what is painted on surfaces: surface, low u, low v, high u, high v in m, label
 
     def clearance_m(self, points: Array) -> Array:
         """Return the distance [N] from points [N, 3] to the nearest surface (discs count as their squares)."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from vislam.sim.scene import paint, signs
+from vislam.sim.scene.names import Hung, named
 from vislam.sim.scene.paint import VIVID
 from vislam.sim.scene.scene import Painter, SceneBuilder
-from vislam.sim.scene.signs import Hung
 
 Point = tuple[float, float]
 
 
+@named("wall")
 def wall(
     world: SceneBuilder, left: Point, right: Point, height_m: float, painter: Painter, texels_per_m: float = 200.0
 ) -> None:
@@ -25,12 +26,14 @@ def wall(
     )
 
 
+@named("floor")
 def floor(world: SceneBuilder, low: Point, high: Point, painter: Painter, texels_per_m: float = 200.0) -> None:
     """Add a floor at height zero between two corners."""
     length, width = high[0] - low[0], high[1] - low[1]
     world.rectangle((low[0], high[1], 0.0), (length, 0.0, 0.0), (0.0, -width, 0.0), painter, texels_per_m)
 
 
+@named("ceiling")
 def ceiling(
     world: SceneBuilder, low: Point, high: Point, height_m: float, painter: Painter, texels_per_m: float = 80.0
 ) -> None:

@@ -9,11 +9,9 @@ import numpy as np
 
 from vislam.core.messages import ImageU8
 from vislam.sim.scene import paint as p
+from vislam.sim.scene.names import Carrying, Hung, Named
 from vislam.sim.scene.paint import VIVID, Color
 from vislam.sim.scene.scene import Painter
-
-Hung = tuple[float, float, float, float, Painter]
-"""Something flat on a surface: left, top from the surface's bottom, width, height in metres, and its painter."""
 
 
 def _vivid(rng: np.random.Generator) -> Color:
@@ -47,7 +45,7 @@ def carrying(base: Painter, things: Sequence[Hung]) -> Painter:
                 image[y0:y1, x0:x1] = picture[y0 - top : y1 - top, x0 - left : x1 - left]
         return image
 
-    return paint
+    return Carrying(things, paint)
 
 
 def poster() -> Painter:
@@ -62,7 +60,7 @@ def poster() -> Painter:
         grain = p.noise(rng, height, width, (0.1 * ppm, 1.0), (0.02, 0.02))
         return cv2.multiply(image, cv2.merge([grain, grain, grain]), dtype=cv2.CV_8UC3)
 
-    return paint
+    return Named("poster", paint)
 
 
 def _headline(rng: np.random.Generator, height: int, width: int) -> ImageU8:
@@ -151,7 +149,7 @@ def sign(color: Color, words: str | None = None) -> Painter:
         cv2.rectangle(image, (0, 0), (width - 1, height - 1), ink, max(1, int(0.012 * ppm)))
         return image
 
-    return paint
+    return Named("sign", paint)
 
 
 def stripes(first: Color = (35, 195, 235), second: Color = (30, 30, 32), width_m: float = 0.09) -> Painter:
@@ -247,7 +245,7 @@ def door(color: Color, words: str | None = None) -> Painter:
         cv2.rectangle(image, *handle, (200, 205, 208), -1)
         return image
 
-    return paint
+    return Named("door", paint)
 
 
 def lockers(color: Color, width_m: float = 0.3) -> Painter:
@@ -313,7 +311,7 @@ def window() -> Painter:
             cv2.line(image, (0, y), (width, y), (205, 208, 210), bar)
         return image
 
-    return paint
+    return Named("window", paint)
 
 
 def whiteboard() -> Painter:
@@ -336,7 +334,7 @@ def whiteboard() -> Painter:
         cv2.rectangle(image, (0, 0), (width - 1, height - 1), (120, 122, 125), max(2, int(0.03 * ppm)))
         return image
 
-    return paint
+    return Named("whiteboard", paint)
 
 
 def screen() -> Painter:

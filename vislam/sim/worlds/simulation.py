@@ -199,8 +199,7 @@ class Simulation:
         The stamp is the middle of the exposure of the middle row, as the camera's clock has it. Raises
         UsageError for an index that does not exist.
         """
-        if not 0 <= index < self.frame_count:
-            raise UsageError(f"world '{self.name}' has frames 0..{self.frame_count - 1}, asked for {index}")
+        self._check_index(index)
         t_s = float(self._frame_s[index])
         images: list[ImageU8] = []
         color: ImageU8 | None = None
@@ -218,11 +217,27 @@ class Simulation:
                     depth = sense_depth(exact, DepthNoise(), rng) if self.options.depth_noise else exact
         return Frame(int(self._stamp_ns[index]), index, tuple(images), color, depth)
 
+    def labels(self, index: int) -> tuple[int, ImageU8]:
+        """Return the stamp of frame `index` and what its first image shows [H, W]: 1 + the place in `LABELS`; 0: nothing.
+
+        A person who walks through the image is not seen. Raises UsageError as `render`.
+        """
+        self._check_index(index)
+        poses = self._poses(self.rig.T_body_cams[0], self._rows_s(float(self._frame_s[index])))
+        return int(self._stamp_ns[index]), self._renderers[0].labels(self.scene, poses)
+
+    def _check_index(self, index: int) -> None:
+        if not 0 <= index < self.frame_count:
+            raise UsageError(f"world '{self.name}' has frames 0..{self.frame_count - 1}, asked for {index}")
+
+    def _rows_s(self, t_s: float) -> Array:
+        """Return when the rows of an image are taken; one time for all where the shutter is global."""
+        readout, height = self.options.readout_s, self.rig.cameras[0].height
+        return t_s + readout * ((np.arange(height) + 0.5) / height - 0.5) if readout > 0.0 else np.array([t_s])
+
     def _see(self, renderer: Renderer, T_body_cam: Array, t_s: float) -> tuple[ImageF32, ImageF32]:
         """Return noise-free light (averaged over the exposure) and the exact depth at the stamp."""
-        readout, exposure = self.options.readout_s, self._exposure_s
-        height = renderer.camera.height
-        rows_s = t_s + readout * ((np.arange(height) + 0.5) / height - 0.5) if readout > 0.0 else np.array([t_s])
+        exposure, rows_s = self._exposure_s, self._rows_s(t_s)
         shutter: Array | None = None
         if exposure > 0.0:
             moments = (np.arange(self.options.blur_samples) + 0.5) / self.options.blur_samples - 0.5
