@@ -218,7 +218,7 @@ class Simulation:
         return Frame(int(self._stamp_ns[index]), index, tuple(images), color, depth)
 
     def labels(self, index: int) -> tuple[int, ImageU8]:
-        """Return the stamp of frame `index` and what its first image shows [H, W]: 1 + the place in `LABELS`; 0: nothing.
+        """Return the stamp of frame `index`, and what its first image shows [H, W]; see `Renderer.labels`.
 
         A person who walks through the image is not seen. Raises UsageError as `render`.
         """
