@@ -90,6 +90,7 @@ def write_products(
     Labels are written where the map has some.
 
     Where z of the map may not be up, `not_level` says why: what needs that is removed, if it is there, and not written.
+    `step` is told each configured product before it is made.
 
     Raises StorageError when one cannot be written.
     """
@@ -118,7 +119,7 @@ def write_products(
     written: dict[str, Path] = {}
     notes: dict[str, str] = {}
     for product in (*dict.fromkeys(config.products), *(() if labels is None else ("labels",))):
-        if step is not None:
+        if step is not None and product in config.products:
             step(product)
         path = folder / FILES[product]
         if not_level is not None and product in NEEDS_UP:

@@ -93,7 +93,7 @@ class SurfelMap:
                 scan.depth, view.unit_m, view.rays_body, colors, labels, view.max_range_m, self._spacing_m
             )
             measured[:, :3] += view.T_body_view[:3, 3]
-            discs.fuse(measured, keyframe_id, self._spacing_m)
+            discs.fuse(measured, keyframe_id, self._spacing_m, is_one_vote=False)
         values = discs.values[: discs.count]
         values[:, _LABEL] = discs.votes.winners()[0][: discs.count]  # its one vote
         self._discs[keyframe_id] = values.astype(np.float32)
@@ -111,7 +111,7 @@ class SurfelMap:
             rows = self._discs[keyframe_id].astype(np.float64)
             rows[:, :3] = rows[:, :3] @ T[:3, :3].T + T[:3, 3]
             rows[:, 3:6] = rows[:, 3:6] @ T[:3, :3].T
-            self._merged.fuse(rows, keyframe_id, self._spacing_m)
+            self._merged.fuse(rows, keyframe_id, self._spacing_m, is_one_vote=True)
             self._merged_poses[keyframe_id] = T
         return self._merged.surfels()
 
@@ -148,8 +148,8 @@ class _Discs:
         self._next = np.empty(1 << 12, np.int64)  # surfel made before in the same cell; -1: none
         self._keys = np.empty(1 << 12, np.int64)
 
-    def fuse(self, values: Array, keyframe_id: int, spacing_m: float) -> None:
-        """Merge measurements [M, 12] of a keyframe in."""
+    def fuse(self, values: Array, keyframe_id: int, spacing_m: float, is_one_vote: bool) -> None:
+        """Merge measurements [M, 12] of a keyframe in; with `is_one_vote` it has one vote for the label of a surfel."""
         need = self.count + len(values)
         if need > len(self.anchors):
             size = max(need, 2 * len(self.anchors))
@@ -166,6 +166,7 @@ class _Discs:
         self.count = _fuse(
             values, keyframe_id, spacing_m, _Cells(self._table, self._heads, self._next, self._keys),
             _Kept(self.values, self.anchors, self._last, self._views, self.votes), self.count,
+            is_one_vote,
         )  # fmt: skip
 
     def surfels(self) -> Surfels:
@@ -254,7 +255,8 @@ def _nearest(row: Array, spacing: float, table: I64, heads: I64, following: I64,
 
 
 @njit(cache=True, nogil=True)
-def _fuse(values: Array, keyframe_id: int, spacing: float, cells: _Cells, kept: _Kept, count: int) -> int:
+def _fuse(values: Array, keyframe_id: int, spacing: float, cells: _Cells, kept: _Kept, count: int,
+          is_one_vote: bool) -> int:  # fmt: skip
     table, heads, following, keys = cells
     out, out_anchors, out_last, out_views, votes = kept
     for i in range(len(values)):
@@ -273,7 +275,7 @@ def _fuse(values: Array, keyframe_id: int, spacing: float, cells: _Cells, kept: 
                 vote(votes, count, int(row[11]))
             count += 1
             continue
-        if row[11] > 0.0:
+        if row[11] > 0.0 and not (is_one_vote and out_last[k] == keyframe_id):
             vote(votes, k, int(row[11]))
         there = out[k]
         share = row[10] / (row[10] + there[10])
