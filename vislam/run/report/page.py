@@ -357,7 +357,9 @@ def _lost(run: RunFiles) -> str:
                 reasons[f"{state}: " + re.sub(r"\d+(\.\d+)?", "…", reason)] += 1
     why: list[list[str | Cell]] = [[Cell(reason, kind="text long"), str(n)] for reason, n in reasons.most_common(10)]
     cards = [
-        card(table(["room", "what", "count"], rows, text_columns=(0, 1)), title="Counters", kind="list") if rows else "",
+        card(table(["room", "what", "count"], rows, text_columns=(0, 1)), title="Counters", kind="list")
+        if rows
+        else "",
         card(table(["why", "frames"], why), title="Frames that were not ok") if why else "",
     ]
     if not rows and not why:

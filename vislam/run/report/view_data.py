@@ -16,6 +16,7 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.loop.table import caption
 from vislam.mapping.formats.ply import read_ply
+from vislam.run.report.label_data import label_data
 from vislam.run.report.page_assets import floats, packed
 from vislam.run.report.run_files import RunFiles
 from vislam.run.report.scene import Scene, loop_ends
@@ -59,6 +60,7 @@ def view_data(run: RunFiles, scene: Scene, most_points: int = MAX_POINTS) -> dic
         "tracking": _tracking(run, scene),
         "loops": _loops(run, scene),
         "cloud": _cloud(run, scene, most_points),
+        "voxels": label_data(run, scene),
         **_pictures(pictures, scene),
     }
 

@@ -11,7 +11,8 @@ from vislam.run.report.html import escape
 from vislam.run.report.page_assets import assets
 from vislam.run.report.view_data import as_script
 
-_MODULES = ("data.js", "view.js", "layers.js", "plots.js", "details.js", "main.js")  # each may use those before it
+# each may use those before it
+_MODULES = ("data.js", "view.js", "layers.js", "plots.js", "details.js", "labels.js", "main.js")
 _LIBRARIES = ("vendor/three.min.js", "vendor/uplot.min.js")
 
 

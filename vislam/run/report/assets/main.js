@@ -1,6 +1,7 @@
 // Joins the view, the plots and the details: one moment, one chosen loop.
 import { readData } from "./data.js";
 import { Details } from "./details.js";
+import { addLabels } from "./labels.js";
 import { layerButtons } from "./layers.js";
 import { Plots } from "./plots.js";
 import { View } from "./view.js";
@@ -61,6 +62,7 @@ function start() {
   player(slider, at("view-play"), data, setTime);
   at("plots-whole").addEventListener("click", () => plots.whole());
   if (view) {
+    addLabels(view, data.voxels, at("view-layers").parentElement);
     layerButtons(view, at("view-layers"));
     at("view-home").addEventListener("click", () => view.overview());
     at("view-above").addEventListener("click", () => view.fromAbove());
