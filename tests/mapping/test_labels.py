@@ -12,9 +12,9 @@ from vislam.core.messages import GraphUpdate
 from vislam.mapping.formats.ply import read_ply, read_ply_rows
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.semantic.classes import LabelClasses
-from vislam.mapping.semantic.files import read_layer, write_layer
 from vislam.mapping.semantic.images import LabelFolder, checked
 from vislam.mapping.semantic.layer import LabelLayer
+from vislam.mapping.semantic.layer_files import read_layer, write_layer
 from vislam.mapping.semantic.query import describe_nearest, label_at, nearest, things_of
 from vislam.mapping.semantic.votes import VoxelVotes, voxel_centres, voxel_keys
 from worlds.box import CAMERA, CONFIG, RIG, ROOM_HIGH, ROOM_LOW, T_BODY_CAM0, depth_image, keyframe, pose
@@ -47,7 +47,7 @@ def away_from_edges(points):
 
 
 def mapped(poses, labels=label_image, config=CONFIG, true=True):
-    mapper = Mapper(config, RIG, classes=CLASSES)
+    mapper = Mapper(config, RIG, names=CLASSES)
     for k, T in enumerate(poses):
         seen = labels(pose(k))
         mapper.add(keyframe(k, T if true else pose(k), None if true else depth_image(pose(k))), T, seen)
@@ -135,7 +135,7 @@ def test_labels_move_with_keyframes_as_if_made_from_scratch(room):
 
 
 def test_labels_asked_for_in_between_change_nothing(room):
-    mapper = Mapper(CONFIG, RIG, classes=CLASSES)
+    mapper = Mapper(CONFIG, RIG, names=CLASSES)
     for k in range(8):
         mapper.add(keyframe(k), pose(k), label_image(pose(k)))
         mapper.labels()
@@ -157,7 +157,7 @@ def test_wrong_images_are_outvoted():
         return np.full_like(labels, OTHER) if np.array_equal(T, pose(0)) else labels
 
     poses = [pose(0.2 * k) for k in range(6)]
-    mapper = Mapper(CONFIG, RIG, classes=CLASSES)
+    mapper = Mapper(CONFIG, RIG, names=CLASSES)
     for k, T in enumerate(poses):
         mapper.add(keyframe(k, T), T, wrong_first(T))
     layer = mapper.labels()

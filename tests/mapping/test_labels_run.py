@@ -13,7 +13,7 @@ from vislam.config import Config, ImuConfig, LabelConfig, MapConfig, ViewConfig
 from vislam.core.errors import DataError
 from vislam.mapping.formats.ply import read_ply_rows
 from vislam.mapping.semantic.classes import LabelClasses
-from vislam.mapping.semantic.files import read_layer
+from vislam.mapping.semantic.layer_files import read_layer
 from vislam.run import execute
 from vislam.run.folder import prepare
 from vislam.run.offline.rebuild import map_settings, rebuild

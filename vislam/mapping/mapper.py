@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -41,11 +40,11 @@ class Mapper:
     """Keeps every keyframe's geometry in its own frame, and the maps made of it at the poses the graph gives."""
 
     def __init__(
-        self, config: MapConfig, rig: Rig, one_camera: bool = False, classes: LabelClasses | None = None
+        self, config: MapConfig, rig: Rig, one_camera: bool = False, names: LabelClasses | None = None
     ) -> None:
         """Prepare for a rig; with `one_camera` only cam0 counts, and depth comes by `add_depth`.
 
-        `classes` say what the labels of keyframes mean, where they have some. Raises DataError when the settings or the
+        `names` say what the labels of keyframes mean, where they have some. Raises DataError when the settings or the
         rig cannot make a map.
         """
         self._config = config
@@ -56,7 +55,7 @@ class Mapper:
         self._occupancy = CorrectedOccupancy(config, self._store, self._extractor.view)
         self._drive = DriveMap(config)
         self._surfels = SurfelMap(config.surfel_m)
-        self._labels = LabelFusion(config.resolution_m, config.labels, classes or LabelClasses())
+        self._labels = LabelFusion(config.resolution_m, config.labels, names or LabelClasses())
         self._submaps = Submaps()
         self._apart: dict[int, Array] = {}  # newest poses of keyframes in submaps that no loop has joined with the map
         self.notes: dict[str, str] = {}  # what was left out of an export, and why
@@ -84,15 +83,13 @@ class Mapper:
     def add(self, keyframe: Keyframe, T_map_body: Array, labels: NDArray[np.integer] | None = None) -> None:
         """Integrate a keyframe at its pose [4, 4], after the `move` that knows its submap.
 
-        `labels` are of its first image, ids [H, W] of what each pixel shows, 0 where that is unknown, as large or
-        smaller by a whole factor.
+        `labels` [H, W] are ids of what its first image shows, 0: unknown; they may be coarser by a whole factor.
 
         Where no loop has joined that submap with the oldest one, it waits outside of the map, for its pose there means
         nothing. Raises DataError on a pose that is not rigid, an id seen before, or images or labels of another size
         than the camera's.
         """
-        T = np.array(T_map_body, dtype=np.float64)
-        _check_rigid(T[None], np.array([keyframe.id]))
+        T = _rigid(T_map_body, keyframe.id)
         scan = self._extractor.extract(keyframe, labels)
         if self._one_camera and labels is not None:
             self._labels.wait(keyframe.id, self._extractor.on_rays(labels))
@@ -107,22 +104,10 @@ class Mapper:
         Raises DataError on a pose that is not rigid, a keyframe that has depth already, or depth of another size than
         the mapper's rays.
         """
-        T = np.array(late.T_map_body, dtype=np.float64)
-        _check_rigid(T[None], np.array([late.keyframe_id]))
+        T = _rigid(late.T_map_body, late.keyframe_id)
         scan = self._extractor.late(late.depth_m, late.image, self._labels.waited_for(late.keyframe_id))
         self._store.add(late.keyframe_id, late.t_ns, scan)
         self._place(late.keyframe_id, scan, T)
-
-    def label(self, keyframe_id: int, labels: NDArray[np.integer]) -> None:
-        """Give the depth image of a keyframe that is there other labels, as `add` takes them.
-
-        Raises DataError when it has no depth image, or labels are of another size than the camera's images.
-        """
-        if keyframe_id not in self._store or not self._store.has_depth(keyframe_id):
-            raise DataError(f"keyframe {keyframe_id} has no depth image that labels could be given to")
-        self._store.label(keyframe_id, self._extractor.on_rays(labels))
-        self._labels.forget()
-        self._surfels = SurfelMap(self._config.surfel_m)
 
     def packed(self, keyframe_id: int) -> PackedScan | None:
         """Return what is kept of a keyframe's geometry, None if there was none."""
@@ -172,7 +157,9 @@ class Mapper:
     def cloud(self) -> Cloud:
         """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
         config = self._config
-        average, sparse_only = self._averaged(config.cloud_voxel_m, config.cloud_max_points)
+        average, sparse_only = _averaged(
+            self._scans(), self._extractor.view, config.min_range_m, config.cloud_voxel_m, config.cloud_max_points
+        )
         fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
@@ -182,7 +169,8 @@ class Mapper:
     def coloured_octree(self) -> Octree:
         """Return the octree of log-odds; occupied leaves have the mean colour of what keyframes saw in them."""
         octree = self.occupancy.octree()
-        average, _ = self._averaged(self._config.resolution_m, _MAX_COLOURED_VOXELS)
+        view, config = self._extractor.view, self._config
+        average, _ = _averaged(self._scans(), view, config.min_range_m, config.resolution_m, _MAX_COLOURED_VOXELS)
         points = average.cloud()
         points = points.select(octree.log_odds_at(points.points_m) >= 0.0)
         return octree.with_colors(points.points_m, points.colors)
@@ -215,17 +203,13 @@ class Mapper:
         """
         for keyframe_id in self._occupancy.poses:
             if keyframe_id not in self._surfels:
-                scan = replace(self._store.scan(keyframe_id), labels=self._store.labels(keyframe_id))
-                self._surfels.add(keyframe_id, scan, self._extractor.view)
+                self._surfels.add(keyframe_id, self._store.labelled(keyframe_id), self._extractor.view)
         surfels = self._surfels.surfels(self._occupancy.poses)
         surfels = surfels.select(surfels.views >= self._config.surfel_min_views)
         return surfels.select(self.occupancy.state_at(surfels.points_m) != Occupancy.FREE)
 
     def labels(self) -> LabelLayer | None:
-        """Return the labels of the occupied voxels at the newest poses; None where no keyframe has labels.
-
-        Only keyframes that are new since the last call are looked at, unless some were moved.
-        """
+        """Return the labels of the occupied voxels at the newest poses; None where no keyframe has labels."""
         if not self._store.has_labels:
             return None
         return self._labels.layer(self._occupancy.poses, self._store, self._extractor.view, self.occupancy)
@@ -264,8 +248,7 @@ class Mapper:
             self.notes[f"{name} in the map"] = (
                 f"no loop joined these {len(layer._store.ids)} keyframes with it; {folder.name}/{name} is their own"
             )
-        if refused := self._labels.refused:
-            self.notes[f"labels of {refused} votes"] = "there was no room for more voxels; raise labels.max_voxels"
+        self.notes |= self._labels.notes
         if left_out := self._occupancy.left_out:
             self.notes[f"occupancy of {len(left_out)} keyframes"] = next(iter(left_out.values()))
         return written
@@ -289,11 +272,8 @@ class Mapper:
 
     def _layers(self) -> dict[str, Mapper]:
         """Return the maps of the submaps that are not joined with the map, complete, by name."""
-        layers: dict[str, Mapper] = {}
-        for submap in sorted({self._submaps.group(i) for i in self._apart}):
-            poses = {i: T for i, T in self._apart.items() if self._submaps.group(i) == submap}
-            layers[f"submap_{submap}"] = self._made_again(poses, Submaps())
-        return layers
+        groups = _by_group(self._apart, self._submaps)
+        return {f"submap_{number}": self._made_again(poses, Submaps()) for number, poses in groups.items()}
 
     def _made_again(self, poses: dict[int, Array], submaps: Submaps) -> Mapper:
         """Return the complete map of some keyframes at other poses."""
@@ -307,18 +287,21 @@ class Mapper:
         for keyframe_id, T_map_body in self._occupancy.poses.items():
             yield self._store.scan(keyframe_id), T_map_body
 
-    def _averaged(self, voxel_m: float, max_points: int) -> tuple[VoxelAverage, bool]:
-        """Return the average of all keyframes' points in each voxel, and whether none of them has dense depth."""
-        average = VoxelAverage(voxel_m, max_points)
-        sparse_only = True
-        for scan, T in self._scans():
-            sparse_only = sparse_only and scan.depth is None
-            points = _points(scan, self._extractor.view, T)
-            seen_from = (T @ self._extractor.view.T_body_view)[:3, 3].astype(np.float32)
-            squared_m2 = np.maximum(np.sum((points.points_m - seen_from) ** 2, axis=1), self._config.min_range_m**2)
-            # depth from disparity, structured light included, errs with the square of range: weight 1 / sigma^2
-            average.add(points, (1.0 / squared_m2**2).astype(np.float32))
-        return average, sparse_only
+
+def _averaged(
+    scans: Iterable[tuple[Scan, Array]], view: DepthView, min_range_m: float, voxel_m: float, max_points: int
+) -> tuple[VoxelAverage, bool]:
+    """Return the average of all keyframes' points in each voxel, and whether none of them has dense depth."""
+    average = VoxelAverage(voxel_m, max_points)
+    sparse_only = True
+    for scan, T in scans:
+        sparse_only = sparse_only and scan.depth is None
+        points = _points(scan, view, T)
+        seen_from = (T @ view.T_body_view)[:3, 3].astype(np.float32)
+        squared_m2 = np.maximum(np.sum((points.points_m - seen_from) ** 2, axis=1), min_range_m**2)
+        # depth from disparity, structured light included, errs with the square of range: weight 1 / sigma^2
+        average.add(points, (1.0 / squared_m2**2).astype(np.float32))
+    return average, sparse_only
 
 
 def _points(scan: Scan, view: DepthView, T_frame_body: Array) -> Cloud:
@@ -329,6 +312,19 @@ def _points(scan: Scan, view: DepthView, T_frame_body: Array) -> Cloud:
         return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     points_body = scan.points_body_m.astype(np.float64)
     return Cloud((points_body @ T_frame_body[:3, :3].T + T_frame_body[:3, 3]).astype(np.float32), scan.colors)
+
+
+def _by_group(poses: dict[int, Array], submaps: Submaps) -> dict[int, dict[int, Array]]:
+    """Return the poses of each group of submaps, by its number."""
+    groups = sorted({submaps.group(i) for i in poses})
+    return {number: {i: T for i, T in poses.items() if submaps.group(i) == number} for number in groups}
+
+
+def _rigid(T_map_body: Array, keyframe_id: int) -> Array:
+    """Return a copy of a keyframe's pose [4, 4]; raises DataError when it is not a rigid transform."""
+    T = np.array(T_map_body, dtype=np.float64)
+    _check_rigid(T[None], np.array([keyframe_id]))
+    return T
 
 
 def _check_rigid(T: Array, keyframe_ids: NDArray[np.int64]) -> None:

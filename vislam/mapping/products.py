@@ -25,8 +25,8 @@ from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mesh.atlas import textured
 from vislam.mapping.mesh.posed import PosedView
 from vislam.mapping.octree import OccupancyMap, Octree, encode_bt, encode_ot
-from vislam.mapping.semantic.files import CLASSES_NAME, VOXELS_NAME, write_layer
 from vislam.mapping.semantic.layer import LabelLayer
+from vislam.mapping.semantic.layer_files import CLASSES_NAME, VOXELS_NAME, write_layer
 
 FILES = {
     "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",

@@ -39,7 +39,7 @@ from vislam.loop.injection import SOURCE as INJECTED
 from vislam.loop.injection import is_injected
 from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
 from vislam.mapping.products import FILES as MAP_FILES
-from vislam.mapping.semantic.files import CLASSES_NAME as LABEL_CLASSES
+from vislam.mapping.semantic.layer_files import CLASSES_NAME as LABEL_CLASSES
 from vislam.pipeline.steps import KeyframeStep, Step
 from vislam.run.geodetic_outputs import LINES, TABLES
 from vislam.run.session import Session, has_frames

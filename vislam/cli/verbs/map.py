@@ -82,7 +82,7 @@ def _describe(options: MapOptions) -> int:
 
 
 def _nearest(options: MapOptions, name: str) -> int:
-    from vislam.mapping.semantic.files import read_layer
+    from vislam.mapping.semantic.layer_files import read_layer
     from vislam.mapping.semantic.query import describe_nearest
 
     folder = options.source / "map"

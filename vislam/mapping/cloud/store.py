@@ -85,21 +85,13 @@ class KeyframeStore:
             depth_png = _encode(".png", scan.depth, _PNG_OPTIONS)
             bgr = np.ascontiguousarray(scan.colors[..., ::-1])
             colors = _encode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-            self._packed[keyframe_id] = PackedScan(t_ns, depth_png, b"", colors, _packed_labels(scan.labels))
+            self._packed[keyframe_id] = PackedScan(t_ns, depth_png, b"", colors, packed_labels(scan.labels))
         elif scan.points_body_m is not None:
             points = np.ascontiguousarray(scan.points_body_m[:_MAX_SPARSE_POINTS], dtype=np.float32)
             colors = np.ascontiguousarray(scan.colors[:_MAX_SPARSE_POINTS]).tobytes()
             labels = None if scan.labels is None else scan.labels[None, :_MAX_SPARSE_POINTS]
             packed_points = zlib.compress(points.tobytes(), 1)
-            self._packed[keyframe_id] = PackedScan(t_ns, b"", packed_points, colors, _packed_labels(labels))
-
-    def has_depth(self, keyframe_id: int) -> bool:
-        """Return whether a stored keyframe has a depth image."""
-        return bool(self._packed[keyframe_id].depth_png)
-
-    def label(self, keyframe_id: int, labels: NDArray[np.uint16]) -> None:
-        """Give the depth image of a stored keyframe other labels [h, w]."""
-        self._packed[keyframe_id] = replace(self._packed[keyframe_id], labels_png=_packed_labels(labels))
+            self._packed[keyframe_id] = PackedScan(t_ns, b"", packed_points, colors, packed_labels(labels))
 
     def labels(self, keyframe_id: int) -> NDArray[np.uint16] | None:
         """Return the labels [h, w] of a stored keyframe's depth image, or [N] of its points; None: it has none.
@@ -135,6 +127,10 @@ class KeyframeStore:
             raise _damaged(keyframe_id, "it has not as many colours as points")
         return replace(geometry, colors=np.frombuffer(colors, np.uint8).reshape(-1, 3))
 
+    def labelled(self, keyframe_id: int) -> Scan:
+        """Return the scan of a stored keyframe with its labels, if it has some; raises DataError as `scan`."""
+        return replace(self.scan(keyframe_id), labels=self.labels(keyframe_id))
+
     def geometry(self, keyframe_id: int) -> Scan:
         """Return the scan without decoding its colours (they are empty): all that occupancy needs.
 
@@ -161,7 +157,7 @@ def _parts(packed: PackedScan) -> tuple[object, ...]:
     return packed.depth_png, packed.points, packed.colors, packed.labels_png
 
 
-def _packed_labels(labels: NDArray[np.uint16] | None) -> bytes:
+def packed_labels(labels: NDArray[np.uint16] | None) -> bytes:
     """Return labels as a PNG, of 8 bits where that is enough; empty where there are none."""
     if labels is None or not labels.any():
         return b""

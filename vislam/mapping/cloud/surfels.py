@@ -172,6 +172,8 @@ class _Discs:
     def surfels(self) -> Surfels:
         """Return all of them, in the order in which they were made."""
         values = self.values[: self.count]
+        votes = self.votes.select(np.arange(self.count))
+        labels, label_votes = votes.winners()
         return Surfels(
             values[:, :3].astype(np.float32),
             values[:, 3:6].astype(np.float32),
@@ -180,8 +182,9 @@ class _Discs:
             values[:, 10].astype(np.float32),
             self._views[: self.count].astype(np.int32),
             self.anchors[: self.count].copy(),
-            *(part[: self.count] for part in self.votes.winners()),
-            self.votes.total[: self.count].copy(),
+            labels,
+            label_votes,
+            votes.total,
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import MapConfig
-from vislam.core.camera import Rig
+from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8, Keyframe
 from vislam.mapping.cloud.store import Scan
@@ -33,6 +33,11 @@ class ScanExtractor:
         one_camera_view = mono_view(rig, config.mono_depth) if one_camera else rgbd_view(rig, config)
         self.view: DepthView = self._stereo.view if self._stereo else one_camera_view
         self.counters = {"keyframes_dense": 0, "keyframes_sparse": 0, "keyframes_without_depth": 0}
+
+    @property
+    def camera(self) -> Camera:
+        """The first camera."""
+        return self._cameras[0]
 
     def on_rays(self, labels: NDArray[np.integer]) -> NDArray[np.uint16]:
         """Return labels [H, W] of a first image on the rays [h, w] of the view; raises DataError as `extract`."""

@@ -18,7 +18,7 @@ from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.octree import Occupancy, OccupancyMap
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer import LabelLayer
-from vislam.mapping.semantic.votes import Votes, VoxelVotes, voxel_centres
+from vislam.mapping.semantic.votes import VoxelVotes, voxel_centres
 
 _MOST_WAITING = 16  # keyframes whose depth comes late
 
@@ -35,9 +35,11 @@ class LabelFusion:
         self._votes = VoxelVotes(resolution_m, config.max_voxels)
 
     @property
-    def refused(self) -> int:
-        """Votes at voxels for which there was no room."""
-        return self._votes.refused
+    def notes(self) -> dict[str, str]:
+        """What was left out, and why."""
+        refused = self._votes.refused
+        why = "there was no room for more voxels; raise labels.max_voxels"
+        return {f"labels of {refused} votes": why} if refused else {}
 
     def wait(self, keyframe_id: int, labels: NDArray[np.uint16]) -> None:
         """Keep the labels [h, w] of a keyframe until its depth comes; those that waited longest are given up."""
@@ -49,10 +51,6 @@ class LabelFusion:
         """Return labels that were kept until now."""
         return self._waiting.pop(keyframe_id, None)
 
-    def forget(self) -> None:
-        """Count anew at the next call."""
-        self._poses, self._votes = {}, VoxelVotes(self._resolution_m, self._config.max_voxels)
-
     def layer(
         self, T_map_body: Mapping[int, Array], store: KeyframeStore, view: DepthView, occupancy: OccupancyMap
     ) -> LabelLayer:
@@ -60,18 +58,19 @@ class LabelFusion:
         done = self._poses
         is_prefix = list(T_map_body)[: len(done)] == list(done)
         if not is_prefix or any(not np.array_equal(T, T_map_body[i]) for i, T in done.items()):
-            self.forget()
+            self._poses, self._votes = {}, VoxelVotes(self._resolution_m, self._config.max_voxels)
         for keyframe_id in list(T_map_body)[len(self._poses) :]:
             T = T_map_body[keyframe_id]
             self._count(keyframe_id, T, store, view)
             self._poses[keyframe_id] = T.copy()
         keys, votes = self._votes.voxels()
         there = occupancy.state_at(voxel_centres(keys, self._resolution_m)) == Occupancy.OCCUPIED
-        labels, counts = Votes(*(part[there] for part in votes)).winners()
+        keys, votes = keys[there], votes.select(there)
+        labels, counts = votes.winners()
         chosen = counts > 0  # all four counters may have been used up
         return LabelLayer(
-            self._resolution_m, self.classes, keys[there][chosen], labels[chosen], counts[chosen],
-            votes.total[there][chosen], self._config.thing_voxels,
+            self._resolution_m, self.classes, keys[chosen], labels[chosen], counts[chosen], votes.total[chosen],
+            self._config.thing_voxels,
         )  # fmt: skip
 
     def _count(self, keyframe_id: int, T_map_body: Array, store: KeyframeStore, view: DepthView) -> None:

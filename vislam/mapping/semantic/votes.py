@@ -39,7 +39,15 @@ class Votes(NamedTuple):
     def grown(self, rows: int) -> Votes:
         """Return as many rows as asked for, these first."""
         more = Votes.none(rows - len(self.total))
-        return Votes(*(np.concatenate(pair) for pair in zip(self, more, strict=True)))
+        return Votes(
+            np.concatenate([self.ids, more.ids]),
+            np.concatenate([self.counts, more.counts]),
+            np.concatenate([self.total, more.total]),
+        )
+
+    def select(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> Votes:
+        """Return those of some places."""
+        return Votes(self.ids[rows], self.counts[rows], self.total[rows])
 
     def winners(self) -> tuple[NDArray[np.uint16], NDArray[np.int32]]:
         """Return the label [N] with most votes, of equal ones the lower id, and its count [N]; 0 without votes."""
@@ -120,7 +128,7 @@ class VoxelVotes:
     def voxels(self) -> tuple[_I64, Votes]:
         """Return the keys [N] of the voxels with votes, ascending, and the votes."""
         order = np.argsort(self._keys[: self._count])
-        return self._keys[order], Votes(*(part[order] for part in self._votes))
+        return self._keys[order], self._votes.select(order)
 
     def _reserve(self, extra: int) -> None:
         need = min(self._count + extra, self._most)
@@ -150,7 +158,7 @@ def voxel_keys(points_m: NDArray[np.floating], resolution_m: float) -> _I64:
     """Return OctoMap's keys [N] of the voxels of points [N, 3], packed; -1 where no octree reaches."""
     with np.errstate(invalid="ignore"):
         cells = np.floor((1.0 / resolution_m) * points_m.astype(np.float64)) + KEY_ORIGIN
-        inside = ((cells >= 0) & (cells < 2 * KEY_ORIGIN)).all(axis=1)
+        inside = np.all((cells >= 0) & (cells < 2 * KEY_ORIGIN), axis=1)
     a, b, c = np.where(inside[:, None], cells, 0.0).astype(np.int64).T
     return np.where(inside, (c << (2 * _KEY_BITS)) | (b << _KEY_BITS) | a, -1)
 

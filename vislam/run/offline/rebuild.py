@@ -19,11 +19,12 @@ from vislam.config import Config, MapConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.files import write_json
-from vislam.core.memory import LoopPlace
+from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
 from vislam.core.up import Up
 from vislam.factors.factor_log import rig_from
 from vislam.frontend import mode_for
+from vislam.mapping.cloud.store import packed_labels
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.of_map import write_pictures
@@ -69,7 +70,7 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
         one_camera = ran.map.mono_depth.enabled and mode_for(ran.frontend, rig) == "mono"
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
-        labels = _Labels(ran.map, config, info, rig)
+        labels = _Labels(ran.map, config, info, ScanExtractor(config, rig, one_camera))
         mapper = Mapper(config, rig, one_camera, labels.classes)
         from_session = ran.map.enabled and (one_camera or _same_extraction(ran.map, config, rig))
         nothing = GraphUpdate(
@@ -175,10 +176,11 @@ def stored_submaps(session: Session) -> Submaps:
 class _Labels:
     """Where the labels of a run's keyframes are: in its session, or in a folder that is given now."""
 
-    def __init__(self, ran: MapConfig, config: MapConfig, info: dict[str, Any], rig: Rig) -> None:
+    def __init__(self, ran: MapConfig, config: MapConfig, info: dict[str, Any], extractor: ScanExtractor) -> None:
         """Choose. Raises DataError when label images or the session cannot be used."""
+        self._extractor = extractor
         path = config.labels.folder
-        self.folder = None if path is None else LabelFolder(Path(path), rig.cameras[0])
+        self.folder = None if path is None else LabelFolder(Path(path), extractor.camera)
         self.is_new = path is not None and path != ran.labels.folder
         self.classes = LabelClasses.of(info.get("labels") or {}, "the session")
         if self.folder is not None:
@@ -191,6 +193,19 @@ class _Labels:
         self.used += labels is not None
         return labels
 
+    def given(self, scans: dict[int, PackedScan], session: Session) -> dict[int, PackedScan]:
+        """Return the scans of a session, where the folder is new with its labels; points alone get none."""
+        if not self.is_new:
+            self.used = sum(bool(scan.labels_png) for scan in scans.values())
+            return scans
+        stamps_ns = _camera_stamps_ns(session)
+        out = {}
+        for i, scan in scans.items():
+            labels = self.of(stamps_ns[i]) if scan.depth_png else None
+            on_rays = None if labels is None else self._extractor.on_rays(labels)
+            out[i] = replace(scan, labels_png=packed_labels(on_rays))
+        return out
+
 
 def _from_session(
     session: Session,
@@ -202,17 +217,7 @@ def _from_session(
     tell: Callable[[int, str], None],
 ) -> None:
     scans = {i: scan for i, scan in session.scans().items() if i in placed}
-    if labels.is_new:
-        scans = {i: replace(scan, labels_png=b"") for i, scan in scans.items()}
-    mapper.restore(scans, placed)
-    if labels.is_new:
-        stamps_ns = _camera_stamps_ns(session)
-        for i, scan in scans.items():
-            found = labels.of(stamps_ns[i]) if scan.depth_png else None
-            if found is not None:
-                mapper.label(i, found)
-    else:
-        labels.used = sum(bool(scan.labels_png) for scan in scans.values())
+    mapper.restore(labels.given(scans, session), placed)
     for done in range(0, len(scans), at_once):
         tell(done, "octree")
         mapper.move(nothing)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vislam.core.errors import DataError
-from vislam.mapping.semantic.files import CLASSES_NAME, read_layer
+from vislam.mapping.semantic.layer_files import CLASSES_NAME, read_layer
 from vislam.run.report.page_assets import packed
 from vislam.run.report.run_files import RunFiles
 from vislam.run.report.scene import Scene

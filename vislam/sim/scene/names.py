@@ -55,7 +55,7 @@ def named(name: str) -> Callable[
 
     def wrap(add: Callable[Concatenate[SceneBuilder, _More], None]) -> Callable[Concatenate[SceneBuilder, _More], None]:
         @wraps(add)
-        def inner(world: SceneBuilder, *args: _More.args, **kwargs: _More.kwargs) -> None:
+        def inner(world: SceneBuilder, /, *args: _More.args, **kwargs: _More.kwargs) -> None:
             outer, world.name = world.name, name
             try:
                 add(world, *args, **kwargs)

@@ -6,6 +6,8 @@ import { element, shorts } from "./data.js";
 export function addLabels(view, labels, parent) {
   if (!labels.count) return;
   const group = new THREE.Group();
+  // three.js takes the size of points for that of a view of 90 degrees
+  const size = labels.size / Math.tan((0.5 * view.camera.fov * Math.PI) / 180);
   const legend = element("div", "legend labels");
   legend.hidden = true;
   for (const one of labels.classes) {
@@ -14,7 +16,7 @@ export function addLabels(view, labels, parent) {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
     const colour = `rgb(${one.color.map(Number).join(",")})`;
-    const material = new THREE.PointsMaterial({ color: new THREE.Color(colour), size: 1.15 * labels.size });
+    const material = new THREE.PointsMaterial({ color: new THREE.Color(colour), size });
     const node = new THREE.Points(geometry, material);
     node.frustumCulled = false;
     group.add(node);

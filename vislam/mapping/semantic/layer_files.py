@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.files import write_json
@@ -22,7 +23,7 @@ _MAX_JSON_BYTES = 64 * 2**20
 
 def write_layer(folder: Path, layer: LabelLayer) -> None:
     """Write both files; raises StorageError when that fails."""
-    extra = {
+    extra: dict[str, NDArray[Any]] = {
         "label": layer.labels,
         "votes": layer.votes,
         "total": layer.total,
