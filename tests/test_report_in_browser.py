@@ -9,6 +9,10 @@ import pytest
 from needs import missing
 from run_folder import LOST, PERIOD_NS, make_run
 from vislam.mapping.formats.ply import write_ply
+from vislam.mapping.semantic.classes import LabelClasses
+from vislam.mapping.semantic.layer import LabelLayer
+from vislam.mapping.semantic.layer_files import write_layer
+from vislam.mapping.semantic.votes import voxel_keys
 from vislam.run.report import write_report
 
 FLAGS = (
@@ -196,3 +200,30 @@ def test_on_paper_the_pictures_stand_and_it_is_short(browser, report):
         assert page.locator("section.still").first.is_visible()
         pages = page.pdf(format="A4").count(b"/Type /Page\n")
         assert 1 <= pages <= 4
+
+
+def test_labels_are_shown_by_class_and_each_can_be_turned_off(browser, tmp_path):
+    run = make_run(tmp_path / "labels")
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-4, 4, 0.05)))
+    keys = np.unique(voxel_keys(np.stack([x, y, np.full_like(x, 0.01)], axis=1), 0.05))
+    labels, ones = (1 + np.arange(len(keys)) * 2 // len(keys)).astype(np.uint16), np.ones(len(keys), np.int32)
+    evil = "</script><script>document.title='owned'</script>"
+    names = LabelClasses.of({"1": {"name": "door", "color": [255, 0, 0]}, "2": evil}, "test")
+    write_layer(run / "map", LabelLayer(0.05, names, keys, labels, ones, ones))
+    red = f"""() => {{ const colors = ({COLORS.replace("new Set(new Uint32Array(pixels.buffer)).size", "pixels")})();
+        let count = 0;
+        for (let k = 0; k < colors.length; k += 4) count += colors[k] > 200 && colors[k + 1] < 60 && colors[k + 2] < 60;
+        return count; }}"""
+    for width in (1400, 400):
+        with Opened(browser, write_report(run), width) as page:
+            before = page.evaluate(red)
+            assert not page.locator(".legend.labels").is_visible()
+            page.locator("#view-layers input[name=labels]").check()
+            shown = page.evaluate(red)
+            assert shown > before + 5000
+            assert page.evaluate("document.documentElement.scrollWidth") == width
+            assert page.evaluate(CUT) == []
+            page.locator(".legend.labels label", has_text="door").locator("input").uncheck()
+            assert page.evaluate(red) < before + 0.1 * (shown - before)
+            assert evil in page.locator(".legend.labels").inner_text()
+            assert "owned" not in page.title()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import Config
+from vislam.config import Config, LabelConfig
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
 from vislam.core.messages import (
@@ -42,6 +42,7 @@ _CORRECTED_M = 0.5  # what a loop moves all by: everything is integrated again
 
 def rehearse_map(config: Config, rig: Rig) -> None:
     """Run the map, the viewer and their files once, in a folder that is thrown away."""
+    config = replace(config, map=replace(config.map, labels=LabelConfig()))  # label images are not of what is made up
     frames = [value for value in made_up(config, rig) if isinstance(value, Frame)][::_EVERY]
     T_map_body = np.tile(np.eye(4), (len(frames), 1, 1))
     T_map_body[:, 0, 3] = _STEP_M * np.arange(len(frames))
