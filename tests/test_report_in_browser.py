@@ -157,6 +157,56 @@ def test_a_loop_that_is_clicked_tells_its_reason(browser, report):
         assert "verified, 3 neighbours agree" in page.locator("#view-details .loop").inner_text()
 
 
+class Fingers:
+    """What fingers on a phone's screen do, in pixels of the page."""
+
+    def __init__(self, page):
+        self.session = page.context.new_cdp_session(page)
+        self.box = page.locator("#view-canvas").bounding_box()
+
+    def move(self, *paths):
+        """Move one or more fingers, each from its first to its last place on the canvas."""
+        steps = 6
+        for k in range(steps + 1):
+            points = [
+                {"x": self.box["x"] + a[0] + k / steps * (b[0] - a[0]),
+                 "y": self.box["y"] + a[1] + k / steps * (b[1] - a[1]), "id": i}
+                for i, (a, b) in enumerate(paths)
+            ]  # fmt: skip
+            self.send("touchMove" if k else "touchStart", points)
+        self.send("touchEnd", [])
+
+    def send(self, kind, points):
+        self.session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+def test_the_map_turns_and_nears_under_fingers_and_a_tap_tells_of_a_loop(browser, report):
+    with Opened(browser, report, width=400) as page:
+        fingers, loops = Fingers(page), page.locator("#view-details .loop:not([hidden])")
+        stands = "() => window.vislamReport.view.camera.position.toArray()"
+        away = "() => { const v = window.vislamReport.view; return v.camera.position.distanceTo(v.controls.target); }"
+        before = page.evaluate(stands)
+        fingers.move([(200, 150), (280, 190)])
+        page.wait_for_function(f"(before) => ({stands})().join() !== before.join()", arg=before)
+        assert page.evaluate("window.scrollY") == 0
+        far = page.evaluate(away)
+        fingers.move([(170, 150), (90, 150)], [(230, 150), (310, 150)])
+        page.wait_for_function(f"(far) => ({away})() < 0.7 * far", arg=far)
+        assert page.evaluate("window.visualViewport.scale") == 1
+        page.locator("#view-above").tap()
+        x, y = page.evaluate(
+            "() => { const v = window.vislamReport.view, e = v.data.loops.ends;"
+            "const a = v.project(e[0], e[1], e[2]), b = v.project(e[3], e[4], e[5]);"
+            "return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]; }"
+        )
+        fingers.move([(x, y), (x, y)], [(x + 60, y), (x + 90, y)])  # one of two fingers stays where it is
+        assert loops.count() == 0
+        page.locator("#view-above").tap()
+        fingers.move([(x - 4, y - 12), (x - 2, y - 4)])  # a finger misses, and rolls
+        loops.wait_for()
+        assert page.evaluate("window.vislamReport.view.chosen.visible")
+
+
 def test_plots_zoom_together(browser, report):
     with Opened(browser, report) as page:
         spans = "() => window.vislamReport.plots.plots.map((p) => p.scales.x.max - p.scales.x.min)"

@@ -8,7 +8,8 @@ const FRAME_MS = 45;
 const FEWEST = 20000;
 const FIRST = 100000; // points of the first picture
 const LOOP_COLORS = { accepted: "good", pending: "warn", rejected: "bad" };
-const CLICK_PX = 9;
+const MOUSE = { hits: 9, rolls: 5 }; // px: so far from a loop a click still means it, and so far the mouse may move
+const FINGER = { hits: 22, rolls: 12 };
 
 export class View {
   constructor(canvas, data) {
@@ -179,10 +180,14 @@ export class View {
     this.controls.enableDamping = false;
     this.controls.addEventListener("change", () => this.ask(true));
     this.controls.addEventListener("end", () => this.rest());
-    let down = null;
-    this.canvas.addEventListener("pointerdown", (event) => (down = [event.clientX, event.clientY]));
+    let down = null; // where the mouse or one finger came down; two fingers are no click
+    this.canvas.addEventListener("pointerdown", (event) => {
+      down = event.isPrimary ? [event.clientX, event.clientY] : null;
+    });
     this.canvas.addEventListener("pointerup", (event) => {
-      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 5) this.click(event);
+      const by = event.pointerType === "touch" ? FINGER : MOUSE;
+      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < by.rolls) this.click(event, by.hits);
+      down = null;
     });
   }
 
@@ -302,10 +307,10 @@ export class View {
     return p.z > 1 ? null : [((p.x + 1) / 2) * clientWidth, ((1 - p.y) / 2) * clientHeight];
   }
 
-  click(event) {
+  click(event, hits) {
     const box = this.canvas.getBoundingClientRect();
     const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-    let best = [CLICK_PX, null];
+    let best = [hits, null];
     for (const node of Object.values(this.loopNodes)) {
       if (!node.visible) continue;
       for (const k of node.userData.indices) {
@@ -319,12 +324,12 @@ export class View {
       }
     }
     if (best[1] !== null && this.onLoop) this.onLoop(best[1]);
-    else this.clickPath(x, y);
+    else this.clickPath(x, y, 2 * hits);
   }
 
-  clickPath(x, y) {
+  clickPath(x, y, hits) {
     const path = this.data.paths[this.data.best];
-    let best = [2 * CLICK_PX, null];
+    let best = [hits, null];
     for (let k = 0; k < path.t.length; k++) {
       const p = this.project(path.xyz[3 * k], path.xyz[3 * k + 1], path.xyz[3 * k + 2]);
       const away = p ? Math.hypot(p[0] - x, p[1] - y) : Infinity;
