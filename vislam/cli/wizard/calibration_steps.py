@@ -96,13 +96,12 @@ class CalibrationSteps:
 
     def _begin(self, values: Mapping[str, str]) -> None:
         self.close()
-        kind = KINDS.get(values.get("kind", ""))
-        watch = None if kind is None else kind.watch
+        name = values.get("kind", "")
+        watch = KINDS[name].watch if name in STEPS else None
         if watch is None:
             raise UsageError(f"there are steps for {', '.join(STEPS)}")
-        board = board_of(values)
-        self._kind = values["kind"]
-        self._watch = watch(self._folder, board)
+        self._kind = name
+        self._watch = watch(self._folder, board_of(values))
         try:
             self._opened = opened(self._source, self._config, self._sensors, watch.has_images)
         except BaseException:
