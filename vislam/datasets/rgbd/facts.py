@@ -13,7 +13,7 @@ from vislam.core.camera import Rig
 from vislam.core.messages import Array, ImageF32
 from vislam.datasets.images import NO_DEPTH, UnreadableImageError, read_raw_depth
 from vislam.datasets.loaders import FrameTable
-from vislam.datasets.rgbd.views import PairTracks, Walk, walk
+from vislam.datasets.rgbd.pair_tracks import PairTracks, Walk, walk
 from vislam.datasets.stream import Survey, open_loader
 from vislam.vision.depth_edges import EdgeAlignment, align_edges
 from vislam.vision.depth_focal import FocalFit, SeenPoints, fit_focal
