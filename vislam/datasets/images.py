@@ -224,7 +224,7 @@ def read_raw_depth(path: Path, camera: Camera) -> NDArray[np.uint16]:
     raw = _decode(path, camera, _RAW_DEPTH)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise UnreadableImageError("depth image that is not 16-bit grey", path)
-    return raw
+    return np.asarray(raw, dtype=np.uint16)
 
 
 def decode_ahead(

@@ -144,8 +144,8 @@ def _lines(found: RgbdCalibration) -> list[str]:
         ms, sigma_ms = -1e3 * found.how.time_offset_s, 1e3 * facts.edges.lag_sigma_s
         out.append(f"depth is late by {ms:.1f} ± {sigma_ms:.1f} ms")
     if facts.focal is not None and found.sure.focal:
-        sigma_px = facts.focal.sigma * camera.fx
-        out.append(f"focal length {camera.fx:.2f}, {camera.fy:.2f} ± {sigma_px:.2f} px, from {facts.focal.pairs} pairs")
+        of_fx_px = facts.focal.sigma * camera.fx
+        out.append(f"focal length {camera.fx:.2f}, {camera.fy:.2f} ± {of_fx_px:.2f} px, from {facts.focal.pairs} pairs")
         ms, sigma_ms = 1e3 * facts.focal.readout_s, 1e3 * facts.focal.readout_sigma_s
         out.append(f"rolling shutter: {ms:.1f} ± {sigma_ms:.1f} ms from the first row to the last")
     return out

@@ -115,7 +115,7 @@ def unpacked_depth_m(message: Any, camera: Camera, path: Path) -> ImageF32:
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise UnreadableImageError("depth image that is not 16-bit grey", path)
     if not message.format.startswith("32FC1"):
-        return DepthFormat(_DEPTH_UNITS_PER_M).in_m(raw)
+        return DepthFormat(_DEPTH_UNITS_PER_M).in_m(np.asarray(raw, dtype=np.uint16))
     numbers = raw.astype(np.float32)
     with np.errstate(all="ignore"):
         depth = np.float32(a) / (numbers - np.float32(b))

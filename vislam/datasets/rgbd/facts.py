@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.camera import Rig
-from vislam.core.messages import Array, ImageF32
+from vislam.core.messages import Array, Bools, ImageF32
 from vislam.datasets.images import NO_DEPTH, UnreadableImageError, read_raw_depth
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.rgbd.pair_tracks import PairTracks, Walk, walk
@@ -100,7 +101,7 @@ def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, floa
     return odd, valid / total, median / found.depth_format.units_per_m
 
 
-def odd_values(counts: Array, often: Array, known: Sequence[int]) -> tuple[OddValue, ...]:
+def odd_values(counts: NDArray[np.int64], often: Bools, known: Sequence[int]) -> tuple[OddValue, ...]:
     """Return the numbers that cannot be depths: a lot of pixels, and nearly none at depths nearby.
 
     Args:
