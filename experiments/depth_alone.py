@@ -5,10 +5,10 @@
     .venv/bin/python experiments/depth_alone.py --imu
 
 The images of a recording are made black from `--begin` on, for so many seconds; depth stays as it is. `placed` is the
-share of the dark frames that have a pose relative to their keyframe, `drift` how far the keyframes just before and after
-the stretch are off relative to each other in the final graph, `ATE` that of all keyframes (SE(3)). `NEES` is the mean of
-e' P^-1 e over the frames that depth placed, six when the covariance is right; "frames by depth off by" says how far they
-are off from their keyframes (median).
+share of the dark frames that have a pose relative to their keyframe, `drift` how far the keyframes just before and
+after the stretch are off relative to each other in the final graph, `ATE` that of all keyframes (SE(3)). `NEES` is
+the mean of e' P^-1 e over the frames that depth placed, six when the covariance is right; "frames by depth off by"
+says how far they are off from their keyframes (median).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import FrontNews
 from vislam.core.messages import (
     Array,
-    Bools,
     Frame,
     ImuSpan,
     Keyframe,
@@ -23,20 +22,20 @@ from vislam.core.messages import (
     no_observations,
 )
 from vislam.frontend.agreement import confirmed, failure, weakness
+from vislam.frontend.attempt import Attempt
 from vislam.frontend.by_depth import ByDepth, Moved
 from vislam.frontend.depth import DepthReading
-from vislam.frontend.depth_lag import DepthLag
+from vislam.frontend.exposures import Exposures
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.result import TrackResult, metric_motion, too_few
 from vislam.frontend.tracker import Tracker, given_rows
-from vislam.frontend.view import View, sees
-from vislam.vision.landmarks import Landmarks, fuse, move
+from vislam.frontend.view import View, sees, spread
+from vislam.vision.landmarks import Landmarks, move
 from vislam.vision.locate import pnp_ransac, recognise
-from vislam.vision.refine import PoseEstimate, extra_parameter, pose_covariance, refine_pose
-from vislam.vision.shutter import Shutter
+from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose
 from vislam.vision.two_view import epipolar_distances
 
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
@@ -46,35 +45,8 @@ _ALIKE = 4.0
 _USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is told: what blurs or bends images spoils both
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
-_FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
 _DEEP = 0.02  # of a keyframe's tracks are given depth at least, or its sensor is covered: wrong matches alone are fewer
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Attempt:
-    """One try to place a frame relative to the keyframe."""
-
-    pixels: Array  # [N, 2] of all tracks, NaN where not found
-    seen: Array  # [N, 2] their directions on z = 1
-    xy: Array  # [N, 2] the same as of the middle row's time
-    depth_now: DepthReading | None  # what this frame measures, if that is used
-    expected_rho: Array  # [N] in this frame
-    twist_per_s: Array  # [6] velocity of the camera
-    estimate: PoseEstimate
-    failure: str  # empty when the pose can be trusted
-
-    @property
-    def followed(self) -> int:
-        return int(np.isfinite(self.xy[:, 0]).sum())
-
-    @property
-    def agreeing(self) -> Bools:
-        return self.estimate.inliers
-
-    @property
-    def inliers(self) -> int:
-        return int(self.estimate.inliers.sum())
 
 
 class MetricFrontEnd:
@@ -92,12 +64,11 @@ class MetricFrontEnd:
         self._tracker = Tracker(config)
         self._noise = PixelNoise(config.track_sigma_px)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
-        self._shutter = Shutter(self._camera, config.readout_s)
-        self._lag = DepthLag(self._camera, config.depth_delay_s)
+        self._exposures = Exposures(self._camera, config)
+        self._shutter, self._lag = self._exposures.shutter, self._exposures.lag
         self._sigma_xy = config.track_sigma_px / self._camera.fx
         self._landmarks = Landmarks()
         self._life = KeyframeLife(config, has_scale=True)
-        self._keyframe_twist: Array = np.zeros(6)
         self._T_key_cam: Array = np.eye(4)  # of the last frame, predicted while lost
         self._key_sees = True  # whether the usual camera sees anything in the keyframe
         self._now_sees = True  # and in this frame; only asked while another camera is looked through
@@ -142,15 +113,17 @@ class MetricFrontEnd:
             if T_found is not None:
                 attempt = self._attempt(frame, T_before, T_found, dt_s)
         if attempt.failure:
-            moved = Moved(T_before, T_guess, dt_s, self._keyframe_twist, None if imu is None else gyro_sigma_rad_s)
+            moved = Moved(
+                T_before, T_guess, dt_s, self._exposures.key_twist_per_s, None if imu is None else gyro_sigma_rad_s
+            )
             return self._place_by_depth(frame, keyframe, attempt, moved) or self._lose(frame, attempt, T_guess)
         self._T_key_cam = attempt.estimate.T_key_cam
         if not self._lost:
             self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
         self._lost = False
         self._life.placed(frame.t_ns)
-        self._learn_shutter(attempt)
-        self._learn_lag(frame, attempt, dt_s)
+        if not self._weakness(attempt):
+            self._exposures.learn(frame, attempt, self._landmarks, self._tracker.pixels, self._sigma_xy, dt_s)
         self._learn_noise(attempt, keyframe)
         return self._report(frame, keyframe, attempt)
 
@@ -158,10 +131,7 @@ class MetricFrontEnd:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
         self._tracker.next_id = news.next_track_id
-        if news.readout_s is not None:
-            self._shutter.start_at(news.readout_s)
-        if news.depth_delay_s is not None:
-            self._lag.start_at(news.depth_delay_s)
+        self._exposures.start_at(news)
 
     @property
     def news(self) -> FrontNews:
@@ -172,13 +142,13 @@ class MetricFrontEnd:
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
-    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float) -> _Attempt:
+    def _attempt(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float) -> Attempt:
         twist = se3_log(invert(T_before) @ T_guess) / dt_s
         predicted, _ = move(self._landmarks.mean, self._landmarks.covariance, T_guess)
         pixels = self._tracker.follow(frame, self._shutter.project(predicted, twist))
         return self._place(frame, T_before, T_guess, dt_s, pixels)
 
-    def _confirmed(self, attempt: _Attempt, frame: Frame, T_before: Array, T_expected: Array, dt_s: float) -> _Attempt:
+    def _confirmed(self, attempt: Attempt, frame: Frame, T_before: Array, T_expected: Array, dt_s: float) -> Attempt:
         """Return the attempt, or another without the tracks that are not where the filter's motion puts them."""
         expected, covariance = move(self._landmarks.mean, self._landmarks.covariance, T_expected)
         gate_xy = self._config.astray_px / self._camera.fx + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
@@ -187,7 +157,7 @@ class MetricFrontEnd:
             attempt, astray, lambda pixels: self._place(frame, T_before, T_expected, dt_s, pixels), self._config
         )
 
-    def _place(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float, pixels: Array) -> _Attempt:
+    def _place(self, frame: Frame, T_before: Array, T_guess: Array, dt_s: float, pixels: Array) -> Attempt:
         """Place the frame by tracks found at `pixels` [N, 2], from a guess."""
         twist = se3_log(invert(T_before) @ T_guess) / dt_s
         predicted, _ = move(self._landmarks.mean, self._landmarks.covariance, T_guess)
@@ -205,7 +175,7 @@ class MetricFrontEnd:
                 depth_now = self._measure(frame, pixels, seen, predicted[:, 2], twist, to_learn=True)
             estimate = self._polish(estimate, xy, depth_now)
         why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
-        return _Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, why_not)
+        return Attempt(pixels, seen, xy, depth_now, predicted[:, 2], twist, estimate, why_not)
 
     def _measure(
         self, frame: Frame, pixels: Array, seen: Array, rho: Array, twist: Array, to_learn: bool
@@ -252,42 +222,13 @@ class MetricFrontEnd:
             keyframe, frame.images[0], self._camera, self._T_body_cam, config.described_features, config.min_inliers
         )
 
-    def _learn_noise(self, attempt: _Attempt, keyframe: Keyframe) -> None:
+    def _learn_noise(self, attempt: Attempt, keyframe: Keyframe) -> None:
         """Take note of the distances from epipolar lines."""
         key_xy, ends = self._landmarks.mean[:, :2], 1.0
         if keyframe.frame.tracks is not None:  # as it was seen there, not as it was improved: its noise is then known
             given = keyframe.frame.tracks
             key_xy, ends = self._camera.normalise(given_rows(given, given.pixels_px, self._tracker.ids)), 2.0
         self._noise.learn(epipolar_distances(self._T_key_cam, key_xy, attempt.xy), self._camera, attempt.xy, ends)
-
-    def _learn_shutter(self, attempt: _Attempt) -> None:
-        """Let the shear that is left in this frame correct the readout time."""
-        if not self._shutter.learns or self._weakness(attempt) or not self._keyframe_twist.any():
-            return
-        mean, covariance = self._landmarks.mean, self._landmarks.covariance
-        xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
-        change = extra_parameter(
-            self._T_key_cam, mean, covariance, xy, self._sigma_xy, self._config.cauchy, self._shear(attempt, xy)
-        )
-        self._shutter.learn(*change)
-
-    def _learn_lag(self, frame: Frame, attempt: _Attempt, dt_s: float) -> None:
-        """Let the misfit of this frame's depth correct how much later it was taken."""
-        if attempt.depth_now is None or frame.depth_m is None or self._weakness(attempt):
-            return
-        rho = move(self._landmarks.mean, self._landmarks.covariance, self._T_key_cam)[0][:, 2]
-        good = attempt.estimate.inliers & self._landmarks.known
-        misfit = attempt.depth_now.rho - rho
-        slope = attempt.depth_now.slope - self._landmarks.by_delay
-        self._lag.learn(misfit, slope, attempt.depth_now.sigma_rho, good, dt_s)
-
-    def _shear(self, attempt: _Attempt, xy: Array) -> Array:
-        """Return the derivative [N, 2] of predicted minus measured directions `xy` [N, 2] by the readout time."""
-        mean = self._landmarks.mean
-        of_key = self._shutter.slope(self._tracker.pixels, mean[:, :2], mean[:, 2], self._keyframe_twist)
-        of_now = self._shutter.slope(attempt.pixels, xy, attempt.expected_rho, attempt.twist_per_s)
-        # a landmark's own shear is carried by the rotation between the two, nearly one over such short times
-        return of_key - of_now
 
     # -- looking through another camera ------------------------------------------------------------------------------
 
@@ -298,7 +239,7 @@ class MetricFrontEnd:
         T_cam_other = invert(self._T_body_cam) @ view.T_body_cam
         back = se3_adjoint(np.asarray(invert(T_cam_other)))
         self._T_key_cam = invert(T_cam_other) @ self._T_key_cam @ T_cam_other
-        self._keyframe_twist = back @ self._keyframe_twist
+        self._exposures.key_twist_per_s = back @ self._exposures.key_twist_per_s
         self._predictor.look_through(view.T_body_cam, np.asarray(T_cam_other))
         self._shutter.look_through(view.camera)
         self._sigma_xy = self._config.track_sigma_px / view.camera.fx
@@ -310,20 +251,17 @@ class MetricFrontEnd:
         landmarks = Landmarks()
         landmarks.mean, landmarks.covariance = self._view.carry(self._landmarks.mean, self._landmarks.covariance, view)
         self._look_through(view)
-        vague = view.camera.fx * _spread(landmarks.covariance) > self._config.epipolar_gate_px
+        vague = view.camera.fx * spread(landmarks.covariance) > self._config.epipolar_gate_px
         landmarks.mean[vague] = np.nan
         # from here on the landmark is the patch at this place, and no longer the one that the other camera saw
-        rho_variance = landmarks.covariance[:, 2, 2].copy()
-        landmarks.covariance = np.zeros_like(landmarks.covariance)
-        landmarks.covariance[:, 0, 0] = landmarks.covariance[:, 1, 1] = (_CORNER_SIGMA * self._sigma_xy) ** 2
-        landmarks.covariance[:, 2, 2] = rho_variance
+        landmarks.pin(_CORNER_SIGMA * self._sigma_xy)
         landmarks.by_delay = self._landmarks.by_delay
         self._landmarks = landmarks
-        pixels = self._shutter.project(landmarks.mean, self._keyframe_twist)
+        pixels = self._shutter.project(landmarks.mean, self._exposures.key_twist_per_s)
         pixels[~view.camera.contains(pixels)] = np.nan
         self._tracker.look_through(view.of(keyframe.frame).images[0], pixels)
 
-    def _by_other_camera(self, whole: Frame, keyframe: Keyframe, T_guess: Array, dt_s: float) -> _Attempt | None:
+    def _by_other_camera(self, whole: Frame, keyframe: Keyframe, T_guess: Array, dt_s: float) -> Attempt | None:
         """Place the frame by the other camera and go on looking through it; None, and nothing changed, if that fails.
 
         Which camera is covered is not asked of its image: what counts is which one can be followed.
@@ -362,26 +300,17 @@ class MetricFrontEnd:
         return "cam1 sees again" if lost_depth and sees(frame.images[1], self._config) else ""
 
     def _as_cam0_would(self, ids: NDArray[np.int64], xy: Array, means: Array, covariances: Array) -> Observations:
-        """Return what cam0 would see of tracks [N] that cam1 sees at `xy` [N, 2], where their depth tells it.
-
-        The depth is that of landmarks `means` [N, 3] of the same instant, with covariances [N, 3, 3].
-        """
-        covariance = np.zeros_like(covariances)
-        covariance[:, 2, 2] = covariances[:, 2, 2]
-        points, covariance = self._view.carry(np.column_stack([xy, means[:, 2]]), covariance, self._views[0])
-        usual = self._views[0].camera
-        pixels = usual.project(np.column_stack([points[:, :2], np.ones(len(points))]))
-        told = usual.contains(pixels) & (usual.fx * _spread(covariance) < self._config.epipolar_gate_px)
-        return Observations(ids[told], pixels[told])
+        gate_px = self._config.epipolar_gate_px
+        return self._view.as_other_would(self._views[0], ids, xy, means, covariances, gate_px)
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 
-    def _report(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt) -> TrackResult:
+    def _report(self, frame: Frame, keyframe: Keyframe, attempt: Attempt) -> TrackResult:
         vo = self._measurement(frame, keyframe.id, attempt)
         departure = self._life.departure(
             frame.t_ns,
             self._T_key_cam[:3, :3],
-            self._parallax_px(attempt),
+            self._camera.fx * attempt.parallax(self._landmarks.mean[:, :2]),
             attempt.followed,
             attempt.inliers,
             self._depth.available(frame),
@@ -396,12 +325,12 @@ class MetricFrontEnd:
             self._tracker.ids[good].copy(), attempt.pixels[good], instant_px=self._instant_px(attempt.xy[good])
         )
         if self._view.is_swapped:
-            seen = move(self._landmarks.mean[good], self._landmarks.covariance[good], self._T_key_cam)
-            observations = self._as_cam0_would(observations.track_ids, attempt.xy[good], *seen)
+            means, covariances = move(self._landmarks.mean[good], self._landmarks.covariance[good], self._T_key_cam)
+            observations = self._as_cam0_would(observations.track_ids, attempt.xy[good], means, covariances)
         self._landmarks.keep(self._tracker.judge(good))
         return TrackResult(vo, observations, None, departure.parallax_px, self._weakness(attempt))
 
-    def _weakness(self, attempt: _Attempt) -> str:
+    def _weakness(self, attempt: Attempt) -> str:
         """Return why the tracking is degraded, or an empty string."""
         if self._view.is_swapped:
             return "cam0 sees nothing; cam1 is followed"
@@ -409,14 +338,14 @@ class MetricFrontEnd:
             return "the keyframe has no depth of its own"
         return weakness(attempt.followed, attempt.inliers, self._config.degraded_inliers, self._config)
 
-    def _measurement(self, frame: Frame, keyframe_id: int, attempt: _Attempt) -> VoMeasurement:
+    def _measurement(self, frame: Frame, keyframe_id: int, attempt: Attempt) -> VoMeasurement:
         covariance = self._covariance(attempt, frame.tracks is not None)
         return metric_motion(
             frame.t_ns, keyframe_id, attempt.estimate.T_key_cam, covariance, self._T_body_cam, attempt.inliers,
             is_weak=bool(self._weakness(attempt)),
         )  # fmt: skip
 
-    def _covariance(self, attempt: _Attempt, given: bool) -> Array:
+    def _covariance(self, attempt: Attempt, given: bool) -> Array:
         """Return the covariance [6, 6] of the camera's motion, by the noise that was measured instead of told."""
         measured_px = self._noise.frame_px
         # tracks that were followed elsewhere are independent, and the noise of their depth is told
@@ -425,27 +354,21 @@ class MetricFrontEnd:
         by_pixel = np.array([ratio, ratio, 1.0])
         mean, covariance = self._landmarks.mean, self._landmarks.covariance * by_pixel[:, None] * by_pixel
         xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
+        shear = self._exposures.shear(attempt, self._landmarks, self._tracker.pixels, xy)
         found = pose_covariance(
             attempt.estimate.T_key_cam, mean, covariance, xy, ratio * self._sigma_xy, self._config.cauchy,
-            *self._weighed(attempt.depth_now), scale, self._shear(attempt, xy), self._shutter.sigma_s,
+            *self._weighed(attempt.depth_now), scale, shear, self._shutter.sigma_s,
         )  # fmt: skip
         return attempt.estimate.covariance if found is None else found
 
-    def _parallax_px(self, attempt: _Attempt) -> float:
-        good = attempt.estimate.inliers
-        rays = np.column_stack([attempt.xy, np.ones(len(attempt.xy))])[good]
-        turned = rays @ self._T_key_cam[:3, :3].T
-        moved = turned[:, :2] / turned[:, 2:] - self._landmarks.mean[good, :2]
-        return float(np.median(np.linalg.norm(moved, axis=1)) * self._camera.fx)
-
-    def _lose(self, frame: Frame, attempt: _Attempt, T_guess: Array) -> TrackResult:
+    def _lose(self, frame: Frame, attempt: Attempt, T_guess: Array) -> TrackResult:
         self._T_key_cam = T_guess
         self._lost = True
         if self._life.is_given_up(frame.t_ns) and self._depth.available(frame):
             return self._start(frame, attempt.failure)
         return self._life.lost(frame.t_ns, attempt.failure, attempt.inliers)
 
-    def _place_by_depth(self, frame: Frame, keyframe: Keyframe, attempt: _Attempt, moved: Moved) -> TrackResult | None:
+    def _place_by_depth(self, frame: Frame, keyframe: Keyframe, attempt: Attempt, moved: Moved) -> TrackResult | None:
         """Return the result of a frame that only its depth image places; None where that does not either."""
         placed = None if self._by_depth is None else self._by_depth.place(frame, keyframe, moved, len(self._tracker))
         if placed is None:
@@ -491,11 +414,11 @@ class MetricFrontEnd:
         why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         if why_not:
             return self._start(frame, why_not)
-        attempt = _Attempt(pixels, xy, xy, None, reading.rho, np.zeros(6), estimate, "")
+        attempt = Attempt(pixels, xy, xy, None, reading.rho, np.zeros(6), estimate, "")
         self._T_key_cam = estimate.T_key_cam
         # followed for long, through a rolling shutter of which nothing was known: true, but not to the millimetre
         vo = replace(self._measurement(frame, keyframe.id, attempt), tracking=Tracking.DEGRADED)
-        parallax_px = self._parallax_px(attempt)
+        parallax_px = self._camera.fx * attempt.parallax(self._landmarks.mean[:, :2])
         new, observations = self._continue_from(frame, attempt)
         self._blind = False
         return TrackResult(vo, observations, new, parallax_px, "the first depth")
@@ -532,22 +455,16 @@ class MetricFrontEnd:
             return f"only {deep} of {corners} corners have depth"
         return ""
 
-    def _continue_from(self, frame: Frame, attempt: _Attempt) -> tuple[Keyframe, Observations]:
+    def _continue_from(self, frame: Frame, attempt: Attempt) -> tuple[Keyframe, Observations]:
         """Carry the agreeing landmarks into this frame, improve them by what it measures, fill the gaps."""
         kept = attempt.estimate.inliers
         reading = self._lag.measure(
             self._depth, frame, attempt.pixels[kept], attempt.seen[kept], attempt.expected_rho[kept],
             attempt.twist_per_s, self._tracker.ids[kept],
         )  # fmt: skip
-        landmarks = Landmarks()
-        moved = move(self._landmarks.mean[kept], self._landmarks.covariance[kept], self._T_key_cam)
-        landmarks.mean, landmarks.covariance = fuse(
-            *moved, attempt.xy[kept], reading.rho, self._sigma_xy, reading.sigma_rho, _FUSE_GATE
+        landmarks = self._landmarks.carried(
+            kept, self._T_key_cam, attempt.xy[kept], self._sigma_xy, reading.rho, reading.sigma_rho, reading.slope
         )
-        # depth that is measured again counts by what was not known before
-        weight = moved[1][:, 2, 2] / (moved[1][:, 2, 2] + reading.sigma_rho**2)
-        before = self._landmarks.by_delay[kept]
-        landmarks.by_delay = np.where(np.isfinite(reading.rho), before + weight * (reading.slope - before), before)
         self._landmarks = landmarks
         # the patch that is followed from now on is the one where the landmark is believed to be
         pixels = attempt.pixels.copy()
@@ -597,15 +514,10 @@ class MetricFrontEnd:
             return usual.depth.measure(whole, pixels, xy, expected_rho, ids).depth_m
 
         keyframe = self._life.install(whole, usual.camera, usual.T_body_cam, len(self._tracker), measure_depth)
-        self._keyframe_twist = twist_per_s
+        self._exposures.key_twist_per_s = twist_per_s
         self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)
         return keyframe
-
-
-def _spread(covariances: Array) -> Array:
-    """Return how far directions [N] scatter, of landmarks with covariances [N, 3, 3]."""
-    return np.asarray(np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))
 
 
 def _points(inverse_depth: Array) -> Array:

@@ -450,14 +450,9 @@ class Front:
         is_blind = self.config.ekf.vision == "none"  # nothing corrects it, and the graph's bias is not to turn it
         if is_blind or state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
-        # a correction may enter with a later sample only, so what the filter was told is no measure of it
         walk = 0.0 if self.noise is None else self.noise.gyro_bias_walk
         gyro_bias, sigma_rad_s = surer_gyro_bias(last, self._graph_state, walk)
-        turning = replace(last, gyro_bias_rad_s=gyro_bias)
-        before = pose_after(turning, span, self.config.imu.gravity_m_s2)
-        way_m = float(np.linalg.norm(before[:3, 3] - last.T_world_body[:3, 3]))
-        if at_rest and way_m < _SWAY_M_S * (int(span.t_ns[-1]) - int(span.t_ns[0])) * 1e-9:
-            before = last.T_world_body
+        before = _uncorrected(replace(last, gyro_bias_rad_s=gyro_bias), span, self.config.imu.gravity_m_s2, at_rest)
         return Estimate(before, after, sigma_rad_s), state
 
     def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:
@@ -540,3 +535,14 @@ class Front:
 def _variance_m2(state: NavState | None) -> float:
     """Return how unsure a filter is of where the body is; infinite before it has a state."""
     return np.inf if state is None else float(np.trace(state.covariance[3:6, 3:6]))
+
+
+def _uncorrected(last: NavState, span: ImuSpan, gravity_m_s2: float, at_rest: bool) -> Array:
+    """Return the pose [4, 4] after a span by inertial data alone.
+
+    A correction may enter with a later sample only, so what the filter was told is no measure of it.
+    """
+    after = pose_after(last, span, gravity_m_s2)
+    way_m = float(np.linalg.norm(after[:3, 3] - last.T_world_body[:3, 3]))
+    sways = way_m < _SWAY_M_S * (int(span.t_ns[-1]) - int(span.t_ns[0])) * 1e-9
+    return last.T_world_body if at_rest and sways else after

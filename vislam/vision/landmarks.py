@@ -18,6 +18,7 @@ UNKNOWN_RHO_SIGMA = 0.75  # 1/m: ... or anywhere between a metre and infinity
 _KNOWN_FRACTION = 0.25  # sigma of rho relative to rho
 _KNOWN_FAR = 0.02  # 1/m: sigma below which a point is known to be far, whatever its rho
 _MIN_Z = 0.05  # of a landmark moved into another camera, relative to its old z-depth: nearer is behind or beside
+_FUSE_GATE = 3.0  # standard deviations; depth at an edge is off by more
 
 
 @njit(cache=True, nogil=True)
@@ -167,6 +168,37 @@ class Landmarks:
         self.mean = np.vstack([self.mean, np.column_stack([xy, np.where(known, rho, UNKNOWN_RHO)])])
         self.covariance = np.concatenate([self.covariance, covariance])
         self.by_delay = np.concatenate([self.by_delay, np.zeros(len(xy)) if by_delay is None else by_delay])
+
+    def pin(self, sigma_xy: float) -> None:
+        """Let each landmark be the patch where it is believed to be: its direction is known to `sigma_xy`."""
+        rho_variance = self.covariance[:, 2, 2].copy()
+        self.covariance = np.zeros_like(self.covariance)
+        self.covariance[:, 0, 0] = self.covariance[:, 1, 1] = sigma_xy**2
+        self.covariance[:, 2, 2] = rho_variance
+
+    def carried(
+        self, kept: NDArray[np.bool_], T_key_cam: Array, xy: Array, sigma_xy: float, rho: Array, sigma_rho: Array,
+        by_delay: Array,
+    ) -> Landmarks:  # fmt: skip
+        """Return the landmarks of `kept` [N] as a camera at `T_key_cam` [4, 4] sees them, improved by what it measures.
+
+        Args:
+            kept: M of them.
+            T_key_cam: pose in the keyframe.
+            xy: their directions [M, 2] on z = 1, with standard deviation `sigma_xy`.
+            sigma_xy: see `xy`.
+            rho: inverse depths [M] in 1/m, NaN where not measured, with standard deviations `sigma_rho` [M].
+            sigma_rho: see `rho`.
+            by_delay: derivative [M] of `rho` by the delay of depth.
+        """
+        out = Landmarks()
+        mean, covariance = move(self.mean[kept], self.covariance[kept], T_key_cam)
+        # depth that is measured again counts by what was not known before
+        weight = covariance[:, 2, 2] / (covariance[:, 2, 2] + sigma_rho**2)
+        before = self.by_delay[kept]
+        out.by_delay = np.where(np.isfinite(rho), before + weight * (by_delay - before), before)
+        out.mean, out.covariance = fuse(mean, covariance, xy, rho, sigma_xy, sigma_rho, _FUSE_GATE)
+        return out
 
     def expected_rho(self, xy: Array) -> Array:
         """Return the inverse depth [M] of the nearest known landmark to each direction [M, 2]; NaN without any."""

@@ -1,0 +1,72 @@
+"""When the rows and the depth of a frame were taken: the shutter's readout and the lag of depth, both learnt."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.config import FrontEndConfig
+from vislam.core.camera import Camera
+from vislam.core.memory import FrontNews
+from vislam.core.messages import Array, Frame
+from vislam.frontend.attempt import Attempt
+from vislam.frontend.depth_lag import DepthLag
+from vislam.vision.landmarks import Landmarks, move
+from vislam.vision.refine import extra_parameter
+from vislam.vision.shutter import Shutter
+
+
+class Exposures:
+    """Readout and lag of one camera, and how fast it moved at the keyframe, whose landmarks they shaped.
+
+    Attributes:
+        shutter: how the rows are spread in time.
+        lag: how much later depth is taken.
+        key_twist_per_s: velocity [6] of the camera at the keyframe, in its own frame, rotation first.
+    """
+
+    def __init__(self, camera: Camera, config: FrontEndConfig) -> None:
+        """Begin with what the configuration tells, or with nothing."""
+        self.shutter = Shutter(camera, config.readout_s)
+        self.lag = DepthLag(camera, config.depth_delay_s)
+        self.key_twist_per_s: Array = np.zeros(6)
+        self._cauchy = config.cauchy
+
+    def start_at(self, news: FrontNews) -> None:
+        """Take what an earlier run had learned, to be learned further."""
+        if news.readout_s is not None:
+            self.shutter.start_at(news.readout_s)
+        if news.depth_delay_s is not None:
+            self.lag.start_at(news.depth_delay_s)
+
+    def learn(
+        self, frame: Frame, attempt: Attempt, landmarks: Landmarks, key_pixels: Array, sigma_xy: float, dt_s: float
+    ) -> None:
+        """Let what a placed frame leaves over correct readout and lag.
+
+        Args:
+            frame: that was placed.
+            attempt: that placed the frame.
+            landmarks: of the keyframe, [N].
+            key_pixels: [N, 2] where the keyframe sees them.
+            sigma_xy: standard deviation of a direction on z = 1.
+            dt_s: over which its velocity was measured.
+        """
+        if self.shutter.learns and self.key_twist_per_s.any():
+            xy = np.where(attempt.agreeing[:, None], attempt.xy, np.nan)
+            shear = self.shear(attempt, landmarks, key_pixels, xy)
+            T = attempt.estimate.T_key_cam
+            change = extra_parameter(T, landmarks.mean, landmarks.covariance, xy, sigma_xy, self._cauchy, shear)
+            self.shutter.learn(*change)
+        if attempt.depth_now is not None and frame.depth_m is not None:
+            rho = move(landmarks.mean, landmarks.covariance, attempt.estimate.T_key_cam)[0][:, 2]
+            slope = attempt.depth_now.slope - landmarks.by_delay
+            good = attempt.agreeing & landmarks.known
+            self.lag.learn(attempt.depth_now.rho - rho, slope, attempt.depth_now.sigma_rho, good, dt_s)
+
+    def shear(self, attempt: Attempt, landmarks: Landmarks, key_pixels: Array, xy: Array) -> Array:
+        """Return the derivative [N, 2] of predicted minus measured directions `xy` [N, 2] by the readout time."""
+        mean = landmarks.mean
+        of_key = self.shutter.slope(key_pixels, mean[:, :2], mean[:, 2], self.key_twist_per_s)
+        of_now = self.shutter.slope(attempt.pixels, xy, attempt.expected_rho, attempt.twist_per_s)
+        # a landmark's own shear is carried by the rotation between the two, nearly one over such short times
+        return of_key - of_now
