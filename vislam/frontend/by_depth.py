@@ -13,7 +13,7 @@ import numpy as np
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera
-from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, Frame, ImageF32, Keyframe, Tracking, VoMeasurement
 from vislam.frontend.view import sees
 from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
@@ -45,6 +45,7 @@ class Moved:
     T_guess: Array  # [4, 4] now
     dt_s: float
     key_twist_per_s: Array  # [6] velocity of the camera at the keyframe
+    depth_delay_s: float  # by which depth is taken later than its stamps say
     gyro_sigma_rad_s: float | None  # of its bias, where a gyroscope told the turn; infinite: not known
 
 
@@ -85,24 +86,24 @@ class ByDepth:
         of_key, of_frame = self._surface(keyframe), self._made(frame.depth_m)
         if of_key is None or of_frame is None:
             return None
-        off = self._exposed_apart(moved)
-        prior = Prior(moved.T_guess, covariance[:6, :6] + off + 1e-10 * np.eye(6))
+        at_key, now = _velocities(moved)
+        key_lag_s, lag_s = (f.depth_lag_s + moved.depth_delay_s for f in (keyframe.frame, frame))
+        T_key_depth, T_cam_depth = se3_exp(key_lag_s * moved.key_twist_per_s), se3_exp(lag_s * now)
+        to_cam = se3_adjoint(T_cam_depth)
+        to_depth = np.linalg.inv(to_cam)
+        off = self._config.depth_apart_s**2 * (np.outer(now, now) + np.outer(at_key, at_key))
+        known = to_depth @ (covariance[:6, :6] + off) @ to_depth.T + 1e-10 * np.eye(6)
+        prior = Prior(np.asarray(invert(T_key_depth) @ moved.T_guess @ T_cam_depth), known)
         sigma_rho = _WIDER * self._config.depth_sigma_rho
         found = align_depth(of_frame, (SeenFrom(of_key, np.eye(4)),), prior, sigma_rho)
         if not self._is_trusted(found, prior):
             return None
-        of_pose = found.covariance + off
+        of_pose = to_cam @ found.covariance @ to_cam.T + off
         self._covariance = _updated(covariance, of_pose)
         if not self._is_known(of_pose):
             return None
-        return Placed(found.T_model_cam, of_pose, self._keyframe_reason(frame, keyframe, found, tracks))
-
-    def _exposed_apart(self, moved: Moved) -> Array:
-        """Return the covariance [6, 6] of what the camera moves between the exposures of colour and depth."""
-        now = se3_log(invert(moved.T_before) @ moved.T_guess) / moved.dt_s
-        at_key = se3_adjoint(np.asarray(invert(moved.T_guess))) @ moved.key_twist_per_s
-        apart_s = self._config.depth_apart_s
-        return apart_s**2 * (np.outer(now, now) + np.outer(at_key, at_key))
+        T_key_cam = np.asarray(T_key_depth @ found.T_model_cam @ invert(T_cam_depth))
+        return Placed(T_key_cam, of_pose, self._keyframe_reason(frame, keyframe, found, tracks))
 
     def _predicted(self, moved: Moved) -> Array:
         """Return the covariance [12, 12] after the motion, and keep it."""
@@ -161,6 +162,12 @@ class ByDepth:
         if found.overlap < config.depth_alone_renew:
             return f"only {found.overlap:.0%} of the depth overlaps"
         return f"{dt_s:.1f} s since the last keyframe" if dt_s >= config.keyframe_max_interval_s else ""
+
+
+def _velocities(moved: Moved) -> tuple[Array, Array]:
+    """Return the camera's velocities [6] at the keyframe and now, in its own frame now, rotation first."""
+    now = se3_log(invert(moved.T_before) @ moved.T_guess) / moved.dt_s
+    return se3_adjoint(np.asarray(invert(moved.T_guess))) @ moved.key_twist_per_s, now
 
 
 def _updated(covariance: Array, of_pose: Array) -> Array:

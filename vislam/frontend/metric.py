@@ -113,9 +113,8 @@ class MetricFrontEnd:
             if T_found is not None:
                 attempt = self._attempt(frame, T_before, T_found, dt_s)
         if attempt.failure:
-            moved = Moved(
-                T_before, T_guess, dt_s, self._exposures.key_twist_per_s, None if imu is None else gyro_sigma_rad_s
-            )
+            twist, bias = self._exposures.key_twist_per_s, None if imu is None else gyro_sigma_rad_s
+            moved = Moved(T_before, T_guess, dt_s, twist, self._lag.delay_s, bias)
             return self._place_by_depth(frame, keyframe, attempt, moved) or self._lose(frame, attempt, T_guess)
         self._T_key_cam = attempt.estimate.T_key_cam
         if not self._lost:
