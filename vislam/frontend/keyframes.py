@@ -106,6 +106,10 @@ class KeyframeLife:
         """Take note that a frame was placed."""
         self._t_placed_ns = t_ns
 
+    def placed_without_vision(self, t_ns: int) -> None:
+        """Take note that a frame was placed, not by vision: what follows should be recognised soon, as after a loss."""
+        self._t_placed_ns, self._since_restart = t_ns, 0
+
     def is_given_up(self, t_ns: int) -> bool:
         """Return whether no frame was placed for so long that another keyframe has to begin."""
         return (t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s

@@ -377,7 +377,7 @@ class MetricFrontEnd:
         if not self._lost:
             self._predictor.observe(T_before_now, moved.dt_s)
         self._lost = False
-        self._life.placed(frame.t_ns)
+        self._life.placed_without_vision(frame.t_ns)
         vo = metric_motion(
             frame.t_ns, keyframe.id, placed.T_key_cam, placed.covariance, self._T_body_cam, 0, is_weak=True
         )
