@@ -448,6 +448,32 @@ def test_mesh_of_the_room(tmp_path):
     assert np.abs(np.median(colors, axis=0) - [200, 0, 0]).max() <= 4
 
 
+def test_what_one_keyframe_saw_is_in_the_mesh_unless_later_rays_passed_through_it():
+    if _open3d.load_open3d()[0] is None:
+        missing("no open3d; pip install 'vislam[map]'")
+    depth_m = depth_image(TRUE[0])
+    depth_m[40:80, 60:100] = 1.0  # a board that is gone in later keyframes
+    config = replace(CONFIG, products=("mesh",), mesh_voxel_m=0.04, pixel_step=1)
+
+    def near_the_board(later):
+        mapper = Mapper(config, RIG)
+        mapper.add(keyframe(0, TRUE[0], depth_m), TRUE[0])
+        for k in range(1, 1 + later):
+            mapper.add(keyframe(k, TRUE[0]), TRUE[0])
+        mesh, reason = mapper.mesh()
+        assert mesh is not None, reason
+        assert mesh.triangles.max() == len(mesh.points_m) - 1
+        at_m = ((mesh.points_m - TRUE[0][:3, 3]) @ TRUE[0][:3, :3] - T_BODY_CAM0[:3, 3]) @ T_BODY_CAM0[:3, :3]
+        return np.count_nonzero(np.abs(at_m[:, 2] - 1.0) < 0.1), np.count_nonzero(at_m[:, 2] > 1.5)
+
+    board, walls = near_the_board(0)
+    assert board > 30
+    assert walls > 500
+    board, walls = near_the_board(4)
+    assert board == 0
+    assert walls > 500
+
+
 def test_without_open3d_the_mesh_is_left_out_with_a_reason(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     mapper = mapper_at(TRUE[:2], replace(CONFIG, products=(*CONFIG.products, "mesh")))

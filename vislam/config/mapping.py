@@ -110,7 +110,7 @@ class MapConfig:
     drive: DriveConfig = field(default_factory=DriveConfig)
     mesh_voxel_m: Positive = 0.01  # about the noise of depth at 2 m; farther views count less, by that noise
     mesh_max_blocks: Count = 40_000  # of 8 x 8 x 8 voxels, 12 kB each; a mesh that takes more gets larger voxels
-    mesh_min_views: Count = 2  # keyframes that must have seen a surface; with depth from one camera one is enough
+    mesh_min_views: Count = 2  # a surface that fewer keyframes saw is left out where other rays passed through it
     mesh_atlas_px: Annotated[int, Range(0, 16384)] = 4096  # edge of the picture on mesh.glb; 0: colours of vertices
     surfel_m: Positive = 0.02  # between surfels
     surfel_min_views: Count = 2  # keyframes that must have seen a surfel; what one alone saw may be noise

@@ -24,6 +24,7 @@ from vislam.mapping.depth.mono import LateDepth
 from vislam.mapping.drive.drive import DriveGrid, DriveMap
 from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh.posed import PosedView, posed_views
+from vislam.mapping.mesh.volume import Volume
 from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
 from vislam.mapping.products import LEVEL, NotLevel, remove_products, write_products
 from vislam.mapping.semantic.classes import LabelClasses
@@ -188,9 +189,10 @@ class Mapper:
 
     def mesh(self) -> tuple[Mesh | None, str]:
         """Return the mesh of all keyframes with dense depth, or None and the reason there is none."""
+        config = self._config
         # depth from one camera is what several frames agree on: one keyframe is enough
-        min_views = 1 if self._one_camera else self._config.mesh_min_views
-        return fuse_mesh(self.posed_views, self._config.mesh_voxel_m, min_views, self._config.mesh_max_blocks)
+        is_false = None if self._one_camera else self._is_seen_through
+        return fuse_mesh(self.posed_views, config.mesh_voxel_m, config.mesh_max_blocks, is_false)
 
     def posed_views(self) -> Iterator[PosedView]:
         """Return what keyframes with dense depth saw, at their poses."""
@@ -282,6 +284,12 @@ class Mapper:
         other.restore({i: scan for i in poses if (scan := self._store.packed(i)) is not None}, poses)
         other.finish()
         return other
+
+    def _is_seen_through(self, volume: Volume, points_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return which vertices of a mesh [N, 3] few keyframes saw and rays passed through: moving, or noise."""
+        few = volume.views_of(points_m) < self._config.mesh_min_views
+        few[few] = self.occupancy.state_at(points_m[few]) == Occupancy.FREE
+        return few
 
     def _scans(self) -> Iterator[tuple[Scan, Array]]:
         for keyframe_id, T_map_body in self._occupancy.poses.items():

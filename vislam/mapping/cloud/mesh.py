@@ -32,14 +32,21 @@ class Mesh:
     colors: NDArray[np.uint8]  # [N, 3] RGB
     triangles: NDArray[np.int32]  # [M, 3] counter-clockwise from outside
 
+    def select(self, chosen: NDArray[np.bool_]) -> Mesh:
+        """Return the chosen triangles [M] with the points that they have, in the same order."""
+        used, triangles = np.unique(self.triangles[chosen], return_inverse=True)
+        return Mesh(self.points_m[used], self.colors[used], triangles.reshape(-1, 3).astype(np.int32))
+
 
 def fuse_mesh(
-    views: Callable[[], Iterable[PosedView]], voxel_m: float, min_views: int, max_blocks: int
-) -> tuple[Mesh | None, str]:
+    views: Callable[[], Iterable[PosedView]], voxel_m: float, max_blocks: int,
+    is_false: Callable[[Volume, NDArray[np.float32]], NDArray[np.bool_]] | None = None,
+) -> tuple[Mesh | None, str]:  # fmt: skip
     """Return the mesh of views, and an empty string; or None and the reason there is none.
 
-    A surface has to be seen by `min_views`. When it takes more than `max_blocks` of voxels, the views are asked for
-    again, and voxels are larger.
+    Triangles with a vertex of which `is_false` says, given the volume and vertices [N, 3], that no surface is there,
+    are left out. When the mesh takes more than `max_blocks` of voxels, the views are asked for again, and voxels are
+    larger.
     """
     open3d, reason = load_open3d()
     if open3d is None:
@@ -48,11 +55,14 @@ def fuse_mesh(
         voxel_m *= _COARSER
     if volume.blocks == 0:
         return None, "no keyframe has dense depth"
-    surface = volume.triangles(min_views)
+    surface = volume.triangles()
     if surface is None:
-        return None, f"no surface was seen by enough keyframes ({min_views})"
+        return None, "the depth of keyframes makes no surface"
     points, colors, triangles = surface
-    return _sorted(points, np.clip(np.round(colors * 255.0), 0, 255).astype(np.uint8), triangles), ""
+    mesh = _sorted(points, np.clip(np.round(colors * 255.0), 0, 255).astype(np.uint8), triangles)
+    if is_false is not None:
+        mesh = mesh.select(~is_false(volume, mesh.points_m)[mesh.triangles].any(axis=1))
+    return (mesh, "") if len(mesh.triangles) else (None, "later rays passed through every surface that was seen")
 
 
 def _fused(open3d: Any, views: Iterable[PosedView], voxel_m: float, max_blocks: int) -> Volume | None:

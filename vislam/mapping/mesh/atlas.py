@@ -147,7 +147,7 @@ def textured(mesh: Mesh, views: Callable[[], Iterable[PosedView]], size_px: int)
             (x, y), (w, h) = places[c], sizes[c]
             atlas[y : y + h, x : x + w] = cv2.resize(part, (int(w), int(h)), interpolation=cv2.INTER_AREA)
     uv = (pixels + 0.5 - low[chart_of]) * (sizes / (high - low))[chart_of] + places[chart_of]
-    rest = _compact(mesh, ~seen)
+    rest = mesh.select(~seen)
     uv = (uv / [size_px, height]).astype(np.float32)
     return TexturedMesh(points, uv, corner_at.reshape(-1, 3).astype(np.int32), atlas, rest)
 
@@ -214,9 +214,3 @@ def _packed(extent: I64, size_px: int) -> tuple[I64, I64, int] | None:
             return sizes, places, int(y + shelf)
         scale *= _SMALLER
     return None
-
-
-def _compact(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
-    """Return the chosen triangles with the points that they have."""
-    used, triangles = np.unique(mesh.triangles[chosen], return_inverse=True)
-    return Mesh(mesh.points_m[used], mesh.colors[used], triangles.reshape(-1, 3).astype(np.int32))

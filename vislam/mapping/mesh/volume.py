@@ -99,17 +99,26 @@ class Volume:
         ).numpy()
         return np.ascontiguousarray(keys[np.lexsort(keys.T[::-1])])
 
-    def triangles(self, min_views: int) -> tuple[F32, F32, NDArray[np.int64]] | None:
-        """Return vertices [N, 3], colours [N, 3] from 0 to 1 and triangles [M, 3] of what enough views saw, or None.
+    def triangles(self) -> tuple[F32, F32, NDArray[np.int64]] | None:
+        """Return vertices [N, 3], colours [N, 3] from 0 to 1 and triangles [M, 3], None where there are none.
 
-        Their order is left to chance. Nothing can be added afterwards.
+        Their order is left to chance.
         """
-        _, weight, _, views = self._arrays()
-        weight[views < min_views] = 0.0
         mesh = self._grid.extract_triangle_mesh(weight_threshold=0.0)
         if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
             return None
         return mesh.vertex.positions.numpy(), mesh.vertex.colors.numpy(), mesh.triangle.indices.numpy()
+
+    def views_of(self, points_m: F32) -> NDArray[np.int64]:
+        """Return how many views [N] the voxels nearest to points [N, 3] have, 0 outside of all blocks."""
+        voxels = np.round(points_m.astype(np.float64) / self.voxel_m).astype(np.int64)
+        block, inside = voxels // _BLOCK, voxels % _BLOCK
+        keys, of_key = np.unique(block, axis=0, return_inverse=True)
+        rows, found = self._grid.hashmap().find(self._core.Tensor(np.ascontiguousarray(keys, np.int32)))
+        is_known = found.numpy()[of_key.ravel()]
+        row = np.where(is_known, rows.numpy()[of_key.ravel()], 0)
+        index = inside @ np.array([1, _BLOCK, _BLOCK * _BLOCK])
+        return np.where(is_known, self._arrays()[3][row, index], 0.0).astype(np.int64)
 
     def _arrays(self) -> tuple[F32, F32, F32, F32]:
         shared = {name: self._grid.attribute(name).numpy() for name in ("tsdf", "weight", "color", "views")}
