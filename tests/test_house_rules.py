@@ -22,6 +22,7 @@ LONG_CLASSES = {
     "Initialiser": 430,
     "LiveRun": 270,
     "LoopSet": 410,  # decides about all loops of a run
+    "Mapper": 280,  # every product of a map
     "MetricFrontEnd": 470,  # keyframe life of stereo and RGB-D
     "MonoFrontEnd": 270,
     "PoseGraph": 340,

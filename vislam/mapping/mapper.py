@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from vislam.mapping.cloud.mesh import Mesh, fuse_mesh
 from vislam.mapping.cloud.smooth import smoothed
 from vislam.mapping.cloud.store import KeyframeStore, Scan
 from vislam.mapping.cloud.surfels import SurfelMap, Surfels
+from vislam.mapping.dense.refined_poses import refined_poses
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.depth.mono import LateDepth
@@ -59,6 +61,7 @@ class Mapper:
         self._labels = LabelFusion(config.resolution_m, config.labels, names or LabelClasses())
         self._submaps = Submaps()
         self._apart: dict[int, Array] = {}  # newest poses of keyframes in submaps that no loop has joined with the map
+        self.refinement: dict[str, Any] = {}  # what `refined` found; empty where it was not asked
         self.notes: dict[str, str] = {}  # what was left out of an export, and why
 
     @property
@@ -222,6 +225,21 @@ class Mapper:
             return self
         poses = {i: T @ pose for i, pose in sorted((self._occupancy.poses | self._apart).items())}
         return self._made_again(poses, self._submaps)
+
+    def refined(self) -> Mapper:
+        """Return the map at poses that fit depth images to each other, itself where that is not asked for or no gain.
+
+        What was found is in `refinement`. Keyframes of submaps that are not joined with the map stay where they are.
+        """
+        # the noise of depth that it goes by is that of a depth sensor
+        if not self._config.refine_poses or not self._rig.has_depth or self._one_camera:
+            return self
+        poses, self.refinement = refined_poses(self._store, self._occupancy.poses, self._extractor.view)
+        if not poses:
+            return self
+        other = self._made_again(poses | self._apart, self._submaps)
+        other.refinement = self.refinement
+        return other
 
     def views(self) -> list[View]:
         """Return the directions of surfaces that keyframes with dense depth saw, evenly over a long run."""

@@ -110,7 +110,7 @@ class Levelled:
 
     def export(self, mapper: Mapper, folder: Path) -> Mapper:
         """Write the files of a map in the level frame; return the map as they have it. Raises StorageError."""
-        level = mapper if self.up is None else mapper.turned(self.T_level_map)
+        level = (mapper if self.up is None else mapper.turned(self.T_level_map)).refined()
         level.export(folder, not_level=self.not_level)
         return level
 

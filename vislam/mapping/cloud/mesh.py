@@ -61,7 +61,7 @@ def fuse_mesh(
     points, colors, triangles = surface
     mesh = _sorted(points, np.clip(np.round(colors * 255.0), 0, 255).astype(np.uint8), triangles)
     if is_false is not None:
-        mesh = mesh.select(~is_false(volume, mesh.points_m)[mesh.triangles].any(axis=1))
+        mesh = mesh.select(np.asarray(~is_false(volume, mesh.points_m)[mesh.triangles].any(axis=1)))
     return (mesh, "") if len(mesh.triangles) else (None, "later rays passed through every surface that was seen")
 
 

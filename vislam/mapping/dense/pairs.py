@@ -25,6 +25,7 @@ _LEAST_FACING = 0.2  # cosine between ray and normal
 _SIGMA_1M = 0.0025  # of depth from structured light at one metre; it grows with the square of depth
 _SIGMA_M = 0.002  # that it never falls below: calibration
 _SAME_FACING = 0.85  # cosine between two normals of one surface
+_FAR_SIGMAS = 3.0  # farther off is not worse
 _CORRELATED = 30.0  # samples that err alike: depth images are wrong in patches, not in pixels
 _WEAK_SHARE = 0.02  # of the strongest direction's information; weaker is noise of normals
 
@@ -41,8 +42,7 @@ class Equations(NamedTuple):
 
     H: Array  # [6, 6]
     g: Array  # [6], J^T W r
-    share: float  # of a's samples that met a surface of b
-    cost: float  # mean robust error in sigmas, squared; of those that met one
+    cost: float  # mean robust error in sigmas, squared, of a's samples; those that met no surface count as far off
 
 
 @njit(cache=True, nogil=True)
@@ -71,7 +71,7 @@ def _fit(depth_m: NDArray[np.float32], v: int, u: int, K: Array, out: Planes) ->
     if x[2] <= 0.0:
         return
     # rms of 1 / z from the plane, as depth
-    off_m = np.sqrt(max(squares - x @ right, 0.0) / count) / (x[2] * x[2])
+    off_m = np.sqrt(max(float(squares - x @ right), 0.0) / count) / (x[2] * x[2])
     if off_m > _FLAT_SIGMAS * (_SIGMA_M + _SIGMA_1M * z0 * z0):
         return
     ray_x, ray_y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
@@ -105,7 +105,7 @@ def seen_in(depth_m: NDArray[np.float32], K: Array, step: int, max_depth_m: floa
 def _pair(a: Planes, b: Planes, K: Array, T_b_a: Array, gate_m: float, step: int) -> tuple[Array, Array, Array]:
     """Return H [6, 6], g [6] and (samples, those that met a surface, sum of their costs)."""
     H, g, told, J = np.zeros((6, 6)), np.zeros(6), np.zeros(3), np.zeros(6)
-    R = T_b_a[:3, :3]
+    R = np.ascontiguousarray(T_b_a[:3, :3])
     for i in range(0, a.shape[0], step):
         for j in range(0, a.shape[1], step):
             z = a[i, j, 3]
@@ -135,7 +135,7 @@ def _pair(a: Planes, b: Planes, K: Array, T_b_a: Array, gate_m: float, step: int
             scale2 = max(4.0 * variance, gate_m * gate_m / 9.0)
             w = 1.0 / (variance * (1.0 + r * r / scale2) * _CORRELATED)
             told[1] += 1.0
-            told[2] += min(r * r / variance, 9.0)
+            told[2] += min(r * r / variance, _FAR_SIGMAS**2)
             J[0], J[1], J[2] = p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0]
             J[3:] = n
             for x in range(6):
@@ -149,7 +149,13 @@ def equations(a: Seen, b: Seen, T_b_a: Array, gate_m: float, step: int) -> Equat
     """Return what view a's surfaces say of its pose against view b's; those farther apart than the gate say nothing."""
     H, g, (samples, met, cost) = _pair(a.planes, b.planes, a.K, np.ascontiguousarray(T_b_a), gate_m, step)
     H, g = without_weak(H, g)
-    return Equations(H, g, met / max(samples, 1.0), cost / max(met, 1.0))
+    return Equations(H, g, (cost + _FAR_SIGMAS**2 * (samples - met)) / max(samples, 1.0))
+
+
+def overlap(a: Seen, b: Seen, T_b_a: Array, gate_m: float, step: int) -> float:
+    """Return the share of view a's surfaces that meet those of view b within the gate."""
+    samples, met, _ = _pair(a.planes, b.planes, a.K, np.ascontiguousarray(T_b_a), gate_m, step)[2]
+    return float(met / max(samples, 1.0))
 
 
 def without_weak(H: Array, g: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import spsolve
 
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array
-from vislam.mapping.dense.pairs import Equations, Seen, equations, seen_in
+from vislam.mapping.dense.pairs import Equations, Seen, equations, overlap, seen_in
 from vislam.mapping.mesh.posed import PosedView
 
 _COLUMNS = 160  # of the grid that planes are on
@@ -24,7 +24,10 @@ _GATES_M = (0.10, 0.07, 0.05, 0.04, 0.03, 0.03)  # by step, coarse to fine
 _STEPS_PX = (4, 4, 2, 2, 2, 2)  # of the grid, between samples
 _LOOK_PX = 8  # between samples that tell whether two views overlap
 _LEAST_OVERLAP = 0.3  # share of a view's samples that meet the other's surfaces
+_REACH_M = 3.0  # between two cameras that are asked
 _PARTNERS = 12  # of a keyframe among older ones, evenly over time
+_SAME_WAY = 0.3  # cosine between two views' axes
+_LEAST_GAIN = 0.02  # of the cost; poses that fit so well already are left alone
 _BEFORE = 2  # keyframes just before that are always among them
 _SIGMA_STEP = np.array([0.01] * 3 + [0.01] * 3)  # rad, m: of the motion between two keyframes
 _SIGMA_POSE = np.array([0.05] * 3 + [0.10] * 3)  # rad, m: of a keyframe in the map
@@ -38,7 +41,7 @@ class Refined:
         T_map_view: [N, 4, 4].
         pairs: of views that see the same surfaces.
         cost_before: mean over pairs of squared distance in sigmas, at the poses that came in.
-        cost_after: the same at the new poses.
+        cost_after: the same at the poses that come out.
     """
 
     T_map_view: Array
@@ -48,7 +51,10 @@ class Refined:
 
 
 def refined(views: Iterable[PosedView]) -> Refined:
-    """Return the poses that fit the depth of all views best; those that came in where they fit no worse."""
+    """Return the poses that fit the depth of all views best; those that came in where that is no gain.
+
+    Views are in the order of time and have pictures of one size.
+    """
     seen, start = [], []
     for view in views:
         step = max(1, round(view.depth_m.shape[1] / _COLUMNS))
@@ -63,19 +69,21 @@ def refined(views: Iterable[PosedView]) -> Refined:
         told = [equations(seen[a], seen[b], invert(T[b]) @ T[a], gate_m, step) for a, b in pairs]
         T = _moved(T, T0, pairs, told)
     before, after = (_cost(seen, pairs, poses) for poses in (T0, T))
-    return Refined(T if after < before else T0, len(pairs), before, after)
+    is_better = after < (1.0 - _LEAST_GAIN) * before
+    return Refined(T if is_better else T0, len(pairs), before, after if is_better else before)
 
 
 def overlapping(seen: list[Seen], T_map_view: Array) -> list[tuple[int, int]]:
     """Return pairs (newer, older) of views that see the same surfaces."""
     pairs: list[tuple[int, int]] = []
     for a in range(len(seen)):
-        ahead = T_map_view[:a, :3, 2] @ T_map_view[a, :3, 2]
-        found = [
-            b for b in np.flatnonzero(ahead > 0.3).tolist()
-            if equations(seen[a], seen[b], invert(T_map_view[b]) @ T_map_view[a], _GATES_M[0], _LOOK_PX).share
-            > _LEAST_OVERLAP
-        ]  # fmt: skip
+        is_near = T_map_view[:a, :3, 2] @ T_map_view[a, :3, 2] > _SAME_WAY
+        is_near &= np.linalg.norm(T_map_view[:a, :3, 3] - T_map_view[a, :3, 3], axis=1) < _REACH_M
+        found = []
+        for b in np.flatnonzero(is_near).tolist():
+            T_b_a = invert(T_map_view[b]) @ T_map_view[a]
+            if overlap(seen[a], seen[b], T_b_a, _GATES_M[0], _LOOK_PX) > _LEAST_OVERLAP:
+                found.append(b)
         near, far = [b for b in found if b >= a - _BEFORE], [b for b in found if b < a - _BEFORE]
         chosen = np.unique(np.linspace(0, len(far) - 1, min(_PARTNERS - _BEFORE, len(far))).round().astype(int))
         pairs += [(a, far[k]) for k in chosen] + [(a, b) for b in near]
@@ -84,7 +92,7 @@ def overlapping(seen: list[Seen], T_map_view: Array) -> list[tuple[int, int]]:
 
 def _cost(seen: list[Seen], pairs: list[tuple[int, int]], T: Array) -> float:
     told = [equations(seen[a], seen[b], invert(T[b]) @ T[a], _GATES_M[-1], _STEPS_PX[0]) for a, b in pairs]
-    return float(np.mean([pair.cost * pair.share + 9.0 * (1.0 - pair.share) for pair in told]))
+    return float(np.mean([pair.cost for pair in told]))
 
 
 def _moved(T: Array, T0: Array, pairs: list[tuple[int, int]], told: list[Equations]) -> Array:
@@ -106,8 +114,8 @@ def _moved(T: Array, T0: Array, pairs: list[tuple[int, int]], told: list[Equatio
     row, column = np.meshgrid(np.arange(6), np.arange(6), indexing="ij")
     rows, columns = 6 * at[:, :1] + row.ravel(), 6 * at[:, 1:] + column.ravel()
     values = np.array([block for _, _, block in blocks]).reshape(len(blocks), 36)
-    H = coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(g.size, g.size)).tocsc()
-    x = spsolve(H, -g.ravel()).reshape(-1, 6)
+    whole = coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(g.size, g.size)).tocsc()
+    x = spsolve(whole, -g.ravel()).reshape(-1, 6)
     return np.array([pose @ se3_exp(step) for pose, step in zip(T, x, strict=True)])
 
 

@@ -88,6 +88,7 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     mapper.finish()
     if info.get("first_state") is None:
         level, mapper, placed = _levelled(level, mapper, placed, ran)
+    mapper = mapper.refined()
     folder = run / "map" if out is None else out
     steps = iter(range(len(placed), total))
     written = mapper.export(folder, lambda product: tell(next(steps), product), level.not_level)
@@ -103,6 +104,8 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     }
     if labels.folder is not None:
         answer["labels"] = {"keyframes labelled": labels.used, **labels.folder.problems}
+    if mapper.refinement:
+        answer["refined"] = mapper.refinement
     if level.up is not None:
         answer["up"] = level.up.entry()
     write_json(folder / "map.json", {**answer, "settings": asdict(config)})
