@@ -14,10 +14,9 @@ from vislam.frontend.planar.floor import Regions
 from vislam.frontend.tracker import Tracker
 from vislam.vision.brightness import matched
 from vislam.vision.features import FlowSettings, follow
-from vislam.vision.landmarks import UNKNOWN_RHO, Landmarks, fuse, move
+from vislam.vision.landmarks import UNKNOWN_RHO, Landmarks
 
 _GUESSED_RHO_SIGMA = 0.15  # 1/m, of a corner under the horizon, which is on the floor or on what stands there
-_FUSE_GATE = 3.0  # standard deviations
 _NEAR_PX = 12.0  # of a track, within which a feature lies on the same surface
 _TELLING_PX = 3.0  # of image motion; less, and anything fits
 
@@ -84,10 +83,8 @@ class FloorTracks:
         self, frame: Frame, kept: Bools, pixels: Array, xy: Array, T_key_cam: Array, R_level_cam: Array
     ) -> None:
         """Make a frame the keyframe: tracks `kept` [N] go on, seen at `pixels` and `xy` [N, 2]; new ones fill gaps."""
-        moved = move(self.landmarks.mean[kept], self.landmarks.covariance[kept], T_key_cam)
         unknown, sigma_xy = np.full(int(kept.sum()), np.nan), self._planar.sigma_px * self.px
-        landmarks = Landmarks()
-        landmarks.mean, landmarks.covariance = fuse(*moved, xy[kept], unknown, sigma_xy, unknown, _FUSE_GATE)
+        landmarks = self.landmarks.carried(kept, T_key_cam, xy[kept], sigma_xy, unknown, unknown, unknown)
         landmarks.mean[:, :2] = xy[kept]  # the patch that is followed from now on
         self.landmarks = landmarks
         self._off_floor, self._confirmed = self._off_floor[kept], self._confirmed[kept]
