@@ -7,6 +7,7 @@ import { DECISIONS, color, nearest } from "./data.js";
 const FRAME_MS = 45;
 const FEWEST = 20000;
 const FIRST = 100000; // points of the first picture
+const PATH_WIDTH = 0.003; // half of it, in radii of the scene: lines of WebGL have one pixel whatever one asks for
 const LOOP_COLORS = { accepted: "good", pending: "warn", rejected: "bad" };
 const MOUSE = { hits: 9, rolls: 5 }; // px: so far from a loop a click still means it, and so far the mouse may move
 const FINGER = { hits: 22, rolls: 12 };
@@ -105,7 +106,7 @@ export class View {
     geometry.setAttribute("position", new THREE.BufferAttribute(cloud.position, 3));
     geometry.setAttribute("color", new THREE.BufferAttribute(cloud.color, 4, true));
     // as large as points that lie evenly on surfaces of this extent would have to be to close them
-    this.pointSize = (4.4 * this.reach) / Math.sqrt(Math.max(cloud.count, cloud.usual || 0));
+    this.pointSize = (6.2 * this.reach) / Math.sqrt(Math.max(cloud.count, cloud.usual || 0));
     const material = new THREE.PointsMaterial({ vertexColors: true, size: this.pointSize });
     this.points = new THREE.Points(geometry, material);
     this.points.frustumCulled = false;
@@ -122,11 +123,22 @@ export class View {
     return node;
   }
 
+  // A path as two bands that cross, so that it has a width from wherever one looks.
+  band(xyz, name) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(bands(xyz, PATH_WIDTH * this.reach), 3));
+    const material = new THREE.MeshBasicMaterial({ side: 2 }); // both sides
+    this.painted.push([material, name]);
+    const node = new THREE.Mesh(geometry, material);
+    node.frustumCulled = false;
+    return node;
+  }
+
   addPaths() {
     const { paths, labels } = this.data;
     for (const [name, path] of Object.entries(paths)) {
       const shown = name !== "live" || !paths.graph;
-      this.add(name, this.line(path.xyz, name, 1), labels[name], name, shown);
+      this.add(name, this.band(path.xyz, name), labels[name], name, shown);
     }
   }
 
@@ -337,4 +349,28 @@ export class View {
     }
     if (best[1] !== null && this.onTime) this.onTime(best[1]);
   }
+}
+
+// Two triangles for each step of a path and each of two directions across it; steps shorter than the width are joined.
+function bands(xyz, width) {
+  const out = [];
+  const [a, b, along, up, across] = Array.from({ length: 5 }, () => new THREE.Vector3());
+  const least = width * width;
+  a.set(xyz[0], xyz[1], xyz[2]);
+  for (let k = 3; k < xyz.length; k += 3) {
+    b.set(xyz[k], xyz[k + 1], xyz[k + 2]);
+    along.copy(b).sub(a);
+    if (!(along.lengthSq() >= least)) continue;
+    up.set(0, 0, 1);
+    if (Math.abs(along.z) > 0.9 * along.length()) up.set(1, 0, 0);
+    across.copy(along).cross(up).normalize();
+    up.copy(across).cross(along).normalize();
+    for (const side of [across, up]) {
+      const [x, y, z] = [side.x * width, side.y * width, side.z * width];
+      const corners = [[a, 1], [a, -1], [b, 1], [b, 1], [a, -1], [b, -1]];
+      for (const [p, s] of corners) out.push(p.x + s * x, p.y + s * y, p.z + s * z);
+    }
+    a.copy(b);
+  }
+  return new Float32Array(out);
 }
