@@ -21,6 +21,8 @@ from vislam.vision.depth_surface import SurfaceMaker
 
 _NEAREST_M, _FARTHEST_M, _SIGMA_RHO = 0.3, 8.0, 2e-3  # as in a run (`FrontEndConfig`)
 _WIDER = 3.0  # times the standard deviations of depth, as frames are placed by it in a run
+# beside the noise of depth: what the poses of keyframes, stamps and registration leave, as fr1_desk shows it
+_MAP_SIGMA_M, _MAP_SIGMA_RAD = 0.01, np.deg2rad(0.6)
 _PARTS = 4  # keyframes around a guess: more see the same
 _NEAR_M, _NEAR_RAD = 1.0, np.deg2rad(40.0)  # how far off a keyframe is as far as another is turned away
 _FAR = 2.0  # of those distances together: such a keyframe sees something else
@@ -123,9 +125,11 @@ class DepthLocaliser:
 
     def _answer(self, found: DepthAlignment, reason: str) -> DepthAnswer:
         adjoint = se3_adjoint(self._T_body_cam)
+        of_map = np.diag(np.repeat([_MAP_SIGMA_RAD**2, _MAP_SIGMA_M**2], 3))
+        covariance = adjoint @ (found.covariance + of_map) @ adjoint.T
         basis = np.linalg.qr(adjoint @ found.undetermined)[0] if found.undetermined.size else np.empty((6, 0))
         return DepthAnswer(
-            not reason, reason, found.T_model_cam @ invert(self._T_body_cam), adjoint @ found.covariance @ adjoint.T,
+            not reason, reason, found.T_model_cam @ invert(self._T_body_cam), covariance,
             found.determined, basis, found.overlap, found.agreement, found.seen_through,
         )  # fmt: skip
 
