@@ -39,7 +39,7 @@ from vislam.trajectory import Trajectory  # noqa: E402
 
 SOURCES = (
     "sim:handheld-room,camera_hz=15,image_width_px=480",
-    "sim:corridor-loop,camera_hz=15,image_width_px=480",
+    "sim:corridor-loop,rig=rgbd,camera_hz=15,image_width_px=480",
 )
 BLACK = 8  # grey level
 

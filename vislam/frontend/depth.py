@@ -38,8 +38,8 @@ class DepthReading:
 
     @property
     def slope(self) -> Array:
-        """Return `by_delay` [N], zero where nothing is known."""
-        return np.zeros(len(self.rho)) if self.by_delay is None else np.nan_to_num(self.by_delay)
+        """Return `by_delay` [N]; NaN where it could not be measured, as at the edge of what has depth."""
+        return np.zeros(len(self.rho)) if self.by_delay is None else self.by_delay
 
 
 class DepthSensor(Protocol):

@@ -143,7 +143,7 @@ class Landmarks:
         """Start empty."""
         self.mean: Array = np.empty((0, 3))
         self.covariance: Array = np.empty((0, 3, 3))
-        self.by_delay: Array = np.empty(0)  # [N] derivative of rho by a delay of the depth it was made of, 1/m/s
+        self.by_delay: Array = np.empty(0)  # [N] of rho by a delay of the depth it was made of, 1/m/s; NaN: unknown
 
     def __len__(self) -> int:
         return len(self.mean)
