@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
-from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.geometry import invert, se3_adjoint, se3_log, transform
 from vislam.core.memory import FrontNews
 from vislam.core.messages import (
     Array,
@@ -23,6 +23,7 @@ from vislam.core.messages import (
 )
 from vislam.frontend.agreement import confirmed, failure, weakness
 from vislam.frontend.attempt import Attempt
+from vislam.frontend.blind_keyframe import BlindKeyframe
 from vislam.frontend.by_depth import ByDepth, Moved
 from vislam.frontend.depth import DepthReading
 from vislam.frontend.exposures import Exposures
@@ -30,7 +31,7 @@ from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
-from vislam.frontend.result import TrackResult, metric_motion, too_few
+from vislam.frontend.result import TrackResult, metric_motion, too_few, unscaled_motion
 from vislam.frontend.tracker import Tracker, given_rows
 from vislam.frontend.view import View, sees, spread
 from vislam.vision.landmarks import Landmarks, move
@@ -46,6 +47,7 @@ _USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is told: wha
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _DEEP = 0.02  # of a keyframe's tracks are given depth at least, or its sensor is covered: wrong matches alone are fewer
+_NO_DEPTH = "no depth has been seen yet"
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
 
@@ -76,8 +78,7 @@ class MetricFrontEnd:
         self._lacks_depth = False  # hardly a track of the keyframe was given depth when it began
         alone = config.depth_alone and rig.has_depth and mode == "rgbd"
         self._by_depth = ByDepth(config, self._camera) if alone else None
-        self._blind = False  # the keyframe is the first and has no depth
-        self._blind_px: Array = np.empty((0, 2))  # where its tracks were last seen
+        self._blind: BlindKeyframe | None = None  # the keyframe is the first and has no depth
 
     def track(
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
@@ -99,8 +100,8 @@ class MetricFrontEnd:
         frame = self._view.of(whole)
         T_before = self._T_key_cam
         T_guess = T_before @ self._predictor.predict(dt_s, imu)
-        if self._blind:
-            return self._leave_blindness(frame, keyframe, T_guess)
+        if self._blind is not None:
+            return self._leave_blindness(self._blind, frame, keyframe, T_guess, dt_s, imu is not None)
         attempt = self._attempt(frame, T_before, T_guess, dt_s)
         other = self._by_other_camera(whole, keyframe, T_guess, dt_s) if attempt.failure else None
         if other is not None:
@@ -391,15 +392,25 @@ class MetricFrontEnd:
 
     # -- a first keyframe without depth ------------------------------------------------------------------------------
 
-    def _leave_blindness(self, frame: Frame, keyframe: Keyframe, T_guess: Array) -> TrackResult:
+    def _leave_blindness(
+        self, blind: BlindKeyframe, frame: Frame, keyframe: Keyframe, T_guess: Array, dt_s: float, has_imu: bool
+    ) -> TrackResult:
         """Follow a first keyframe that has no depth until a frame comes that has: then place it by its own depth."""
-        rays = np.column_stack([self._camera.normalise(self._blind_px), np.ones(len(self._blind_px))])
-        pixels = self._tracker.follow(frame, self._camera.project(rays @ T_guess[:3, :3]))
-        self._blind_px = np.where(np.isfinite(pixels), pixels, self._blind_px)
+        T_before = self._T_key_cam
+        T_step = invert(T_before) @ T_guess
+        pixels = self._tracker.follow(frame, blind.expected(T_step))
         if not self._depth.available(frame):
-            return self._life.lost(frame.t_ns, "no depth has been seen yet")
-        xy = self._camera.normalise(pixels)
-        reading = self._depth.measure(frame, pixels, xy, np.full(len(xy), np.nan), self._tracker.ids)
+            turn = blind.turn(pixels, T_guess)
+            self._T_key_cam = T_guess if turn is None else transform(turn.R_key_cam, np.zeros(3))
+            # with an IMU, filter and graph begin with what has scale, and know the turn
+            if turn is None or has_imu:
+                return self._life.lost(frame.t_ns, _NO_DEPTH)
+            self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
+            R_body_cam, agree = self._T_body_cam[:3, :3], int(turn.inliers.sum())
+            vo = unscaled_motion(frame.t_ns, keyframe.id, turn, R_body_cam, agree, is_weak=True)
+            return TrackResult(vo, no_observations(), None, 0.0, _NO_DEPTH)
+        xy, twist = self._camera.normalise(pixels), se3_log(T_step) / dt_s
+        reading = self._measure(frame, pixels, xy, np.full(len(xy), np.nan), twist, to_learn=False)
         points = np.column_stack([xy, reading.rho])
         usable = np.isfinite(points).all(axis=1) & (reading.rho > 0.0)
         T_cam_key = self._ransac(_points(points[usable]), self._landmarks.mean[usable, :2])
@@ -413,13 +424,13 @@ class MetricFrontEnd:
         why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         if why_not:
             return self._start(frame, why_not)
-        attempt = Attempt(pixels, xy, xy, None, reading.rho, np.zeros(6), estimate, "")
+        attempt = Attempt(pixels, xy, xy, None, reading.rho, twist, estimate, "")
         self._T_key_cam = estimate.T_key_cam
         # followed for long, through a rolling shutter of which nothing was known: true, but not to the millimetre
         vo = replace(self._measurement(frame, keyframe.id, attempt), tracking=Tracking.DEGRADED)
         parallax_px = self._camera.fx * attempt.parallax(self._landmarks.mean[:, :2])
         new, observations = self._continue_from(frame, attempt)
-        self._blind = False
+        self._blind = None
         return TrackResult(vo, observations, new, parallax_px, "the first depth")
 
     # -- keyframes ---------------------------------------------------------------------------------------------------
@@ -440,7 +451,8 @@ class MetricFrontEnd:
         self._predictor.forget()
         self._lost = False
         self._lacks_depth = False
-        self._blind, self._blind_px = not self._depth.available(frame), self._tracker.pixels.copy()
+        has_depth = self._depth.available(frame)
+        self._blind = None if has_depth else BlindKeyframe(self._config, self._camera, self._tracker.pixels)
         self._install(frame, np.zeros(6))
         observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
         return self._life.started(observations, count, why)

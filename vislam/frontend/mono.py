@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,14 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, transform
 from vislam.core.memory import FrontNews
-from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
+from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations
 from vislam.core.quantiles import median
 from vislam.frontend.agreement import confirmed, failure, weakness
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
-from vislam.frontend.result import TrackResult, too_few
+from vislam.frontend.result import TrackResult, too_few, unscaled_motion
 from vislam.frontend.tracker import Tracker
 from vislam.vision.refine import refine_pose
 from vislam.vision.two_view import (
@@ -29,6 +29,7 @@ from vislam.vision.two_view import (
     essential_ransac,
     from_epipolar_segment,
     refine_two_view,
+    turn_only,
 )
 
 _RANSAC_PX = 1.5
@@ -37,7 +38,6 @@ _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a trans
 _VAGUE_RAD = 0.35  # sigma of a direction that a linear model of its error no longer describes
 _GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
 _BOTH_ENDS = 2.0**0.5
-_ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +195,7 @@ class MonoFrontEnd:
         start = transform(np.ascontiguousarray(R_guess), np.zeros(3))
         pose = refine_pose(start, points, no_noise, xy, self._sigma_xy, self._config.cauchy, rotation_only=True)
         R = np.ascontiguousarray(pose.T_key_cam[:3, :3])
-        return _turn_only(TwoViewEstimate(R, np.zeros(3), pose.covariance, pose.inliers, pose.converged))
+        return turn_only(TwoViewEstimate(R, np.zeros(3), pose.covariance, pose.inliers, pose.converged))
 
     def _turn_by(self, prior: RotationPrior, key_xy: Array, xy: Array) -> TwoViewEstimate:
         """Take the gyroscope's rotation: what vision finds alone swallows small translations before a flat scene."""
@@ -203,7 +203,7 @@ class MonoFrontEnd:
         with np.errstate(invalid="ignore"):
             inliers = np.asarray(moved_px < self._min_parallax_px, dtype=np.bool_)
         covariance = np.eye(6) * (_GYRO_KNOWN_ALREADY * prior.sigma_rad) ** 2
-        return _turn_only(TwoViewEstimate(prior.R_key_cam, np.zeros(3), covariance, inliers, True))
+        return turn_only(TwoViewEstimate(prior.R_key_cam, np.zeros(3), covariance, inliers, True))
 
     def _two_view(self, R_guess: Array, prior: RotationPrior | None, key_xy: Array, xy: Array) -> TwoViewEstimate:
         """Refine from the prediction, for a new keyframe going on as before; search by RANSAC if not all agree."""
@@ -258,7 +258,9 @@ class MonoFrontEnd:
 
     def _report(self, frame: Frame, motion: _Motion) -> TrackResult:
         weak = self._weakness(motion)
-        vo = self._measurement(frame, self._life.newest_id, motion, Tracking.DEGRADED if weak else Tracking.OK)
+        vo = unscaled_motion(
+            frame.t_ns, self._life.newest_id, motion.view, self._R_body_cam, motion.inliers, is_weak=bool(weak)
+        )
         good = motion.view.inliers
         departure = self._life.departure(
             frame.t_ns, self._R_key_cam, motion.parallax_px, motion.followed, motion.inliers
@@ -277,24 +279,6 @@ class MonoFrontEnd:
         # of tracks that somebody chose, as many times the least as of our own
         enough = self._config.degraded_inliers * self._min_inliers // self._config.min_inliers
         return weakness(motion.followed, motion.inliers, enough, self._config)
-
-    def _measurement(self, frame: Frame, keyframe_id: int, motion: _Motion, tracking: Tracking) -> VoMeasurement:
-        """Express rotation and direction in body axes; the perturbation is on the body side, as for metric motion."""
-        view, R_body_cam = motion.view, self._R_body_cam
-        R_key_body = R_body_cam @ view.R_key_cam @ R_body_cam.T
-        change = np.zeros((6, 6))
-        change[:3, :3] = R_body_cam
-        change[3:, 3:] = R_key_body.T @ R_body_cam
-        covariance = change @ view.covariance @ change.T
-        return VoMeasurement(
-            t_ns=frame.t_ns,
-            keyframe_id=keyframe_id,
-            T_keyframe_body=np.asarray(transform(R_key_body, R_body_cam @ view.direction_key)),
-            covariance=0.5 * (covariance + covariance.T),
-            has_scale=False,
-            tracking=tracking,
-            inliers=motion.inliers,
-        )
 
     def _lose(self, frame: Frame, motion: _Motion) -> TrackResult:
         self._lost = True
@@ -336,12 +320,4 @@ class MonoFrontEnd:
 def _without_vague_direction(view: TwoViewEstimate) -> TwoViewEstimate:
     """Return the estimate without its direction if that is hardly known."""
     vague = view.converged and float(np.trace(view.covariance[3:, 3:])) > _VAGUE_RAD**2
-    return _turn_only(view) if vague else view
-
-
-def _turn_only(view: TwoViewEstimate) -> TwoViewEstimate:
-    """Return the rotation alone: no direction, and the covariance of a unit vector of which nothing is known."""
-    covariance = view.covariance.copy()
-    covariance[3:, :] = covariance[:, 3:] = 0.0
-    covariance[3:, 3:] = np.eye(3) * _ANY_DIRECTION
-    return replace(view, direction_key=np.zeros(3), covariance=covariance)
+    return turn_only(view) if vague else view

@@ -11,6 +11,7 @@ from vislam.core.geometry import se3_adjoint, transform
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 from vislam.frontend.prediction import body_motion
+from vislam.vision.two_view import TwoViewEstimate
 
 _NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement that says nothing
 
@@ -91,6 +92,26 @@ def metric_motion(
         T_keyframe_body=body_motion(T_key_cam, T_body_cam),
         covariance=0.5 * (of_body + of_body.T),
         has_scale=True,
+        tracking=Tracking.DEGRADED if is_weak else Tracking.OK,
+        inliers=inliers,
+    )
+
+
+def unscaled_motion(
+    t_ns: int, keyframe_id: int, view: TwoViewEstimate, R_body_cam: Array, inliers: int, is_weak: bool
+) -> VoMeasurement:
+    """Return the measurement of a camera's turn and direction in body axes; the perturbation is on the body side."""
+    R_key_body = R_body_cam @ view.R_key_cam @ R_body_cam.T
+    change = np.zeros((6, 6))
+    change[:3, :3] = R_body_cam
+    change[3:, 3:] = R_key_body.T @ R_body_cam
+    covariance = change @ view.covariance @ change.T
+    return VoMeasurement(
+        t_ns=t_ns,
+        keyframe_id=keyframe_id,
+        T_keyframe_body=np.asarray(transform(R_key_body, R_body_cam @ view.direction_key)),
+        covariance=0.5 * (covariance + covariance.T),
+        has_scale=False,
         tracking=Tracking.DEGRADED if is_weak else Tracking.OK,
         inliers=inliers,
     )

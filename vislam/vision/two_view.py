@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -23,6 +23,7 @@ _LONGEST = 3.0  # times the usual parallax that one track may count for
 _REWEIGHTED = 4
 _CONFIDENCE = 0.999
 _MAX_TRIES = 500
+_ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,14 @@ class RotationPrior:
 
     R_key_cam: Array  # [3, 3]
     sigma_rad: float
+
+
+def turn_only(view: TwoViewEstimate) -> TwoViewEstimate:
+    """Return the rotation alone: no direction, and the covariance of a unit vector of which nothing is known."""
+    covariance = view.covariance.copy()
+    covariance[3:, :] = covariance[:, 3:] = 0.0
+    covariance[3:, 3:] = np.eye(3) * _ANY_DIRECTION
+    return replace(view, direction_key=np.zeros(3), covariance=covariance)
 
 
 def refine_two_view(
