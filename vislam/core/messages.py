@@ -142,6 +142,7 @@ class Keyframe:
     keypoints_px: Array  # [N, 2] raw pixels of the described features in cam0
     descriptors: NDArray[np.uint8]  # [N, 32] ORB
     points_body_m: Array | None  # [N, 3] of the described features in the body frame, NaN where unknown; None: no depth
+    T_image_depth: Array | None = None  # [4, 4] where cam0 was when depth was taken, as the image sees it; None: there
 
 
 @dataclass(frozen=True, slots=True, eq=False)

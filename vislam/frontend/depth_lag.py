@@ -7,12 +7,14 @@ same for all images and learnt from how depth misfits the landmarks, along the g
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.camera import Camera
+from vislam.core.geometry import se3_exp
 from vislam.core.messages import Array, Bools, Frame
 from vislam.frontend.depth import DepthReading, DepthSensor
 from vislam.vision.shutter import later
@@ -64,7 +66,7 @@ class DepthLag:
 
     def measure(
         self, sensor: DepthSensor, frame: Frame, pixels: Array, xy: Array, rho: Array, twist_per_s: Array,
-        ids: NDArray[np.int64], to_learn: bool = True,
+        ids: NDArray[np.int64] | None, to_learn: bool = True,
     ) -> DepthReading:  # fmt: skip
         """Return the depth of raw pixels [N, 2] at the time of the image.
 
@@ -75,7 +77,7 @@ class DepthLag:
             xy: their directions [N, 2] on z = 1.
             rho: inverse depths [N] in 1/m that are expected; NaN: unknown.
             twist_per_s: velocity [6] of the camera in its own frame, rotation first.
-            ids: tracks [N] that they belong to.
+            ids: tracks [N] that they belong to; None: of none.
             to_learn: say how it would change with the delay, too.
         """
         lag_s = self._lag_s(frame)
@@ -90,6 +92,26 @@ class DepthLag:
             return reading
         before, after = (self._read(sensor, frame, seen, twist_per_s, ids, lag_s + s) for s in (-_STEP_S, _STEP_S))
         return replace(reading, by_delay=(after.rho - before.rho) / (2.0 * _STEP_S))
+
+    def reader(
+        self, sensor: DepthSensor, frame: Frame, twist_per_s: Array, expected_rho: Callable[[Array], Array]
+    ) -> Callable[[Array, NDArray[np.int64] | None], Array]:
+        """Return what gives raw pixels [N, 2] of tracks [N] their z-depth [N], at a velocity [6] of the camera.
+
+        `expected_rho` returns the inverse depths [N] that are likely in directions [N, 2] on z = 1.
+        """
+
+        def depth_m(pixels: Array, ids: NDArray[np.int64] | None) -> Array:
+            xy = self._camera.normalise(pixels)
+            rho = expected_rho(xy)
+            return self.measure(sensor, frame, pixels, xy, rho, twist_per_s, ids, to_learn=False).depth_m
+
+        return depth_m
+
+    def motion(self, frame: Frame, twist_per_s: Array) -> Array | None:
+        """Return T_image_depth [4, 4] of a frame at a velocity [6] of the camera; None where it did not move."""
+        twist = self._lag_s(frame) * twist_per_s
+        return np.asarray(se3_exp(twist)) if twist.any() else None
 
     def learn(self, misfit: Array, slope: Array, sigma_rho: Array, good: Bools, dt_s: float) -> None:
         """Let the misfit of depth in one frame correct the delay.
@@ -121,7 +143,13 @@ class DepthLag:
         return 0.0 if frame.depth_m is None else frame.depth_lag_s + self.delay_s
 
     def _read(
-        self, sensor: DepthSensor, frame: Frame, seen: Array, twist_per_s: Array, ids: NDArray[np.int64], lag_s: float
+        self,
+        sensor: DepthSensor,
+        frame: Frame,
+        seen: Array,
+        twist_per_s: Array,
+        ids: NDArray[np.int64] | None,
+        lag_s: float,
     ) -> DepthReading:
         """Return the depth of inverse-depth points [N, 3] in an image that is taken `lag_s` later."""
         there = later(seen, lag_s, twist_per_s)

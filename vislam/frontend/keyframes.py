@@ -59,8 +59,9 @@ MeasureDepth = Callable[[Array, NDArray[np.int64] | None], Array]
 
 
 def make_keyframe(
-    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int, measure_depth: MeasureDepth | None
-) -> Keyframe:
+    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int,
+    measure_depth: MeasureDepth | None, T_image_depth: Array | None = None,
+) -> Keyframe:  # fmt: skip
     """Describe a frame for loop closing.
 
     A frame that brings its tracks brings their descriptors too, or has nothing to recognise it by.
@@ -75,7 +76,7 @@ def make_keyframe(
     points = None
     if measure_depth is not None:
         points = transform_points(T_body_cam, camera.unproject(pixels) * measure_depth(pixels, ids)[:, None])
-    return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points)
+    return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points, T_image_depth)
 
 
 class KeyframeLife:
@@ -130,12 +131,13 @@ class KeyframeLife:
         )
 
     def install(
-        self, frame: Frame, camera: Camera, T_body_cam: Array, tracks: int, measure_depth: MeasureDepth | None = None
-    ) -> Keyframe:
+        self, frame: Frame, camera: Camera, T_body_cam: Array, tracks: int, measure_depth: MeasureDepth | None = None,
+        T_image_depth: Array | None = None,
+    ) -> Keyframe:  # fmt: skip
         """Make a frame with so many tracks the keyframe; see make_keyframe."""
         new_id = self._first_id if self.keyframe is None else self.keyframe.id + 1
         features = self._config.described_features
-        self.keyframe = make_keyframe(new_id, frame, camera, T_body_cam, features, measure_depth)
+        self.keyframe = make_keyframe(new_id, frame, camera, T_body_cam, features, measure_depth, T_image_depth)
         self._since_restart += 1
         self._tracks = tracks
         self._t_placed_ns = frame.t_ns

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
-from vislam.core.geometry import invert, se3_adjoint, se3_log, transform
+from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import FrontNews
 from vislam.core.messages import (
     Array,
@@ -23,7 +23,7 @@ from vislam.core.messages import (
 )
 from vislam.frontend.agreement import confirmed, failure, weakness
 from vislam.frontend.attempt import Attempt
-from vislam.frontend.blind_keyframe import BlindKeyframe
+from vislam.frontend.blind_keyframe import NO_DEPTH, BlindKeyframe
 from vislam.frontend.by_depth import ByDepth, Moved
 from vislam.frontend.depth import DepthReading
 from vislam.frontend.exposures import Exposures
@@ -31,10 +31,10 @@ from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
-from vislam.frontend.result import TrackResult, metric_motion, too_few, unscaled_motion
+from vislam.frontend.result import TrackResult, metric_motion, too_few
 from vislam.frontend.tracker import Tracker, given_rows
 from vislam.frontend.view import View, sees, spread
-from vislam.vision.landmarks import Landmarks, move
+from vislam.vision.landmarks import Landmarks, metric_points, move
 from vislam.vision.locate import pnp_ransac, recognise
 from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose
 from vislam.vision.two_view import epipolar_distances
@@ -47,7 +47,6 @@ _USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is told: wha
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _DEEP = 0.02  # of a keyframe's tracks are given depth at least, or its sensor is covered: wrong matches alone are fewer
-_NO_DEPTH = "no depth has been seen yet"
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
 
@@ -192,7 +191,7 @@ class MetricFrontEnd:
         followed = int(np.isfinite(xy[:, 0]).sum())
         if estimate.inliers.sum() < _RANSAC_BELOW * followed:
             known = self._landmarks.known & (self._landmarks.mean[:, 2] > 0.0)
-            T_ransac = self._ransac(_points(self._landmarks.mean[known]), xy[known])
+            T_ransac = self._ransac(metric_points(self._landmarks.mean[known]), xy[known])
             if T_ransac is not None:
                 other = self._refine(T_ransac, xy, depth_now)
                 if other.inliers.sum() > estimate.inliers.sum():
@@ -321,9 +320,8 @@ class MetricFrontEnd:
             new, observations = self._continue_from(frame, attempt)
             return TrackResult(vo, observations, new, departure.parallax_px, reason)
         good = attempt.estimate.inliers
-        observations = Observations(
-            self._tracker.ids[good].copy(), attempt.pixels[good], instant_px=self._instant_px(attempt.xy[good])
-        )
+        at_instant = self._shutter.instant_px(attempt.xy[good])
+        observations = Observations(self._tracker.ids[good].copy(), attempt.pixels[good], instant_px=at_instant)
         if self._view.is_swapped:
             means, covariances = move(self._landmarks.mean[good], self._landmarks.covariance[good], self._T_key_cam)
             observations = self._as_cam0_would(observations.track_ids, attempt.xy[good], means, covariances)
@@ -400,26 +398,22 @@ class MetricFrontEnd:
         T_step = invert(T_before) @ T_guess
         pixels = self._tracker.follow(frame, blind.expected(T_step))
         if not self._depth.available(frame):
-            turn = blind.turn(pixels, T_guess)
-            self._T_key_cam = T_guess if turn is None else transform(turn.R_key_cam, np.zeros(3))
+            turned = blind.turn(frame, keyframe, pixels, T_guess)
+            self._T_key_cam = T_guess if turned is None else turned[0]
             # with an IMU, filter and graph begin with what has scale, and know the turn
-            if turn is None or has_imu:
-                return self._life.lost(frame.t_ns, _NO_DEPTH)
+            if turned is None or has_imu:
+                return self._life.lost(frame.t_ns, NO_DEPTH)
             self._predictor.observe(invert(T_before) @ self._T_key_cam, dt_s)
-            R_body_cam, agree = self._T_body_cam[:3, :3], int(turn.inliers.sum())
-            vo = unscaled_motion(frame.t_ns, keyframe.id, turn, R_body_cam, agree, is_weak=True)
-            return TrackResult(vo, no_observations(), None, 0.0, _NO_DEPTH)
+            return turned[1]
         xy, twist = self._camera.normalise(pixels), se3_log(T_step) / dt_s
         reading = self._measure(frame, pixels, xy, np.full(len(xy), np.nan), twist, to_learn=False)
-        points = np.column_stack([xy, reading.rho])
-        usable = np.isfinite(points).all(axis=1) & (reading.rho > 0.0)
-        T_cam_key = self._ransac(_points(points[usable]), self._landmarks.mean[usable, :2])
-        if T_cam_key is None:
+        placed = blind.placed(np.column_stack([xy, reading.rho]), self._ransac)
+        if placed is None:
             return self._start(frame, "the first keyframe, which had no depth, is out of sight")
-        moved, _ = move(points[usable], np.zeros((int(usable.sum()), 3, 3)), T_cam_key)
-        self._landmarks.mean[usable, 2] = moved[:, 2]
-        self._landmarks.covariance[usable, 2, 2] = (_BLIND_SIGMA * moved[:, 2]) ** 2
-        estimate = self._search(np.asarray(invert(T_cam_key)), xy, None)
+        T_key_cam, rho = placed
+        self._landmarks.mean[:, 2] = rho
+        self._landmarks.covariance[:, 2, 2] = (_BLIND_SIGMA * rho) ** 2
+        estimate = self._search(T_key_cam, xy, None)
         estimate = self._polish(estimate, xy, None) if estimate.converged else estimate
         why_not = self._failure(estimate, int(np.isfinite(xy[:, 0]).sum()))
         if why_not:
@@ -452,7 +446,7 @@ class MetricFrontEnd:
         self._lost = False
         self._lacks_depth = False
         has_depth = self._depth.available(frame)
-        self._blind = None if has_depth else BlindKeyframe(self._config, self._camera, self._tracker.pixels)
+        self._blind = None if has_depth else BlindKeyframe(self._config, self._view, self._tracker.pixels)
         self._install(frame, np.zeros(6))
         observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
         return self._life.started(observations, count, why)
@@ -509,28 +503,20 @@ class MetricFrontEnd:
         ids = self._tracker.ids.copy()
         if self._view.is_swapped:
             return self._as_cam0_would(ids, xy, self._landmarks.mean, self._landmarks.covariance)
-        return Observations(ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self._instant_px(xy))
-
-    def _instant_px(self, xy: Array) -> Array | None:
-        if self._shutter.readout_s == 0.0:
-            return None
-        return self._camera.project(np.column_stack([xy, np.ones(len(xy))]))
+        return Observations(
+            ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self._shutter.instant_px(xy)
+        )
 
     def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
         whole, usual = self._view.of(frame), self._views[0]
+        usual_twist = np.zeros(6) if self._view.is_swapped else twist_per_s
 
-        def measure_depth(pixels: Array, ids: NDArray[np.int64] | None) -> Array:
-            xy = usual.camera.normalise(pixels)
-            expected_rho = self._landmarks.expected_rho(xy)
-            return usual.depth.measure(whole, pixels, xy, expected_rho, ids).depth_m
-
-        keyframe = self._life.install(whole, usual.camera, usual.T_body_cam, len(self._tracker), measure_depth)
+        depth_of = self._lag.reader(usual.depth, whole, usual_twist, self._landmarks.expected_rho)
+        T_image_depth = self._lag.motion(whole, usual_twist)
+        keyframe = self._life.install(
+            whole, usual.camera, usual.T_body_cam, len(self._tracker), depth_of, T_image_depth
+        )
         self._exposures.key_twist_per_s = twist_per_s
         self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)
         return keyframe
-
-
-def _points(inverse_depth: Array) -> Array:
-    """Return points [N, 3] in metres of inverse-depth points [N, 3] with rho > 0."""
-    return np.column_stack([inverse_depth[:, :2], np.ones(len(inverse_depth))]) / inverse_depth[:, 2:]

@@ -136,6 +136,11 @@ def fuse(
     return out, P
 
 
+def metric_points(inverse_depth: Array) -> Array:
+    """Return points [N, 3] in metres of inverse-depth points [N, 3] with rho > 0."""
+    return np.column_stack([inverse_depth[:, :2], np.ones(len(inverse_depth))]) / inverse_depth[:, 2:]
+
+
 class Landmarks:
     """The landmarks of the tracks, row by row: means [N, 3] and covariances [N, 3, 3]."""
 

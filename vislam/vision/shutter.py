@@ -52,6 +52,12 @@ class Shutter:
         """Whether the readout is estimated."""
         return not self._known
 
+    def instant_px(self, xy: Array) -> Array | None:
+        """Return raw pixels [N, 2] of directions [N, 2] of the middle row's time; None: all rows are of one time."""
+        if self.readout_s == 0.0:
+            return None
+        return self._camera.project(np.column_stack([xy, np.ones(len(xy))]))
+
     def look_through(self, camera: Camera) -> None:
         """Go on with another camera of the same make."""
         self._camera = camera

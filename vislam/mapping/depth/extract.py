@@ -15,6 +15,7 @@ from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8, Keyframe
 from vislam.mapping.cloud.store import Scan
 from vislam.mapping.depth.image import DepthView, filter_depth, mono_view, rgbd_view
+from vislam.mapping.depth.moment import as_image_sees
 from vislam.mapping.depth.stereo import DenseStereo
 from vislam.mapping.semantic.images import LabelRays, checked
 
@@ -90,7 +91,10 @@ class ScanExtractor:
             return None
         image = frame.images[0] if frame.color is None else frame.color
         self._cameras[0].check_image(image)
-        depth = filter_depth(frame.depth_m, self._config.pixel_step, self.view, self._config)
+        depth_m, T_image_depth = frame.depth_m, keyframe.T_image_depth
+        if T_image_depth is not None:
+            depth_m = as_image_sees(depth_m, self._cameras[0], T_image_depth)
+        depth = filter_depth(depth_m, self._config.pixel_step, self.view, self._config)
         return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
 
     def _sparse(self, keyframe: Keyframe, labels: NDArray[np.integer] | None) -> Scan | None:
