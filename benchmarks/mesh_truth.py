@@ -3,10 +3,11 @@
     .venv/bin/python benchmarks/mesh_truth.py RUN [--map FOLDER] [--world NAME]
 
 The reference is the depth of every n-th frame, every 8th row and column of it, within the range and without the
-borders of objects that maps leave out, put at the true poses. With `--world` it is the exact depth of that simulated
-world at the times of the recording. A run is moved onto the truth by the rigid motion that fits its final trajectory
-best, and a second time ("fitted") by the one that fits the reference to its mesh best: a trajectory of 1 m says little
-about a turn of 1 degree, which is 4 cm at 2 m, and motion capture knows the camera's axes no better. Told are:
+borders of objects that maps leave out, put where the camera truly was when depth was taken: by its stamps, and
+`--depth-delay-s` later. With `--world` it is the exact depth of that simulated world at the times of the recording. A
+run is moved onto the truth by the rigid motion that fits its final trajectory best, and a second time ("fitted") by the
+one that fits the reference to its mesh best: a trajectory of 1 m says little about a turn of 1 degree, which is 4 cm at
+2 m, and motion capture knows the camera's axes no better. Told are:
 
 complete    share of reference points with the surface (mesh) or a point (cloud) within 3 cm
 median      of the distances from reference points to the surface, in mm; of a mesh of all raw depth at true poses too
@@ -59,10 +60,12 @@ FIT_REACH_M = 0.1
 FIT_SCALE_M = 0.015  # of errors that count half
 
 
-def reference(recording: Recording, every: int, config: MapConfig, world: Simulation | None) -> NDArray[np.float64]:
+def reference(
+    recording: Recording, every: int, config: MapConfig, world: Simulation | None, delay_s: float
+) -> NDArray[np.float64]:
     """Return the reference points [N, 3] in the truth's world."""
     view, parts = rgbd_view(recording.rig, config), []
-    for frame, T in frames_at_truth(recording, every):
+    for frame, T in frames_at_truth(recording, every, delay_s):
         depth_m = frame.depth_m
         if world is not None:
             exact = world.render(frame.index)
@@ -80,20 +83,23 @@ def reference(recording: Recording, every: int, config: MapConfig, world: Simula
     return np.concatenate(parts)
 
 
-def frames_at_truth(recording: Recording, every: int) -> Iterator[tuple[Frame, Array]]:
-    """Yield every n-th frame that has depth, and its true pose."""
+def frames_at_truth(recording: Recording, every: int, delay_s: float) -> Iterator[tuple[Frame, Array]]:
+    """Yield every n-th frame that has depth, and where its depth was taken: `delay_s` later than it is stamped."""
     truth = recording.truth()
     assert truth is not None, "the recording has no truth"
     count = 0
     for frame in recording.events():
-        if not isinstance(frame, Frame) or frame.depth_m is None or not _covers(truth, frame.t_ns):
+        if not isinstance(frame, Frame) or frame.depth_m is None:
+            continue
+        t_ns = frame.t_ns + round((frame.depth_lag_s + delay_s) * 1e9)
+        if not _covers(truth, t_ns):
             continue
         count += 1
         if (count - 1) % every == 0:
-            yield frame, truth.at(frame.t_ns)
+            yield frame, truth.at(t_ns)
 
 
-def mesh_at_truth(recording: Recording, view: DepthView) -> Surface:
+def mesh_at_truth(recording: Recording, view: DepthView, delay_s: float) -> Surface:
     """Return the mesh of the raw depth of all frames at true poses, by Open3D's own integration."""
     open3d, _ = load_open3d()
     core = open3d.core
@@ -101,7 +107,7 @@ def mesh_at_truth(recording: Recording, view: DepthView) -> Surface:
         ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), TRUE_VOXEL_M, 8, 40000, core.Device("CPU:0"),
     )  # fmt: skip
     K = core.Tensor(np.ascontiguousarray(view.K))
-    for frame, T in frames_at_truth(recording, 1):
+    for frame, T in frames_at_truth(recording, 1, delay_s):
         assert frame.depth_m is not None
         depth = np.nan_to_num(np.where(frame.depth_m < view.max_range_m, frame.depth_m, 0.0)).astype(np.float32)
         image = open3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
@@ -196,6 +202,7 @@ def main() -> None:
     parser.add_argument("--duration-s", type=float, help="as the world was recorded")
     parser.add_argument("--camera-hz", type=float, help="as the world was recorded")
     parser.add_argument("--every", type=int, default=5, help="every n-th frame is reference")
+    parser.add_argument("--depth-delay-s", type=float, default=0.0, help="how much later than stamped depth was taken")
     parser.add_argument("--cache", type=Path, help="file for the reference and the mesh at true poses")
     arguments = parser.parse_args()
     source, config, _ = read_setup(arguments.run)
@@ -209,8 +216,10 @@ def main() -> None:
         world = None
         if arguments.world is not None:
             world = open_world(arguments.world, rig="rgbd", depth_noise=False, image_noise=False, **options)
-        points = reference(recording, arguments.every, whole, world)
-        best = of_surface(mesh_at_truth(recording, rgbd_view(recording.rig, whole)), points, "at true poses ")
+        delay_s = arguments.depth_delay_s
+        points = reference(recording, arguments.every, whole, world, delay_s)
+        true_mesh = mesh_at_truth(recording, rgbd_view(recording.rig, whole), delay_s)
+        best = of_surface(true_mesh, points, "at true poses ")
         if arguments.cache is not None:
             np.savez(arguments.cache, points=points, best=json.dumps(best))
     truth = recording.truth()
