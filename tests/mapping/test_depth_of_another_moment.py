@@ -10,7 +10,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert, se3_exp
 from vislam.core.messages import Array, Frame, Keyframe
 from vislam.mapping.depth.extract import ScanExtractor
-from vislam.mapping.depth.moment import as_image_sees
+from vislam.mapping.depth.moment import DepthAtImage
 
 PLAIN = Camera(160, 120, 130.0, 128.0, 80.0, 59.0)
 BENT = Camera(160, 120, 130.0, 128.0, 80.0, 59.0, distortion="radtan", coefficients=(-0.25, 0.06, 0.001, -0.002))
@@ -32,7 +32,7 @@ def drawn(camera: Camera, T_world_cam: Array) -> Array:
 @pytest.mark.parametrize("camera", [PLAIN, BENT])
 def test_depth_is_where_the_image_sees_it(camera: Camera) -> None:
     depth_m = drawn(camera, TURNED).astype(np.float32)
-    seen = as_image_sees(depth_m, camera, TURNED)
+    seen = DepthAtImage(camera)(depth_m, TURNED)
     truth = drawn(camera, np.eye(4))
     known = seen > 0.0
     assert known.mean() > 0.9
@@ -45,22 +45,22 @@ def test_depth_is_where_the_image_sees_it(camera: Camera) -> None:
 def test_depth_of_the_same_moment_stays() -> None:
     depth_m = drawn(BENT, np.eye(4)).astype(np.float32)
     depth_m[10:20, 30:50] = np.nan
-    seen = as_image_sees(depth_m, BENT, np.eye(4))
+    seen = DepthAtImage(BENT)(depth_m, np.eye(4))
     assert np.allclose(seen, np.nan_to_num(depth_m), atol=1e-6)
 
 
 def test_what_depth_did_not_see_stays_unknown() -> None:
     depth_m = drawn(PLAIN, TURNED).astype(np.float32)
     depth_m[:, :80] = 0.0
-    seen = as_image_sees(depth_m, PLAIN, TURNED)
+    seen = DepthAtImage(PLAIN)(depth_m, TURNED)
     assert not seen[:, :70].any() and (seen[:, 80:140] > 0.0).mean() > 0.95
-    away = as_image_sees(depth_m, PLAIN, se3_exp(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0])))
+    away = DepthAtImage(PLAIN)(depth_m, se3_exp(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0])))
     assert not away.any()
 
 
 def test_two_calls_give_the_same_bytes() -> None:
     depth_m = drawn(BENT, TURNED).astype(np.float32)
-    assert as_image_sees(depth_m, BENT, TURNED).tobytes() == as_image_sees(depth_m, BENT, TURNED).tobytes()
+    assert DepthAtImage(BENT)(depth_m, TURNED).tobytes() == DepthAtImage(BENT)(depth_m, TURNED).tobytes()
 
 
 def test_the_scan_of_a_keyframe_has_the_depth_of_its_image() -> None:

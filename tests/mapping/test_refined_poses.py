@@ -108,10 +108,12 @@ def test_directions_that_equations_hardly_know_are_left_out_of_them():
     np.testing.assert_array_equal(without_weak(np.zeros((6, 6)), np.zeros(6))[0], 0.0)
 
 
-def test_the_maps_files_are_made_at_refined_poses_only_when_asked():
+def test_a_map_with_a_surface_is_made_at_refined_poses_unless_that_is_switched_off():
     shift = transform(np.eye(3), np.array([0.05, 0.0, 0.0]))
-    for is_asked in (False, True):
-        mapper = Mapper(replace(CONFIG, pixel_step=1, refine_poses=is_asked), RIG)
+    for products, switch, is_asked in (
+        (("cloud", "octomap"), True, False), (("cloud", "mesh"), False, False), (("cloud", "mesh"), True, True),
+    ):  # fmt: skip
+        mapper = Mapper(replace(CONFIG, pixel_step=1, products=products, refine_poses=switch), RIG)
         for k in range(4):
             mapper.add(keyframe(k, pose(0.25 * k)), pose(0.25 * k) @ (shift if k == 2 else np.eye(4)))
         other = mapper.refined()

@@ -108,8 +108,8 @@ class MapConfig:
     grid_low_m: Finite = 0.10  # above the floor: lower things are driven over or are the floor's own noise
     grid_high_m: Finite = 1.60  # above the floor: higher things are driven under
     drive: DriveConfig = field(default_factory=DriveConfig)
-    # poses of keyframes fitted to each other's depth for the files of the map alone; half a second per ten keyframes
-    refine_poses: bool = False
+    # where a surface is asked for, its map is made at poses that fit the depth of keyframes to each other: 0.1 s each
+    refine_poses: bool = True
     mesh_voxel_m: Positive = 0.01  # about the noise of depth at 2 m; farther views count less, by that noise
     mesh_max_blocks: Count = 40_000  # of 8 x 8 x 8 voxels, 12 kB each; a mesh that takes more gets larger voxels
     mesh_min_views: Count = 2  # a surface that fewer keyframes saw is left out where other rays passed through it

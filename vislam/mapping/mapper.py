@@ -28,7 +28,7 @@ from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh.posed import PosedView, posed_views
 from vislam.mapping.mesh.volume import Volume
 from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
-from vislam.mapping.products import LEVEL, NotLevel, remove_products, write_products
+from vislam.mapping.products import LEVEL, SURFACES, NotLevel, remove_products, write_products
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.fusion import LabelFusion
 from vislam.mapping.semantic.layer import LabelLayer
@@ -227,12 +227,14 @@ class Mapper:
         return self._made_again(poses, self._submaps)
 
     def refined(self) -> Mapper:
-        """Return the map at poses that fit depth images to each other, itself where that is not asked for or no gain.
+        """Return the map at poses that fit depth images to each other, itself where that is no gain or not asked for.
 
-        What was found is in `refinement`. Keyframes of submaps that are not joined with the map stay where they are.
+        It is where a surface is among the products. What was found is in `refinement`. Keyframes of submaps that are
+        not joined with the map stay where they are.
         """
         # the noise of depth that it goes by is that of a depth sensor
-        if not self._config.refine_poses or not self._rig.has_depth or self._one_camera:
+        is_asked = self._config.refine_poses and not set(SURFACES).isdisjoint(self._config.products)
+        if not is_asked or not self._rig.has_depth or self._one_camera:
             return self
         poses, self.refinement = refined_poses(self._store, self._occupancy.poses, self._extractor.view)
         if not poses:

@@ -35,6 +35,7 @@ FILES = {
     "labels": VOXELS_NAME,
 }  # fmt: skip
 
+SURFACES = ("mesh", "glb", "obj", "poisson", "surfels")  # what a doubled wall spoils
 NEEDS_UP = ("grid", "drive")  # what means nothing in a map that is not level
 
 

@@ -15,7 +15,7 @@ from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8, Keyframe
 from vislam.mapping.cloud.store import Scan
 from vislam.mapping.depth.image import DepthView, filter_depth, mono_view, rgbd_view
-from vislam.mapping.depth.moment import as_image_sees
+from vislam.mapping.depth.moment import DepthAtImage
 from vislam.mapping.depth.stereo import DenseStereo
 from vislam.mapping.semantic.images import LabelRays, checked
 
@@ -47,6 +47,10 @@ class ScanExtractor:
     @cached_property
     def _label_rays(self) -> LabelRays:
         return LabelRays(self.view, self._rig)
+
+    @cached_property
+    def _depth_at_image(self) -> DepthAtImage:
+        return DepthAtImage(self._cameras[0])
 
     def extract(self, keyframe: Keyframe, labels: NDArray[np.integer] | None = None) -> Scan | None:
         """Return the keyframe's scan, or None when nothing of its geometry is known.
@@ -93,7 +97,7 @@ class ScanExtractor:
         self._cameras[0].check_image(image)
         depth_m, T_image_depth = frame.depth_m, keyframe.T_image_depth
         if T_image_depth is not None:
-            depth_m = as_image_sees(depth_m, self._cameras[0], T_image_depth)
+            depth_m = self._depth_at_image(depth_m, T_image_depth)
         depth = filter_depth(depth_m, self._config.pixel_step, self.view, self._config)
         return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
 

@@ -13,27 +13,35 @@ from vislam.core.messages import Array, ImageF32
 _STEPS = 3  # of the search for the pixel that sees a point; the first takes it for infinitely far
 
 
-def as_image_sees(depth_m: ImageF32, camera: Camera, T_image_depth: Array) -> ImageF32:
-    """Return depth [H, W] in metres along the optical axis as the camera saw it when its image was taken, 0: unknown.
+class DepthAtImage:
+    """Puts depth where the camera saw it when its image was taken."""
 
-    Args:
-        depth_m: registered depth image [H, W], NaN or 0 where unknown.
-        camera: of both.
-        T_image_depth: [4, 4] where the camera was when depth was taken, as the image sees it: some pixels away, so
-            distortion is that of the pixel that looks into the same direction.
-    """
-    rows, columns = depth_m.shape
-    u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
-    T_depth_image = invert(T_image_depth)
-    rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()])) @ T_depth_image[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy = rays[:, :2] / rays[:, 2:]
-    return np.asarray(
-        _gathered(
-            np.ascontiguousarray(depth_m, dtype=np.float32), camera.project(rays), np.ascontiguousarray(xy),
-            T_depth_image[:3, 3] , T_image_depth[2], np.array([camera.fx, camera.fy]),
+    def __init__(self, camera: Camera) -> None:
+        """Take the camera of both."""
+        u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
+        self._camera = camera
+        self._rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()]))
+
+    def __call__(self, depth_m: ImageF32, T_image_depth: Array) -> ImageF32:
+        """Return depth [H, W] in metres along the optical axis as the image sees it, 0: unknown.
+
+        Args:
+            depth_m: registered depth image [H, W], NaN or 0 where unknown.
+            T_image_depth: [4, 4] where the camera was when depth was taken, as the image sees it: some pixels away, so
+                distortion is that of the pixel that looks into the same direction.
+
+        Raises DataError when the depth image has not the camera's size.
+        """
+        camera, T_depth_image = self._camera, invert(T_image_depth)
+        camera.check_image(depth_m)
+        rays = self._rays @ T_depth_image[:3, :3].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = rays[:, :2] / rays[:, 2:]
+        depth_m = np.ascontiguousarray(depth_m, dtype=np.float32)
+        focal_px = np.array([camera.fx, camera.fy])
+        return np.asarray(
+            _gathered(depth_m, camera.project(rays), xy, T_depth_image[:3, 3], T_image_depth[2], focal_px)
         )
-    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
