@@ -2,7 +2,7 @@
 
 Views are chosen as in Waechter, Moehrle and Goesele, "Let there be color! Large-scale texturing of 3D reconstructions",
 ECCV 2014, but without their graph cut: triangles of one small cube that face the same way vote for one view, and those
-that it did not see take the best of their own. What hides a triangle is the view's own depth.
+that it did not see, or hardly, take the best of their own. What hides a triangle is the view's own depth.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageU8
 from vislam.mapping.cloud.cloud import cells_of
 from vislam.mapping.cloud.mesh import Mesh
+from vislam.mapping.mesh.exposure import exposure_gains
 from vislam.mapping.mesh.posed import PosedView
 
 I64 = NDArray[np.int64]
@@ -31,6 +32,10 @@ _MIN_FACING = 0.2  # cosine to the ray; more grazing pictures are smeared
 _HIDDEN_M = 0.03  # behind the view's depth by more than this, and twice the noise of depth: something stands before it
 _NOISE_1M = 0.005
 _NEAR_M = 0.1  # before the camera; nearer things are not in focus
+_WHITE = 250  # of 255, in all channels: overexposed, whatever is there ...
+_OVEREXPOSED = 0.1  # ... and worth so much of another picture of it
+_MUCH_WORSE = 0.2  # of the score of a triangle's own best view: it takes that instead of what its cube voted for
+_PLACES = 20_000  # triangles, evenly over the mesh, by which exposures are compared
 _MARGIN_PX = 2  # around a chart, so that filters of viewers find colours of its own
 _SMALLER = 0.85  # an atlas that gets too full gets charts smaller by this
 _SMALLEST = 0.05  # less is worse than the colours of vertices
@@ -84,9 +89,12 @@ def _is_clear(depth_m: NDArray[np.float32], K: Array, point: tuple[float, float,
 
 
 @njit(cache=True, nogil=True)
-def _scores(corners: NDArray[np.float64], normals: NDArray[np.float64], depth_m: NDArray[np.float32], K: Array,
-            T: Array, out: NDArray[np.float64]) -> None:  # fmt: skip
-    """Give each triangle the pixels per square metre that a view has of it, 0 where it does not see it whole."""
+def _scores(corners: NDArray[np.float64], normals: NDArray[np.float64], depth_m: NDArray[np.float32], colors: ImageU8,
+            K: Array, T: Array, out: NDArray[np.float64]) -> None:  # fmt: skip
+    """Give each triangle the pixels per square metre that a view has of it, 0 where it does not see it whole.
+
+    Where the picture is overexposed they count less.
+    """
     for i in range(len(corners)):
         out[i] = 0.0
         middle = (corners[i, 0] + corners[i, 1] + corners[i, 2]) / 3.0
@@ -103,13 +111,16 @@ def _scores(corners: NDArray[np.float64], normals: NDArray[np.float64], depth_m:
         nz = T[2, 0] * normals[i, 0] + T[2, 1] * normals[i, 1] + T[2, 2] * normals[i, 2]
         cosine = -(nx * x + ny * y + nz * z) / np.sqrt(x * x + y * y + z * z)
         if cosine > _MIN_FACING:
-            out[i] = cosine * K[0, 0] * K[1, 1] / (z * z)
+            pixel = colors[int(K[1, 1] * y / z + K[1, 2] + 0.5), int(K[0, 0] * x / z + K[0, 2] + 0.5)]
+            counts = _OVEREXPOSED if min(pixel[0], pixel[1], pixel[2]) >= _WHITE else 1.0
+            out[i] = counts * cosine * K[0, 0] * K[1, 1] / (z * z)
 
 
 def textured(mesh: Mesh, views: Callable[[], Iterable[PosedView]], size_px: int) -> TexturedMesh | None:
     """Return the mesh with an atlas of at most `size_px` squared, None where no view sees it or that is far too small.
 
-    Views are asked for four times, one at a time; the same ones give the same bytes.
+    Pictures are multiplied so that they agree on what they see together. Views are asked for five times, one at a time;
+    the same ones give the same bytes.
     """
     corners = mesh.points_m.astype(np.float64)[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -140,11 +151,13 @@ def textured(mesh: Mesh, views: Callable[[], Iterable[PosedView]], size_px: int)
     if packed is None:
         return None
     sizes, places, height = packed
+    gains = _gains(corners, normals, views)
     atlas = np.zeros((height, size_px, 3), np.uint8)
     for k, view in enumerate(views()):
         for c in np.flatnonzero(view_of == k):
             part = view.colors[low[c, 1] : high[c, 1], low[c, 0] : high[c, 0]]
             (x, y), (w, h) = places[c], sizes[c]
+            part = np.clip(part * gains[k] + 0.5, 0.0, 255.0).astype(np.uint8)
             atlas[y : y + h, x : x + w] = cv2.resize(part, (int(w), int(h)), interpolation=cv2.INTER_AREA)
     uv = (pixels + 0.5 - low[chart_of]) * (sizes / (high - low))[chart_of] + places[chart_of]
     rest = mesh.select(~seen)
@@ -171,13 +184,31 @@ def _chosen(corners: Array, normals: Array, views: Callable[[], Iterable[PosedVi
     out = own.view.copy()
     for k, view in enumerate(views()):
         _score(corners, normals, view, score)
-        out[(voted.view[patch] == k) & (score > 0.0)] = k
+        out[(voted.view[patch] == k) & (score > _MUCH_WORSE * own.score)] = k
     return out
 
 
 def _score(corners: Array, normals: Array, view: PosedView, out: Array) -> None:
     T = np.ascontiguousarray(invert(view.T_map_view))
-    _scores(corners, normals, view.depth_m, np.ascontiguousarray(view.K), T, out)
+    _scores(corners, normals, view.depth_m, view.colors, np.ascontiguousarray(view.K), T, out)
+
+
+def _gains(corners: Array, normals: Array, views: Callable[[], Iterable[PosedView]]) -> Array:
+    """Return what to multiply the pictures by [V, 3], by places that are evenly spread over the mesh."""
+    every = -(-len(corners) // _PLACES)
+    some, facing = corners[::every], normals[::every]
+    return exposure_gains([_colors_seen(some, facing, view) for view in views()], len(some))
+
+
+def _colors_seen(corners: Array, normals: Array, view: PosedView) -> tuple[I64, ImageU8]:
+    """Return which triangles a view sees, and the colours [M, 3] in their middles."""
+    score = np.zeros(len(corners))
+    _score(corners, normals, view, score)
+    seen = np.flatnonzero(score > 0.0)
+    T = invert(view.T_map_view)
+    p = (corners[seen].mean(axis=1) @ T[:3, :3].T + T[:3, 3]) @ view.K.T
+    column, row = np.round(p[:, :2] / p[:, 2:]).astype(np.int64).T
+    return seen, view.colors[row, column]
 
 
 def _charts(triangles: NDArray[np.int32], chosen: I64) -> I64:
