@@ -15,8 +15,9 @@ from vislam.calibration.cameras.board_watch import BoardWatch
 from vislam.calibration.inertial.sample_watches import PoseWatch, StillWatch, TurnWatch
 from vislam.calibration.kinds import KINDS
 from vislam.calibration.options import BoardOptions
-from vislam.cli.wizard import calibration_steps
+from vislam.cli.wizard import calibration_steps, run_setup
 from vislam.cli.wizard.calibration_steps import STEPS, CalibrationSteps, board_of
+from vislam.cli.wizard.run_setup import RunSetup
 from vislam.cli.wizard.step_sensors import opened
 from vislam.config import Config, SensorsConfig
 from vislam.core.errors import DataError, UsageError
@@ -181,7 +182,7 @@ def test_a_board_is_what_the_page_says() -> None:
 @pytest.mark.parametrize("source", ["virtual-cart", "gy85+none"])
 def test_a_source_without_what_a_step_needs_is_told(source: str) -> None:
     with pytest.raises(UsageError, match=r"nothing that a hand could move|no camera"):
-        opened(source, Config(), SensorsConfig(), has_images=True)
+        opened(RunSetup(source, Config(), SensorsConfig()), has_images=True)
 
 
 class Page:
@@ -218,7 +219,7 @@ class Hand:
 def steps_with(monkeypatch, tmp_path: Path, hand: Hand) -> tuple[CalibrationSteps, Page]:
     monkeypatch.setattr(calibration_steps, "opened", lambda *_: hand)
     page = Page()
-    return CalibrationSteps(page, "gy85+webcam", Config(), SensorsConfig(), tmp_path / "run"), page
+    return CalibrationSteps(page, RunSetup("gy85+webcam", Config(), SensorsConfig()), tmp_path / "run"), page
 
 
 def test_a_step_is_begun_watched_and_finished_and_writes_below_the_run_folder_only(monkeypatch, tmp_path: Path) -> None:
@@ -271,6 +272,6 @@ def test_a_step_that_is_left_leaves_nothing(monkeypatch, tmp_path: Path) -> None
 
 
 def test_every_step_has_its_words() -> None:
-    assert {*STEPS} == {name for name, kind in KINDS.items() if kind.watch is not None} == {*calibration_steps._USES}
+    assert {*STEPS} == {name for name, kind in KINDS.items() if kind.watch is not None} == {*run_setup._FILES}
     script = (Path(calibration_steps.__file__).parents[2] / "live/web/assets/wizard.js").read_text(encoding="utf-8")
     assert all(f"{name}: " in script for name in STEPS)

@@ -180,8 +180,19 @@ def with_raw_samples(config: SensorsConfig) -> SensorsConfig:
 
 def calibration_of(name: str, config: SensorsConfig) -> SensorCalibration:
     """Return the calibration in the settings of an inertial sensor."""
-    if name.startswith("serial"):
-        return config.serial.calibration
-    if name.partition(":")[0] in WITH_IMU:
-        return frame_config(name, config).calibration
-    return config.board.calibration if _is_board(name) and name != "none" else config.gy85.calibration
+    found: SensorCalibration = getattr(config, _section(name)).calibration
+    return found
+
+
+def with_calibration(name: str, config: SensorsConfig, calibration: SensorCalibration) -> SensorsConfig:
+    """Return the settings with another calibration of an inertial sensor."""
+    section = _section(name)
+    return replace(config, **{section: replace(getattr(config, section), calibration=calibration)})
+
+
+def _section(name: str) -> str:
+    """Return which settings of `SensorsConfig` are those of an inertial sensor."""
+    kind = name.partition(":")[0]
+    if kind in ("serial", *WITH_IMU):
+        return kind
+    return "board" if _is_board(name) and name != "none" else "gy85"

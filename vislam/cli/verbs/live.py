@@ -104,12 +104,12 @@ def main(arguments: list[str]) -> int:
 
     base = None if options.map is None else MapChoice(options.map, options.localize_only)
     with opened(web, options.settings.live.name, options.out) as station:
-        make = partial(_made, options, command, base, station)
+        make = partial(_made, command=command, base=base, station=station)
         if station is not None and web is not None and web.waits:
             prepare(options.out, options.overwrite, base)
-            live, seconds = begun_by_page(station, options, command, make)
+            (live, seconds), options = begun_by_page(station, options, command, make)
         else:
-            live, seconds = make()
+            live, seconds = make(options)
             prepare(options.out, options.overwrite, base)
         return _execute(live, command, options.out, options.sensors, seconds, options.json, station)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -83,22 +83,27 @@ def opened(web: WebChoice | None, pose_name: str, out: Path) -> Iterator[Station
         station.close()
 
 
-def begun_by_page(station: Station, options: LiveOptions, command: list[str], make: Callable[[], Made]) -> Made:
-    """Wait until the page says that the run shall begin, and return what `make` makes; meanwhile it can calibrate.
+def begun_by_page(
+    station: Station, options: LiveOptions, command: list[str], make: Callable[[LiveOptions], Made]
+) -> tuple[Made, LiveOptions]:
+    """Wait until the page says that the run shall begin, and return what `make` makes of the options, and those.
 
-    Where it cannot be made, as where a sensor is missing, the page says why and it may be tried again.
+    Meanwhile the page can calibrate: the options then have what was found. Where it cannot be made, as where a sensor
+    is missing, the page says why and it may be tried again.
 
     Raises VislamError: the process of the page died.
     """
     from vislam.cli.wizard.calibration_steps import STEPS, CalibrationSteps
+    from vislam.cli.wizard.run_setup import RunSetup
 
-    steps = CalibrationSteps(station, options.source, options.settings, options.sensors, options.out)
+    steps = CalibrationSteps(station, RunSetup(options.source, options.settings, options.sensors), options.out)
     with log_to(options.out, command), closing(steps):
         while station.is_well:
             for asked in station.asked():
                 if asked.do == "start" and not steps.is_going:
                     try:
-                        return make()
+                        found = replace(options, settings=steps.setup.config, sensors=steps.setup.sensors)
+                        return make(found), found
                     except VislamError as error:
                         steps.shown = {"kind": "run", "stage": "failed", "lines": [str(error)]}
                 else:

@@ -12,8 +12,9 @@ from typing import Any
 from vislam.calibration.kinds import KINDS
 from vislam.calibration.options import BoardOptions
 from vislam.calibration.watching import Progress, Watch
+from vislam.cli.wizard.run_setup import RunSetup
 from vislam.cli.wizard.step_sensors import StepSensors, opened
-from vislam.config import Config, SensorsConfig, validated
+from vislam.config import validated
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.files import plain
 from vislam.live.web.station import Station
@@ -24,28 +25,23 @@ _TOLD_S = 0.5  # between two looks at the progress
 _FEWEST_SQUARES, _MOST_SQUARES = 3, 64
 FOLDER = "calibration"  # in the run folder
 STEPS = {name: kind.summary for name, kind in KINDS.items() if kind.watched_by is not None}
-_USES = {  # what to do with the file of each
-    "camera": "--calibration.camera {}/camchain.yaml, once vislam calibrate camera-imu has added T_cam_imu",
-    "imu": "biases and matrices of {}/imu.yaml go into [SENSOR.calibration] of the sensors file (--sensors)",
-    "mag": "bias and matrix of {}/mag.yaml go into [SENSOR.calibration] of the sensors file (--sensors)",
-    "noise": "--calibration.imu-noise {}/noise.yaml",
-}
 
 
 class CalibrationSteps:
     """Owns the step that is going on, if any; everything it writes is below one folder."""
 
-    def __init__(self, station: Station, source: str, config: Config, sensors: SensorsConfig, out: Path) -> None:
+    def __init__(self, station: Station, setup: RunSetup, out: Path) -> None:
         """Begin with none.
 
         Args:
             station: the page.
-            source: of the run that waits.
-            config: of the run.
-            sensors: of the cart.
+            setup: of the run that waits.
             out: the run folder.
+
+        Attributes:
+            setup: the same with what was calibrated since.
         """
-        self._station, self._source, self._config, self._sensors = station, source, config, sensors
+        self._station, self.setup = station, setup
         self._folder = out / FOLDER
         self._kind = ""
         self._watch: Watch | None = None
@@ -103,7 +99,7 @@ class CalibrationSteps:
         self._kind = name
         self._watch = watch(self._folder, board_of(values))
         try:
-            self._opened = opened(self._source, self._config, self._sensors, watch.has_images)
+            self._opened = opened(self.setup, watch.has_images)
         except BaseException:
             self._watch = None
             raise
@@ -121,12 +117,12 @@ class CalibrationSteps:
         self._watch = self._opened = None
         outcome = watch.calibrate()
         files = [f"{FOLDER}/{path.name}" for path in outcome.files]
-        usage = _USES[self._kind].format(self._folder)
+        self.setup, use = self.setup.calibrated(self._kind, self._folder)
         lines = [line for line in outcome.lines if not line.startswith("next: ")]
         self.shown = {
             "kind": self._kind,
             "stage": "done",
-            "lines": [*lines, f"for the next run: {usage}"],
+            "lines": [*lines, use],
             "files": files,
         }
         _LOG.info("calibrated: %s; %s", self._kind, ", ".join(files))

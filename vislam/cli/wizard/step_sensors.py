@@ -10,6 +10,7 @@ from typing import Protocol
 
 import cv2
 
+from vislam.cli.wizard.run_setup import RunSetup
 from vislam.config import Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
@@ -41,13 +42,14 @@ class StepSensors(Protocol):
         ...
 
 
-def opened(source: str, config: Config, sensors: SensorsConfig, has_images: bool) -> StepSensors:
+def opened(setup: RunSetup, has_images: bool) -> StepSensors:
     """Return the cameras, or the IMU, of a live run's source.
 
     Raises UsageError where it has none that a person could move, HardwareError where one is missing.
     """
+    source = setup.source
     if source.startswith("replay:"):
-        return _Played(source.removeprefix("replay:"), config, has_images)
+        return _Played(source.removeprefix("replay:"), setup.config, has_images)
     inertial, plus, camera = source.partition("+")
     if not plus and inertial.partition(",")[0].partition(":")[0] in WITH_IMU:
         inertial, camera = "", source
@@ -57,7 +59,7 @@ def opened(source: str, config: Config, sensors: SensorsConfig, has_images: bool
         raise UsageError(f"{source} has nothing that a hand could move; calibrate with a cart's sensors or a replay")
     if has_images and camera == "none":
         raise UsageError(f"{source} has no camera to calibrate")
-    return _Cart(inertial, camera, sensors, has_images)
+    return _Cart(inertial, camera, setup.sensors, has_images)
 
 
 class _Cart:
