@@ -63,6 +63,12 @@ class LoopConfig:
     training_descriptors: Count = 500_000  # at most: bounds a training, in the background, to 2 s
     vocabulary_branching: Count = 10  # children of a node
     vocabulary_depth: Count = 6  # levels at most; as many as leave each word five descriptors
+    # with --map OLD and a depth camera: where no image finds the map, depth is asked about the pose carried on so far
+    depth_in_map: bool = True
+    depth_in_a_row: Count = 3  # keyframes whose answers agree through odometry, before one is offered: rooms repeat
+    depth_worth_m: NonNegative = 0.03  # of that pose, one sigma: known better, depth adds little to it ...
+    depth_worth_deg: NonNegative = 1.5  # ... nor to where it looks: an answer is good to 1 cm and 0.6 deg
+    start_in_map: str | None = None  # X,Y,Z,QX,QY,QZ,QW of the body in OLD's map at the begin, for depth: 0.3 m, 15 deg
     inject_share: Share = 0.0  # for experiments: share of false loops, made up, among those that the graph is offered
     inject_group: Count = 1  # how many of them agree among themselves, as from an object that is there twice
 

@@ -262,6 +262,8 @@ class SlamMemory:
     places: PlacesMemory
     scans: dict[int, PackedScan]  # by keyframe
     held: int = 0  # so many of the first keyframes belong to a map that is not to change
+    map_keyframes: int = 0  # so many of the first keyframes are those of earlier runs
+    T_guess: Array | None = None  # [4, 4] where the body is thought to be in that map when a recording begins; None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -170,13 +170,13 @@ class LoopCandidate:
 
     from_id: int  # the older keyframe
     to_id: int  # the newer keyframe
-    source: str  # "appearance", "odometry" or "tag"
+    source: str  # "appearance", "odometry", "tag" or "depth"
     score: float
     inliers: int
     decision: LoopDecision
     reason: str
     sigma_m: float = float("nan")
-    consistency: int = 0  # by appearance: how many keyframes before this one pointed at the same place in a row
+    consistency: int = 0  # by appearance and depth: how many keyframes before this one said the same place in a row
     supporters: int = 0  # matches that agree with the refined pose
     T_from_to: Array | None = None  # [4, 4] that verification found; None: no pose. A unit direction without scale
     matches_px: Array | None = None  # [M, 4] some of the matches: x, y in the older keyframe, x, y in the newer

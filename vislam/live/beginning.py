@@ -9,6 +9,7 @@ from pathlib import Path
 from vislam.config import Config
 from vislam.core.errors import DataError, UsageError
 from vislam.core.memory import SlamMemory
+from vislam.core.messages import Array
 from vislam.core.recording import Recording
 from vislam.run import check_fits, imu_noise, map_of
 from vislam.run.folder import MapChoice
@@ -24,6 +25,7 @@ class Beginning:
     first_id: int  # of the new keyframes
     next_track_id: int
     held: int  # keyframes that are not to move
+    T_guess: Array | None = None  # [4, 4] where the body is thought to be in the map, if somebody said so
 
 
 def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
@@ -70,9 +72,9 @@ def recalled(beginning: Beginning) -> SlamMemory:
         stored.close()
     if memory is None:
         raise DataError(f"{beginning.session} was changed while the run began; start it again")
-    return replace(memory, held=beginning.held)
+    return replace(memory, held=beginning.held, map_keyframes=beginning.first_id, T_guess=beginning.T_guess)
 
 
 def _of(memory: SlamMemory, session: Path, is_own: bool) -> Beginning:
     front = memory.front
-    return Beginning(session, is_own, front.keyframe_id + 1, front.news.next_track_id, memory.held)
+    return Beginning(session, is_own, front.keyframe_id + 1, front.news.next_track_id, memory.held, memory.T_guess)

@@ -23,7 +23,7 @@ class Candidate:
     """An old keyframe that may show the same place."""
 
     id: int
-    source: str  # "appearance", "odometry" or "tag"
+    source: str  # "appearance", "odometry", "tag" or "depth"
     score: float  # similarity of an island of keyframes, or share of what should be visible in both
     consistency: int = 0  # how many keyframes before this one pointed at the same place in a row
 

@@ -124,6 +124,13 @@ class LoopDetector:
         self._database.add(view)
         return edges, records
 
+    def offer(
+        self, candidate: Candidate, keyframe_id: int, found: Verification
+    ) -> tuple[list[LoopEdge], LoopCandidate]:
+        """Judge what others found of a keyframe that `detect` has seen; return its edge, if any, and the record."""
+        edges: list[LoopEdge] = []
+        return edges, self._record(candidate, self._views[keyframe_id], found, edges)
+
     def close(self) -> None:
         """End what runs in the background; raises what failed there."""
         self._database.close()

@@ -30,6 +30,7 @@ from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.semantic.images import Labeller
 from vislam.mapping.stage import MapStage
+from vislam.pipeline.depth_in_map import DepthInMap
 from vislam.pipeline.front import Front
 from vislam.pipeline.settings import without_gravity
 from vislam.pipeline.steps import FrontStep, KeyframeStep
@@ -69,6 +70,8 @@ class Back:
         if config.loop.inject_share > 0.0:
             self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)
         self.map = map_stage(config, rig, clock, labeller)
+        self._by_depth: DepthInMap | None = None
+        self._config, self._rig = config, rig
         self.clock = clock
         self.T_map_odom = np.eye(4)
         self._words_revision = 0
@@ -82,7 +85,8 @@ class Back:
     def counters(self) -> dict[str, dict[str, int]]:
         """Counters of the rooms that there are."""
         loops = {} if self.loops is None else {"loop": dict(self.loops.counters)}
-        return {**loops, **({} if self.map is None else self.map.counters)}
+        depth = {} if self._by_depth is None else {"depth in map": dict(self._by_depth.counters)}
+        return {**loops, **depth, **({} if self.map is None else self.map.counters)}
 
     @collector.paused()
     def restore(self, memory: SlamMemory) -> GraphUpdate:
@@ -96,6 +100,8 @@ class Back:
             self._words_revision = self.loops.words_revision
         if self.map is not None:
             self.map.restore(memory.scans, graph.T_map_body, memory.held > 0)
+        if memory.map_keyframes and self._rig.has_depth and self._config.loop.depth_in_map:
+            self._by_depth = DepthInMap(self._config, self._rig, memory, update.submaps)
         self._follow(update)
         if memory.held:
             self.graph.hold(memory.held)
@@ -122,6 +128,12 @@ class Back:
                 edges, candidates = self.loops.detect(
                     keyframe, self.T_map_odom @ odometry.T_odom_body, odometry.packet.begins_submap
                 )
+            if self._by_depth is not None:
+                with self.clock.measure("depth in map"):
+                    found = self._by_depth.look(odometry, self.T_map_odom, self.graph.relative_covariance, edges)
+                if found is not None:
+                    by_depth, record = self.loops.offer(found[0], keyframe.id, found[1])
+                    edges, candidates = edges + by_depth, [*candidates, record]
         if self._false is not None:
             false = self._false.add(odometry.T_odom_body, edges)
             edges, candidates = edges + false, candidates + [as_candidate(edge) for edge in false]
@@ -155,6 +167,8 @@ class Back:
         self.T_map_odom = update.T_map_odom
         if self.loops is not None:
             self.loops.move(update)
+        if self._by_depth is not None:
+            self._by_depth.move(update)
         if self.map is not None:
             self.map.move(update)
 

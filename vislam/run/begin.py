@@ -9,9 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vislam.config import Config
 from vislam.core.errors import DataError, UsageError
+from vislam.core.geometry import invert, rotation_from_quaternion_xyzw, transform
 from vislam.core.memory import SlamMemory
+from vislam.core.messages import Array
 from vislam.core.recording import Recording
 from vislam.factors.factor_log import rig_data
 from vislam.imu import ImuNoise
@@ -19,8 +23,10 @@ from vislam.mapping.semantic.images import LabelFolder
 from vislam.pipeline.settings import derived
 from vislam.run.drive import Progress, Run, imu_noise
 from vislam.run.folder import MapChoice, storage, write_setup
+from vislam.run.levelled import stored_level
 from vislam.run.session import Session, SessionWriter, has_begun, recall
 
+_FARTHEST_M = 1e5  # of a pose that somebody gives
 # settings (map.*) that decide what a keyframe's cloud is; what is made of clouds may be set otherwise in every run
 _SHAPING = (
     "min_range_m", "max_range_m", "pixel_step", "edge_ratio", "edge_px", "speckle_pixels", "stereo_scale",
@@ -136,11 +142,35 @@ def map_of(
     memory = recall(stored)
     if memory is None:
         raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
-    memory = replace(memory, held=len(memory.graph.packets) if is_held else 0)
+    if config.loop.start_in_map is not None and not recording.rig.has_depth:
+        raise UsageError(f"--loop.start-in-map is a guess for depth, which {recording.name} does not have")
+    count = len(memory.graph.packets)
+    T_guess = told_start(config.loop.start_in_map, stored_level(stored.info()).T_level_map)
+    memory = replace(memory, held=count if is_held else 0, map_keyframes=count, T_guess=T_guess)
     was, now = (stored.info().get("config") or {}).get("map") or {}, json.loads(json.dumps(asdict(config.map)))
     if any(was.get(name) != now[name] for name in _SHAPING):
         return replace(memory, scans={})
     return memory
+
+
+def told_start(text: str | None, T_level_map: Array) -> Array | None:
+    """Return the pose [4, 4] that `loop.start_in_map` gives in a map's files, in the frame of its session.
+
+    `T_level_map` [4, 4] turns one into the other. Raises UsageError when it is no pose.
+    """
+    if text is None:
+        return None
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+        if values.shape != (7,) or not np.isfinite(values).all() or np.abs(values[:3]).max() > _FARTHEST_M:
+            raise ValueError
+        T = transform(rotation_from_quaternion_xyzw(values[3:]), values[:3])
+    except ValueError:
+        raise UsageError(
+            f"--loop.start-in-map {text}: give X,Y,Z in metres and QX,QY,QZ,QW of the body in the map, as a line of "
+            "its trajectory_graph.tum has them after the stamp"
+        ) from None
+    return np.asarray(invert(T_level_map) @ T)
 
 
 def check_fits(stored: Session, recording: Recording, config: Config, noise: ImuNoise | None) -> None:

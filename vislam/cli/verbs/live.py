@@ -100,6 +100,8 @@ def main(arguments: list[str]) -> int:
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
     if options.localize_only and options.map is None:
         raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    if options.settings.loop.start_in_map is not None and options.map is None:
+        raise UsageError("--loop.start-in-map is a place in a map; give --map OLD/session.db")
     from vislam.run.folder import MapChoice, prepare
 
     base = None if options.map is None else MapChoice(options.map, options.localize_only)

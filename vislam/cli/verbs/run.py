@@ -86,6 +86,8 @@ def main(arguments: list[str]) -> int:
     told_up(options.settings.up)
     if options.localize_only and options.map is None:
         raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    if options.settings.loop.start_in_map is not None and options.map is None:
+        raise UsageError("--loop.start-in-map is a place in a map; give --map OLD/session.db")
     print_metrics(run_source(options, command), options.out, options.json)
     return 0
 

@@ -26,7 +26,7 @@ def judge(found: Verification, tilt_rad: float | None, config: LoopConfig) -> tu
     """Return whether a candidate is offered to the graph, by its verification and its tilt (None: unknown), and why."""
     if found.T_a_b is None:
         return LoopDecision.REJECTED, found.reason
-    seen = f"{found.inliers} inliers, {found.supporters} with guided matching"
+    seen = found.reason or f"{found.inliers} inliers, {found.supporters} with guided matching"
     against = objection(found, tilt_rad, config)
     if against:
         return LoopDecision.REJECTED, f"{against} ({seen})"

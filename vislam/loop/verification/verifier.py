@@ -34,9 +34,9 @@ _REFINE_PASSES = 2  # guided matching, then once more with the better pose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verification:
-    """What verification of an older view a against a newer view b found; without a pose, `reason` says why."""
+    """What verification of an older view a against a newer view b found."""
 
-    reason: str
+    reason: str  # why there is no pose; with one, by what it was found, where that was not matches
     matches: int
     inliers: int = 0  # of RANSAC, before guided matching: what the acceptance rule counts
     supporters: int = 0  # matches that agree with the refined pose, guided ones included

@@ -7,17 +7,18 @@ overlaps fits, nothing is seen through, and no other start ends in another place
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError, UsageError
-from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
+from vislam.core.geometry import invert, invert_many, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, ImageF32
 from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
-from vislam.vision.depth_surface import SurfaceMaker
+from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
 
 _NEAREST_M, _FARTHEST_M, _SIGMA_RHO = 0.3, 8.0, 2e-3  # as in a run (`FrontEndConfig`)
 _WIDER = 3.0  # times the standard deviations of depth, as frames are placed by it in a run
@@ -26,6 +27,7 @@ _MAP_SIGMA_M, _MAP_SIGMA_RAD = 0.01, np.deg2rad(0.6)
 _PARTS = 4  # keyframes around a guess: more see the same
 _NEAR_M, _NEAR_RAD = 1.0, np.deg2rad(40.0)  # how far off a keyframe is as far as another is turned away
 _FAR = 2.0  # of those distances together: such a keyframe sees something else
+_KEPT = 64  # surfaces of keyframes at once, 1 MB each: those of a room
 _LEAST_SHARE = 0.3  # of the pixels have depth
 _OVERLAP, _AGREEMENT, _SEEN_THROUGH, _RESIDUAL = 0.5, 0.9, 0.04, 1.5
 _SAME_M, _SAME_RAD = 0.03, np.deg2rad(1.5)  # two starts that end within this are at one place
@@ -55,6 +57,7 @@ class DepthAnswer:
     overlap: float  # share of the frame's surface that falls on the map's
     agreement: float  # share of what could be compared that fits
     seen_through: float  # share of what was compared that one side looks through
+    nearest: int = -1  # of the keyframes as they were added, that whose view is most like the guess's; -1: none is near
 
 
 class DepthLocaliser:
@@ -66,20 +69,33 @@ class DepthLocaliser:
         self._maker = SurfaceMaker(camera, _NEAREST_M, _FARTHEST_M, _SIGMA_RHO)
         other = camera if map_camera is None else map_camera
         self._map_maker = SurfaceMaker(other, _NEAREST_M, _FARTHEST_M, _SIGMA_RHO)
-        self._parts: list[SeenFrom] = []
+        self._T_map_cams: list[Array] = []
+        self._depths: list[Callable[[], ImageF32]] = []
+        self._surfaces: OrderedDict[int, DepthSurface] = OrderedDict()  # that were asked for last
 
     def __len__(self) -> int:
-        return len(self._parts)
+        return len(self._depths)
 
-    def add(self, T_map_body: Array, depth_m: ImageF32) -> None:
-        """Add a keyframe of the map by its pose [4, 4] and depth image [H, W]; one without depth adds nothing.
+    def add(self, T_map_body: Array, depth_m: ImageF32 | Callable[[], ImageF32]) -> None:
+        """Add a keyframe of the map by its pose [4, 4] and depth image [H, W], or what makes it when it is needed.
 
-        Raises DataError for a pose that is not finite, or an image that has not the size of the map's camera.
+        One without depth is never asked. Raises DataError for a pose that is not finite, or an image that has not the
+        size of the map's camera; for one that is made later, `localise` does.
         """
         T_map_cam = _checked(T_map_body) @ self._T_body_cam
-        seen = self._map_maker.make(depth_m)
-        if seen.share > 0.0:
-            self._parts.append(SeenFrom(seen, T_map_cam))
+        if callable(depth_m):
+            self._depths.append(depth_m)
+        else:
+            seen = self._map_maker.make(depth_m)
+            if seen.share == 0.0:
+                return
+            image = depth_m
+            self._depths.append(lambda: image)
+        self._T_map_cams.append(T_map_cam)
+
+    def move(self, index: int, T_map_body: Array) -> None:
+        """Put the keyframe that was added as number `index` to another pose [4, 4]."""
+        self._T_map_cams[index] = _checked(T_map_body) @ self._T_body_cam
 
     def localise(self, depth_m: ImageF32, guess: Guess) -> DepthAnswer:
         """Return the pose of a depth image [H, W] near a guess, accepted or refused with the reason.
@@ -97,26 +113,40 @@ class DepthLocaliser:
         frame = self._maker.make(depth_m)
         if frame.share < _LEAST_SHARE:
             return self._refused(prior, None, f"only {frame.share:.0%} of the image has depth on surfaces")
-        parts = self._around(T_map_cam)
-        if not parts:
+        around = self._around(T_map_cam)
+        if not around:
             return self._refused(prior, None, "no keyframe of the map is near the guess")
+        parts = [SeenFrom(self._surface(k), self._T_map_cams[k]) for k in around]
         found = [
             align_depth(frame, parts, prior, _WIDER * _SIGMA_RHO, T_map_cam @ se3_exp(start))
             for start in _starts(sigmas)
         ]
         best = max(found, key=_score)
         reason = _why_not(best, found)
-        return self._refused(prior, best, reason) if reason else self._answer(best, "")
+        return replace(self._answer(best, reason), nearest=around[0])
 
-    def _around(self, T_map_cam: Array) -> Sequence[SeenFrom]:
+    def nearest(self, T_map_body: Array) -> int:
+        """Return the number of the keyframe whose view is most like that of a body at T_map_body [4, 4]; -1: none is.
+
+        Raises DataError for a pose that is not finite.
+        """
+        return next(iter(self._around(_checked(T_map_body) @ self._T_body_cam)), -1)
+
+    def _around(self, T_map_cam: Array) -> Sequence[int]:
         """Return the keyframes whose views are most like that of a camera at T_map_cam [4, 4], the most alike first."""
-        apart = []
-        for part in self._parts:
-            T = invert(T_map_cam) @ part.T_model_cam
-            turned = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
-            apart.append(float(np.linalg.norm(T[:3, 3])) / _NEAR_M + turned / _NEAR_RAD)
-        order = np.argsort(np.array(apart), kind="stable")[:_PARTS]
-        return [self._parts[k] for k in order if apart[k] <= _FAR]
+        if not self._T_map_cams:
+            return []
+        T = invert_many(np.array(self._T_map_cams)) @ T_map_cam
+        turned = np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0))
+        apart = np.linalg.norm(T[:, :3, 3], axis=1) / _NEAR_M + turned / _NEAR_RAD
+        return [int(k) for k in np.argsort(apart, kind="stable")[:_PARTS] if apart[k] <= _FAR]
+
+    def _surface(self, k: int) -> DepthSurface:
+        seen = self._surfaces.pop(k, None)
+        self._surfaces[k] = self._map_maker.make(self._depths[k]()) if seen is None else seen
+        if len(self._surfaces) > _KEPT:
+            self._surfaces.popitem(last=False)
+        return self._surfaces[k]
 
     def _refused(self, prior: Prior, found: DepthAlignment | None, reason: str) -> DepthAnswer:
         if found is None:

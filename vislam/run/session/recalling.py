@@ -90,6 +90,7 @@ def recall(session: Session) -> SlamMemory | None:
             places=places,
             scans=session.scans(),
             held=int(base["keyframes"]) if base.get("localize_only") else 0,
+            map_keyframes=int(base.get("keyframes", 0)),
         )
 
 

@@ -1,0 +1,174 @@
+"""Where a keyframe is in the map of an earlier run by its depth, where images do not tell: in the dark, in other light.
+
+It needs to be known about where that is: the pose carried on from the last loop through odometry, whose covariance the
+graph tells, or one that somebody gave. What depth answers (`DepthLocaliser`) is offered as a loop like any other once
+several keyframes in a row agree through odometry; the graph tests it then as it tests all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.config import Config
+from vislam.core.camera import Rig
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.memory import SlamMemory
+from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopEdge, Submaps
+from vislam.loop.candidates import Candidate
+from vislam.loop.verification import Verification
+from vislam.mapping.depth.localise import DepthAnswer, Guess
+from vislam.mapping.depth.stored import stored_depth
+from vislam.trajectory.odometry_keyframe import OdometryKeyframe
+
+RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed at j
+
+_LEAST_M, _LEAST_DEG = 0.05, 3.0  # of a guess's standard deviations: where several starts are to end in one place
+_TOLD_M, _TOLD_DEG = 0.3, 15.0  # of a pose that somebody gave: "near the charging station"
+_DRIFT = 0.05  # of the way since then: odometry that nothing holds
+_MOST_M, _MOST_DEG = 0.5, 20.0  # farther off, depth was measured to find false places
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Last:
+    """What depth answered for a keyframe."""
+
+    id: int
+    answer: DepthAnswer
+    in_a_row: int
+
+
+class DepthInMap:
+    """Asks the depth of a map's keyframes about new ones."""
+
+    def __init__(self, config: Config, rig: Rig, memory: SlamMemory, submaps: Submaps) -> None:
+        """Take the first `memory.map_keyframes` keyframes, those of the map, but for what no loop joined with it."""
+        self._config = config.loop
+        self._limit = chi_square_limit(config.graph.loop_gate_probability, 6)
+        self._count = memory.map_keyframes
+        poses = memory.graph.T_map_body
+        of_map = {k: s for k, s in memory.scans.items() if k < self._count and submaps.group(k) == 0}
+        self._localiser, self._ids = stored_depth(rig, config.map, of_map, poses)
+        self._numbers = {k: n for n, k in enumerate(self._ids)}
+        self._poses = {k: poses[k] for k in self._ids}
+        self._submaps = submaps
+        self._told = memory.T_guess
+        self._T_map_odom_told: Array | None = None
+        self._way_m, self._T_odom_before = 0.0, np.eye(4)
+        self._last: _Last | None = None
+        self.counters = {"asked": 0, "refused": 0, "alone": 0, "offered": 0}
+
+    def move(self, update: GraphUpdate) -> None:
+        """Follow the keyframes that the graph moved, and the submaps that it joined."""
+        self._submaps = update.submaps
+        for k, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
+            if k in self._numbers:
+                self._poses[k] = T
+                self._localiser.move(self._numbers[k], T)
+
+    def look(
+        self, odometry: OdometryKeyframe, T_map_odom: Array, known: RelativeCovariance, edges: Sequence[LoopEdge]
+    ) -> tuple[Candidate, Verification] | None:
+        """Return what depth says of a new keyframe; None where it has nothing to say, or need not be asked.
+
+        Args:
+            odometry: the keyframe, which the graph does not have yet.
+            T_map_odom: where the graph has odom [4, 4].
+            known: covariance between keyframes of the graph.
+            edges: loops that end with it already; one into the map is all that is wanted.
+        """
+        packet = odometry.packet
+        self._follow_told(odometry)
+        depth_m = packet.keyframe.frame.depth_m
+        if depth_m is None or any(edge.from_id < self._count for edge in edges):
+            return None
+        guess = self._guess(odometry, T_map_odom, known)
+        near = -1 if guess is None else self._localiser.nearest(guess.T_map_body)
+        if guess is None or near < 0:
+            return None
+        self.counters["asked"] += 1
+        answer = self._localiser.localise(depth_m, guess)
+        candidate = Candidate(self._ids[near], "depth", answer.overlap * answer.agreement)
+        against = answer.reason or (
+            "" if answer.determined == 6 else f"depth tells {answer.determined} of 6 directions"
+        )
+        if against:
+            self.counters["refused"] += 1
+            return candidate, Verification(f"by depth: {against}", 0)
+        return self._in_a_row(packet, odometry.T_odom_body, candidate, answer)
+
+    def _in_a_row(
+        self, packet: KeyframePacket, T_odom_body: Array, candidate: Candidate, answer: DepthAnswer
+    ) -> tuple[Candidate, Verification]:
+        """Return an answer that nothing speaks against as a verified pose, if those before it agree."""
+        wanted, last, k = self._config.depth_in_a_row, self._last, packet.keyframe.id
+        agrees = last is not None and last.id == k - 1 and self._agree(last.answer, answer, packet)
+        count = last.in_a_row + 1 if agrees and last is not None else 1
+        self._last = _Last(k, answer, count)
+        candidate = Candidate(candidate.id, candidate.source, candidate.score, count - 1)
+        if agrees and self._T_map_odom_told is not None:
+            self._T_map_odom_told, self._way_m = answer.T_map_body @ invert(T_odom_body), 0.0
+        if count < wanted:
+            self.counters["alone"] += 1
+            return candidate, Verification(f"by depth: {count} of {wanted} keyframes in a row agree", 0)
+        self.counters["offered"] += 1
+        fits = f"by depth: {answer.overlap:.0%} overlaps, {answer.agreement:.0%} of it fits, {count} in a row agree"
+        return candidate, Verification(
+            fits, 0, T_a_b=invert(self._poses[candidate.id]) @ answer.T_map_body, covariance=answer.covariance,
+            sigma_m=float(np.sqrt(np.linalg.eigvalsh(answer.covariance[3:, 3:])[-1])),
+        )  # fmt: skip
+
+    def _agree(self, before: DepthAnswer, now: DepthAnswer, packet: KeyframePacket) -> bool:
+        """Return whether two answers are as far from one another as odometry says that their keyframes are."""
+        moved = packet.vo.T_keyframe_body
+        if moved is None or packet.begins_submap:
+            return False
+        change = se3_log(invert(before.T_map_body @ moved) @ now.T_map_body)
+        covariance = now.covariance + _carried(before.covariance, packet)
+        return float(change @ np.linalg.solve(covariance, change)) < self._limit
+
+    def _guess(self, odometry: OdometryKeyframe, T_map_odom: Array, known: RelativeCovariance) -> Guess | None:
+        """Return where the body is thought to be; None where nobody knows, or it is known well enough already."""
+        config, packet, T_odom_body = self._config, odometry.packet, odometry.T_odom_body
+        k = packet.keyframe.id
+        is_joined = not packet.begins_submap and self._submaps.group(k) == 0
+        if not is_joined:
+            if self._T_map_odom_told is None:
+                return None
+            sigma_m = _TOLD_M + _DRIFT * self._way_m
+            return Guess(self._T_map_odom_told @ T_odom_body, sigma_m, _TOLD_DEG) if sigma_m <= _MOST_M else None
+        self._T_map_odom_told = None  # loops know better
+        T_map_body = T_map_odom @ T_odom_body
+        near = self._localiser.nearest(T_map_body)
+        if near < 0 or packet.vo.T_keyframe_body is None:
+            return None
+        covariance = _carried(known(self._ids[near], k - 1), packet)
+        sigma_rad, sigma_m = (float(np.sqrt(np.linalg.eigvalsh(covariance[i : i + 3, i : i + 3])[-1])) for i in (0, 3))
+        sigma_deg = float(np.rad2deg(sigma_rad))
+        if not (sigma_m <= _MOST_M and sigma_deg <= _MOST_DEG):
+            return None
+        if sigma_m <= config.depth_worth_m and sigma_deg <= config.depth_worth_deg:
+            return None
+        return Guess(T_map_body, max(sigma_m, _LEAST_M), max(sigma_deg, _LEAST_DEG))
+
+    def _follow_told(self, odometry: OdometryKeyframe) -> None:
+        """Carry on the pose that somebody gave, of the first keyframe; a loss of track ends it."""
+        T_odom_body = odometry.T_odom_body
+        if self._told is not None:
+            self._T_map_odom_told, self._told = self._told @ invert(T_odom_body), None
+        elif odometry.packet.begins_submap:
+            self._T_map_odom_told = None
+        else:
+            self._way_m += float(np.linalg.norm(T_odom_body[:3, 3] - self._T_odom_before[:3, 3]))
+        self._T_odom_before = T_odom_body
+
+
+def _carried(covariance: Array, packet: KeyframePacket) -> Array:
+    """Return a covariance [6, 6] at the keyframe before as it is at this one, after visual odometry's motion."""
+    moved = packet.vo.T_keyframe_body
+    assert moved is not None, "asked only where there is a motion"
+    adjoint = se3_adjoint(np.asarray(invert(moved)))
+    return np.asarray(adjoint @ covariance @ adjoint.T + packet.vo.covariance)
