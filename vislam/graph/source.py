@@ -11,7 +11,7 @@ import numpy as np
 from vislam.config import GraphConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError
-from vislam.core.geometry import skew
+from vislam.core.geometry import invert, se3_exp, se3_log, skew
 from vislam.core.memory import EdgeRecord, GraphMemory, GravityRecord, WindowRecord, at_pose
 from vislam.core.messages import Array, KeyframePacket, NavState
 from vislam.core.readings import Motion
@@ -176,6 +176,7 @@ class WindowSource:
         self._window = window
         self._local: list[NavState | None] = []  # of each keyframe in the window's frame, settled or as it was newest
         self._fresh: dict[int, NavState] = {}  # of those, since `take_states`
+        self._by_depth: dict[int, tuple[Array, Array]] = {}  # motions to keyframes that no track ties to the one before
         self._details: dict[str, Any] = {}
 
     @property
@@ -207,6 +208,7 @@ class WindowSource:
             self._window.initialise(better)
             self._window.add(packet, T_odom_body)
             update = replace(update, note="; ".join(note for note in (update.note, why) if note))
+        self._note_depth(packet, record)
         said = self._record(update, record)
         self._odometry.append(said)
         self._local.append(update.newest)
@@ -273,7 +275,7 @@ class WindowSource:
             for edge in update.odometry
             if (edge.settled or edge.to_id >= recent) and not self._begins_submap(edge.to_id, record)
         ]
-        for edge in _edge_records(wanted, notes):
+        for edge in map(self._with_depth, _edge_records(wanted, notes)):
             sigmas = self._odometry.worth_replacing(edge)
             if edge.settled or edge.to_id == record.id:
                 kept.append(edge)
@@ -292,6 +294,26 @@ class WindowSource:
         )
         note = "; ".join(n for n in notes if n)
         return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, note, record.rest_from)
+
+    def _note_depth(self, packet: KeyframePacket, record: KeyframeRecord) -> None:
+        """Remember the motion to a keyframe that its depth image placed, and no track: windows do not hear of it."""
+        T, covariance = record.T_previous_body, record.covariance
+        if packet.vo.inliers or record.begins_submap or not record.has_scale or T is None or covariance is None:
+            return
+        if np.linalg.eigvalsh(covariance)[0] > 0.0:
+            self._by_depth[record.id] = T, covariance
+
+    def _with_depth(self, edge: EdgeRecord) -> EdgeRecord:
+        """Return an edge of the window with what depth alone says of the same motion, if it does: they err apart."""
+        known = self._by_depth.get(edge.to_id)
+        if known is None:
+            return edge
+        T, covariance = known
+        both = edge.covariance + covariance
+        gain = np.linalg.solve(both, edge.covariance).T
+        step = gain @ se3_log(invert(edge.T_previous_body) @ T)
+        left = edge.covariance - gain @ edge.covariance
+        return replace(edge, T_previous_body=edge.T_previous_body @ se3_exp(step), covariance=0.5 * (left + left.T))
 
     def _begins_submap(self, k: int, newest: KeyframeRecord) -> bool:
         """Return whether keyframe k begins a submap: what a window makes of its motion is no edge."""

@@ -1,0 +1,145 @@
+"""A run in the map of another that depth finds where no image does: in the dark, on other wallpaper, or elsewhere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vislam.cli import run_verb
+from vislam.config import load
+from vislam.core.errors import UsageError
+from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.loop.table import read_loops
+from vislam.run import execute
+from vislam.run.begin import told_start
+from vislam.run.folder import MapChoice, prepare
+from vislam.trajectory import read_tum
+from worlds import corner
+from worlds.corner import World, path
+
+# keyframes often, and depth asked whenever it can: a short film is enough
+SETTINGS = {
+    "view.enabled": False, "map.products": [], "frontend.keyframe_max_interval_s": 0.15, "frontend.readout_s": 0.0,
+    "loop.depth_worth_m": 0.0, "loop.depth_worth_deg": 0.0,
+}  # fmt: skip
+OTHER_ROOM = (  # nearer, and with other angles
+    (np.array([0.0, 0.0, 1.0]), 2.9),
+    (np.array([-0.8, 0.0, 0.6]), 1.9),
+    (np.array([0.0, -1.0, 0.0]), 1.4),
+)
+
+
+class Film:
+    """Frames as a recording."""
+
+    name = "corner"
+    imu_noise = None
+
+    def __init__(self, world, frames):
+        self.rig, self._frames = world.rig, frames
+        self.frame_count = len(frames)
+        self.problems = {}
+
+    def events(self, from_ns=None):
+        yield from self._frames
+
+    def truth(self):
+        return None
+
+
+def film(world, poses, dark_from=None):
+    frames = world.frames(poses)
+    if dark_from is not None:
+        frames = [
+            replace(f, images=tuple(np.full_like(i, 4) for i in f.images)) if f.index >= dark_from else f
+            for f in frames
+        ]
+    return Film(world, frames)
+
+
+def run(recording, out, base=None, **settings):
+    prepare(out, overwrite=False)
+    changed = {name.replace("__", "."): value for name, value in settings.items()}
+    return execute(recording, load(None, {**SETTINGS, **changed}), out, "film", [], None, base)
+
+
+def by_depth(out):
+    return [loop for loop in read_loops(out / "loops.csv") if loop.source == "depth"]
+
+
+def told(T, off=(0.0, np.deg2rad(4.0), 0.0, 0.08, 0.0, -0.06)):
+    """A start that is a little off, as somebody types it."""
+    from vislam.core.geometry import quaternion_xyzw_from_rotation
+
+    T = T @ se3_exp(np.array(off))
+    return ",".join(f"{x:.6f}" for x in [*T[:3, 3], *quaternion_xyzw_from_rotation(T[:3, :3])])
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "old"
+    metrics = run(film(World("rgbd"), path(24)), out, map__enabled=True, up="none")
+    assert metrics["keyframes"] > 4
+    return out
+
+
+def other_noise(seed=7):
+    world = World("rgbd", seed=seed)
+    world._rng = np.random.default_rng(99)
+    return world
+
+
+def errors_m(out, poses):
+    """Position errors of a run's frames in the map, whose origin is pose 0 of the path."""
+    found = read_tum(out / "trajectory_graph.tum")
+    index = np.round((found.t_ns - 1_000_000_000) / corner.FRAME_NS).astype(int)
+    return np.array(
+        [np.linalg.norm(se3_log(invert(T) @ poses[k])[3:]) for T, k in zip(found.T_world_body, index, strict=True)]
+    )
+
+
+def test_in_the_dark_depth_ties_a_run_to_the_map_it_was_found_in(old, tmp_path):
+    poses = path(34, 1.5)[4:]
+    metrics = run(film(other_noise(), poses, dark_from=8), tmp_path / "new", MapChoice(old, False), up="none")
+    assert metrics["map"]["found_t_s"] < 0.5
+    loops = by_depth(tmp_path / "new")
+    kept = [loop for loop in loops if loop.decision == "accepted"]
+    assert len(kept) >= 2, [loop.reason for loop in loops]
+    assert all(loop.from_id < metrics["map"]["keyframes"] <= loop.to_id for loop in kept)
+    assert "1 of 3 keyframes in a row agree" in loops[0].reason
+    assert metrics["counters"]["depth in map"]["offered"] >= len(kept)
+    assert errors_m(tmp_path / "new", poses).max() < 0.03
+
+
+def test_a_place_that_is_told_is_found_on_other_wallpaper_by_depth_alone(old, tmp_path):
+    poses = path(24)[2:]
+    start = told(poses[0])
+    metrics = run(film(other_noise(8), poses), tmp_path / "new", MapChoice(old, True), loop__start_in_map=start, up="none")
+    loops = read_loops(tmp_path / "new" / "loops.csv")
+    kept = {loop.source for loop in loops if loop.decision == "accepted" and loop.from_id < metrics["map"]["keyframes"]}
+    assert kept == {"depth"}
+    assert metrics["map"]["found_t_s"] is not None
+    assert errors_m(tmp_path / "new", poses).max() < 0.03
+
+
+def test_another_room_gets_no_edge_by_depth_whatever_place_is_told(old, tmp_path, monkeypatch):
+    monkeypatch.setattr(corner, "_PLANES", OTHER_ROOM)
+    poses = path(24)[2:]
+    start = told(poses[0])
+    metrics = run(film(other_noise(8), poses), tmp_path / "new", MapChoice(old, True), loop__start_in_map=start, up="none")
+    loops = by_depth(tmp_path / "new")
+    assert len(loops) > 2  # it was asked
+    assert not [loop for loop in loops if loop.decision == "accepted"]
+    assert metrics["map"]["found_t_s"] is None
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "0,0,0,0,0,0,0", "nan,0,0,0,0,0,1", "1e300,0,0,0,0,0,1", "a,b,c,d,e,f,g"])
+def test_a_start_that_is_no_pose_is_told(text):
+    with pytest.raises(UsageError, match="QX,QY,QZ,QW"):
+        told_start(text, np.eye(4))
+
+
+def test_a_start_without_a_map_is_told(tmp_path, capsys):
+    arguments = ["run", "sim:handheld-room", "--out", str(tmp_path / "run"), "--loop.start-in-map", "0,0,0,0,0,0,1"]
+    assert run_verb(arguments) == 2
+    assert "--map OLD" in capsys.readouterr().err
