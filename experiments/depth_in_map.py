@@ -18,7 +18,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -30,11 +30,12 @@ sys.path[:0] = [str(ROOT)]
 import numpy as np  # noqa: E402
 
 from vislam.config import Config, load  # noqa: E402
-from vislam.core.geometry import align_points, invert, se3_exp, se3_log  # noqa: E402
+from vislam.core.geometry import align_points, invert, quaternion_xyzw_from_rotation, se3_exp, se3_log  # noqa: E402
 from vislam.core.imu_noise import ImuNoise  # noqa: E402
-from vislam.core.messages import Array, Frame, ImuSample, Localisation, LoopEdge, MagSample  # noqa: E402
+from vislam.core.messages import Array, Frame, ImuSample, Localisation, LoopDecision, LoopEdge, MagSample  # noqa: E402
 from vislam.core.recording import Recording, WrappedRecording  # noqa: E402
 from vislam.pipeline.settings import derived  # noqa: E402
+from vislam.pipeline.steps import Step  # noqa: E402
 from vislam.run import execute, imu_noise, map_of  # noqa: E402
 from vislam.run.session import Session  # noqa: E402
 from vislam.run.sources import open_source  # noqa: E402
@@ -76,72 +77,80 @@ def truth_in_map(session: Session, truth: Trajectory) -> Array:
     return align_points(T[:, :3, 3], np.array([k.T_map_body[:3, 3] for k in stored]))
 
 
+@dataclass
+class Seen:
+    """What a run in a map left."""
+
+    errors: list[tuple[float, float, float]] = field(default_factory=list)  # in the dark: seconds, metres, degrees
+    edges: dict[int, LoopEdge] = field(default_factory=dict)  # by depth, that were offered to the graph
+    asked: int = 0
+    stamps: dict[int, int] = field(default_factory=dict)  # of keyframes
+
+    def take(self, step: Step) -> None:
+        """Take what came of keyframes."""
+        for keyframe in step.keyframes:
+            new = keyframe.odometry.packet.keyframe
+            self.stamps[new.id] = new.t_ns
+            pairs = {(c.from_id, c.to_id) for c in keyframe.candidates if c.source == "depth"}
+            self.asked += len(pairs)
+            self.edges.update({e.id: e for e in keyframe.edges if (e.from_id, e.to_id) in pairs})
+
+
 def run(old: Path, part: Part, settings: Config, noise: ImuNoise | None, dark_after_s: float | None) -> str:
     """Run a stretch in a map and return a row of the table; dark from the begin where `dark_after_s` is None."""
-    truth = part.truth()
+    truth, config = part.truth(), derived(settings, part.rig, noise)
     assert truth is not None
-    config = derived(settings, part.rig, noise)
     session = Session(old / "session.db")
     T_map_truth = truth_in_map(session, truth)
     memory = map_of(session, part, config, noise)
-    stamps = {k.id: k.t_ns for k in session.keyframes()}
+    seen = Seen(stamps={k.id: k.t_ns for k in session.keyframes()})
     session.close()
-    first_id = len(stamps)
     slam = Slam(config, part.rig, noise)
     slam.begin_in_map(memory)
-    edges: dict[int, LoopEdge] = {}
     dark_from: int | None = 0 if dark_after_s is None else None
-    found_t_ns, errors, asked = None, [], []
-    reasons: dict[str, int] = {}
+    is_found = False
     for value in part.events():
-        if isinstance(value, Frame) and dark_from is not None and value.t_ns >= dark_from:
-            value = darkened(value)
-        for step in slam.feed(value):
+        is_dark = isinstance(value, Frame) and dark_from is not None and value.t_ns >= dark_from
+        for step in slam.feed(darkened(value) if is_dark and isinstance(value, Frame) else value):
+            seen.take(step)
             t_ns = step.front.frame.t_ns
-            if step.localisation is Localisation.RELOCALISED and found_t_ns is None:
-                found_t_ns = t_ns
+            if step.localisation is Localisation.RELOCALISED and not is_found:
+                is_found = True
                 dark_from = t_ns + round((dark_after_s or 0.0) * 1e9) if dark_from is None else dark_from
-            if found_t_ns is not None and dark_from is not None and t_ns >= dark_from and step.T_map_body is not None:
-                error = se3_log(invert(step.T_map_body) @ T_map_truth @ truth.at(np.array([t_ns]))[0])
-                errors.append([t_ns * 1e-9, np.linalg.norm(error[3:]), np.rad2deg(np.linalg.norm(error[:3]))])
-            for keyframe in step.keyframes:
-                k = keyframe.odometry.packet.keyframe
-                stamps[k.id] = k.t_ns
-                of_depth = [c for c in keyframe.candidates if c.source == "depth"]
-                asked += of_depth
-                for c in of_depth:
-                    words = "".join(x for x in c.reason.split(",")[0] if not x.isdigit())
-                    reasons[words] = reasons.get(words, 0) + 1
-                pairs = {(c.from_id, c.to_id) for c in of_depth}
-                edges.update({e.id: e for e in keyframe.edges if (e.from_id, e.to_id) in pairs})
+            if is_found and dark_from is not None and t_ns >= dark_from and step.T_map_body is not None:
+                xi = se3_log(invert(step.T_map_body) @ T_map_truth @ truth.at(np.array([t_ns]))[0])
+                rad, m = np.linalg.norm(xi.reshape(2, 3), axis=1)
+                seen.errors.append((t_ns * 1e-9, float(m), float(np.rad2deg(rad))))
     slam.finish()
     assert slam.back is not None
-    believed = [r.loop_id for r in slam.back.graph.edge_reports() if r.loop_id in edges and r.decision == "accepted"]
-    off, nees = [], []
-    for i in believed:
-        e = edges[i]
-        a, b = truth.at(np.array([stamps[e.from_id], stamps[e.to_id]]))
-        xi = se3_log(invert(e.T_from_to) @ invert(a) @ b)
-        off.append([np.linalg.norm(xi[3:]), np.rad2deg(np.linalg.norm(xi[:3]))])
-        nees.append(float(xi @ np.linalg.solve(e.covariance, xi)))
-    E, O = np.array(errors).reshape(-1, 3), np.array(off).reshape(-1, 2)
-    false = int(((O[:, 0] > 0.1) | (O[:, 1] > 5.0)).sum())
-    print(f"  reasons {reasons}; counters {slam.back.counters.get('depth in map')}; "
-          f"{len([k for k in stamps if k >= first_id])} keyframes; timing {slam.clock.summary_ms().get('depth in map')}",
-          file=sys.stderr)  # fmt: skip
-    if not len(E):
-        return "not found |  |  |  |  |  |  |  |"
-    lasted = E[-1, 0] - E[0, 0]
-    rms = np.sqrt(np.mean(E[:, 1:] ** 2, axis=0))
-    edge = f"{len(believed)} of {len(edges)}"
-    if off:
-        edge += f" | {100 * np.median(O[:, 0]):.1f}, {100 * O[:, 0].max():.1f} cm; {np.median(O[:, 1]):.2f}, "
-        edge += f"{O[:, 1].max():.2f}° | {false} | {np.mean(nees):.1f}"
+    reports = slam.back.graph.edge_reports()
+    believed = [r.loop_id for r in reports if r.loop_id in seen.edges and r.decision is LoopDecision.ACCEPTED]
+    return row(seen, [seen.edges[i] for i in believed], truth)
+
+
+def row(seen: Seen, believed: list[LoopEdge], truth: Trajectory) -> str:
+    """Return the columns of the table."""
+    if not seen.errors:
+        return "not found" + " |" * 8
+    t_s, off_m, off_deg = np.array(seen.errors).T
+    rms_m, rms_deg = (float(np.sqrt(np.mean(e**2))) for e in (off_m, off_deg))
+    edges = f"{len(believed)} of {len(seen.edges)}, asked {seen.asked} times"
+    if believed:
+        xi = []
+        for edge in believed:
+            a, b = truth.at(np.array([seen.stamps[edge.from_id], seen.stamps[edge.to_id]]))
+            xi.append(se3_log(invert(edge.T_from_to) @ invert(a) @ b))
+        nees = np.mean([x @ np.linalg.solve(e.covariance, x) for x, e in zip(xi, believed, strict=True)])
+        rad, m = np.linalg.norm(np.array(xi).reshape(-1, 2, 3), axis=2).T
+        cm, deg = 100.0 * m, np.rad2deg(rad)
+        false = int(((cm > 10.0) | (deg > 5.0)).sum())
+        off = f"{np.median(cm):.1f}, {cm.max():.1f} cm; {np.median(deg):.2f}, {deg.max():.2f}°"
+        edges += f" | {off} | {false} | {nees:.1f}"
     else:
-        edge += " |  |  | "
+        edges += " | | | "
     return (
-        f"{lasted:.1f} s | {100 * rms[0]:.1f} cm, {rms[1]:.2f}° | {100 * E[:, 1].max():.1f} cm | "
-        f"{100 * E[-1, 1]:.1f} cm, {E[-1, 2]:.2f}° | {edge} |"
+        f"{t_s[-1] - t_s[0]:.1f} s | {100.0 * rms_m:.1f} cm, {rms_deg:.2f}° | {100.0 * off_m.max():.1f} cm | "
+        f"{100.0 * off_m[-1]:.1f} cm, {off_deg[-1]:.2f}° | {edges} |"
     )
 
 
@@ -173,14 +182,12 @@ def main() -> None:
                 loop = replace(settings.loop, depth_in_map=asks)
                 if args.start:
                     loop = replace(loop, start_in_map=start(old, part))
-                row = run(old, part, replace(settings, loop=loop), noise, None if args.start else args.dark_after)
-                print(f"| {source} | {'yes' if asks else 'no'} | {row}", flush=True)
+                columns = run(old, part, replace(settings, loop=loop), noise, None if args.start else args.dark_after)
+                print(f"| {source} | {'yes' if asks else 'no'} | {columns}", flush=True)
 
 
 def start(old: Path, part: Part) -> str:
     """Return the true pose at the begin of a stretch, 0.2 m and 10 deg off, as `--loop.start-in-map` takes it."""
-    from vislam.core.geometry import quaternion_xyzw_from_rotation
-
     truth, session = part.truth(), Session(old / "session.db")
     assert truth is not None
     first = next(value.t_ns for value in part.events() if isinstance(value, Frame))

@@ -8,11 +8,12 @@ import pytest
 from vislam.cli import run_verb
 from vislam.config import load
 from vislam.core.errors import UsageError
-from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.geometry import invert, quaternion_xyzw_from_rotation, se3_exp, se3_log
 from vislam.loop.table import read_loops
 from vislam.run import execute
 from vislam.run.begin import told_start
 from vislam.run.folder import MapChoice, prepare
+from vislam.slam import Slam
 from vislam.trajectory import read_tum
 from worlds import corner
 from worlds.corner import World, path
@@ -67,10 +68,8 @@ def by_depth(out):
     return [loop for loop in read_loops(out / "loops.csv") if loop.source == "depth"]
 
 
-def told(T, off=(0.0, np.deg2rad(4.0), 0.0, 0.08, 0.0, -0.06)):
+def told(T, off=(0.0, 0.07, 0.0, 0.08, 0.0, -0.06)):
     """A start that is a little off, as somebody types it."""
-    from vislam.core.geometry import quaternion_xyzw_from_rotation
-
     T = T @ se3_exp(np.array(off))
     return ",".join(f"{x:.6f}" for x in [*T[:3, 3], *quaternion_xyzw_from_rotation(T[:3, :3])])
 
@@ -111,10 +110,25 @@ def test_in_the_dark_depth_ties_a_run_to_the_map_it_was_found_in(old, tmp_path):
     assert errors_m(tmp_path / "new", poses).max() < 0.03
 
 
+def test_the_graph_knows_motion_in_the_dark_as_well_as_depth_does():
+    recording = film(World("rgbd"), path(20), dark_from=8)
+    slam = Slam(load(None, {**SETTINGS, "map.enabled": False}), recording.rig)
+    steps = [step for frame in recording.events() for step in slam.feed(frame)]
+    slam.finish()
+    dark = [t.keyframe.id for t in (step.front.track for step in steps) if t.by_depth and t.keyframe is not None]
+    assert len(dark) > 2
+    for k in dark:
+        sigmas = np.sqrt(np.diag(slam.back.graph.relative_covariance(k - 1, k)))
+        assert sigmas[:3].max() < np.deg2rad(3.0)
+        assert sigmas[3:].max() < 0.05
+
+
 def test_a_place_that_is_told_is_found_on_other_wallpaper_by_depth_alone(old, tmp_path):
     poses = path(24)[2:]
     start = told(poses[0])
-    metrics = run(film(other_noise(8), poses), tmp_path / "new", MapChoice(old, True), loop__start_in_map=start, up="none")
+    metrics = run(
+        film(other_noise(8), poses), tmp_path / "new", MapChoice(old, True), loop__start_in_map=start, up="none"
+    )
     loops = read_loops(tmp_path / "new" / "loops.csv")
     kept = {loop.source for loop in loops if loop.decision == "accepted" and loop.from_id < metrics["map"]["keyframes"]}
     assert kept == {"depth"}
@@ -126,14 +140,18 @@ def test_another_room_gets_no_edge_by_depth_whatever_place_is_told(old, tmp_path
     monkeypatch.setattr(corner, "_PLANES", OTHER_ROOM)
     poses = path(24)[2:]
     start = told(poses[0])
-    metrics = run(film(other_noise(8), poses), tmp_path / "new", MapChoice(old, True), loop__start_in_map=start, up="none")
+    metrics = run(
+        film(other_noise(8), poses), tmp_path / "new", MapChoice(old, True), loop__start_in_map=start, up="none"
+    )
     loops = by_depth(tmp_path / "new")
     assert len(loops) > 2  # it was asked
     assert not [loop for loop in loops if loop.decision == "accepted"]
     assert metrics["map"]["found_t_s"] is None
 
 
-@pytest.mark.parametrize("text", ["", "1,2,3", "0,0,0,0,0,0,0", "nan,0,0,0,0,0,1", "1e300,0,0,0,0,0,1", "a,b,c,d,e,f,g"])
+@pytest.mark.parametrize(
+    "text", ["", "1,2,3", "0,0,0,0,0,0,0", "nan,0,0,0,0,0,1", "1e300,0,0,0,0,0,1", "a,b,c,d,e,f,g"]
+)
 def test_a_start_that_is_no_pose_is_told(text):
     with pytest.raises(UsageError, match="QX,QY,QZ,QW"):
         told_start(text, np.eye(4))
