@@ -8,7 +8,8 @@ made black from `--dark-after` seconds after it was found there. Errors are of c
 laid on the truth by the map's keyframes: rms over the dark frames, and at the end. `edges` are loops by depth into the
 map that the graph believes at the end, of those that were offered; `off` is by how much they differ from the truth
 (median, worst), `false` those by more than 10 cm or 5 deg, `NEES` the mean of e' P^-1 e, six when the covariance is
-right. With `--start` no image is seen at all: the true pose at the begin, 0.2 m and 10 deg off, is given instead.
+right. With `--start` the images are black from the begin, and a pose is given: the true one, `--off` metres and degrees
+off. Far off, nothing must be found.
 """
 
 from __future__ import annotations
@@ -163,6 +164,7 @@ def main() -> None:
     parser.add_argument("--dark-after", type=float, default=1.0, help="seconds after the run was found in the map")
     parser.add_argument("--imu", action="store_true", help="with the recording's inertial data")
     parser.add_argument("--start", action="store_true", help="dark from the begin, with a pose that is given")
+    parser.add_argument("--off", nargs=2, type=float, default=(0.2, 10.0), help="metres and degrees")
     parser.add_argument("--old", type=Path, help="folder for the map; it is made where it is not there")
     args = parser.parse_args()
     print("| recording | by depth | dark | rms | worst | at the end | edges | off (median, worst) | false | NEES |")
@@ -181,17 +183,17 @@ def main() -> None:
             for asks in (True, False):
                 loop = replace(settings.loop, depth_in_map=asks)
                 if args.start:
-                    loop = replace(loop, start_in_map=start(old, part))
+                    loop = replace(loop, start_in_map=start(old, part, *args.off))
                 columns = run(old, part, replace(settings, loop=loop), noise, None if args.start else args.dark_after)
                 print(f"| {source} | {'yes' if asks else 'no'} | {columns}", flush=True)
 
 
-def start(old: Path, part: Part) -> str:
-    """Return the true pose at the begin of a stretch, 0.2 m and 10 deg off, as `--loop.start-in-map` takes it."""
+def start(old: Path, part: Part, off_m: float, off_deg: float) -> str:
+    """Return the true pose at the begin of a stretch, so far off, as `--loop.start-in-map` takes it."""
     truth, session = part.truth(), Session(old / "session.db")
     assert truth is not None
     first = next(value.t_ns for value in part.events() if isinstance(value, Frame))
-    off = se3_exp(np.array([0.0, np.deg2rad(10.0), 0.0, 0.14, 0.0, -0.14]))
+    off = se3_exp(np.array([0.0, np.deg2rad(off_deg), 0.0, 0.7 * off_m, 0.0, -0.7 * off_m]))
     T = truth_in_map(session, truth) @ truth.at(np.array([first]))[0] @ off
     session.close()
     return ",".join(f"{x:.9f}" for x in [*T[:3, 3], *quaternion_xyzw_from_rotation(T[:3, :3])])

@@ -8,7 +8,7 @@ several keyframes in a row agree through odometry; the graph tests it then as it
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,8 @@ class DepthInMap:
         self._told = memory.T_guess
         self._T_map_odom_told: Array | None = None
         self._way_m, self._T_odom_before = 0.0, np.eye(4)
+        self._since_s, self._t_ns_before = 0.0, 0  # from the keyframe before to the newest
+        self._depth_apart_s = config.frontend.depth_apart_s
         self._last: _Last | None = None
         self.counters = {"asked": 0, "refused": 0, "alone": 0, "offered": 0}
 
@@ -81,7 +83,7 @@ class DepthInMap:
             edges: loops that end with it already; one into the map is all that is wanted.
         """
         packet = odometry.packet
-        self._follow_told(odometry)
+        self._follow(odometry)
         depth_m = packet.keyframe.frame.depth_m
         if depth_m is None or any(edge.from_id < self._count for edge in edges):
             return None
@@ -91,6 +93,7 @@ class DepthInMap:
             return None
         self.counters["asked"] += 1
         answer = self._localiser.localise(depth_m, guess)
+        answer = replace(answer, covariance=answer.covariance + self._apart(packet))
         candidate = Candidate(self._ids[near], "depth", answer.overlap * answer.agreement)
         against = answer.reason or (
             "" if answer.determined == 6 else f"depth tells {answer.determined} of 6 directions"
@@ -154,9 +157,19 @@ class DepthInMap:
             return None
         return Guess(T_map_body, max(sigma_m, _LEAST_M), max(sigma_deg, _LEAST_DEG))
 
-    def _follow_told(self, odometry: OdometryKeyframe) -> None:
-        """Carry on the pose that somebody gave, of the first keyframe; a loss of track ends it."""
-        T_odom_body = odometry.T_odom_body
+    def _apart(self, packet: KeyframePacket) -> Array:
+        """Return the covariance [6, 6] that comes of depth taken apart from images, here and in the map, in motion."""
+        moved = packet.vo.T_keyframe_body
+        if moved is None or not self._since_s > 0.0:
+            return np.zeros((6, 6))
+        twist_per_s = se3_log(moved) / self._since_s
+        lag2_s2 = packet.keyframe.frame.depth_lag_s**2 + self._depth_apart_s**2
+        return 2.0 * lag2_s2 * np.outer(twist_per_s, twist_per_s)
+
+    def _follow(self, odometry: OdometryKeyframe) -> None:
+        """Carry on the pose that somebody gave of the first keyframe, and the time; a loss of track ends the former."""
+        T_odom_body, t_ns = odometry.T_odom_body, odometry.packet.keyframe.t_ns
+        self._since_s, self._t_ns_before = (t_ns - self._t_ns_before) * 1e-9, t_ns
         if self._told is not None:
             self._T_map_odom_told, self._told = self._told @ invert(T_odom_body), None
         elif odometry.packet.begins_submap:
