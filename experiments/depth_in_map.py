@@ -8,8 +8,8 @@ made black from `--dark-after` seconds after it was found there. Errors are of c
 laid on the truth by the map's keyframes: rms over the dark frames, and at the end. `edges` are loops by depth into the
 map that the graph believes at the end, of those that were offered; `off` is by how much they differ from the truth
 (median, worst), `false` those by more than 10 cm or 5 deg, `NEES` the mean of e' P^-1 e, six when the covariance is
-right. With `--start` the images are black from the begin, and a pose is given: the true one, `--off` metres and degrees
-off. Far off, nothing must be found.
+right. With `--start` all images are negatives, which odometry follows and no image of the map is like, and a pose is
+given: the true one, `--off` metres and degrees off. Far off, nothing must be found.
 """
 
 from __future__ import annotations
@@ -71,6 +71,12 @@ def darkened(frame: Frame) -> Frame:
     return replace(frame, images=tuple(np.full_like(image, BLACK) for image in frame.images), color=color)
 
 
+def negative(frame: Frame) -> Frame:
+    """Return a frame whose images are negatives."""
+    color = None if frame.color is None else 255 - frame.color
+    return replace(frame, images=tuple(255 - image for image in frame.images), color=color)
+
+
 def truth_in_map(session: Session, truth: Trajectory) -> Array:
     """Return T_map_truth [4, 4], by the positions of the map's keyframes."""
     stored = list(session.keyframes())
@@ -98,7 +104,7 @@ class Seen:
 
 
 def run(old: Path, part: Part, settings: Config, noise: ImuNoise | None, dark_after_s: float | None) -> str:
-    """Run a stretch in a map and return a row of the table; dark from the begin where `dark_after_s` is None."""
+    """Run a stretch in a map and return a row of the table; negative from the begin where `dark_after_s` is None."""
     truth, config = part.truth(), derived(settings, part.rig, noise)
     assert truth is not None
     session = Session(old / "session.db")
@@ -112,7 +118,8 @@ def run(old: Path, part: Part, settings: Config, noise: ImuNoise | None, dark_af
     is_found = False
     for value in part.events():
         is_dark = isinstance(value, Frame) and dark_from is not None and value.t_ns >= dark_from
-        for step in slam.feed(darkened(value) if is_dark and isinstance(value, Frame) else value):
+        change = negative if dark_after_s is None else darkened
+        for step in slam.feed(change(value) if is_dark and isinstance(value, Frame) else value):
             seen.take(step)
             t_ns = step.front.frame.t_ns
             if step.localisation is Localisation.RELOCALISED and not is_found:

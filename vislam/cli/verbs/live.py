@@ -80,7 +80,8 @@ BRIEF = Brief(
     ),
     (
         *COMMON, "live.send_to", "live.allow_remote", "live.ros2_domain", "live.mavlink", "live.realtime_priority",
-        "power_up.memory", "sensors.gy85.bus", "sensors.board.bus", "sensors.serial.port", "sensors.webcam.device",
+        "loop.start_in_map", "power_up.memory", "sensors.gy85.bus", "sensors.board.bus", "sensors.serial.port",
+        "sensors.webcam.device",
     ),
     TAKEN,
 )  # fmt: skip
