@@ -10,9 +10,9 @@ from vislam.config import load
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, quaternion_xyzw_from_rotation, se3_exp, se3_log
 from vislam.loop.table import read_loops
-from vislam.run import execute
+from vislam.run import execute, resume
 from vislam.run.begin import told_start
-from vislam.run.folder import MapChoice, prepare
+from vislam.run.folder import MapChoice, prepare, read_setup
 from vislam.slam import Slam
 from vislam.trajectory import read_tum
 from worlds import corner
@@ -108,6 +108,24 @@ def test_in_the_dark_depth_ties_a_run_to_the_map_it_was_found_in(old, tmp_path):
     assert "1 of 3 keyframes in a row agree" in loops[0].reason
     assert metrics["counters"]["depth in map"]["offered"] >= len(kept)
     assert errors_m(tmp_path / "new", poses).max() < 0.03
+
+
+def test_a_run_in_a_map_that_is_resumed_and_goes_dark_then_asks_depth_too(old, tmp_path):
+    def stop(done, total, note):
+        if done == 12:
+            raise KeyboardInterrupt
+
+    recording, out = film(other_noise(), path(36, 1.5)[4:], dark_from=15), tmp_path / "new"
+    config = load(None, {**SETTINGS, "up": "none"})
+    prepare(out, overwrite=False)
+    with pytest.raises(KeyboardInterrupt):
+        execute(recording, config, out, "film", [], stop, MapChoice(old, False))
+    _, config, base = read_setup(out)
+    metrics = resume(recording, config, out, "film", [], None, base)
+    assert metrics["resumed"]
+    assert metrics["counters"]["depth in map"]["asked"] > 0  # since then
+    again = metrics["resumed"][0]["keyframe"]
+    assert [loop for loop in by_depth(out) if loop.to_id > again and loop.decision == "accepted"]
 
 
 def test_the_graph_knows_motion_in_the_dark_as_well_as_depth_does():
