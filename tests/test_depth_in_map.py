@@ -10,9 +10,11 @@ from vislam.config import load
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, quaternion_xyzw_from_rotation, se3_exp, se3_log
 from vislam.loop.table import read_loops
-from vislam.run import execute, resume
+from vislam.pipeline.settings import derived
+from vislam.run import execute, map_of, resume
 from vislam.run.begin import told_start
 from vislam.run.folder import MapChoice, prepare, read_setup
+from vislam.run.session import Session
 from vislam.slam import Slam
 from vislam.trajectory import read_tum
 from worlds import corner
@@ -128,11 +130,14 @@ def test_a_run_in_a_map_that_is_resumed_and_goes_dark_then_asks_depth_too(old, t
     assert [loop for loop in by_depth(out) if loop.to_id > again and loop.decision == "accepted"]
 
 
-def test_the_graph_knows_motion_in_the_dark_as_well_as_depth_does():
-    recording = film(World("rgbd"), path(20), dark_from=8)
-    slam = Slam(load(None, {**SETTINGS, "map.enabled": False}), recording.rig)
+def test_in_a_map_the_graph_knows_motion_in_the_dark_as_well_as_depth_does(old):
+    recording = film(other_noise(), path(30, 1.5)[4:], dark_from=8)
+    config = derived(load(None, {**SETTINGS, "up": "none"}), recording.rig, None)
+    stored = Session(old / "session.db")
+    slam = Slam(config, recording.rig)
+    slam.begin_in_map(map_of(stored, recording, config, None))
+    stored.close()
     steps = [step for frame in recording.events() for step in slam.feed(frame)]
-    slam.finish()
     dark = [t.keyframe.id for t in (step.front.track for step in steps) if t.by_depth and t.keyframe is not None]
     assert len(dark) > 2
     for k in dark:
