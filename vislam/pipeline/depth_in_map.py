@@ -17,7 +17,7 @@ from vislam.core.camera import Rig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import SlamMemory
-from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopEdge, Submaps
+from vislam.core.messages import Array, GraphUpdate, Keyframe, KeyframePacket, LoopEdge, Submaps
 from vislam.loop.candidates import Candidate
 from vislam.loop.verification import Verification
 from vislam.mapping.depth.localise import DepthAnswer, Guess
@@ -60,6 +60,7 @@ class DepthInMap:
         self._way_m, self._T_odom_before = 0.0, np.eye(4)
         self._since_s, self._t_ns_before = 0.0, 0  # from the keyframe before to the newest
         self._depth_apart_s = config.frontend.depth_apart_s
+        self._T_body_cam = rig.T_body_cams[0]
         self._last: _Last | None = None
         self.counters = {"asked": 0, "refused": 0, "alone": 0, "offered": 0}
 
@@ -92,8 +93,10 @@ class DepthInMap:
         if guess is None or near < 0:
             return None
         self.counters["asked"] += 1
-        answer = self._localiser.localise(depth_m, guess)
-        answer = replace(answer, covariance=answer.covariance + self._apart(packet))
+        T_body_then = self._body_at_depth(packet.keyframe)
+        answer = self._localiser.localise(depth_m, replace(guess, T_map_body=guess.T_map_body @ T_body_then))
+        T_map_body = answer.T_map_body @ invert(T_body_then)
+        answer = replace(answer, T_map_body=T_map_body, covariance=answer.covariance + self._apart(packet))
         candidate = Candidate(self._ids[near], "depth", answer.overlap * answer.agreement)
         against = answer.reason or (
             "" if answer.determined == 6 else f"depth tells {answer.determined} of 6 directions"
@@ -157,14 +160,19 @@ class DepthInMap:
             return None
         return Guess(T_map_body, max(sigma_m, _LEAST_M), max(sigma_deg, _LEAST_DEG))
 
+    def _body_at_depth(self, keyframe: Keyframe) -> Array:
+        """Return where the body was when depth was taken [4, 4], as seen from where it was for the image."""
+        if keyframe.T_image_depth is None:
+            return np.eye(4)
+        return np.asarray(self._T_body_cam @ keyframe.T_image_depth @ invert(self._T_body_cam))
+
     def _apart(self, packet: KeyframePacket) -> Array:
-        """Return the covariance [6, 6] that comes of depth taken apart from images, here and in the map, in motion."""
+        """Return the covariance [6, 6] of what is not known of when depth was taken, here and in the map, in motion."""
         moved = packet.vo.T_keyframe_body
         if moved is None or not self._since_s > 0.0:
             return np.zeros((6, 6))
         twist_per_s = se3_log(moved) / self._since_s
-        lag2_s2 = packet.keyframe.frame.depth_lag_s**2 + self._depth_apart_s**2
-        return 2.0 * lag2_s2 * np.outer(twist_per_s, twist_per_s)
+        return 2.0 * self._depth_apart_s**2 * np.outer(twist_per_s, twist_per_s)
 
     def _follow(self, odometry: OdometryKeyframe) -> None:
         """Carry on the pose that somebody gave of the first keyframe, and the time; a loss of track ends the former."""
