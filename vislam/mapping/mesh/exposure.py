@@ -40,9 +40,8 @@ def exposure_gains(seen: Sequence[tuple[NDArray[np.int64], ImageU8]], count: int
     for _ in range(_PASSES):
         gains = _solved(place[good], view[good], logs[good], (count, len(seen)))
         at = logs + gains[view]
-        weight = np.bincount(place[good], minlength=count)
-        mean = np.column_stack([np.bincount(place[good], at[good, c], count) for c in range(3)])
-        mean /= np.maximum(weight, 1)[:, None]
+        often = np.maximum(np.bincount(place[good], minlength=count), 1)
+        mean = np.column_stack([np.bincount(place[good], at[good, c], count) / often for c in range(3)])
         good = (np.abs(at - mean[place]) < _ASTRAY).all(axis=1)
     return np.exp(gains)
 
@@ -50,8 +49,9 @@ def exposure_gains(seen: Sequence[tuple[NDArray[np.int64], ImageU8]], count: int
 def _solved(place: NDArray[np.int64], view: NDArray[np.int64], logs: Array, size: tuple[int, int]) -> Array:
     """Return logarithms of gains [V, 3]; what a place is like is eliminated, and gains that nothing tells are 0."""
     saw = csr_matrix((np.ones(len(place)), (place, view)), shape=size)
-    often = np.maximum(np.asarray(saw.sum(axis=1)).ravel(), 1.0)
-    H = np.diag(np.asarray(saw.sum(axis=0)).ravel()) - (saw.T @ saw.multiply(1.0 / often[:, None])).toarray()
+    often = np.maximum(np.bincount(place, minlength=size[0]), 1)
+    together = saw.T @ csr_matrix(saw.multiply(1.0 / often[:, None]))
+    H = np.diag(np.bincount(view, minlength=size[1]).astype(np.float64)) - together.toarray()
     mean = np.column_stack([np.bincount(place, logs[:, c], size[0]) for c in range(3)]) / often[:, None]
     g = np.column_stack([np.bincount(view, (logs - mean[place])[:, c], size[1]) for c in range(3)])
     return -np.linalg.solve(H + (_SIGMA_LOG / _SIGMA_GAIN) ** 2 * np.eye(size[1]), g)
