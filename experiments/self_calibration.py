@@ -16,17 +16,17 @@ import numpy as np
 from vislam.calibration.kinds import KINDS
 from vislam.calibration.options import SelfOptions
 from vislam.config import CalibrationConfig, Config, FrontEndConfig
-from vislam.core.camera import Camera
+from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.run import execute
 from vislam.run.folder import prepare
 from vislam.run.sources import open_source
 
 
-def true_camera(source: str) -> Camera:
-    """Return the lens that a recording tells, or of simulated points the one that projected them."""
+def true_rig(source: str) -> Rig:
+    """Return the rig that a recording tells, or of simulated points the one that projected them."""
     recording = open_source(source)
-    return getattr(recording, "true_rig", recording.rig).cameras[0]
+    return getattr(recording, "true_rig", recording.rig)
 
 
 def field_deg(camera: Camera, wrong: float, model: str) -> float:
@@ -54,7 +54,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("self_calibration"))
     arguments = parser.parse_args()
     for number, source in enumerate(arguments.sources):
-        camera, folder = true_camera(source), arguments.out / str(number)
+        rig, folder = true_rig(source), arguments.out / str(number)
+        camera = rig.cameras[0]
         wide = camera.distortion if arguments.model == "auto" else arguments.model
         fov_deg = field_deg(camera, arguments.wrong, wide)
         print(f"\n{source}: begins at {arguments.wrong * camera.fx:.0f} px, {fov_deg:.0f} deg")
@@ -72,6 +73,11 @@ def main() -> None:
             f"  readout {1e3 * report['parameters']['readout_s']:.2f} +- {1e3 * report['sigmas']['readout_s']:.2f} ms"
         )
         print(f"  camera and IMU: {report['camera_imu']}")
+        arm = report["camera_imu"].get("accelerometer")
+        if arm is not None:
+            errors_cm = 1e2 * (np.array(arm["translation_m"]) - rig.T_body_cams[0][:3, 3])
+            sigmas_cm = 1e2 * np.array(arm["translation_sigma_m"])
+            print(f"  translation off by {errors_cm.round(2)} cm, sigma {sigmas_cm.round(2)} cm")
         if arguments.runs:
             found = CalibrationConfig(camera=str(folder / "camchain.yaml"))
             own = ate_m(source, folder / "own", CalibrationConfig(), arguments.mode, None)

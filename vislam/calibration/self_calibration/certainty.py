@@ -21,6 +21,7 @@ class Certainty:
     covariance: Array  # [P, P]
     moves: Array  # [B, P] by which leaving out one stretch changes the answer
     grouping: float  # variance between stretches over that of independent pixels, the median of all unknowns
+    wider: Array  # [P] sigmas over those of independent pixels
 
     @property
     def sigmas(self) -> Array:
@@ -36,17 +37,25 @@ def certainty(solution: Solution, widened: float = 1.0) -> Certainty:
     of all, for few stretches by Student's t, and `widened` times for what all stretches share.
     """
     parts = reduce_all(solution.pieces, solution.shared, solution.sigma_px)
-    n = len(parts)
     free = solution.shared.free
     parts = [replace(part, H=part.H[np.ix_(free, free)], g=part.g[free]) for part in parts]
-    H = solution.prior.equations(solution.shared)[0][np.ix_(free, free)] + np.sum([part.H for part in parts], axis=0)
-    nothing = Certainty(np.full(H.shape, np.inf), np.zeros((n, len(H))), np.inf)
+    prior = solution.prior.equations(solution.shared)[0][np.ix_(free, free)]
+    return left_out(prior, np.array([part.H for part in parts]), np.array([part.g for part in parts]), widened)
+
+
+def left_out(prior: Array, informations: Array, gradients: Array, widened: float) -> Certainty:
+    """Return the certainty of a solution of which B stretches say this [B, P, P], [B, P], beside a prior [P, P]."""
+    n = len(informations)
+    H = prior + informations.sum(axis=0)
+    nothing = Certainty(np.full(H.shape, np.inf), np.zeros((n, len(H))), np.inf, np.full(len(H), np.inf))
     if n < 3 or not np.linalg.cond(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) < 1e12:
         return nothing
     white = np.linalg.inv(H)
-    moves = np.array([np.linalg.lstsq(H - part.H, -part.g, rcond=None)[0] for part in parts])
+    moves = np.array(
+        [np.linalg.lstsq(H - one, -g, rcond=None)[0] for one, g in zip(informations, gradients, strict=True)]
+    )
     moves -= moves.mean(axis=0)
     ratio = (n - 1) / n * np.sum(moves**2, axis=0) / np.diag(white)
     grouping = max(1.0, float(np.median(ratio)))
     wider = np.sqrt(np.maximum(ratio, grouping)) * student.ppf(_ONE_SIGMA, n - 1) * widened
-    return Certainty(white * np.outer(wider, wider), moves, grouping)
+    return Certainty(white * np.outer(wider, wider), moves, grouping, wider)

@@ -13,8 +13,10 @@ from vislam.calibration.options import SelfOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.calibration.self_calibration.adjust import Piece, Shared
 from vislam.calibration.self_calibration.certainty import Certainty, certainty
+from vislam.calibration.self_calibration.depth_lens import focal_by_depth, with_focal
 from vislam.calibration.self_calibration.gyro import BIAS, OFFSET, SCALE, Gyro
 from vislam.calibration.self_calibration.lens_search import Solution, find_lens, with_gyro
+from vislam.calibration.self_calibration.lever_arm import LeverArm, find_lever_arm
 from vislam.calibration.self_calibration.patches import found_again
 from vislam.calibration.self_calibration.segments import Segment, follow_segments
 from vislam.calibration.self_calibration.structure import GYRO, READOUT
@@ -24,7 +26,8 @@ from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
 from vislam.core.recording import Recording
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
-from vislam.run.sources import open_source
+from vislam.run.sources import open_source, recorded_path
+from vislam.vision.depth_focal import FocalFit
 
 _FILES = ("camchain.yaml", "self.png", "self.json")
 _WIDE_DEG = 100.0  # a wider lens is no pinhole
@@ -40,6 +43,7 @@ _SAME = 3.0  # sigmas
 _GYRO_SCALE = 0.01  # of a gyroscope of which nothing is told
 _MAX_TURN_SIGMA_DEG = 0.5
 _MAX_OFFSET_SIGMA_S = 0.003
+_MAX_ARM_SIGMA_M = 0.01  # about what a ruler gives
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +56,8 @@ class SelfResult:
     told: Rig  # of the recording
     without_imu: str  # why nothing is said of the IMU; empty where there is something
     widened: float  # of the sigmas
+    by_depth: FocalFit | None = None  # what depth images said of the focal length
+    lever: LeverArm | None = None  # where the camera sits on the IMU
 
     @property
     def camera(self) -> Camera:
@@ -62,6 +68,12 @@ class SelfResult:
     def focal_sigma(self) -> float:
         """Relative sigma of the worse focal length."""
         return float(max(self.known.sigmas[0] / self.camera.fx, self.known.sigmas[1] / self.camera.fy))
+
+    @property
+    def arm_m(self) -> Array | None:
+        """Translation [3] of T_body_cam where it is known better than by a ruler."""
+        sure = self.lever is not None and bool(np.all(self.lever.known.sigmas[:3] < _MAX_ARM_SIGMA_M))
+        return self.lever.arm_m if sure and self.lever is not None else None
 
 
 def calibrate_self(options: SelfOptions) -> Outcome:
@@ -97,7 +109,11 @@ def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
     first = next(_frames(recording, options.max_s, []), None)
     widened = 1.0 if first is not None and first.tracks is not None else _IMAGES_WIDER
     known = certainty(solution, widened)
-    result = SelfResult(solution, known, len(segments), recording.rig, "", widened)
+    by_depth = focal_by_depth(options.source, solution.shared.camera) if recorded_path(options.source) else None
+    if by_depth is not None and np.isfinite(known.wider[0]):
+        solution = with_focal(solution, known, by_depth)
+        known = certainty(solution, widened)
+    result = SelfResult(solution, known, len(segments), recording.rig, "", widened, by_depth)
     result = _with_imu(result, recording, samples)
     refuse(what, _doubts(result))
     return result
@@ -126,7 +142,8 @@ def _with_imu(result: SelfResult, recording: Recording, samples: list[ImuSample]
             without_imu=f"rotation and time offset would be known to {turn_deg:.1f} deg and {1e3 * offset_s:.1f} ms "
             "only; turn to and fro more briskly, about all axes",
         )
-    return replace(result, solution=joint, known=known)
+    lever = find_lever_arm(joint.pieces, joint.shared, samples, noise, result.widened)
+    return replace(result, solution=joint, known=known, lever=lever)
 
 
 def _chain(result: SelfResult) -> list[CameraCalibration]:
@@ -143,7 +160,8 @@ def _chain(result: SelfResult) -> list[CameraCalibration]:
 
 def _pose(result: SelfResult) -> Array:
     R_body_cam = np.ascontiguousarray(result.solution.shared.R_cam_body.T)
-    return transform(R_body_cam, result.told.T_body_cams[0][:3, 3].copy())
+    told_m = result.told.T_body_cams[0][:3, 3].copy()
+    return transform(R_body_cam, told_m if result.arm_m is None else result.arm_m)
 
 
 def _guess(told: Camera, options: SelfOptions) -> Camera:
@@ -244,6 +262,11 @@ def _statements(result: SelfResult) -> list[str]:
     readout_s, sigma_s = result.solution.shared.readout_s, float(result.known.sigmas[READOUT])
     if readout_s > max(_GLOBAL_S, _SAME * sigma_s):
         said.append(f"the shutter rolls: {1e3 * readout_s:.1f} ± {1e3 * sigma_s:.1f} ms from the first to the last row")
+    fit = result.by_depth
+    if fit is not None:
+        said.append(
+            f"depth images say that the focal length is {fit.factor - 1.0:+.1%} ± {fit.sigma:.1%} of what tracks do"
+        )
     if result.told.is_stereo:
         said.append("of two cameras the first was calibrated; the second stands as the recording has it")
     lost = result.segments - len(result.solution.pieces)
@@ -278,6 +301,9 @@ def _report(result: SelfResult, options: SelfOptions) -> dict[str, Any]:
         "observations": sum(int(piece.kept.sum()) for piece in pieces),
         "turned_deg": turned.tolist(),
         "travelled": travelled,
+        "focal_by_depth": None
+        if result.by_depth is None
+        else {"factor": result.by_depth.factor, "sigma": result.by_depth.sigma},
         "statements": _statements(result),
     }
 
@@ -296,8 +322,17 @@ def _imu_report(result: SelfResult) -> dict[str, Any]:
         "gyro_bias_sigma_rad_s": sigmas[BIAS].tolist(),
         "gyro_scale": shared.gyro_scale,
         "gyro_scale_sigma": float(sigmas[SCALE]),
-        "translation_m": result.told.T_body_cams[0][:3, 3].tolist(),
-        "translation_determined": False,
+        "translation_m": _pose(result)[:3, 3].tolist(),
+        "translation_determined": result.arm_m is not None,
+        "accelerometer": None
+        if result.lever is None
+        else {
+            "translation_m": result.lever.arm_m.tolist(),
+            "translation_sigma_m": result.lever.known.sigmas[:3].tolist(),
+            "bias_m_s2": result.lever.accel_bias_m_s2.tolist(),
+            "bias_sigma_m_s2": result.lever.known.sigmas[3:].tolist(),
+            "noise_of_places_m": result.lever.centre_sigma_m,
+        },
     }
 
 
@@ -334,10 +369,26 @@ def _imu_lines(result: SelfResult) -> list[str]:
     return [
         f"R_body_cam [{rows}], sigma about the camera's axes "
         f"{', '.join(f'{x:.2f}' for x in np.rad2deg(sigmas[:3]))} deg; {_difference_deg(result):.2f} deg from what the "
-        "recording says; its translation is the recording's own",
+        "recording says",
+        _arm_line(result),
         f"time offset {1e3 * shared.time_offset_s:+.2f} ± {1e3 * sigmas[OFFSET]:.2f} ms, to be added to the stamps of "
         "the camera",
     ]
+
+
+def _arm_line(result: SelfResult) -> str:
+    lever = result.lever
+    if lever is None:
+        return "translation: the accelerometer does not tell it; the recording's own is written"
+    numbers = ", ".join(
+        f"{x:+.1f} ± {s:.1f}" for x, s in zip(1e2 * lever.arm_m, 1e2 * lever.known.sigmas[:3], strict=True)
+    )
+    if result.arm_m is not None:
+        return f"translation {numbers} cm, by the accelerometer"
+    return (
+        f"translation {numbers} cm by the accelerometer, worse than {1e2 * _MAX_ARM_SIGMA_M:.0f} cm: the recording's "
+        "own is written; measure it with a ruler, or turn briskly to and fro while the camera sees things nearby"
+    )
 
 
 def draw(figure: Figure, colors: Mapping[str, str], result: SelfResult) -> None:
