@@ -125,7 +125,7 @@ def _information(rows: _Rows, sigma_m: float) -> Array:
 
 def _reduced(parts: Sequence[_Rows], own: Array, sigma_m: float) -> tuple[Array, Array, list[Array]]:
     """Return what stretches say of the shared unknowns, H [B, 6, 6] and g [B, 6], and how their own follow them."""
-    H, g, back = [], [], []
+    H, g, back = list[Array](), list[Array](), list[Array]()
     for rows, at in zip(parts, own, strict=True):
         WA = _information(rows, sigma_m) @ rows.A
         N, right = rows.A.T @ WA, WA.T @ rows.b
@@ -135,7 +135,7 @@ def _reduced(parts: Sequence[_Rows], own: Array, sigma_m: float) -> tuple[Array,
             N[1:_OWN, 1:_OWN] += np.outer(along, along)
             right[1:_OWN] += along * _GRAVITY_M_S2 / _GRAVITY_SIGMA
         N[:_OWN, :_OWN] += np.diag(1e-9 * np.diag(N)[:_OWN] + 1e-12)
-        b = np.linalg.solve(N[:_OWN, :_OWN], np.column_stack([right[:_OWN], N[:_OWN, _OWN:]]))
+        b: Array = np.linalg.solve(N[:_OWN, :_OWN], np.column_stack([right[:_OWN], N[:_OWN, _OWN:]]))
         H.append(N[_OWN:, _OWN:] - N[_OWN:, :_OWN] @ b[:, 1:])
         g.append(right[_OWN:] - N[_OWN:, :_OWN] @ b[:, 0])
         back.append(b)
