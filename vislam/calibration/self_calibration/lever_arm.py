@@ -135,7 +135,7 @@ def _reduced(parts: Sequence[_Rows], own: Array, sigma_m: float) -> tuple[Array,
             N[1:_OWN, 1:_OWN] += np.outer(along, along)
             right[1:_OWN] += along * _GRAVITY_M_S2 / _GRAVITY_SIGMA
         N[:_OWN, :_OWN] += np.diag(1e-9 * np.diag(N)[:_OWN] + 1e-12)
-        b: Array = np.linalg.solve(N[:_OWN, :_OWN], np.column_stack([right[:_OWN], N[:_OWN, _OWN:]]))
+        b = np.asarray(np.linalg.solve(N[:_OWN, :_OWN], np.column_stack([right[:_OWN], N[:_OWN, _OWN:]])), np.float64)
         H.append(N[_OWN:, _OWN:] - N[_OWN:, :_OWN] @ b[:, 1:])
         g.append(right[_OWN:] - N[_OWN:, :_OWN] @ b[:, 0])
         back.append(b)
