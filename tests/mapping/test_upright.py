@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vislam.core.up import angle_deg
-from vislam.mapping.upright import View, up_of_planes
+from vislam.mapping.upright import View, surest_up, up_of_planes
 
 UP = np.array([0.0, 0.0, 1.0])
 TURNED = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix()  # the map's axes are never those of the room
@@ -93,3 +93,30 @@ def test_one_plane_seen_by_cameras_held_in_every_way_says_nothing():
 def test_the_same_surfaces_give_the_same_bytes():
     one, other = (up_of_planes(room(FLOOR | WALLS, 0.3, 30.0)) for _ in range(2))
     assert one.entry() == other.entry()
+
+
+def tilted(views: list[View], deg: float) -> list[View]:
+    R = Rotation.from_rotvec([np.deg2rad(deg), 0.0, 0.0]).as_matrix()
+    return [View((v.normals @ R.T).astype(np.float32), R @ v.right, R @ v.upward) for v in views]
+
+
+def noisier(views: list[View], seed: int) -> list[View]:
+    """The same with every keyframe leaning its own way."""
+    rng = np.random.default_rng(seed)
+    return [tilted([v], deg)[0] for v, deg in zip(views, rng.normal(0.0, 4.0, len(views)), strict=True)]
+
+
+def test_the_reach_of_normals_that_makes_an_answer_surest_gives_it():
+    plain = room(FLOOR | WALLS, 0.3, 20.0)
+    by_reach = {3: noisier(plain, 1), 5: plain, 8: noisier(plain, 2)}
+    up = surest_up(by_reach.__getitem__)
+    assert up.sigma_deg == up_of_planes(plain).sigma_deg < up_of_planes(by_reach[3]).sigma_deg
+    assert angle_deg(up.direction, TURNED @ UP) < 0.5
+
+
+def test_wider_normals_make_no_other_answer():
+    plain = room(FLOOR | WALLS, 0.3, 20.0)
+    blurred = noisier(plain, 1)
+    up = surest_up({3: blurred, 5: tilted(plain, 40.0), 8: blurred}.__getitem__)
+    assert np.array_equal(up.direction, up_of_planes(blurred).direction)
+    assert not surest_up({3: [], 5: plain, 8: plain}.__getitem__).is_known

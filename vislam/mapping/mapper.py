@@ -243,12 +243,12 @@ class Mapper:
         other.refinement = self.refinement
         return other
 
-    def views(self) -> list[View]:
-        """Return the directions of surfaces that keyframes with dense depth saw, evenly over a long run."""
+    def views(self, reach: int) -> list[View]:
+        """Return the directions of surfaces that keyframes with depth saw, evenly over a long run, by `view_of`."""
         poses, view = self._occupancy.poses, self._extractor.view
         R_body_cam = self._rig.T_body_cams[0][:3, :3]
         scans = ((poses[i], self._store.geometry(i).depth) for i in sorted(poses)[:: 1 + len(poses) // _MOST_VIEWS])
-        return [view_of(depth, view, T[:3, :3], R_body_cam) for T, depth in scans if depth is not None]
+        return [view_of(depth, view, T[:3, :3], R_body_cam, reach) for T, depth in scans if depth is not None]
 
     def export(
         self, folder: Path, step: Callable[[str], None] | None = None, not_level: NotLevel = LEVEL

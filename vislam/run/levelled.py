@@ -25,7 +25,7 @@ from vislam.datasets.stream import FileRecording
 from vislam.frontend.planar import up_in_camera
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.products import LEVEL, NotLevel
-from vislam.mapping.upright import up_of_planes
+from vislam.mapping.upright import surest_up
 from vislam.run.pipeline import FrontHalf
 from vislam.trajectory.gravity_mean import up_of_forces
 
@@ -160,7 +160,7 @@ def find_up(recording: Recording, config: Config, known: Known) -> Levelled:
 
 def _found(recording: Recording, known: Known) -> Levelled:
     """Return which way is up by what was measured."""
-    planes = Up.unknown("there is no map to look at") if known.mapper is None else up_of_planes(known.mapper.views())
+    planes = Up.unknown("there is no map to look at") if known.mapper is None else surest_up(known.mapper.views)
     others = [_by_forces(recording, known.path), _by_floor(known, recording.rig)]
     asked = (*(up for up in others if up is not None), planes)
     first = next((up for up in asked if up.is_known), None)

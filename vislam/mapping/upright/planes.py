@@ -8,7 +8,7 @@ what was seen lies across or along it. The best one is made exact by all surface
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vislam.core.geometry import tangent_basis
 from vislam.core.messages import Array
 from vislam.core.up import Up, angle_deg
-from vislam.mapping.upright.normals import View
+from vislam.mapping.upright.normals import REACHES, View
 
 _CAP_DEG = 5.0  # surfaces within it belong to a direction; noise of normals is 2 to 3 degrees
 _APART_DEG = 15.0  # directions nearer than this are one
@@ -52,6 +52,23 @@ class _Judged:
     score: float
     level: float  # share of surfaces that lie across it
     upright: float  # share of surfaces that stand along it
+
+
+def surest_up(views: Callable[[int], Sequence[View]]) -> Up:
+    """Return which way is up by the surfaces of keyframes, by normals over as many pixels as make it surest.
+
+    `views` gives the keyframes by the reach of their normals: noise of a stereo camera's depth hides floors from narrow
+    ones. Wider ones may make an answer exact, not another one. Deterministic.
+    """
+    first, *wider = (up_of_planes(views(reach)) for reach in REACHES)
+    return min((first, *(up for up in wider if _refines(up, first))), key=lambda up: up.sigma_deg or 0.0)
+
+
+def _refines(up: Up, first: Up) -> bool:
+    """Return whether one says what the other says; neither does where one is unknown."""
+    if up.direction is None or first.direction is None:
+        return False
+    return angle_deg(up.direction, first.direction) < _APART_DEG
 
 
 def up_of_planes(views: Sequence[View]) -> Up:

@@ -30,7 +30,7 @@ from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.of_map import write_pictures
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.images import LabelFolder, camera_t_ns
-from vislam.mapping.upright import up_of_planes
+from vislam.mapping.upright import surest_up
 from vislam.run.folder import read_setup
 from vislam.run.levelled import Levelled, stored_level
 from vislam.run.session import Session
@@ -119,7 +119,7 @@ def _levelled(
     if level.up is not None:
         return level, mapper, placed  # it is level already
     is_asked = ran.up == "auto"
-    level = Levelled(up_of_planes(mapper.views()) if is_asked else Up.unknown(f"the run had --up {ran.up}"))
+    level = Levelled(surest_up(mapper.views) if is_asked else Up.unknown(f"the run had --up {ran.up}"))
     T = level.T_level_map
     return level, mapper.turned(T), {i: T @ pose for i, pose in placed.items()}
 
