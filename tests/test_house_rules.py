@@ -24,7 +24,6 @@ LONG_CLASSES = {
     "LoopSet": 410,  # decides about all loops of a run
     "Mapper": 280,  # every product of a map
     "MetricFrontEnd": 470,  # keyframe life of stereo and RGB-D
-    "MonoFrontEnd": 270,
     "PoseGraph": 340,
     "Run": 320,
     "RunViewer": 290,

@@ -14,7 +14,7 @@ from vislam.frontend.result import TrackResult, unscaled_motion
 from vislam.frontend.view import View
 from vislam.vision.landmarks import metric_points, move
 from vislam.vision.refine import refine_pose
-from vislam.vision.two_view import TwoViewEstimate, turn_only
+from vislam.vision.two_view import TwoViewEstimate, moved_xy, turn_only
 
 NO_DEPTH = "no depth has been seen yet"
 _FITS = 2  # the second with a kernel as wide as what the first leaves
@@ -88,6 +88,5 @@ class BlindKeyframe:
 
     def _left(self, R_key_cam: Array, xy: Array) -> float:
         """Return the median way on z = 1 that a turn leaves unexplained."""
-        turned = np.column_stack([xy, np.ones(len(xy))]) @ R_key_cam.T
-        left = np.linalg.norm(turned[:, :2] / turned[:, 2:] - self._key_xy, axis=1)
+        left = moved_xy(R_key_cam, self._key_xy, xy)
         return median(left[np.isfinite(left)])

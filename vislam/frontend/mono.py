@@ -28,6 +28,7 @@ from vislam.vision.two_view import (
     epipolar_distances,
     essential_ransac,
     from_epipolar_segment,
+    moved_xy,
     refine_two_view,
     turn_only,
 )
@@ -199,7 +200,7 @@ class MonoFrontEnd:
 
     def _turn_by(self, prior: RotationPrior, key_xy: Array, xy: Array) -> TwoViewEstimate:
         """Take the gyroscope's rotation: what vision finds alone swallows small translations before a flat scene."""
-        moved_px = self._moved_xy(prior.R_key_cam, key_xy, xy) * self._camera.fx
+        moved_px = moved_xy(prior.R_key_cam, key_xy, xy) * self._camera.fx
         with np.errstate(invalid="ignore"):
             inliers = np.asarray(moved_px < self._min_parallax_px, dtype=np.bool_)
         covariance = np.eye(6) * (_GYRO_KNOWN_ALREADY * prior.sigma_rad) ** 2
@@ -244,15 +245,9 @@ class MonoFrontEnd:
         self._noise.learn(distances, self._camera, motion.xy, ends)
 
     def _parallax_px(self, R_key_cam: Array, key_xy: Array, xy: Array) -> float:
-        moved = self._moved_xy(R_key_cam, key_xy, xy)
+        moved = moved_xy(R_key_cam, key_xy, xy)
         seen = np.isfinite(moved)
         return median(moved[seen]) * self._camera.fx if seen.any() else 0.0
-
-    @staticmethod
-    def _moved_xy(R_key_cam: Array, key_xy: Array, xy: Array) -> Array:
-        """Return how far points [N] moved on z = 1 once the rotation is taken out; NaN where they were not found."""
-        turned = np.column_stack([xy, np.ones(len(xy))]) @ R_key_cam.T
-        return np.asarray(np.linalg.norm(turned[:, :2] / turned[:, 2:] - key_xy, axis=1))
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 

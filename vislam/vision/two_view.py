@@ -54,6 +54,12 @@ def turn_only(view: TwoViewEstimate) -> TwoViewEstimate:
     return replace(view, direction_key=np.zeros(3), covariance=covariance)
 
 
+def moved_xy(R_key_cam: Array, key_xy: Array, xy: Array) -> Array:
+    """Return how far points [N] moved on z = 1 once the rotation is taken out; NaN where they were not found."""
+    turned = np.column_stack([xy, np.ones(len(xy))]) @ R_key_cam.T
+    return np.asarray(np.linalg.norm(turned[:, :2] / turned[:, 2:] - key_xy, axis=1))
+
+
 def refine_two_view(
     R_key_cam: Array,
     direction_key: Array,
