@@ -251,5 +251,6 @@ class PublishConfig:
     # a correction of orientation fades in so long, 1 deg by 0.03 deg/s: what good gyroscopes err ...
     turn_s: Positive = 30.0
     gyro_share: Share = 0.5  # ... or by so much of what the gyroscope itself may err, where that is faster
+    turn_share: Share = 0.1  # ... or, where no gyroscope is, by so much of the turn that the body makes
     at_once_m: NonNegative = 1.0  # a larger correction is another belief about the place: it comes at once
     at_once_deg: NonNegative = 5.0

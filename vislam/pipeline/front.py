@@ -431,7 +431,7 @@ class Front:
         """Return the pose in `odom` and the filter's state after this frame."""
         if self._filter is None:
             T_vo_body = self._T_vo_body.copy()
-            return Estimate(T_vo_body, T_vo_body, 0.0), None
+            return Estimate(T_vo_body, T_vo_body, np.inf), None
         ekf = self._filter.ekf
         if not ekf.initialised:
             return None, None

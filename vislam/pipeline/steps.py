@@ -26,7 +26,7 @@ class Estimate:
 
     T_odom_before: Array  # [4, 4] by inertial data alone, from where it was at the last frame
     T_odom_body: Array  # [4, 4] with all that is known
-    rate_sigma_rad_s: float  # of the gyroscope's bias; 0 without an IMU
+    rate_sigma_rad_s: float  # of the gyroscope's bias; infinite without an IMU
 
 
 @dataclass(frozen=True, slots=True, eq=False)

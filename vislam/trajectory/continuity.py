@@ -49,6 +49,7 @@ class Continuity:
             T_before: [4, 4] the estimate as it was before what came in with this call, carried on to `t_ns`.
             T_after: [4, 4] the estimate of the same instant now.
             rate_sigma_rad_s: how well the body's rate of turn is known: what the gyroscope may drift, nobody sees.
+                Infinite: vision alone tells it, which errs with the turn.
         """
         if self._t_ns is not None:
             self._let_go(max(t_ns - self._t_ns, 0) / _NS, T_before, rate_sigma_rad_s)
@@ -66,8 +67,12 @@ class Continuity:
         resting_m = min(config.creep_m_s, owed_m / config.creep_s) * dt_s
         self.owed_m = self.owed_m * _left(owed_m, moving_m + resting_m)
         owed_rad = float(np.linalg.norm(self.owed_rad))
-        rate_rad_s = max(owed_rad / config.turn_s, config.gyro_share * rate_sigma_rad_s)
-        self.owed_rad = self.owed_rad * _left(owed_rad, min(rate_rad_s, owed_rad / config.fade_s) * dt_s)
+        if np.isfinite(rate_sigma_rad_s):
+            turning_rad = config.gyro_share * rate_sigma_rad_s * dt_s
+        else:
+            turning_rad = config.turn_share * turn_rad
+        paid_rad = min(max(owed_rad * dt_s / config.turn_s, turning_rad), owed_rad * dt_s / config.fade_s)
+        self.owed_rad = self.owed_rad * _left(owed_rad, paid_rad)
 
     def _owe(self, T_before: Array, T_after: Array) -> None:
         """Take in that the estimate of one instant has changed."""
