@@ -139,7 +139,7 @@ class Keyframe:
     id: int
     t_ns: int
     frame: Frame
-    keypoints_px: Array  # [N, 2] raw pixels of the described features in cam0
+    keypoints_px: Array  # [N, 2] raw pixels of the described features in cam0, as of the middle row's time
     descriptors: NDArray[np.uint8]  # [N, 32] ORB
     points_body_m: Array | None  # [N, 3] of the described features in the body frame, NaN where unknown; None: no depth
     T_image_depth: Array | None = None  # [4, 4] where cam0 was when depth was taken, as the image sees it; None: there

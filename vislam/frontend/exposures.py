@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from vislam.config import FrontEndConfig
@@ -9,7 +12,9 @@ from vislam.core.camera import Camera
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Frame
 from vislam.frontend.attempt import Attempt
+from vislam.frontend.depth import DepthSensor
 from vislam.frontend.depth_lag import DepthLag
+from vislam.frontend.keyframes import Exposed
 from vislam.vision.landmarks import Landmarks, move
 from vislam.vision.refine import extra_parameter
 from vislam.vision.shutter import Shutter
@@ -62,6 +67,16 @@ class Exposures:
             slope = attempt.depth_now.slope - landmarks.by_delay
             good = attempt.agreeing & landmarks.known
             self.lag.learn(attempt.depth_now.rho - rho, slope, attempt.depth_now.sigma_rho, good, dt_s)
+
+    def of_keyframe(
+        self, sensor: DepthSensor, frame: Frame, twist_per_s: Array, expected_rho: Callable[[Array], Array]
+    ) -> Exposed:
+        """Return when a keyframe's rows and depth were taken, at a velocity [6] of the camera; see DepthLag.reader."""
+        return Exposed(
+            self.lag.reader(sensor, frame, twist_per_s, expected_rho),
+            partial(self.shutter.moved_to_instant, twist_per_s=twist_per_s),
+            self.lag.motion(frame, twist_per_s),
+        )
 
     def shear(self, attempt: Attempt, landmarks: Landmarks, key_pixels: Array, xy: Array) -> Array:
         """Return the derivative [N, 2] of predicted minus measured directions `xy` [N, 2] by the readout time."""

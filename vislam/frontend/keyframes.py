@@ -58,11 +58,25 @@ MeasureDepth = Callable[[Array, NDArray[np.int64] | None], Array]
 """Gives z-depths [N] in metres of raw pixels [N, 2] and the tracks [N] that they belong to, if any."""
 
 
+def _as_seen(pixels: Array, depth_m: Array) -> Array:
+    return pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposed:
+    """When the rows and the depth of a keyframe were taken, as far as its features ask for it."""
+
+    depth_m: MeasureDepth
+    instant_px: Callable[[Array, Array], Array] = (
+        _as_seen  # raw pixels [N, 2] with depths [N], at the middle row's time
+    )
+    T_image_depth: Array | None = None  # see Keyframe
+
+
 def make_keyframe(
-    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int,
-    measure_depth: MeasureDepth | None, T_image_depth: Array | None = None,
-) -> Keyframe:  # fmt: skip
-    """Describe a frame for loop closing.
+    keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int, exposed: Exposed | None
+) -> Keyframe:
+    """Describe a frame for loop closing; None: nothing tells depths.
 
     A frame that brings its tracks brings their descriptors too, or has nothing to recognise it by.
     """
@@ -73,10 +87,12 @@ def make_keyframe(
         ids, pixels, descriptors = frame.tracks.track_ids, frame.tracks.pixels_px, frame.tracks.descriptors
     else:
         pixels, descriptors = np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
-    points = None
-    if measure_depth is not None:
-        points = transform_points(T_body_cam, camera.unproject(pixels) * measure_depth(pixels, ids)[:, None])
-    return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points, T_image_depth)
+    if exposed is None:
+        return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, None)
+    depth_m = exposed.depth_m(pixels, ids)
+    pixels = exposed.instant_px(pixels, depth_m)
+    points = transform_points(T_body_cam, camera.unproject(pixels) * depth_m[:, None])
+    return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points, exposed.T_image_depth)
 
 
 class KeyframeLife:
@@ -131,13 +147,12 @@ class KeyframeLife:
         )
 
     def install(
-        self, frame: Frame, camera: Camera, T_body_cam: Array, tracks: int, measure_depth: MeasureDepth | None = None,
-        T_image_depth: Array | None = None,
-    ) -> Keyframe:  # fmt: skip
+        self, frame: Frame, camera: Camera, T_body_cam: Array, tracks: int, exposed: Exposed | None = None
+    ) -> Keyframe:
         """Make a frame with so many tracks the keyframe; see make_keyframe."""
         new_id = self._first_id if self.keyframe is None else self.keyframe.id + 1
         features = self._config.described_features
-        self.keyframe = make_keyframe(new_id, frame, camera, T_body_cam, features, measure_depth, T_image_depth)
+        self.keyframe = make_keyframe(new_id, frame, camera, T_body_cam, features, exposed)
         self._since_restart += 1
         self._tracks = tracks
         self._t_placed_ns = frame.t_ns

@@ -510,12 +510,8 @@ class MetricFrontEnd:
     def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
         whole, usual = self._view.of(frame), self._views[0]
         usual_twist = np.zeros(6) if self._view.is_swapped else twist_per_s
-
-        depth_of = self._lag.reader(usual.depth, whole, usual_twist, self._landmarks.expected_rho)
-        T_image_depth = self._lag.motion(whole, usual_twist)
-        keyframe = self._life.install(
-            whole, usual.camera, usual.T_body_cam, len(self._tracker), depth_of, T_image_depth
-        )
+        exposed = self._exposures.of_keyframe(usual.depth, whole, usual_twist, self._landmarks.expected_rho)
+        keyframe = self._life.install(whole, usual.camera, usual.T_body_cam, len(self._tracker), exposed)
         self._exposures.key_twist_per_s = twist_per_s
         self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)

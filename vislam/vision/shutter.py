@@ -87,6 +87,21 @@ class Shutter:
         """
         return self._undone(pixels, xy, rho, twist_per_s, self.readout_s)
 
+    def moved_to_instant(self, pixels: Array, depth_m: Array, twist_per_s: Array) -> Array:
+        """Return raw pixels [N, 2] where the camera would have seen the same at the middle row's time.
+
+        Args:
+            pixels: raw pixels [N, 2] as seen.
+            depth_m: z-depths [N]; NaN: unknown, and taken for infinitely far.
+            twist_per_s: velocity [6] of the camera in its own frame, rotation first.
+        """
+        if self.readout_s == 0.0 or not twist_per_s.any():
+            return pixels
+        xy = self.to_instant(pixels, self._camera.normalise(pixels), np.nan_to_num(1.0 / depth_m), twist_per_s)
+        moved = self.instant_px(xy)
+        assert moved is not None
+        return np.where(np.isfinite(moved), moved, pixels)
+
     def slope(self, pixels: Array, xy: Array, rho: Array, twist_per_s: Array) -> Array:
         """Return the derivative [N, 2] of `to_instant` by the readout, in 1/s; zero where `xy` is NaN."""
         return np.nan_to_num((self._undone(pixels, xy, rho, twist_per_s, _STEP_S) - xy) / _STEP_S)

@@ -20,7 +20,7 @@ from vislam.core.camera import Rig
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
 from vislam.frontend.intake import Intake
-from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
+from vislam.frontend.keyframes import Exposed, KeyframeLife, keyframe_reason
 from vislam.frontend.planar.course import Course
 from vislam.frontend.planar.fit import Fit, FloorPair, camera_motion, joint_fit, no_fit, split_fit
 from vislam.frontend.planar.floor import Mount, Regions, Tilt, make_mount
@@ -265,7 +265,7 @@ class PlanarFrontEnd:
         self._R_key = self._tilt.R_level_cam
         self._tracks.install(self._R_key)
         on_floor = int(np.count_nonzero(self._tracks.candidates))
-        keyframe = self._life.install(frame, self._camera, self._T_body_cam, on_floor, self._measure_depth)
+        keyframe = self._life.install(frame, self._camera, self._T_body_cam, on_floor, Exposed(self._measure_depth))
         self._steps.begin(frame, self._tracks.pixels)
         self._frames_since_keyframe = 0
         return keyframe
