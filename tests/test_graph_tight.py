@@ -100,6 +100,28 @@ def chain(window: FakeWindow, count: int, keyframes: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("imu", [True, False])
+def test_motions_that_surfaces_had_a_say_in_are_the_edges_where_no_imu_is(world: World, make, imu: bool) -> None:
+    """Half of the keyframes: their odometry is 20 cm beside what the window says."""
+    graph, window = make(world, imu)
+    aside = np.eye(4)
+    aside[1, 3] = 0.2
+    for k in range(60):
+        packet = world.packet(k)
+        packet = packet if imu else replace(packet, imu=None)
+        if k % 2:
+            T = invert(world.truth[k - 1]) @ world.truth[k] @ aside
+            vo = replace(packet.vo, T_keyframe_body=T, covariance=1e-6 * np.eye(6), by_surfaces=True)
+            packet = replace(packet, vo=vo)
+        graph.add(packet, [])
+    by_window = [window.edge(k, settled=k < 60 - window.keyframes).T_from_to for k in range(1, 60)]
+    poses = graph.poses()
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    differ = np.array([np.linalg.norm(s[:3, 3] - w[:3, 3]) > 0.1 for s, w in zip(steps, by_window, strict=True)])
+    expected = np.zeros(59, dtype=bool) if imu else np.arange(1, 60) % 2 == 1
+    np.testing.assert_array_equal(differ, expected)
+
+
+@pytest.mark.parametrize("imu", [True, False])
 def test_every_provisional_edge_makes_room_for_the_settled_one(world: World, make, imu: bool) -> None:
     graph, window = make(world, imu)
     feed(graph, world, 0, 80)

@@ -78,9 +78,10 @@ class FrontEndConfig:
     # of depth images after colour beyond what stamps say, None estimates it while running
     depth_delay_s: Finite | None = None
     depth_edge_rho: NonNegative = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
+    local_surfaces: Whole = 4  # of the last keyframes, to which a new one's depth is fitted; 2 to 8 differ little
     depth_alone: bool = True  # frames that vision cannot place are placed by their depth image, as degraded
     depth_alone_sigma_m: Positive = 0.3  # of the place in the keyframe; beyond, depth may meet the wrong surfaces
-    depth_alone_overlap: Share = 0.4  # of its surface that falls on the keyframe's; less fits by chance
+    depth_alone_overlap: Share = 0.4  # of its surface that falls on the last keyframes'; less fits by chance
     # between the exposures of depth and colour of a frame: TUM's pairs are up to 16 ms apart, and depth is stamped late
     depth_apart_s: NonNegative = 0.03
     depth_alone_renew: Share = 0.6  # overlap below which a new keyframe begins; each costs drift

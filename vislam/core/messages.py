@@ -130,6 +130,7 @@ class VoMeasurement:
     has_scale: bool
     tracking: Tracking
     inliers: int
+    by_surfaces: bool = False  # depth images of the last keyframes had a say, of which tracks know nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)

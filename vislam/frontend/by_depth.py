@@ -1,4 +1,4 @@
-"""Frames that vision cannot place, by their depth image: against the keyframe's, from where motion predicts the camera.
+"""Frames that vision cannot place, by their depth image: against the last keyframes', from where motion predicts them.
 
 Dark rooms and bare walls leave a depth camera what it measures itself. What the shape of the room does not tell (a wall
 slides, a corridor in one direction) is kept from the prediction, with its growing uncertainty: where that becomes too
@@ -12,20 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.config import FrontEndConfig
-from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
-from vislam.core.messages import Array, Frame, ImageF32, Keyframe, Tracking, VoMeasurement
+from vislam.core.messages import Array, Frame, Keyframe, Tracking, VoMeasurement
+from vislam.frontend.local_surfaces import CHI2, WIDER, LocalSurfaces, is_alike
 from vislam.frontend.view import sees
-from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
-from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
+from vislam.vision.depth_alignment import DepthAlignment, Prior, align_depth
 
 _TURN_WALK, _SPEED_WALK = 2.0, 0.7  # rad/s and m/s per root of a second: 6 rad/s^2, 2 m/s^2 of a hand over 0.1 s
 _TURN_SIGMA, _SPEED_SIGMA = 0.3, 0.2  # rad/s and m/s, of what the last two frames that vision placed say
 _GYRO_SIGMA_RAD, _BIAS_RAD_S = 0.002, 0.2  # of a turn by the gyroscope, and of its bias where nobody knows it
-_WIDER = 3.0  # times the standard deviations of depth: errors of its calibration, the same in both images, stay
-_LEAST_SHARE = 0.15  # of the pixels have a surface, or there is nothing to align
-_AGREEMENT, _SEEN_THROUGH = 0.8, 0.1  # shares of what overlaps: more contradicts, and it is another place
-_CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,11 +50,10 @@ class ByDepth:
     A velocity that nothing measures walks at random, so what depth does not see grows unsure as it should.
     """
 
-    def __init__(self, config: FrontEndConfig, camera: Camera) -> None:
-        """Take the camera that depth images are registered to."""
+    def __init__(self, config: FrontEndConfig, surfaces: LocalSurfaces) -> None:
+        """Take the surfaces that frames are placed by."""
         self._config = config
-        self._maker = SurfaceMaker(camera, config.min_depth_m, config.max_depth_m, config.depth_sigma_rho)
-        self._key: tuple[int, DepthSurface | None] = (-1, None)
+        self._surfaces = surfaces
         self._covariance: Array | None = None  # [12, 12] pose and velocity; None while vision works
         self._of_vision: Array = np.zeros((6, 6))  # the last frame that it placed
 
@@ -81,28 +75,26 @@ class ByDepth:
         `tracks` is with how many the keyframe is followed: a frame that could begin with more, ends it.
         """
         covariance = self._predicted(moved)
-        if frame.depth_m is None or not self._is_known(covariance):
+        if not self._is_known(covariance):
             return None
-        of_key, of_frame = self._surface(keyframe), self._made(frame.depth_m)
-        if of_key is None or of_frame is None:
+        model, of_frame = self._surfaces.kept, self._surfaces.of(frame)
+        if not model or of_frame is None:
             return None
         at_key, now = _velocities(moved)
-        key_lag_s, lag_s = (f.depth_lag_s + moved.depth_delay_s for f in (keyframe.frame, frame))
-        T_key_depth, T_cam_depth = se3_exp(key_lag_s * moved.key_twist_per_s), se3_exp(lag_s * now)
+        T_cam_depth = se3_exp((frame.depth_lag_s + moved.depth_delay_s) * now)
         to_cam = se3_adjoint(T_cam_depth)
         to_depth = np.linalg.inv(to_cam)
         off = self._config.depth_apart_s**2 * (np.outer(now, now) + np.outer(at_key, at_key))
         known = to_depth @ (covariance[:6, :6] + off) @ to_depth.T + 1e-10 * np.eye(6)
-        prior = Prior(np.asarray(invert(T_key_depth) @ moved.T_guess @ T_cam_depth), known)
-        sigma_rho = _WIDER * self._config.depth_sigma_rho
-        found = align_depth(of_frame, (SeenFrom(of_key, np.eye(4)),), prior, sigma_rho)
+        prior = Prior(np.asarray(moved.T_guess @ T_cam_depth), known)
+        found = align_depth(of_frame, model, prior, WIDER * self._config.depth_sigma_rho)
         if not self._is_trusted(found, prior):
             return None
         of_pose = to_cam @ found.covariance @ to_cam.T + off
         self._covariance = _updated(covariance, of_pose)
         if not self._is_known(of_pose):
             return None
-        T_key_cam = np.asarray(T_key_depth @ found.T_model_cam @ invert(T_cam_depth))
+        T_key_cam = np.asarray(found.T_model_cam @ invert(T_cam_depth))
         return Placed(T_key_cam, of_pose, self._keyframe_reason(frame, keyframe, found, tracks))
 
     def _predicted(self, moved: Moved) -> Array:
@@ -136,21 +128,12 @@ class ByDepth:
         most_m = self._config.depth_alone_sigma_m
         return turn <= most_m**2 and way <= most_m**2  # a radian moves what is a metre away by one
 
-    def _made(self, depth_m: ImageF32) -> DepthSurface | None:
-        surface = self._maker.make(depth_m)
-        return surface if surface.share >= _LEAST_SHARE else None
-
-    def _surface(self, keyframe: Keyframe) -> DepthSurface | None:
-        if self._key[0] != keyframe.id:
-            depth_m = keyframe.frame.depth_m
-            self._key = (keyframe.id, None if depth_m is None else self._made(depth_m))
-        return self._key[1]
-
     def _is_trusted(self, found: DepthAlignment, prior: Prior) -> bool:
         change = se3_log(invert(prior.T_model_cam) @ found.T_model_cam)
         chi2 = float(change @ np.linalg.solve(prior.covariance, change))
-        enough = found.overlap >= self._config.depth_alone_overlap and found.agreement >= _AGREEMENT
-        return found.converged and enough and found.seen_through <= _SEEN_THROUGH and chi2 <= _CHI2
+        return (
+            found.converged and found.overlap >= self._config.depth_alone_overlap and is_alike(found) and chi2 <= CHI2
+        )
 
     def _keyframe_reason(self, frame: Frame, keyframe: Keyframe, found: DepthAlignment, tracks: int) -> str:
         config = self._config

@@ -29,6 +29,7 @@ from vislam.frontend.depth import DepthReading
 from vislam.frontend.exposures import Exposures
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
+from vislam.frontend.local_surfaces import LocalSurfaces
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.result import TrackResult, metric_motion, too_few
@@ -75,8 +76,9 @@ class MetricFrontEnd:
         self._now_sees = True  # and in this frame; only asked while another camera is looked through
         self._lost = False
         self._lacks_depth = False  # hardly a track of the keyframe was given depth when it began
-        alone = config.depth_alone and rig.has_depth and mode == "rgbd"
-        self._by_depth = ByDepth(config, self._camera) if alone else None
+        has_surfaces = rig.has_depth and mode == "rgbd"
+        self._surfaces = LocalSurfaces(config, self._camera, self._T_body_cam) if has_surfaces else None
+        self._by_depth = ByDepth(config, self._surfaces) if self._surfaces is not None and config.depth_alone else None
         self._blind: BlindKeyframe | None = None  # the keyframe is the first and has no depth
 
     def track(
@@ -317,6 +319,8 @@ class MetricFrontEnd:
         reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
         reason = self._sees_again(frame) or reason
         if reason:
+            if self._surfaces is not None:
+                vo, self._T_key_cam = self._surfaces.fitted(frame, vo, self._T_key_cam, self._lag, attempt.twist_per_s)
             new, observations = self._continue_from(frame, attempt)
             return TrackResult(vo, observations, new, departure.parallax_px, reason)
         good = attempt.estimate.inliers
@@ -443,11 +447,10 @@ class MetricFrontEnd:
             self._landmarks = Landmarks()
             return self._life.refused(frame.t_ns, why, lack)
         self._predictor.forget()
-        self._lost = False
-        self._lacks_depth = False
+        self._lost = self._lacks_depth = False
         has_depth = self._depth.available(frame)
         self._blind = None if has_depth else BlindKeyframe(self._config, self._view, self._tracker.pixels)
-        self._install(frame, np.zeros(6))
+        self._install(frame, np.zeros(6), None)
         observations = self._observations(self._tracker.pixels, reading, self._landmarks.mean[:, :2])
         return self._life.started(observations, count, why)
 
@@ -481,7 +484,7 @@ class MetricFrontEnd:
         measured = reading.joined(fresh)
         self._lacks_depth = len(measured.rho) > np.isfinite(measured.rho).sum() / _DEEP
         observations = self._observations(seen_at, measured, instant)
-        return self._install(frame, attempt.twist_per_s), observations
+        return self._install(frame, attempt.twist_per_s, self._T_key_cam), observations
 
     def _add_landmarks(self, frame: Frame, count: int, twist_per_s: Array) -> DepthReading:
         """Give the tracker's last `count` corners landmarks; return their depth reading."""
@@ -507,11 +510,13 @@ class MetricFrontEnd:
             ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self._shutter.instant_px(xy)
         )
 
-    def _install(self, frame: Frame, twist_per_s: Array) -> Keyframe:
+    def _install(self, frame: Frame, twist_per_s: Array, T_key_new: Array | None) -> Keyframe:
         whole, usual = self._view.of(frame), self._views[0]
         usual_twist = np.zeros(6) if self._view.is_swapped else twist_per_s
         exposed = self._exposures.of_keyframe(usual.depth, whole, usual_twist, self._landmarks.expected_rho)
         keyframe = self._life.install(whole, usual.camera, usual.T_body_cam, len(self._tracker), exposed)
+        if self._surfaces is not None:
+            self._surfaces.add(keyframe, T_key_new)
         self._exposures.key_twist_per_s = twist_per_s
         self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)

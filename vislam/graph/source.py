@@ -169,6 +169,9 @@ class MotionSource:
 class WindowSource:
     """Tight coupling: a sliding window estimates states and landmarks, and the graph takes its edges and tilts.
 
+    Where no inertial data are in it, and odometry had the surfaces of depth images as well, the edge is odometry's: the
+    window knows the tracks alone.
+
     With `GraphMemory.ties_by_depth`, where no track ties a keyframe to the one before, what its depth image says of the
     motion goes into the edge as well: a map that is asked by depth needs to know how well a place is known in the dark.
     Elsewhere it is left out: hololens_000, without any darkness, was 7 mm worse (44 and 51 mm, means of three seeds).
@@ -181,6 +184,7 @@ class WindowSource:
         self._window = window
         self._local: list[NavState | None] = []  # of each keyframe in the window's frame, settled or as it was newest
         self._fresh: dict[int, NavState] = {}  # of those, since `take_states`
+        self._by_surfaces: dict[int, tuple[Array, Array]] = {}  # motions of keyframes whose edges are not settled yet
         self._ties_by_depth = False
         self._by_depth: dict[int, tuple[Array, Array]] = {}  # motions to keyframes that no track ties to the one before
         self._details: dict[str, Any] = {}
@@ -303,15 +307,26 @@ class WindowSource:
         return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, note, record.rest_from)
 
     def _note_depth(self, packet: KeyframePacket, record: KeyframeRecord) -> None:
-        """Remember the motion to a keyframe that its depth image placed, and no track: windows do not hear of it."""
+        """Remember the motion to a keyframe of which depth images said what windows do not hear of."""
         T, covariance = record.T_previous_body, record.covariance
+        if packet.vo.by_surfaces and packet.imu is None and T is not None and covariance is not None:
+            self._by_surfaces[record.id] = T, covariance
         if not self._ties_by_depth or packet.vo.inliers or record.begins_submap or not record.has_scale:
             return
         if T is not None and covariance is not None and np.linalg.eigvalsh(covariance)[0] > 0.0:
             self._by_depth[record.id] = T, covariance
 
     def _with_depth(self, edge: EdgeRecord) -> EdgeRecord:
-        """Return an edge of the window with what depth alone says of the same motion, if it does: they err apart."""
+        """Return an edge of the window with what depth says of the same motion, if it does.
+
+        What depth alone says errs apart from it. With what tracks and depth say together it has the tracks in common,
+        so that stands in its place.
+        """
+        if edge.to_id in self._by_surfaces:
+            T, covariance = self._by_surfaces[edge.to_id]
+            if edge.settled:
+                del self._by_surfaces[edge.to_id]
+            return replace(edge, T_previous_body=T, covariance=covariance)
         known = self._by_depth.get(edge.to_id)
         if known is None:
             return edge
