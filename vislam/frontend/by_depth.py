@@ -7,7 +7,7 @@ large the frame is lost as before.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, Frame, Keyframe, Tracking, VoMeasurement
 from vislam.frontend.local_surfaces import CHI2, WIDER, LocalSurfaces, is_alike
+from vislam.frontend.result import metric_motion
 from vislam.frontend.view import sees
 from vislam.vision.depth_alignment import DepthAlignment, Prior, align_depth
 
@@ -30,6 +31,11 @@ class Placed:
     T_key_cam: Array  # [4, 4]
     covariance: Array  # [6, 6] of its right perturbation, rotation first
     reason: str  # why it should become a keyframe, or an empty string
+
+    def motion(self, t_ns: int, keyframe_id: int, T_body_cam: Array) -> VoMeasurement:
+        """Return the same as a measurement of the body's motion, degraded."""
+        vo = metric_motion(t_ns, keyframe_id, self.T_key_cam, self.covariance, T_body_cam, 0, is_weak=True)
+        return replace(vo, by_surfaces=True)
 
 
 @dataclass(frozen=True, slots=True)

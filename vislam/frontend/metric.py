@@ -381,9 +381,7 @@ class MetricFrontEnd:
             self._predictor.observe(T_before_now, moved.dt_s)
         self._lost = False
         self._life.placed_without_vision(frame.t_ns)
-        vo = metric_motion(
-            frame.t_ns, keyframe.id, placed.T_key_cam, placed.covariance, self._T_body_cam, 0, is_weak=True
-        )
+        vo = placed.motion(frame.t_ns, keyframe.id, self._T_body_cam)
         reason = f"{placed.reason or 'placed by depth alone'}: {attempt.failure}"
         if not placed.reason:
             return TrackResult(vo, no_observations(), None, 0.0, reason, by_depth=True)
