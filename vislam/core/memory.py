@@ -159,7 +159,6 @@ class GraphMemory:
     vo_scale: float
     revision: int
     own: tuple[OwnStart, ...] = ()  # the last estimate of the own variables of sensors
-    ties_by_depth: bool = False  # what depth alone says of the motion to new keyframes counts, where no track ties them
 
 
 @dataclass(frozen=True, slots=True, eq=False)

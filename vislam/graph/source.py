@@ -169,12 +169,9 @@ class MotionSource:
 class WindowSource:
     """Tight coupling: a sliding window estimates states and landmarks, and the graph takes its edges and tilts.
 
-    Where no inertial data are in it, and odometry had the surfaces of depth images as well, the edge is odometry's: the
-    window knows the tracks alone.
-
-    With `GraphMemory.ties_by_depth`, where no track ties a keyframe to the one before, what its depth image says of the
-    motion goes into the edge as well: a map that is asked by depth needs to know how well a place is known in the dark.
-    Elsewhere it is left out: hololens_000, without any darkness, was 7 mm worse (44 and 51 mm, means of three seeds).
+    Of depth images as surfaces the window knows nothing. Where it has no inertial data either, the edge of a keyframe
+    whose motion surfaces had a say in is odometry's. Where it has, what depth alone says of a motion that no track
+    tells goes into the edge as well.
     """
 
     def __init__(self, config: GraphConfig, window: Window) -> None:
@@ -185,7 +182,6 @@ class WindowSource:
         self._local: list[NavState | None] = []  # of each keyframe in the window's frame, settled or as it was newest
         self._fresh: dict[int, NavState] = {}  # of those, since `take_states`
         self._by_surfaces: dict[int, tuple[Array, Array]] = {}  # motions of keyframes whose edges are not settled yet
-        self._ties_by_depth = False
         self._by_depth: dict[int, tuple[Array, Array]] = {}  # motions to keyframes that no track ties to the one before
         self._details: dict[str, Any] = {}
 
@@ -235,7 +231,6 @@ class WindowSource:
 
     def restore(self, records: list[KeyframeRecord], memory: GraphMemory) -> list[Guess]:
         """See Source."""
-        self._ties_by_depth = memory.ties_by_depth
         for said in memory.windows:
             self._odometry.append(said)
         self._local = [memory.states.get(k) for k in range(len(records))]
@@ -309,11 +304,11 @@ class WindowSource:
     def _note_depth(self, packet: KeyframePacket, record: KeyframeRecord) -> None:
         """Remember the motion to a keyframe of which depth images said what windows do not hear of."""
         T, covariance = record.T_previous_body, record.covariance
-        if packet.vo.by_surfaces and packet.imu is None and T is not None and covariance is not None:
-            self._by_surfaces[record.id] = T, covariance
-        if not self._ties_by_depth or packet.vo.inliers or record.begins_submap or not record.has_scale:
+        if not packet.vo.by_surfaces or record.begins_submap or T is None or covariance is None:
             return
-        if T is not None and covariance is not None and np.linalg.eigvalsh(covariance)[0] > 0.0:
+        if packet.imu is None:
+            self._by_surfaces[record.id] = T, covariance
+        elif packet.vo.inliers == 0 and np.linalg.eigvalsh(covariance)[0] > 0.0:
             self._by_depth[record.id] = T, covariance
 
     def _with_depth(self, edge: EdgeRecord) -> EdgeRecord:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -95,13 +94,12 @@ class Back:
         if self._false is not None:
             raise UsageError("what loop.inject_share made up is not remembered: such a run cannot be gone on with")
         asks_depth = memory.map_keyframes > 0 and self._rig.has_depth and self._config.loop.depth_in_map
-        graph = replace(memory.graph, ties_by_depth=asks_depth)
-        update = self.graph.restore(graph)
+        update = self.graph.restore(memory.graph)
         if self.loops is not None:
             self.loops.restore(memory.places)
             self._words_revision = self.loops.words_revision
         if self.map is not None:
-            self.map.restore(memory.scans, graph.T_map_body, memory.held > 0)
+            self.map.restore(memory.scans, memory.graph.T_map_body, memory.held > 0)
         if asks_depth:
             self._by_depth = DepthInMap(self._config, self._rig, memory, update.submaps)
         self._follow(update)
