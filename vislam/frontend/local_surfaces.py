@@ -23,6 +23,8 @@ from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
 WIDER = 3.0  # times the standard deviations of depth: errors of its calibration, the same in all images, stay
 CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
 _AGREEMENT, _SEEN_THROUGH = 0.8, 0.1  # shares of what overlaps: more contradicts, and it is another place
+_DOUBTED = 12.6  # chi-square of six, exceeded once in 20: tracks and surfaces contradict each other, ...
+_CHI2 = 9.0 * _DOUBTED  # ... and here by more than tracks can be wrong by that are three times as unsure as they say
 _LEAST_SHARE = 0.15  # of the pixels have a surface, or there is nothing to align
 _LEAST_OVERLAP = 0.3  # of its surface that falls on those of the last keyframes
 # times what surfaces are apart by: the noise of independent samples that would move a pose as much. Depth errs in
@@ -87,7 +89,7 @@ class LocalSurfaces:
             return vo, T_key_cam
         twist = se3_adjoint(np.asarray(invert(T_cam_depth))) @ (_APART_S * twist_per_s)
         change, known, chi2 = _weighed(found, prior, 2.0 * np.outer(twist, twist))
-        if chi2 > CHI2:
+        if chi2 > _CHI2:
             return vo, T_key_cam
         T_key_cam = np.asarray(prior.T_model_cam @ se3_exp(change) @ invert(T_cam_depth))
         covariance = to_body @ known @ to_body.T
@@ -124,8 +126,15 @@ def _weighed(found: DepthAlignment, prior: Prior, off: Array) -> tuple[Array, Ar
     less = np.linalg.inv(np.eye(6) + information @ off)
     information = less @ information
     information = 0.5 * (information + information.T)
+    known, change, chi2 = _joined(information, less @ pull, of_prior)
+    if chi2 > _DOUBTED:  # surfaces were judged by how they fit; tracks are doubted where both contradict
+        known, change, _ = _joined(information, less @ pull, of_prior * _DOUBTED / chi2)
+    return change, 0.5 * (known + known.T), chi2
+
+
+def _joined(information: Array, pull: Array, of_prior: Array) -> tuple[Array, Array, float]:
     known = np.linalg.inv(information + of_prior)
-    change = known @ less @ pull
+    change = known @ pull
     kept = of_prior @ change  # both pull as much
     chi2 = change @ kept + kept @ np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ kept
-    return change, 0.5 * (known + known.T), float(chi2)
+    return known, change, float(chi2)

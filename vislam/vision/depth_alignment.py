@@ -26,6 +26,8 @@ from vislam.vision.depth_surface import DepthSurface, Surface
 
 # stride in the frame's pixels, farthest distance to a plane in metres, and iterations: coarse to fine
 _LEVELS = ((4, 0.3, 12), (2, 0.12, 8), (2, 0.06, 8))
+_FAR_M = 3.0  # to surfaces that a turn moves
+_LOOK = 4  # stride in pixels of the points by which the result is judged
 _ALIKE_NORMALS = 0.8  # cosine of the angle between normals that may be of the same surface
 _CAUCHY = 3.0  # scale of the robust kernel in standard deviations
 _FLOOR_M = 0.001  # of a distance's standard deviation: what calibration leaves near the camera
@@ -105,7 +107,7 @@ def align_depth(
     information_0 = np.linalg.inv(prior.covariance)
     T, converged = (prior.T_model_cam if T_start is None else T_start).copy(), False
     sums = _no_sums()
-    for stride, gate_m, most in _LEVELS:
+    for stride, gate_m, most in _LEVELS[_begin(prior) :]:
         rows = _rows(frame, stride)
         converged = False
         for _ in range(most):
@@ -129,6 +131,13 @@ def align_depth(
         T, 0.5 * (covariance + covariance.T), 6 - basis.shape[1], basis, overlap, agreement, through,
         float(np.sqrt(sums.totals[0] / sums.totals[1])), converged,
     )  # fmt: skip
+
+
+def _begin(prior: Prior) -> int:
+    """Return the level to begin with: gates need not be wider than the prior is unsure."""
+    turn, way = (float(np.linalg.eigvalsh(prior.covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3))
+    off_m = 3.0 * np.sqrt(turn * _FAR_M**2 + way)
+    return next((k for k in reversed(range(len(_LEVELS) - 1)) if off_m < _LEVELS[k][1]), 0)
 
 
 def _nothing(prior: Prior) -> DepthAlignment:
@@ -246,13 +255,13 @@ def _determined(sums: _Sums) -> tuple[Array, Array, Array]:
 
 def _judged(frame: DepthSurface, model: Sequence[SeenFrom], T: Array) -> tuple[float, float, float]:
     """Return overlap, agreement and the share seen through, of the frame at T [4, 4] and the model."""
-    rows = _rows(frame, 2)
+    rows = _rows(frame, _LOOK)
     best, through, told = np.zeros(len(rows.points)), 0, 0
     for part in model:
         T_part_cam = np.ascontiguousarray(invert(part.T_model_cam) @ T)
         codes = _compared(rows.points, part.seen, T_part_cam)
         best = np.maximum(best, codes)
-        back = _rows(part.seen, 2).points
+        back = _rows(part.seen, _LOOK).points
         codes_back = _compared(back, frame, np.ascontiguousarray(invert(T_part_cam)))
         through += int((codes_back == 1.0).sum())
         told += int((codes_back > 0.0).sum())
