@@ -14,13 +14,14 @@ import numpy as np
 from vislam.config import FrontEndConfig
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, Frame, Keyframe, Tracking, VoMeasurement
-from vislam.frontend.local_surfaces import CHI2, WIDER, LocalSurfaces, is_alike
+from vislam.frontend.local_surfaces import WIDER, LocalSurfaces, is_alike
 from vislam.frontend.result import metric_motion
 from vislam.frontend.view import sees
 from vislam.vision.depth_alignment import DepthAlignment, Prior, align_depth
 
 _TURN_WALK, _SPEED_WALK = 2.0, 0.7  # rad/s and m/s per root of a second: 6 rad/s^2, 2 m/s^2 of a hand over 0.1 s
 _TURN_SIGMA, _SPEED_SIGMA = 0.3, 0.2  # rad/s and m/s, of what the last two frames that vision placed say
+_CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
 _GYRO_SIGMA_RAD, _BIAS_RAD_S = 0.002, 0.2  # of a turn by the gyroscope, and of its bias where nobody knows it
 
 
@@ -138,7 +139,7 @@ class ByDepth:
         change = se3_log(invert(prior.T_model_cam) @ found.T_model_cam)
         chi2 = float(change @ np.linalg.solve(prior.covariance, change))
         return (
-            found.converged and found.overlap >= self._config.depth_alone_overlap and is_alike(found) and chi2 <= CHI2
+            found.converged and found.overlap >= self._config.depth_alone_overlap and is_alike(found) and chi2 <= _CHI2
         )
 
     def _keyframe_reason(self, frame: Frame, keyframe: Keyframe, found: DepthAlignment, tracks: int) -> str:

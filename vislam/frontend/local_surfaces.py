@@ -21,16 +21,16 @@ from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align
 from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
 
 WIDER = 3.0  # times the standard deviations of depth: errors of its calibration, the same in all images, stay
-CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
 _AGREEMENT, _SEEN_THROUGH = 0.8, 0.1  # shares of what overlaps: more contradicts, and it is another place
+_ROOM = 3.0  # times the standard deviations of tracks, within which surfaces are met: few tracks may be far off
 _DOUBTED = 12.6  # chi-square of six, exceeded once in 20: tracks and surfaces contradict each other, ...
-_CHI2 = 9.0 * _DOUBTED  # ... and here by more than tracks can be wrong by that are three times as unsure as they say
+_REFUSED = 9.0 * _DOUBTED  # ... and here even if tracks are three times as unsure as they say
 _LEAST_SHARE = 0.15  # of the pixels have a surface, or there is nothing to align
 _LEAST_OVERLAP = 0.3  # of its surface that falls on those of the last keyframes
 # times what surfaces are apart by: the noise of independent samples that would move a pose as much. Depth errs in
 # patches, and lens, registration and readout err in common, which leaves no residual. Chosen on fr1_desk, hololens_000
-# and a rendered room; 12 to 30 differ little
-_ALIKE = 20.0
+# and a rendered room; 20 to 30 differ little
+_ALIKE = 30.0
 _LEAST_APART = 0.25  # of what noise explains: so little may be chance
 _APART_S = 0.01  # by which the exposure of depth is not known: readout, and velocity that changes
 
@@ -84,12 +84,13 @@ class LocalSurfaces:
         T_depth_body = np.asarray(invert(self._T_body_cam @ T_cam_depth))
         to_depth, to_body = se3_adjoint(T_depth_body), se3_adjoint(np.asarray(invert(T_depth_body)))
         prior = Prior(np.asarray(T_key_cam @ T_cam_depth), to_depth @ vo.covariance @ to_depth.T + 1e-12 * np.eye(6))
-        found = align_depth(surface, self.kept, prior, WIDER * self._sigma_rho)
+        room = Prior(prior.T_model_cam, _ROOM**2 * prior.covariance)
+        found = align_depth(surface, self.kept, room, WIDER * self._sigma_rho)
         if not found.converged or found.overlap < _LEAST_OVERLAP or not is_alike(found):
             return vo, T_key_cam
         twist = se3_adjoint(np.asarray(invert(T_cam_depth))) @ (_APART_S * twist_per_s)
-        change, known, chi2 = _weighed(found, prior, 2.0 * np.outer(twist, twist))
-        if chi2 > _CHI2:
+        change, known, chi2 = _weighed(found, room, prior, 2.0 * np.outer(twist, twist))
+        if chi2 > _REFUSED:
             return vo, T_key_cam
         T_key_cam = np.asarray(prior.T_model_cam @ se3_exp(change) @ invert(T_cam_depth))
         covariance = to_body @ known @ to_body.T
@@ -113,15 +114,15 @@ def is_alike(found: DepthAlignment) -> bool:
     return found.agreement >= _AGREEMENT and found.seen_through <= _SEEN_THROUGH
 
 
-def _weighed(found: DepthAlignment, prior: Prior, off: Array) -> tuple[Array, Array, float]:
+def _weighed(found: DepthAlignment, room: Prior, prior: Prior, off: Array) -> tuple[Array, Array, float]:
     """Return what surfaces change [6] of the prior's pose, the covariance [6, 6] then, and by how much both contradict.
 
-    The information of surfaces, by residuals, is lowered for what errs in common, and by `off` [6, 6], the covariance
-    of where depth was taken.
+    Surfaces were found with the prior `room`. Their information, by residuals, is lowered for what errs in common, and
+    by `off` [6, 6], the covariance of where depth was taken.
     """
-    of_prior, whole = np.linalg.inv(prior.covariance), np.linalg.inv(found.covariance)
+    of_prior, of_room, whole = (np.linalg.inv(P) for P in (prior.covariance, room.covariance, found.covariance))
     apart = (_ALIKE * max(found.residual, _LEAST_APART / WIDER)) ** 2
-    information = (whole - of_prior) / apart
+    information = (whole - of_room) / apart
     pull = whole @ se3_log(invert(prior.T_model_cam) @ found.T_model_cam) / apart
     less = np.linalg.inv(np.eye(6) + information @ off)
     information = less @ information
