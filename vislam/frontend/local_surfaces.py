@@ -120,7 +120,7 @@ def _weighed(found: DepthAlignment, room: Prior, prior: Prior, off: Array) -> tu
     Surfaces were found with the prior `room`. Their information, by residuals, is lowered for what errs in common, and
     by `off` [6, 6], the covariance of where depth was taken.
     """
-    of_prior, of_room, whole = (np.linalg.inv(P) for P in (prior.covariance, room.covariance, found.covariance))
+    of_prior, of_room, whole = (_inverse(P) for P in (prior.covariance, room.covariance, found.covariance))
     apart = (_ALIKE * max(found.residual, _LEAST_APART / WIDER)) ** 2
     information = (whole - of_room) / apart
     pull = whole @ se3_log(invert(prior.T_model_cam) @ found.T_model_cam) / apart
@@ -133,9 +133,13 @@ def _weighed(found: DepthAlignment, room: Prior, prior: Prior, off: Array) -> tu
     return change, 0.5 * (known + known.T), chi2
 
 
+def _inverse(symmetric: Array) -> Array:
+    return np.asarray(np.linalg.inv(symmetric), dtype=np.float64)
+
+
 def _joined(information: Array, pull: Array, of_prior: Array) -> tuple[Array, Array, float]:
-    known = np.linalg.inv(information + of_prior)
-    change = known @ pull
+    known = _inverse(information + of_prior)
+    change: Array = known @ pull
     kept = of_prior @ change  # both pull as much
     chi2 = change @ kept + kept @ np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ kept
     return known, change, float(chi2)
