@@ -126,7 +126,7 @@ class MetricFrontEnd:
         if not self._weakness(attempt):
             self._exposures.learn(frame, attempt, self._landmarks, self._tracker.pixels, self._sigma_xy, dt_s)
         self._learn_noise(attempt, keyframe)
-        return self._report(frame, keyframe, attempt)
+        return self._report(frame, keyframe, attempt, has_imu=imu is not None)
 
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
@@ -306,7 +306,7 @@ class MetricFrontEnd:
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 
-    def _report(self, frame: Frame, keyframe: Keyframe, attempt: Attempt) -> TrackResult:
+    def _report(self, frame: Frame, keyframe: Keyframe, attempt: Attempt, has_imu: bool) -> TrackResult:
         vo = self._measurement(frame, keyframe.id, attempt)
         departure = self._life.departure(
             frame.t_ns,
@@ -319,7 +319,7 @@ class MetricFrontEnd:
         reason = keyframe_reason(departure, self._config, self.keyframe_spacing)
         reason = self._sees_again(frame) or reason
         if reason:
-            if self._surfaces is not None:
+            if self._surfaces is not None and not has_imu:  # a window does without, and its filter was no better
                 vo, self._T_key_cam = self._surfaces.fitted(frame, vo, self._T_key_cam, self._lag, attempt.twist_per_s)
             new, observations = self._continue_from(frame, attempt)
             return TrackResult(vo, observations, new, departure.parallax_px, reason)
