@@ -71,6 +71,26 @@ def test_a_correction_comes_with_the_way_that_the_body_makes() -> None:
     assert np.max(-np.diff(errors)) < _CONFIG.way_share * 0.05 + 0.001
 
 
+def test_without_a_gyroscope_a_correction_of_orientation_comes_with_the_turn() -> None:
+    """By a tenth of it; who has a gyroscope would see that, and gets it by the gyroscope's own drift."""
+    left_rad = {}
+    for sigma_rad_s in (0.0, np.inf):
+        publisher, T, owed = Continuity(_CONFIG), np.eye(4), moved(0.0, 0.03)
+        publisher.follow(0, T, T, sigma_rad_s)
+        publisher.follow(0, T, owed @ T, sigma_rad_s)
+        T = owed @ T
+        for k in range(1, 11):  # half a second at rest
+            shown = publisher.follow(k * _FRAME_NS, T, T, sigma_rad_s)
+        assert turn_rad(shown, T) > 0.029
+        turns = []
+        for k in range(11, 31):  # one second at 0.4 rad/s
+            T = T @ moved(0.0, 0.02)
+            turns.append(turn_rad(publisher.follow(k * _FRAME_NS, T, T, sigma_rad_s), T))
+        assert np.max(-np.diff(turns)) <= 0.1 * 0.02 + 0.03 * 0.05 / _CONFIG.turn_s + 1e-9
+        left_rad[sigma_rad_s] = turns[-1]
+    assert left_rad[0.0] > 0.028 and left_rad[np.inf] < 0.001
+
+
 def test_a_correction_that_is_another_belief_comes_at_once() -> None:
     publisher, far = Continuity(_CONFIG), moved(1.5)
     publisher.follow(0, np.eye(4), np.eye(4))

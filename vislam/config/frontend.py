@@ -78,7 +78,8 @@ class FrontEndConfig:
     # of depth images after colour beyond what stamps say, None estimates it while running
     depth_delay_s: Finite | None = None
     depth_edge_rho: NonNegative = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
-    local_surfaces: Whole = 4  # of the last keyframes, to which a new one's depth is fitted; 2 to 8 differ little
+    # of the last keyframes, to which a new one's depth is fitted where no IMU is; 2 to 8 differ little, 0: it is not
+    local_surfaces: Whole = 4
     depth_alone: bool = True  # frames that vision cannot place are placed by their depth image, as degraded
     depth_alone_sigma_m: Positive = 0.3  # of the place in the keyframe; beyond, depth may meet the wrong surfaces
     depth_alone_overlap: Share = 0.4  # of its surface that falls on the last keyframes'; less fits by chance

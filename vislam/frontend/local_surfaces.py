@@ -2,7 +2,7 @@
 
 What tracks tell of the way since the last keyframe errs anew with each one. Surfaces that several of the last keyframes
 saw are met again (Newcombe et al., "KinectFusion", ISMAR 2011), so errors do not add up while the same is in view, and
-bare walls count as well as textured ones.
+bare walls count as well as textured ones. See docs/decisions/013-surfaces-of-the-last-keyframes.md.
 """
 
 from __future__ import annotations
