@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vislam.cli.verbs.arguments import parse, take_option, take_path
+from vislam.cli.verbs.arguments import map_choice, parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import rewritten_line
@@ -99,13 +99,9 @@ def main(arguments: list[str]) -> int:
     settings = settings if further.file is None else replace(settings, sensors=further)
     defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
-    if options.localize_only and options.map is None:
-        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
-    if options.settings.loop.start_in_map is not None and options.map is None:
-        raise UsageError("--loop.start-in-map is a place in a map; give --map OLD/session.db")
-    from vislam.run.folder import MapChoice, prepare
+    base = map_choice(options.map, options.localize_only, options.settings)
+    from vislam.run.folder import prepare
 
-    base = None if options.map is None else MapChoice(options.map, options.localize_only)
     with opened(web, options.settings.live.name, options.out) as station:
         make = partial(_made, command=command, base=base, station=station)
         if station is not None and web is not None and web.waits:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional
 
-from vislam.cli.verbs.arguments import parse, take_option, take_path
+from vislam.cli.verbs.arguments import map_choice, parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics, written_up
 from vislam.cli.verbs.terminal import progress_bar
@@ -84,10 +84,6 @@ def main(arguments: list[str]) -> int:
     from vislam.core.up import told_up
 
     told_up(options.settings.up)
-    if options.localize_only and options.map is None:
-        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
-    if options.settings.loop.start_in_map is not None and options.map is None:
-        raise UsageError("--loop.start-in-map is a place in a map; give --map OLD/session.db")
     print_metrics(run_source(options, command), options.out, options.json)
     return 0
 
@@ -113,12 +109,12 @@ def run_source(options: RunOptions, command: list[str]) -> dict[str, Any]:
     """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
     from vislam.datasets.calibrated import with_clock
     from vislam.run import execute
-    from vislam.run.folder import MapChoice, prepare
+    from vislam.run.folder import prepare
     from vislam.run.sources import open_source
 
     settings = with_clock(options.settings)
+    base = map_choice(options.map, options.localize_only, settings)
     recording = open_source(options.source, settings.seed, settings.calibration)
-    base = None if options.map is None else MapChoice(options.map, options.localize_only)
     prepare(options.out, options.overwrite, base)
     with written_up(options.out, command), progress_bar(recording.name) as progress:
         return execute(recording, settings, options.out, options.source, command, progress, base)
