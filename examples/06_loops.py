@@ -10,7 +10,7 @@ import numpy as np
 
 from vislam.config import LoopConfig
 from vislam.core.geometry import invert, se3_log
-from vislam.frontend.keyframes import make_keyframe
+from vislam.frontend.keyframes import Exposed, make_keyframe
 from vislam.loop.verification.verifier import Verifier
 from vislam.loop.view import View, make_view
 from vislam.loop.words.database import PlaceDatabase
@@ -33,7 +33,7 @@ def view_of(index: int) -> View:
         z = frame.depth_m[y, x].astype(float)
         return np.where(z > 0.1, z, np.nan)  # 0: the sensor saw nothing there
 
-    return make_view(make_keyframe(index, frame, camera, T_body_cam, 800, depth_m), world.rig)
+    return make_view(make_keyframe(index, frame, camera, T_body_cam, 800, Exposed(depth_m)), world.rig)
 
 
 places = PlaceDatabase(LoopConfig(), seed=0)  # comes with a small vocabulary; a run trains its own
