@@ -8,6 +8,7 @@ bare walls count as well as textured ones. See docs/decisions/013-surfaces-of-th
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -44,23 +45,27 @@ class LocalSurfaces:
         self._fitted_to = config.local_surfaces
         self._maker = SurfaceMaker(camera, config.min_depth_m, config.max_depth_m, config.depth_sigma_rho)
         self._sigma_rho = config.depth_sigma_rho
-        self._newest: tuple[int, DepthSurface | None] = (-1, None)  # by its frame's time
-        self.kept: tuple[SeenFrom, ...] = ()  # the newest keyframe's first, in its camera
+        self._newest: tuple[int, _DepthImage | None] = (-1, None)  # by its frame's time
+        self._last: tuple[tuple[_DepthImage, Array], ...] = ()  # the newest keyframe's first, in its camera [4, 4]
+
+    @property
+    def kept(self) -> tuple[SeenFrom, ...]:
+        """The surfaces, the newest keyframe's first, in its camera."""
+        return tuple(SeenFrom(depth.surface, T) for depth, T in self._last if depth.surface is not None)
 
     def of(self, frame: Frame) -> DepthSurface | None:
         """Return the surface that a frame sees; None where it has no depth, or too little."""
-        if self._newest[0] != frame.t_ns:
-            surface = None if frame.depth_m is None else self._made(frame.depth_m)
-            self._newest = frame.t_ns, surface
-        return self._newest[1]
+        depth = self._depth_of(frame)
+        return None if depth is None else depth.surface
 
     def add(self, keyframe: Keyframe, T_key_new: Array | None) -> None:
         """Take a new keyframe, at T_key_new [4, 4] in the last one; None: nothing ties it to that."""
-        moved = [] if T_key_new is None else [_moved(old, np.asarray(invert(T_key_new))) for old in self.kept]
-        own, T_image_depth = self.of(keyframe.frame), keyframe.T_image_depth
+        T_new_key = None if T_key_new is None else np.asarray(invert(T_key_new))
+        last = [] if T_new_key is None else [(depth, np.asarray(T_new_key @ T)) for depth, T in self._last]
+        own, T_image_depth = self._depth_of(keyframe.frame), keyframe.T_image_depth
         if own is not None:
-            moved.insert(0, SeenFrom(own, np.eye(4) if T_image_depth is None else T_image_depth))
-        self.kept = tuple(moved[: max(self._fitted_to, 1)])
+            last.insert(0, (own, np.eye(4) if T_image_depth is None else T_image_depth))
+        self._last = tuple([one for one in last if not one[0].is_bare][: max(self._fitted_to, 1)])
 
     def fitted(
         self, frame: Frame, vo: VoMeasurement, T_key_cam: Array, lag: DepthLag, twist_per_s: Array
@@ -76,8 +81,8 @@ class LocalSurfaces:
             lag: of depth after its image.
             twist_per_s: velocity [6] of the camera in its own frame, rotation first.
         """
-        surface = self.of(frame)
-        if surface is None or not self.kept or self._fitted_to == 0:
+        surface, kept = self.of(frame), self.kept
+        if surface is None or not kept or self._fitted_to == 0:
             return vo, T_key_cam
         T_image_depth = lag.motion(frame, twist_per_s)
         T_cam_depth = np.eye(4) if T_image_depth is None else T_image_depth
@@ -85,11 +90,11 @@ class LocalSurfaces:
         to_depth, to_body = se3_adjoint(T_depth_body), se3_adjoint(np.asarray(invert(T_depth_body)))
         prior = Prior(np.asarray(T_key_cam @ T_cam_depth), to_depth @ vo.covariance @ to_depth.T + 1e-12 * np.eye(6))
         room = Prior(prior.T_model_cam, _ROOM**2 * prior.covariance)
-        found = align_depth(surface, self.kept, room, WIDER * self._sigma_rho)
+        found = align_depth(surface, kept, room, WIDER * self._sigma_rho)
         if not found.converged or found.overlap < _LEAST_OVERLAP or not is_alike(found):
             return vo, T_key_cam
         twist = se3_adjoint(np.asarray(invert(T_cam_depth))) @ (_APART_S * twist_per_s)
-        change, known, chi2 = _weighed(found, room, prior, 2.0 * np.outer(twist, twist))
+        change, known, chi2 = _weighed(found, prior, 2.0 * np.outer(twist, twist))
         if chi2 > _REFUSED:
             return vo, T_key_cam
         T_key_cam = np.asarray(prior.T_model_cam @ se3_exp(change) @ invert(T_cam_depth))
@@ -100,13 +105,28 @@ class LocalSurfaces:
         )  # fmt: skip
         return together, T_key_cam
 
-    def _made(self, depth_m: ImageF32) -> DepthSurface | None:
-        surface = self._maker.make(depth_m)
-        return surface if surface.share >= _LEAST_SHARE else None
+    def _depth_of(self, frame: Frame) -> _DepthImage | None:
+        if self._newest[0] != frame.t_ns:
+            self._newest = frame.t_ns, None if frame.depth_m is None else _DepthImage(frame.depth_m, self._maker)
+        return self._newest[1]
 
 
-def _moved(surface: SeenFrom, T_new_key: Array) -> SeenFrom:
-    return SeenFrom(surface.seen, T_new_key @ surface.T_model_cam)
+class _DepthImage:
+    """A depth image whose surface is made once, when it is asked for: with an IMU that is in the dark only."""
+
+    def __init__(self, depth_m: ImageF32, maker: SurfaceMaker) -> None:
+        self._depth_m, self._maker = depth_m, maker
+
+    @cached_property
+    def surface(self) -> DepthSurface | None:
+        """None where there is too little."""
+        made = self._maker.make(self._depth_m)
+        return made if made.share >= _LEAST_SHARE else None
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether it is known that there is too little."""
+        return "surface" in vars(self) and self.surface is None
 
 
 def is_alike(found: DepthAlignment) -> bool:
@@ -114,15 +134,15 @@ def is_alike(found: DepthAlignment) -> bool:
     return found.agreement >= _AGREEMENT and found.seen_through <= _SEEN_THROUGH
 
 
-def _weighed(found: DepthAlignment, room: Prior, prior: Prior, off: Array) -> tuple[Array, Array, float]:
+def _weighed(found: DepthAlignment, prior: Prior, off: Array) -> tuple[Array, Array, float]:
     """Return what surfaces change [6] of the prior's pose, the covariance [6, 6] then, and by how much both contradict.
 
-    Surfaces were found with the prior `room`. Their information, by residuals, is lowered for what errs in common, and
-    by `off` [6, 6], the covariance of where depth was taken.
+    Surfaces were found with _ROOM times the prior's sigmas. Their information, by residuals, is lowered for what errs
+    in common, and by `off` [6, 6], the covariance of where depth was taken.
     """
-    of_prior, of_room, whole = (_inverse(P) for P in (prior.covariance, room.covariance, found.covariance))
+    of_prior, whole = _inverse(prior.covariance), _inverse(found.covariance)
     apart = (_ALIKE * max(found.residual, _LEAST_APART / WIDER)) ** 2
-    information = (whole - of_room) / apart
+    information = (whole - of_prior / _ROOM**2) / apart
     pull = whole @ se3_log(invert(prior.T_model_cam) @ found.T_model_cam) / apart
     less = np.linalg.inv(np.eye(6) + information @ off)
     information = less @ information
