@@ -77,6 +77,8 @@ class FrontEndConfig:
     depth_now_factor: NonNegative = 2.0  # on the sigma of depth between keyframes, which is not averaged over time
     # of depth images after colour beyond what stamps say, None estimates it while running
     depth_delay_s: Finite | None = None
+    # of depth images, first to last row, as the camera moves; None estimates it while running, 0: all rows at once
+    depth_readout_s: NonNegative | None = None
     depth_edge_rho: NonNegative = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
     # of the last keyframes, to which a new one's depth is fitted where no IMU is; 2 to 8 differ little, 0: it is not
     local_surfaces: Whole = 4

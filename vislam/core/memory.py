@@ -231,6 +231,7 @@ class FrontNews:
     filter_camera: Array | None = None  # [8] of the tight filter: time offset, sigma, rotation [3], sigmas [3]
     tilt: Array | None = None  # [6] of a camera over a floor: what the mount lacks [2] and its covariance [2, 2]
     depth_delay_s: float | None = None  # of depth images, beyond their stamps; None: not estimated
+    depth_rows_s: float | None = None  # by how much longer their rows take than an image's; None: not estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

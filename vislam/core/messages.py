@@ -144,6 +144,8 @@ class Keyframe:
     descriptors: NDArray[np.uint8]  # [N, 32] ORB
     points_body_m: Array | None  # [N, 3] of the described features in the body frame, NaN where unknown; None: no depth
     T_image_depth: Array | None = None  # [4, 4] where cam0 was when depth was taken, as the image sees it; None: there
+    depth_sweep: Array | None = None  # [6] twist of cam0 from the first to the last row of depth; None: taken at once
+    image_sweep: Array | None = None  # [6] the same of its image
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,7 +32,7 @@ class Exposures:
     def __init__(self, camera: Camera, config: FrontEndConfig) -> None:
         """Begin with what the configuration tells, or with nothing."""
         self.shutter = Shutter(camera, config.readout_s)
-        self.lag = DepthLag(camera, config.depth_delay_s)
+        self.lag = DepthLag(camera, self.shutter, config.depth_delay_s, config.depth_readout_s)
         self.key_twist_per_s: Array = np.zeros(6)
         self._cauchy = config.cauchy
 
@@ -40,8 +40,7 @@ class Exposures:
         """Take what an earlier run had learned, to be learned further."""
         if news.readout_s is not None:
             self.shutter.start_at(news.readout_s)
-        if news.depth_delay_s is not None:
-            self.lag.start_at(news.depth_delay_s)
+        self.lag.start_at(news.depth_delay_s, news.depth_rows_s)
 
     def learn(
         self, frame: Frame, attempt: Attempt, landmarks: Landmarks, key_pixels: Array, sigma_xy: float, dt_s: float
@@ -64,7 +63,9 @@ class Exposures:
             self.shutter.learn(*change)
         if attempt.depth_now is not None and frame.depth_m is not None:
             rho = move(landmarks.mean, landmarks.covariance, attempt.estimate.T_key_cam)[0][:, 2]
-            slope = attempt.depth_now.slope - landmarks.by_delay
+            now, key = attempt.depth_now.slope, landmarks.by_delay
+            by_rows = now * self.shutter.row(attempt.pixels) - key * self.shutter.row(key_pixels)
+            slope = np.column_stack([now - key, by_rows])
             good = attempt.agreeing & landmarks.known
             self.lag.learn(attempt.depth_now.rho - rho, slope, attempt.depth_now.sigma_rho, good, dt_s)
 
@@ -76,6 +77,8 @@ class Exposures:
             self.lag.reader(sensor, frame, twist_per_s, expected_rho),
             partial(self.shutter.moved_to_instant, twist_per_s=twist_per_s),
             self.lag.motion(frame, twist_per_s),
+            self.lag.sweep(frame, twist_per_s),
+            self.shutter.sweep(twist_per_s),
         )
 
     def shear(self, attempt: Attempt, landmarks: Landmarks, key_pixels: Array, xy: Array) -> Array:

@@ -71,6 +71,8 @@ class Exposed:
         _as_seen  # raw pixels [N, 2] with depths [N], at the middle row's time
     )
     T_image_depth: Array | None = None  # see Keyframe
+    depth_sweep: Array | None = None  # see Keyframe
+    image_sweep: Array | None = None  # see Keyframe
 
 
 def make_keyframe(
@@ -92,7 +94,10 @@ def make_keyframe(
     depth_m = exposed.depth_m(pixels, ids)
     pixels = exposed.instant_px(pixels, depth_m)
     points = transform_points(T_body_cam, camera.unproject(pixels) * depth_m[:, None])
-    return Keyframe(keyframe_id, frame.t_ns, frame, pixels, descriptors, points, exposed.T_image_depth)
+    return Keyframe(
+        keyframe_id, frame.t_ns, frame, pixels, descriptors, points, exposed.T_image_depth, exposed.depth_sweep,
+        exposed.image_sweep,
+    )  # fmt: skip
 
 
 class KeyframeLife:

@@ -64,6 +64,7 @@ class LocalSurfaces:
         last = [] if T_new_key is None else [(depth, np.asarray(T_new_key @ T)) for depth, T in self._last]
         own, T_image_depth = self._depth_of(keyframe.frame), keyframe.T_image_depth
         if own is not None:
+            own.take_sweep(keyframe.depth_sweep)
             last.insert(0, (own, np.eye(4) if T_image_depth is None else T_image_depth))
         self._last = tuple([one for one in last if not one[0].is_bare][: max(self._fitted_to, 1)])
 
@@ -81,8 +82,11 @@ class LocalSurfaces:
             lag: of depth after its image.
             twist_per_s: velocity [6] of the camera in its own frame, rotation first.
         """
-        surface, kept = self.of(frame), self.kept
-        if surface is None or not kept or self._fitted_to == 0:
+        if (depth := self._depth_of(frame)) is None or self._fitted_to == 0:
+            return vo, T_key_cam
+        depth.take_sweep(lag.sweep(frame, twist_per_s))
+        surface, kept = depth.surface, self.kept
+        if surface is None or not kept:
             return vo, T_key_cam
         T_image_depth = lag.motion(frame, twist_per_s)
         T_cam_depth = np.eye(4) if T_image_depth is None else T_image_depth
@@ -116,12 +120,21 @@ class _DepthImage:
 
     def __init__(self, depth_m: ImageF32, maker: SurfaceMaker) -> None:
         self._depth_m, self._maker = depth_m, maker
+        self._sweep: Array | None = None
+
+    def take_sweep(self, sweep: Array | None) -> None:
+        """Take the camera's twist [6] from the first to the last row, once it is known."""
+        if sweep is not None and self._sweep is None:
+            self._sweep = sweep
+            vars(self).pop("surface", None)
 
     @cached_property
     def surface(self) -> DepthSurface | None:
-        """None where there is too little."""
+        """What was seen, as of the middle row's time; None where there is too little."""
         made = self._maker.make(self._depth_m)
-        return made if made.share >= _LEAST_SHARE else None
+        if made.share < _LEAST_SHARE:
+            return None
+        return made if self._sweep is None else made.at_once(self._sweep)
 
     @property
     def is_bare(self) -> bool:

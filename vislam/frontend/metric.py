@@ -138,8 +138,8 @@ class MetricFrontEnd:
     def news(self) -> FrontNews:
         """See FrontEnd.news."""
         readout_s = self._shutter.readout_s if self._shutter.learns else None
-        delay_s = self._lag.estimate_s if self._lag.learns and self._depth.every_frame else None
-        return FrontNews(self._tracker.next_id, readout_s=readout_s, depth_delay_s=delay_s)
+        lag = (self._lag.delay_estimate_s, self._lag.rows_estimate_s) if self._depth.every_frame else (None, None)
+        return FrontNews(self._tracker.next_id, readout_s=readout_s, depth_delay_s=lag[0], depth_rows_s=lag[1])
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 

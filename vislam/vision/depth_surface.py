@@ -13,6 +13,7 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
+from vislam.core.geometry import se3_exp
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageF32
 
@@ -41,6 +42,18 @@ class DepthSurface:
     def share(self) -> float:
         """Return which part of the pixels has a surface."""
         return float(np.isfinite(self.surface.planes[..., 0]).mean())
+
+    def at_once(self, sweep: Array) -> DepthSurface:
+        """Return what a camera would have seen that took all rows when it took the middle one.
+
+        Its twist from the first to the last row was `sweep` [6], rotation first. Surfaces stay at the pixels that saw
+        them, some pixels beside those that would have.
+        """
+        height = self.camera.height
+        T = np.array([se3_exp((row / (height - 1.0) - 0.5) * sweep) for row in range(height)])
+        points, planes, tilt = self.surface
+        points, planes = _at_once(points, planes, T, sweep, self.camera.fy / (height - 1.0))
+        return replace(self, surface=Surface(points, planes, tilt))
 
 
 class SurfaceMaker:
@@ -137,3 +150,26 @@ def _planes(rho: Array, xy: Array, sigma_rho: float) -> tuple[Array, Array, Arra
             variance = max(left, 0.25 * sigma_rho * sigma_rho) * 0.5 * (sxx + syy) / determinant
             tilt[i, j] = np.sqrt(variance / size2)
     return points, planes, tilt
+
+
+@njit(cache=True, nogil=True)
+def _at_once(points: Array, planes: Array, T: Array, sweep: Array, rows_by_slope: float) -> tuple[Array, Array]:
+    """Return points and planes [H, W, 3] with each row moved by its T [H, 4, 4].
+
+    A wall that is seen row by row is bent as well: the next row's points are displaced by more. `rows_by_slope` is by
+    which part of all rows a point is seen lower whose y grows by its z.
+    """
+    moved, turned = np.full_like(points, np.nan), np.full_like(planes, np.nan)
+    w, v = sweep[:3], sweep[3:]
+    for i in range(len(points)):
+        R, t = np.ascontiguousarray(T[i, :3, :3]), T[i, :3, 3]
+        for j in range(points.shape[1]):
+            p, m = points[i, j], planes[i, j]
+            if not np.isfinite(m[0]):
+                continue
+            by_row = np.array([w[1] * p[2] - w[2] * p[1], w[2] * p[0] - w[0] * p[2], w[0] * p[1] - w[1] * p[0]]) + v
+            row_by = np.array([0.0, rows_by_slope / p[2], -rows_by_slope * p[1] / (p[2] * p[2])])
+            turned[i, j] = R @ (m - row_by * ((by_row @ m) / (1.0 + by_row @ row_by)))
+            moved[i, j] = R @ p + t
+            turned[i, j] /= turned[i, j] @ moved[i, j]
+    return moved, turned

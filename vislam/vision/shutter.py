@@ -116,23 +116,32 @@ class Shutter:
             pixels = self._camera.project(np.column_stack([seen[:, :2], np.ones(len(seen))]))
         return pixels
 
+    def sweep(self, twist_per_s: Array) -> Array | None:
+        """Return the camera's twist [6] from the first to the last row; None where they are of one time."""
+        twist = self.readout_s * twist_per_s
+        return twist if twist.any() else None
+
     def _undone(self, pixels: Array, xy: Array, rho: Array, twist_per_s: Array, readout_s: float) -> Array:
         if readout_s == 0.0:
             return xy
         points = np.column_stack([xy, rho])
         return np.asarray(_shift(points, -self._delay_s(pixels, readout_s), twist_per_s)[:, :2])
 
-    def _delay_s(self, pixels: Array, readout_s: float) -> Array:
+    def row(self, pixels: Array) -> Array:
+        """Return where the rows of raw pixels [N, 2] are: -0.5 the first, 0.5 the last."""
         rows = np.clip(pixels[:, 1], 0.0, self._camera.height - 1.0)
-        return np.asarray((rows / (self._camera.height - 1.0) - 0.5) * readout_s)
+        return np.asarray(rows / (self._camera.height - 1.0) - 0.5)
+
+    def _delay_s(self, pixels: Array, readout_s: float) -> Array:
+        return self.row(pixels) * readout_s
 
 
-def later(points: Array, delay_s: float, twist_per_s: Array) -> Array:
-    """Return inverse-depth points [N, 3] as the camera sees them `delay_s` later; NaN behind it.
+def later(points: Array, delay_s: Array, twist_per_s: Array) -> Array:
+    """Return inverse-depth points [N, 3] as the camera sees them `delay_s` [N] later; NaN behind it.
 
     `twist_per_s` [6] is the velocity of the camera in its own frame, rotation first.
     """
-    return np.asarray(_shift(points, np.full(len(points), delay_s), twist_per_s))
+    return np.asarray(_shift(points, delay_s, twist_per_s))
 
 
 @njit(cache=True, nogil=True)

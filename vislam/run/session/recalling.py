@@ -115,7 +115,8 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
 
 
 def _front(data: dict[str, Any]) -> FrontNews:
-    camera, tilt, delay = data["filter_camera"], data.get("tilt"), data.get("depth_delay_s")
+    camera, tilt = data["filter_camera"], data.get("tilt")
+    delay, rows = data.get("depth_delay_s"), data.get("depth_rows_s")
     return FrontNews(
         int(data["next_track_id"]),
         float(data["time_offset_sigma_s"]),
@@ -123,6 +124,7 @@ def _front(data: dict[str, Any]) -> FrontNews:
         None if camera is None else np.array(camera, dtype=np.float64).reshape(8),
         None if tilt is None else np.array(tilt, dtype=np.float64).reshape(6),
         None if delay is None else float(delay),
+        None if rows is None else float(rows),
     )
 
 
