@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from vislam.core.geometry import invert, se3_exp
 from vislam.core.messages import Array, Frame, Keyframe
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.depth.moment import DepthAtImage
+from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
 
 PLAIN = Camera(160, 120, 130.0, 128.0, 80.0, 59.0)
 BENT = Camera(160, 120, 130.0, 128.0, 80.0, 59.0, distortion="radtan", coefficients=(-0.25, 0.06, 0.001, -0.002))
@@ -40,6 +43,60 @@ def test_depth_is_where_the_image_sees_it(camera: Camera) -> None:
     off = np.abs(seen - truth)[known]
     assert np.quantile(off, 0.95) < 0.008
     assert np.quantile(np.abs(depth_m - truth)[known], 0.95) > 0.05
+
+
+SWEEP = np.array([0.03, 0.05, -0.02, 0.01, -0.01, 0.02])  # 3.5 degrees from the first to the last row
+
+
+def row_by_row(camera: Camera, of: Callable[[Camera, Array], Array]) -> Array:
+    """Return what rows see that are taken one after the other."""
+    poses = [se3_exp((row / (camera.height - 1.0) - 0.5) * SWEEP) for row in range(camera.height)]
+    return np.array([of(camera, T)[row] for row, T in enumerate(poses)])
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BENT])
+def test_rows_that_were_taken_one_after_the_other_are_put_where_the_middle_one_sees_them(camera: Camera) -> None:
+    depth_m = row_by_row(camera, drawn).astype(np.float32)
+    truth = drawn(camera, np.eye(4))
+    seen = DepthAtImage(camera)(depth_m, np.eye(4), SWEEP)
+    known = seen > 0.0
+    assert known.mean() > 0.9
+    assert np.median(np.abs(seen - truth)[known]) < 0.3 * np.median(np.abs(depth_m - truth)[known])
+
+
+def painted(camera: Camera, T_world_cam: Array) -> Array:
+    """Return the grey image [H, W] of walls with waves on them, that `drawn` has the depth of."""
+    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    points = camera.unproject(np.column_stack([u.ravel(), v.ravel()])) * drawn(camera, T_world_cam).reshape(-1, 1)
+    x, y = (points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3])[:, :2].T
+    return (128.0 + 100.0 * np.sin(9.0 * x) * np.cos(8.0 * y)).reshape(u.shape).astype(np.uint8)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BENT])
+def test_colours_of_rows_are_put_there_too(camera: Camera) -> None:
+    image, truth = row_by_row(camera, painted).astype(np.uint8), painted(camera, np.eye(4))
+    depth_m = drawn(camera, np.eye(4)).astype(np.float32)
+
+    def off(seen: Array) -> float:
+        return float(np.mean(np.abs(seen.astype(float) - truth)[8:-8, 8:-8]))
+
+    assert off(DepthAtImage(camera).colors(image, depth_m, SWEEP)) < 0.2 * off(image)
+
+
+def test_surfaces_of_rows_are_those_of_the_walls() -> None:
+    depth_m = row_by_row(PLAIN, drawn).astype(np.float32)
+    made = SurfaceMaker(PLAIN, 0.3, 9.0, 0.001).make(depth_m)
+    near, far = np.array([-0.2, 0.0, 1.0]) / 1.5, np.array([0.3, 0.1, 1.0]) / 3.0
+
+    def off(surface: DepthSurface) -> tuple[float, float]:
+        points, planes, _ = surface.surface
+        at = [np.abs(points @ wall - 1.0) / np.linalg.norm(wall) for wall in (near, far)]
+        facing = [np.linalg.norm(planes - wall, axis=-1) for wall in (near, far)]
+        return float(np.nanmedian(np.minimum(*at))), float(np.nanmedian(np.minimum(*facing)))
+
+    (at, facing), (at_first, facing_first) = off(made.at_once(SWEEP)), off(made)
+    assert at < 0.1 * at_first
+    assert facing < 0.2 * facing_first
 
 
 def test_depth_of_the_same_moment_stays() -> None:

@@ -95,9 +95,11 @@ class ScanExtractor:
             return None
         image = frame.images[0] if frame.color is None else frame.color
         self._cameras[0].check_image(image)
-        depth_m, T_image_depth = frame.depth_m, keyframe.T_image_depth
-        if T_image_depth is not None:
-            depth_m = self._depth_at_image(depth_m, T_image_depth)
+        depth_m, T_image_depth, sweep = frame.depth_m, keyframe.T_image_depth, keyframe.depth_sweep
+        if T_image_depth is not None or sweep is not None:
+            depth_m = self._depth_at_image(depth_m, np.eye(4) if T_image_depth is None else T_image_depth, sweep)
+        if keyframe.image_sweep is not None:
+            image = self._depth_at_image.colors(image, depth_m, keyframe.image_sweep)
         depth = filter_depth(depth_m, self._config.pixel_step, self.view, self._config)
         return Scan(depth, None, _rgb(cv2.resize(image, self.view.size, interpolation=cv2.INTER_AREA)))
 
