@@ -24,20 +24,22 @@ _WORST = 0.02  # relative sigma: worse is no help
 _LEAST_SIGMA = 0.004  # of what depth says, too: a sensor's own registration is no better
 
 
-def focal_by_depth(source: str, camera: Camera) -> FocalFit | None:
-    """Return what depth says of a camera's focal length; None where it does not tell, or there is none."""
+def focal_by_depth(source: str, camera: Camera) -> FocalFit | str:
+    """Return what depth says of a camera's focal length, or why it does not; empty: the recording has no depth."""
     try:
         found = survey(source)
-        if found.rig is None or found.depth is None or found.errors:
-            return None
-        frames = frame_table(found, Problems())
-        if not np.any(frames.depth_rows >= 0):
-            return None
+        if found.errors:
+            return str(found.errors[0])
+        frames = None if found.rig is None or found.depth is None else frame_table(found, Problems())
+        if found.rig is None or frames is None or not np.any(frames.depth_rows >= 0):
+            return ""
         rig = replace(found.rig, cameras=(camera, *found.rig.cameras[1:]))
         fit = rgbd_facts(found, rig, frames).focal
-    except DataError:
-        return None
-    return fit if fit is not None and fit.sigma < _WORST else None
+    except DataError as error:
+        return str(error)
+    if fit is None:
+        return "too little moves past edges of depth"
+    return fit if fit.sigma < _WORST else f"they tell it to {fit.sigma:.1%} only"
 
 
 def with_focal(solution: Solution, known: Certainty, fit: FocalFit) -> Solution:

@@ -79,8 +79,8 @@ def find_lens(segments: Sequence[Segment], camera: Camera, rematch: Rematch | No
     return refined(replace(solution, pieces=pieces))
 
 
-def with_gyro(solution: Solution, gyro: Gyro) -> Solution | None:
-    """Return the solution with rotation against the IMU and time offset; None where both do not turn alike."""
+def with_gyro(solution: Solution, gyro: Gyro) -> Solution | str:
+    """Return the solution with rotation against the IMU and time offset, or why there are none."""
     pairs = []
     for piece in solution.pieces:
         t_ns, R = piece.segment.t_ns.tolist(), piece.at.R
@@ -90,8 +90,14 @@ def with_gyro(solution: Solution, gyro: Gyro) -> Solution | None:
     t_ns = gyro.zero_ns + np.round(gyro.t_s * 1e9).astype(np.int64)
     pairs.sort(key=lambda pair: (pair.t_ns, pair.key_ns))
     found = solve_hand_eye(pairs, t_ns, gyro.rate_rad_s) if len(t_ns) > 1 else None
-    if found is None or float(found.correlation[:, 1].max()) < _LEAST_CORRELATION:
-        return None
+    if found is None:
+        return "fewer than 30 pairs of keyframes are within what the gyroscope recorded; check the stamps of both"
+    alike = float(found.correlation[:, 1].max())
+    if alike < _LEAST_CORRELATION:
+        return (
+            f"camera and gyroscope do not turn alike: their speeds correlate by {alike:.2f}, needed are "
+            f"{_LEAST_CORRELATION}; check the stamps of both"
+        )
     shared = replace(
         solution.shared, gyro=gyro, R_cam_body=found.R_body_cam.T, time_offset_s=found.time_offset_s,
         gyro_bias_rad_s=found.gyro_bias_rad_s,

@@ -56,7 +56,7 @@ class SelfResult:
     told: Rig  # of the recording
     without_imu: str  # why nothing is said of the IMU; empty where there is something
     widened: float  # of the sigmas
-    by_depth: FocalFit | None = None  # what depth images said of the focal length
+    by_depth: FocalFit | str = ""  # what depth images said of the focal length, or why nothing; empty: there are none
     lever: LeverArm | None = None  # where the camera sits on the IMU
 
     @property
@@ -109,8 +109,8 @@ def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
     first = next(_frames(recording, options.max_s, []), None)
     widened = 1.0 if first is not None and first.tracks is not None else _IMAGES_WIDER
     known = certainty(solution, widened)
-    by_depth = focal_by_depth(options.source, solution.shared.camera) if recorded_path(options.source) else None
-    if by_depth is not None and np.isfinite(known.wider[0]):
+    by_depth = focal_by_depth(options.source, solution.shared.camera) if recorded_path(options.source) else ""
+    if isinstance(by_depth, FocalFit) and np.isfinite(known.wider[0]):
         solution = with_focal(solution, known, by_depth)
         known = certainty(solution, widened)
     result = SelfResult(solution, known, len(segments), recording.rig, "", widened, by_depth)
@@ -132,8 +132,8 @@ def _with_imu(result: SelfResult, recording: Recording, samples: list[ImuSample]
         noise.gyro_scale_sigma or _GYRO_SCALE,
     )
     joint = with_gyro(result.solution, gyro)
-    if joint is None:
-        return replace(result, without_imu="camera and gyroscope do not turn alike; check the stamps of both")
+    if isinstance(joint, str):
+        return replace(result, without_imu=joint)
     known = certainty(joint, result.widened)
     turn_deg, offset_s = np.rad2deg(known.sigmas[GYRO : GYRO + 3].max()), known.sigmas[GYRO + OFFSET]
     if not (turn_deg < _MAX_TURN_SIGMA_DEG and offset_s < _MAX_OFFSET_SIGMA_S):
@@ -263,7 +263,9 @@ def _statements(result: SelfResult) -> list[str]:
     if readout_s > max(_GLOBAL_S, _SAME * sigma_s):
         said.append(f"the shutter rolls: {1e3 * readout_s:.1f} ± {1e3 * sigma_s:.1f} ms from the first to the last row")
     fit = result.by_depth
-    if fit is not None:
+    if isinstance(fit, str):
+        said += [f"depth images say nothing of the focal length: {fit}"] if fit else []
+    else:
         said.append(
             f"depth images say that the focal length is {fit.factor - 1.0:+.1%} ± {fit.sigma:.1%} of what tracks do"
         )
@@ -301,11 +303,15 @@ def _report(result: SelfResult, options: SelfOptions) -> dict[str, Any]:
         "observations": sum(int(piece.kept.sum()) for piece in pieces),
         "turned_deg": turned.tolist(),
         "travelled": travelled,
-        "focal_by_depth": None
-        if result.by_depth is None
-        else {"factor": result.by_depth.factor, "sigma": result.by_depth.sigma},
+        "focal_by_depth": _focal_report(result.by_depth),
         "statements": _statements(result),
     }
+
+
+def _focal_report(fit: FocalFit | str) -> dict[str, Any] | None:
+    if isinstance(fit, str):
+        return {"reason_without": fit} if fit else None
+    return {"factor": fit.factor, "sigma": fit.sigma}
 
 
 def _imu_report(result: SelfResult) -> dict[str, Any]:
