@@ -317,15 +317,15 @@ class WindowSource:
         What depth alone says errs apart from it. With what tracks and depth say together it has the tracks in common,
         so that stands in its place.
         """
-        if edge.to_id in self._by_surfaces:
-            T, covariance = self._by_surfaces[edge.to_id]
-            if edge.settled:
-                del self._by_surfaces[edge.to_id]
-            return replace(edge, T_previous_body=T, covariance=covariance)
-        known = self._by_depth.get(edge.to_id)
-        if known is None:
+        together, apart = self._by_surfaces.get(edge.to_id), self._by_depth.get(edge.to_id)
+        if edge.settled:
+            self._by_surfaces.pop(edge.to_id, None)
+            self._by_depth.pop(edge.to_id, None)
+        if together is not None:
+            return replace(edge, T_previous_body=together[0], covariance=together[1])
+        if apart is None:
             return edge
-        T, covariance = known
+        T, covariance = apart
         both = edge.covariance + covariance
         gain = np.linalg.solve(both, edge.covariance).T
         step = gain @ se3_log(invert(edge.T_previous_body) @ T)
