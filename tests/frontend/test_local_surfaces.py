@@ -11,6 +11,7 @@ from vislam.core.messages import Keyframe, Tracking, VoMeasurement
 from vislam.frontend import make_frontend
 from vislam.frontend.depth_lag import DepthLag
 from vislam.frontend.local_surfaces import LocalSurfaces
+from vislam.vision.shutter import Shutter
 from worlds.corner import World, path
 
 CONFIG = FrontEndConfig(readout_s=0.0, keyframe_parallax_px=8.0, described_features=50, max_tracks=60)
@@ -80,7 +81,9 @@ def fitted(surfaces, world, frame, T_key_body, sigma_rad, sigma_m):
     vo = VoMeasurement(frame.t_ns, 0, T_key_body, covariance, True, Tracking.OK, 50)
     T_body_cam = world.rig.T_body_cams[0]
     T_key_cam = np.asarray(invert(T_body_cam) @ T_key_body @ T_body_cam)
-    found, T_found = surfaces.fitted(frame, vo, T_key_cam, DepthLag(world.rig.cameras[0], 0.0), np.zeros(6))
+    camera = world.rig.cameras[0]
+    lag = DepthLag(camera, Shutter(camera, 0.0), 0.0, 0.0)
+    found, T_found = surfaces.fitted(frame, vo, T_key_cam, lag, np.zeros(6))
     np.testing.assert_allclose(T_body_cam @ T_found @ invert(T_body_cam), found.T_keyframe_body, atol=1e-9)
     return vo, found
 
