@@ -22,7 +22,7 @@ from vislam.core.messages import Array, Bools, Frame
 from vislam.frontend.depth import DepthReading, DepthSensor
 from vislam.vision.shutter import Shutter, later
 
-_SIGMA_S = 0.01  # of the delay before anything is known
+_SIGMA_S = 0.01  # of the delay, and of by how much longer rows take, before anything is known
 _MAX_S = 0.05
 _TRUST = 0.1  # of a frame's information: successive frames share landmarks and their errors
 _FRAME_SIGMA_S = 0.01  # no single frame may claim to know it better

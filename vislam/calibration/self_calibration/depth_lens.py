@@ -28,10 +28,12 @@ def focal_by_depth(source: str, camera: Camera) -> FocalFit | str:
     """Return what depth says of a camera's focal length, or why it does not; empty: the recording has no depth."""
     try:
         found = survey(source)
+        if found.rig is None or found.depth is None:
+            return ""
         if found.errors:
             return str(found.errors[0])
-        frames = None if found.rig is None or found.depth is None else frame_table(found, Problems())
-        if found.rig is None or frames is None or not np.any(frames.depth_rows >= 0):
+        frames = frame_table(found, Problems())
+        if not np.any(frames.depth_rows >= 0):
             return ""
         rig = replace(found.rig, cameras=(camera, *found.rig.cameras[1:]))
         fit = rgbd_facts(found, rig, frames).focal
