@@ -16,15 +16,15 @@ from vislam.calibration.self_calibration.gyro import Gyro
 from vislam.calibration.self_calibration.lens_search import Solution, find_lens, with_gyro
 from vislam.calibration.self_calibration.patches import _aligned
 from vislam.calibration.self_calibration.segments import Segment
-from vislam.calibration.self_calibration.structure import GYRO, SHARED, Structure, linearise, residuals
+from vislam.calibration.self_calibration.structure import GYRO, READOUT, SHARED, Structure, linearise, residuals
 from vislam.core.camera import Camera, Rig
 from vislam.core.messages import Array
 from vislam.datasets.camera_files import read_cameras
 from worlds.calibration import calibrate, refusal
 
-RADTAN = Camera(640, 480, 470.0, 468.0, 325.0, 234.0, 0.0, "radtan", (-0.21, 0.06, 0.0006, -0.0005))
+RADTAN = Camera(640, 480, 470.0, 468.0, 325.0, 234.0, 0.0, "radtan", (-0.21, 0.06, 0.0006, -0.0005, -0.012))
 WIDE = Camera(640, 480, 290.0, 291.0, 316.0, 243.0, 0.0, "equidistant", (-0.01, 0.004, -0.003, 0.001))
-GUESS = Camera(640, 480, 564.0, 564.0, 319.5, 239.5, 0.0, "radtan", (0.0,) * 4)  # a fifth too long
+GUESS = Camera(640, 480, 564.0, 564.0, 319.5, 239.5, 0.0, "radtan", (0.0,) * 5)  # a fifth too long
 NOISE_PX = 0.3
 
 
@@ -73,13 +73,13 @@ def rolling() -> Solution:
 
 def test_a_focal_length_is_found_from_a_fifth_too_much_with_the_readout(rolling: Solution) -> None:
     found = rolling
-    errors = found.shared.values[:9] - [470.0, 468.0, 325.0, 234.0, -0.21, 0.06, 0.0006, -0.0005, 0.02]
+    errors = found.shared.values[:GYRO] - [470.0, 468.0, 325.0, 234.0, *RADTAN.coefficients, 0.02]
     known = certainty(found)
-    print(errors, known.sigmas[:9])
-    assert np.all(np.abs(errors) < 4.0 * known.sigmas[:9])
+    print(errors, known.sigmas[:GYRO])
+    assert np.all(np.abs(errors) < 4.0 * known.sigmas[:GYRO])
     assert np.all(np.abs(errors[:2]) < 0.005 * 470.0)
     assert np.all(known.sigmas[:2] < 0.01 * 470.0)
-    assert abs(errors[8]) < 1e-3
+    assert abs(errors[READOUT]) < 1e-3
     assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
     kept = sum(int(piece.kept.sum()) for piece in found.pieces)
     assert kept > 0.9 * sum(int(np.isfinite(piece.segment.pixels[:, :, 0]).sum()) for piece in found.pieces)
@@ -114,8 +114,8 @@ def test_a_gyroscope_joins_in(rolling: Solution) -> None:
     errors = np.array(
         [*turn.as_rotvec(), joint.shared.time_offset_s - offset_s, *(joint.shared.gyro_bias_rad_s - bias)]
     )
-    print(errors, known.sigmas[9:])
-    assert np.all(np.abs(errors) < 4.0 * known.sigmas[9:16])
+    print(errors, known.sigmas[GYRO:])
+    assert np.all(np.abs(errors) < 4.0 * known.sigmas[GYRO : GYRO + 7])
     assert np.rad2deg(turn.magnitude()) < 0.3 and abs(errors[3]) < 1e-3
     T_told = np.eye(4)
     T_told[:3, 3] = 0.1, 0.2, 0.3

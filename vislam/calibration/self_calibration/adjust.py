@@ -59,7 +59,7 @@ class Shared:
         c, to = self.camera, step[GYRO:]
         fx, fy, cx, cy, *k = (self.values[:LENS] + step[:LENS]).tolist()
         return Shared(
-            replace(c, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(k)),
+            replace(c, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(k[: len(c.coefficients)])),
             self.readout_s + float(step[READOUT]),
             self.gyro,
             so3_exp(to[:3].copy()) @ self.R_cam_body,
@@ -72,8 +72,9 @@ class Shared:
     def values(self) -> Array:
         """The unknowns [SHARED]; the rotation, which is no vector, counts as zero."""
         c = self.camera
-        lens = [c.fx, c.fy, c.cx, c.cy, *c.coefficients, self.readout_s]
-        return np.array([*lens, *np.zeros(3), self.time_offset_s, *self.gyro_bias_rad_s, self.gyro_scale])
+        lens = [c.fx, c.fy, c.cx, c.cy, *c.coefficients, *[0.0] * (LENS - 4 - len(c.coefficients))]
+        gyro = [*np.zeros(3), self.time_offset_s, *self.gyro_bias_rad_s, self.gyro_scale]
+        return np.array([*lens, self.readout_s, *gyro])
 
     @property
     def free(self) -> Bools:

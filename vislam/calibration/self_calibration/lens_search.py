@@ -12,7 +12,7 @@ from vislam.calibration.self_calibration.adjust import Piece, Prior, Shared, adj
 from vislam.calibration.self_calibration.gyro import SCALE, Gyro
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.start import placed_points, start_structure
-from vislam.calibration.self_calibration.structure import GYRO, READOUT, SHARED
+from vislam.calibration.self_calibration.structure import GYRO, LENS, READOUT, SHARED
 from vislam.core.camera import Camera
 from vislam.core.messages import Bools
 
@@ -27,8 +27,9 @@ _WORST = 3.0  # times the usual scatter: such a stretch ended in a minimum of it
 _LEAST_PIECES = 0.5  # share of the stretches that a focal length must let begin
 # What is taken of cameras in general, one sigma: principal point in the middle, square pixels, modest distortion
 _CENTRE = 0.04  # of the width
-_RADTAN = (0.5, 0.5, 0.01, 0.01)
-_EQUIDISTANT = (0.3, 0.3, 0.3, 0.3)
+_HELD = 1e-6  # of a coefficient that stays zero
+_RADTAN = (0.5, 0.5, 0.01, 0.01, 0.5)
+_EQUIDISTANT = (0.3, 0.3, 0.3, 0.3, _HELD)  # it has no fifth
 _READOUT_S = 0.02
 _ASPECT = 0.01
 _OFFSET_S = 0.1
@@ -71,12 +72,20 @@ def find_lens(segments: Sequence[Segment], camera: Camera, rematch: Rematch | No
         return None
     pieces = begun(segments, shared.camera)
     pieces, shared, _ = adjust(pieces, shared, prior, _only(0, 1, 4, READOUT), _START_PX, _START_STEPS)
-    solution = refined(Solution(pieces, shared, prior, scatter_px(pieces, shared)))
+    solution = refined(Solution(pieces, shared, _stiffer(prior), scatter_px(pieces, shared)))
+    solution = refined(replace(solution, prior=prior))
     if rematch is None:
         return solution
     matched = rematch(solution.pieces, solution.shared)
     pieces = [replace(p, segment=s, kept=_seen(s)) for p, s in zip(solution.pieces, matched, strict=True)]
     return refined(replace(solution, pieces=pieces))
+
+
+def _stiffer(prior: Prior) -> Prior:
+    """Return the prior with the last coefficient held: free from afar it leads astray, left out it bends the rest."""
+    information = prior.information.copy()
+    information[LENS - 1] = _HELD**-2.0
+    return replace(prior, information=information)
 
 
 def with_gyro(solution: Solution, gyro: Gyro) -> Solution | str:

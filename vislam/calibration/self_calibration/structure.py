@@ -18,7 +18,7 @@ from vislam.calibration.self_calibration.segments import Segment
 from vislam.core.camera import Camera
 from vislam.core.messages import Array, Bools
 
-LENS = 8  # fx, fy, cx, cy and four coefficients
+LENS = 9  # fx, fy, cx, cy and five coefficients, of which an equidistant lens has four
 READOUT = LENS  # place of the readout, in s, among the shared unknowns
 GYRO = READOUT + 1  # place of the first of those of `gyro.py`
 SHARED = GYRO + UNKNOWNS
@@ -87,17 +87,17 @@ def linearise(segment: Segment, at: Structure, camera: Camera, readout_s: float,
 
 
 def by_lens(camera: Camera, points: Array) -> Array:
-    """Return derivatives [N, 2, 8] of pixels by fx, fy, cx, cy and four coefficients (radtan or equidistant)."""
+    """Return derivatives [N, 2, LENS] of pixels by fx, fy, cx, cy and coefficients (radtan or equidistant)."""
     x, y = (points[:, :2] / points[:, 2:]).T
     r2 = x * x + y * y
     zero = np.zeros(len(x))
     if camera.distortion == "equidistant":
         r = np.sqrt(np.maximum(r2, 1e-18))
         powers = np.arctan(r)[:, None] ** [3, 5, 7, 9] / r[:, None]
-        u_k, v_k = x[:, None] * powers, y[:, None] * powers
+        u_k, v_k = np.column_stack([x[:, None] * powers, zero]), np.column_stack([y[:, None] * powers, zero])
     else:
-        u_k = np.column_stack([x * r2, x * r2 * r2, 2.0 * x * y, r2 + 2.0 * x * x])
-        v_k = np.column_stack([y * r2, y * r2 * r2, r2 + 2.0 * y * y, 2.0 * x * y])
+        u_k = np.column_stack([x * r2, x * r2 * r2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3])
+        v_k = np.column_stack([y * r2, y * r2 * r2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3])
     pixels = camera.project(points)
     u, v = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
     one = zero + 1.0

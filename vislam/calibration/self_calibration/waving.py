@@ -171,7 +171,7 @@ def _guess(told: Camera, options: SelfOptions) -> Camera:
     focal = 0.5 * told.width / (half if wide else np.tan(half))
     return Camera(
         told.width, told.height, focal, focal, 0.5 * (told.width - 1), 0.5 * (told.height - 1), 0.0,
-        "equidistant" if wide else "radtan", (0.0,) * 4,
+        "equidistant" if wide else "radtan", (0.0,) * (4 if wide else 5),
     )  # fmt: skip
 
 
@@ -277,21 +277,23 @@ def _statements(result: SelfResult) -> list[str]:
     return said
 
 
-def _names(camera: Camera) -> list[str]:
-    k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2"]
-    return ["fx", "fy", "cx", "cy", *k, "readout_s"]
+def _named(camera: Camera, numbers: Array) -> dict[str, float]:
+    """Return what stands for the lens and the readout among the unknowns, or among their sigmas, by name."""
+    k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
+    lens = dict(zip(["fx", "fy", "cx", "cy", *k], numbers.tolist(), strict=False))
+    return lens | {"readout_s": float(numbers[READOUT])}
 
 
 def _report(result: SelfResult, options: SelfOptions) -> dict[str, Any]:
-    pieces, names = result.solution.pieces, _names(result.camera)
+    pieces = result.solution.pieces
     turned, travelled = _motion(result)
     return {
         "kind": "self",
         "model": result.camera.distortion,
         "size": [result.camera.width, result.camera.height],
         "fov_deg_told": options.fov_deg,
-        "parameters": dict(zip(names, result.solution.shared.values.tolist(), strict=False)),
-        "sigmas": dict(zip(names, result.known.sigmas.tolist(), strict=False)),
+        "parameters": _named(result.camera, result.solution.shared.values),
+        "sigmas": _named(result.camera, result.known.sigmas),
         "camera_imu": _imu_report(result),
         "sigma_px": result.solution.sigma_px,
         "grouping": result.known.grouping,
@@ -349,11 +351,12 @@ def _difference_deg(result: SelfResult) -> float:
 
 
 def _lines(result: SelfResult) -> list[str]:
-    values, sigmas = result.solution.shared.values, result.known.sigmas
+    values = _named(result.camera, result.solution.shared.values)
+    sigmas = _named(result.camera, result.known.sigmas)
     pieces = result.solution.pieces
     numbers = [
         f"{name} {value:.2f} ± {sigma:.2f} px" if name[0] in "fc" else f"{name} {value:+.5f} ± {sigma:.5f}"
-        for name, value, sigma in zip(_names(result.camera), values, sigmas, strict=False)
+        for (name, value), sigma in zip(values.items(), sigmas.values(), strict=True)
     ]
     turned, travelled = _motion(result)
     return [
