@@ -85,6 +85,22 @@ def test_a_focal_length_is_found_from_a_fifth_too_much_with_the_readout(rolling:
     assert kept > 0.9 * sum(int(np.isfinite(piece.segment.pixels[:, :, 0]).sum()) for piece in found.pieces)
 
 
+def test_a_coefficient_that_the_model_lacks_bends_the_rest() -> None:
+    """On MH_01 the missing k3 moved the principal point by 11 px and turned the camera by 0.8 deg."""
+    bent = replace(RADTAN, coefficients=(-0.35, 0.25, 0.0006, -0.0005, -0.12))
+    pair = [
+        find_lens([waved(s, bent, 0.02) for s in range(6)], replace(GUESS, coefficients=(0.0,) * n), None)
+        for n in (4, 5)
+    ]
+    short, full = (found for found in pair if found is not None)
+    assert len(short.shared.camera.coefficients) == 4
+    print(short.sigma_px, full.sigma_px, short.shared.values[:GYRO], full.shared.values[:GYRO])
+    known = certainty(full)
+    errors = full.shared.values[:GYRO] - [470.0, 468.0, 325.0, 234.0, *bent.coefficients, 0.02]
+    assert np.all(np.abs(errors) < 4.0 * known.sigmas[:GYRO])
+    assert short.sigma_px > 1.1 * full.sigma_px
+
+
 def test_a_wide_lens_is_found_as_an_equidistant_one() -> None:
     guess = replace(WIDE, fx=350.0, fy=350.0, cx=319.5, cy=239.5, coefficients=(0.0,) * 4)
     found = solved(range(20, 25), WIDE, guess)

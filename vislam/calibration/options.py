@@ -190,8 +190,9 @@ class SelfOptions:
     """Recording as for `vislam run`: 60 s of a camera waved about before a textured scene, turned to all sides"""
     fov_deg: Annotated[float, Range(20.0, 200.0)] = 65.0
     """Horizontal field of view, roughly: focal lengths from 0.6 to 1.6 times what it gives are tried"""
-    model: Literal["auto", "radtan", "equidistant"] = "auto"
-    """radtan: k1 k2 p1 p2; equidistant: lenses of over 100 degrees; auto: by the field of view"""
+    model: Literal["auto", "radtan", "radtan5", "equidistant"] = "auto"
+    """radtan5: k1 k2 p1 p2 k3; radtan: without k3, which Kalibr does not know; equidistant: lenses of over 100 degrees;
+    auto: radtan5 or equidistant by the field of view"""
     max_s: Positive = 120.0
     """Only the first so many seconds"""
     max_stretches: Count = 20

@@ -27,9 +27,9 @@ _WORST = 3.0  # times the usual scatter: such a stretch ended in a minimum of it
 _LEAST_PIECES = 0.5  # share of the stretches that a focal length must let begin
 # What is taken of cameras in general, one sigma: principal point in the middle, square pixels, modest distortion
 _CENTRE = 0.04  # of the width
-_HELD = 1e-6  # of a coefficient that stays zero
 _RADTAN = (0.5, 0.5, 0.01, 0.01, 0.5)
-_EQUIDISTANT = (0.3, 0.3, 0.3, 0.3, _HELD)  # it has no fifth
+_EQUIDISTANT = (0.3, 0.3, 0.3, 0.3)
+_HELD = 1e-6  # a coefficient that stays as it is
 _READOUT_S = 0.02
 _ASPECT = 0.01
 _OFFSET_S = 0.1
@@ -53,7 +53,9 @@ class Solution:
 def prior_of(camera: Camera) -> Prior:
     """Return what is taken of cameras in general."""
     centre = _CENTRE * camera.width
-    k = _EQUIDISTANT if camera.distortion == "equidistant" else _RADTAN
+    count = len(camera.coefficients)
+    modest = _EQUIDISTANT if camera.distortion == "equidistant" else _RADTAN
+    k = [*modest[:count], *[_HELD] * (LENS - 4 - count)]
     nothing = [np.inf] * 3  # of the rotation against the IMU
     sigma = np.array([np.inf, np.inf, centre, centre, *k, _READOUT_S, *nothing, _OFFSET_S, *[_BIAS] * 3, 1.0])
     mean = np.zeros(SHARED)
@@ -73,7 +75,8 @@ def find_lens(segments: Sequence[Segment], camera: Camera, rematch: Rematch | No
     pieces = begun(segments, shared.camera)
     pieces, shared, _ = adjust(pieces, shared, prior, _only(0, 1, 4, READOUT), _START_PX, _START_STEPS)
     solution = refined(Solution(pieces, shared, _stiffer(prior), scatter_px(pieces, shared)))
-    solution = refined(replace(solution, prior=prior))
+    if len(camera.coefficients) == LENS - 4:
+        solution = refined(replace(solution, prior=prior))
     if rematch is None:
         return solution
     matched = rematch(solution.pieces, solution.shared)

@@ -18,7 +18,7 @@ from vislam.calibration.self_calibration.segments import Segment
 from vislam.core.camera import Camera
 from vislam.core.messages import Array, Bools
 
-LENS = 9  # fx, fy, cx, cy and five coefficients, of which an equidistant lens has four
+LENS = 9  # fx, fy, cx, cy and five coefficients, of which a lens may have four
 READOUT = LENS  # place of the readout, in s, among the shared unknowns
 GYRO = READOUT + 1  # place of the first of those of `gyro.py`
 SHARED = GYRO + UNKNOWNS
