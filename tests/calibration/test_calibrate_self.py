@@ -99,6 +99,9 @@ def test_a_coefficient_that_the_model_lacks_bends_the_rest() -> None:
     errors = full.shared.values[:GYRO] - [470.0, 468.0, 325.0, 234.0, *bent.coefficients, 0.02]
     assert np.all(np.abs(errors) < 4.0 * known.sigmas[:GYRO])
     assert short.sigma_px > 1.1 * full.sigma_px
+    names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "readout_s"]
+    assert list(waving._named(full.shared.camera, known.sigmas)) == names
+    assert list(waving._named(short.shared.camera, certainty(short).sigmas)) == [*names[:8], names[9]]
 
 
 def test_a_wide_lens_is_found_as_an_equidistant_one() -> None:

@@ -280,7 +280,7 @@ def _statements(result: SelfResult) -> list[str]:
 def _named(camera: Camera, numbers: Array) -> dict[str, float]:
     """Return what stands for the lens and the readout among the unknowns, or among their sigmas, by name."""
     k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
-    lens = dict(zip(["fx", "fy", "cx", "cy", *k], numbers.tolist(), strict=False))
+    lens = dict(zip(["fx", "fy", "cx", "cy", *k[: len(camera.coefficients)]], numbers.tolist(), strict=False))
     return lens | {"readout_s": float(numbers[READOUT])}
 
 
