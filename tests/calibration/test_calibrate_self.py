@@ -88,10 +88,8 @@ def test_a_focal_length_is_found_from_a_fifth_too_much_with_the_readout(rolling:
 def test_a_coefficient_that_the_model_lacks_bends_the_rest() -> None:
     """On MH_01 the missing k3 moved the principal point by 11 px and turned the camera by 0.8 deg."""
     bent = replace(RADTAN, coefficients=(-0.35, 0.25, 0.0006, -0.0005, -0.12))
-    pair = [
-        find_lens([waved(s, bent, 0.02) for s in range(6)], replace(GUESS, coefficients=(0.0,) * n), None)
-        for n in (4, 5)
-    ]
+    segments = [waved(seed, bent, 0.02) for seed in range(6)]
+    pair = [find_lens(segments, replace(GUESS, coefficients=(0.0,) * n), None) for n in (4, 5)]
     short, full = (found for found in pair if found is not None)
     assert len(short.shared.camera.coefficients) == 4
     print(short.sigma_px, full.sigma_px, short.shared.values[:GYRO], full.shared.values[:GYRO])

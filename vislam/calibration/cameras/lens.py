@@ -22,7 +22,7 @@ from vislam.core.messages import Array, Bools
 
 Model = Literal["radtan", "radtan5", "equidistant"]
 
-_COEFFICIENTS = {"radtan": 4, "radtan5": 5, "equidistant": 4}
+COEFFICIENTS: dict[Model, int] = {"radtan": 4, "radtan5": 5, "equidistant": 4}
 _ITERATIONS = 30
 _CONVERGED = 1e-4  # px: of all residuals together that a step still changes
 _OUTLIER_SIGMAS = 5.0
@@ -47,8 +47,7 @@ class LensFit:
     @property
     def names(self) -> list[str]:
         """The names of the parameters."""
-        k = ["k1", "k2", "k3", "k4"] if self.camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
-        return ["fx", "fy", "cx", "cy", *(["s"] if self.with_skew else []), *k[: len(self.camera.coefficients)]]
+        return parameter_names(self.camera, self.with_skew)
 
     @property
     def values(self) -> Array:
@@ -97,7 +96,7 @@ def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Came
             _, K, k, rotations, translations, _, _, _ = cv2.calibrateCameraExtended(
                 points, pixels, size, np.eye(3), np.zeros(5), flags=flags
             )
-        coefficients = tuple(np.ravel(k)[: _COEFFICIENTS[model]].tolist())
+        coefficients = tuple(np.ravel(k)[: COEFFICIENTS[model]].tolist())
         camera = Camera(
             size[0], size[1], K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0.0,
             "equidistant" if model == "equidistant" else "radtan", coefficients,
@@ -112,6 +111,12 @@ def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Came
         for r, t in zip(rotations, translations, strict=True)
     ]
     return camera, poses
+
+
+def parameter_names(camera: Camera, with_skew: bool = False) -> list[str]:
+    """Return the names of what `parameters_of` returns."""
+    k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
+    return ["fx", "fy", "cx", "cy", *(["s"] if with_skew else []), *k[: len(camera.coefficients)]]
 
 
 def parameters_of(camera: Camera, with_skew: bool = False) -> Array:

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from vislam.calibration.cameras import parameters_of
 from vislam.calibration.self_calibration.gyro import BIAS, OFFSET, SCALE, Gyro, TurnRows, turn_rows
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.structure import (
@@ -72,7 +73,8 @@ class Shared:
     def values(self) -> Array:
         """The unknowns [SHARED]; the rotation, which is no vector, counts as zero."""
         c = self.camera
-        lens = [c.fx, c.fy, c.cx, c.cy, *c.coefficients, *[0.0] * (LENS - 4 - len(c.coefficients))]
+        lens = np.zeros(LENS)
+        lens[: 4 + len(c.coefficients)] = parameters_of(c)
         gyro = [*np.zeros(3), self.time_offset_s, *self.gyro_bias_rad_s, self.gyro_scale]
         return np.array([*lens, self.readout_s, *gyro])
 

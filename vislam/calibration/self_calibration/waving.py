@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from vislam.calibration.cameras import COEFFICIENTS, Model, parameter_names
 from vislam.calibration.options import SelfOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.calibration.self_calibration.adjust import Piece, Shared
@@ -166,12 +167,15 @@ def _pose(result: SelfResult) -> Array:
 
 def _guess(told: Camera, options: SelfOptions) -> Camera:
     """Return the camera to begin with: of what a recording says of its own only the size is used."""
-    wide = options.model == "equidistant" or (options.model == "auto" and options.fov_deg > _WIDE_DEG)
+    model: Model = "equidistant" if options.fov_deg > _WIDE_DEG else "radtan5"
+    if options.model != "auto":
+        model = options.model
+    wide = model == "equidistant"
     half = 0.5 * np.deg2rad(options.fov_deg)
     focal = 0.5 * told.width / (half if wide else np.tan(half))
     return Camera(
         told.width, told.height, focal, focal, 0.5 * (told.width - 1), 0.5 * (told.height - 1), 0.0,
-        "equidistant" if wide else "radtan", (0.0,) * (4 if wide or options.model == "radtan" else 5),
+        "equidistant" if wide else "radtan", (0.0,) * COEFFICIENTS[model],
     )  # fmt: skip
 
 
@@ -279,8 +283,7 @@ def _statements(result: SelfResult) -> list[str]:
 
 def _named(camera: Camera, numbers: Array) -> dict[str, float]:
     """Return what stands for the lens and the readout among the unknowns, or among their sigmas, by name."""
-    k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
-    lens = dict(zip(["fx", "fy", "cx", "cy", *k[: len(camera.coefficients)]], numbers.tolist(), strict=False))
+    lens = dict(zip(parameter_names(camera), numbers.tolist(), strict=False))
     return lens | {"readout_s": float(numbers[READOUT])}
 
 
