@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from browser import CUT, FLAGS, SMALLEST
 from needs import missing
-from test_report_in_browser import CUT, FLAGS, SMALLEST
 
 _PATIENCE_MS = 400_000
 _WORLD = "replay:points:laps,rig=rgbd,camera_hz=10,duration_s=600"

@@ -10,7 +10,7 @@ from pathlib import Path
 from vislam.cli.verbs import VERBS
 from vislam.cli.verbs.completion import known_options
 
-PACKAGE = Path(__file__).resolve().parent.parent / "vislam"
+PACKAGE = Path(__file__).resolve().parents[2] / "vislam"
 TAKEN_BY_ALL = {"--help", "--help-all", "--version", "--log-level"}
 BEGUN = {"--calibration"}  # the rest of its name is put in
 OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z0-9_-]*(?:\.[a-z0-9_-]+)*)(?:[ =]([A-Za-z0-9_.*-]+))?")

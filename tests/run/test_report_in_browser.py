@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from browser import CUT, FLAGS, SMALLEST
 from needs import missing
 from run_folder import LOST, PERIOD_NS, make_run
 from vislam.mapping.formats.ply import write_ply
@@ -15,18 +16,7 @@ from vislam.mapping.semantic.layer_files import write_layer
 from vislam.mapping.semantic.votes import voxel_keys
 from vislam.run.report import write_report
 
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-)  # fmt: skip
 PATIENCE_MS = 120_000
-CUT = """() => [...document.querySelectorAll('h1, h2, h3, p, dt, dd, button, label, summary, figcaption, .tile b')]
-    .filter((e) => e.offsetParent && e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline')
-    .map((e) => e.tagName + ': ' + e.textContent.slice(0, 60))"""
-SMALLEST = """() => Math.min(...[...document.querySelectorAll('main *')]
-    .filter((e) => e.offsetParent && !e.closest("svg")
-        && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()))
-    .map((e) => parseFloat(getComputedStyle(e).fontSize)))"""
 COLORS = """() => {
     const view = window.vislamReport.view, gl = view.renderer.getContext();
     view.rest(); view.draw();

@@ -7,6 +7,7 @@ import textwrap
 import time
 from contextlib import closing
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -183,7 +184,7 @@ def test_a_failed_commit_leaves_no_half_keyframe(tmp_path):
 def test_a_killed_writer_leaves_every_committed_keyframe(tmp_path):
     path = tmp_path / "session.db"
     script = textwrap.dedent(f"""
-        import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
+        import sys; sys.path[:0] = {[str(f) for f in Path(__file__).parents[:2]]!r}
         from pathlib import Path
         from test_session import write_three
         writer, *_ = write_three(Path({str(path)!r}))

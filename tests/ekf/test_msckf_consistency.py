@@ -1,6 +1,6 @@
 """Monte-Carlo: the covariance of the tight filter is what its errors are, with vision late, lost and out of order.
 
-`VISLAM_RUNS=100 python -m pytest tests/test_msckf_consistency.py -s -n0` gives the full experiment.
+`VISLAM_RUNS=100 python -m pytest tests/ekf/test_msckf_consistency.py -s -n0` gives the full experiment.
 """
 
 from __future__ import annotations

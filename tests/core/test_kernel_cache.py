@@ -14,7 +14,7 @@ import pytest
 
 from needs import missing
 
-VISLAM = Path(__file__).resolve().parent.parent / "vislam"
+VISLAM = Path(__file__).resolve().parents[2] / "vislam"
 _DROP_FROM_BOUNDS, _WRITES_ANYWHERE = 24, 1  # PR_CAPBSET_DROP, CAP_DAC_OVERRIDE
 _KERNEL = """
 from numba.core import event

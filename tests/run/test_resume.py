@@ -141,7 +141,7 @@ def folder_of(path: Path) -> dict:
 def test_twenty_kills_at_random_moments_lose_at_most_the_last_keyframe_each(tmp_path):
     """The script checks each time what is left; here the run that came to its end is compared with an undisturbed."""
     print("seed", SEED)
-    command = [sys.executable, str(Path(__file__).parent / "killed_runs.py"), str(tmp_path), str(SEED), str(KILLS)]
+    command = [sys.executable, str(Path(__file__).parents[1] / "killed_runs.py"), str(tmp_path), str(SEED), str(KILLS)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     print(done.stdout[-6000:], done.stderr[-3000:])
     assert done.returncode == 0

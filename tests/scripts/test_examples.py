@@ -14,7 +14,7 @@ import pytest
 from vislam.sensors import registry
 from vislam.sensors.toml import sensor_setup
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 TOLD = {"11_further_sensors": ("wheels", "range")}  # all eleven kinds take a minute and a half of CPU
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 

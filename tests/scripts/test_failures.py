@@ -18,7 +18,7 @@ from vislam.core.log import log_to
 from vislam.run.folder import prepare
 from vislam.run.viewer import recording
 
-_PATH = Path(__file__).resolve().parent.parent / "experiments" / "failures.py"
+_PATH = Path(__file__).resolve().parents[2] / "experiments" / "failures.py"
 _SPEC = importlib.util.spec_from_file_location("failures", _PATH)
 failures = importlib.util.module_from_spec(_SPEC)
 sys.modules["failures"] = failures  # dataclasses look their module up

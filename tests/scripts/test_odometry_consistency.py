@@ -21,7 +21,7 @@ COUNT = 400
 
 
 def script() -> Any:
-    path = Path(__file__).parents[1] / "experiments" / "odometry_consistency.py"
+    path = Path(__file__).parents[2] / "experiments" / "odometry_consistency.py"
     spec = importlib.util.spec_from_file_location("odometry_consistency", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

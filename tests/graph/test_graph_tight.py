@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_graph_faults import Failing
 
 from session_entries import start_facts
-from test_graph_faults import Failing
 from vislam.config import GraphConfig, WindowConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_log

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from test_graph_tight import TIGHT, make  # noqa: F401  a fixture
+
 from vislam.config import GraphConfig, WindowConfig
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, so3_exp, transform

@@ -10,7 +10,7 @@ import pytest
 
 from vislam.core.errors import DataError
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import results
 
 OLD = results.Result("a" * 12, "2026-01-01T00:00:00+00:00", "cpu A", {}, {"predict": 2.0, "correct": 10.0})
