@@ -1,4 +1,4 @@
-"""What is made once in a session of tests and read by all of its workers: a run folder, a drawn recording, a compiled stand-in."""
+"""What is made once in a session of tests and read by all of its workers: a run folder, a drawn recording, a binary."""
 
 import fcntl
 import os
