@@ -35,9 +35,9 @@ from vislam.core.errors import VislamError  # noqa: E402
 from vislam.core.recording import Recording  # noqa: E402
 from vislam.datasets import open_dataset  # noqa: E402
 from vislam.datasets.recorder import record  # noqa: E402
-from vislam.run import execute  # noqa: E402
-from vislam.run.folder import prepare  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs import execute  # noqa: E402
+from vislam.runs.folder import prepare  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 
 SOURCE = "sim:handheld-room,rig=stereo,image_width_px=320,camera_hz=10,exposure_s=0,duration_s=8"
 RIGS = ("stereo", "mono")

@@ -31,7 +31,7 @@ from scipy.sparse import csc_matrix  # noqa: E402
 from vislam.core.messages import Frame  # noqa: E402
 from vislam.loop.words.index import InvertedIndex  # noqa: E402
 from vislam.loop.words.vocabulary import BagOfWords, Vocabulary, depth_for, train  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 from vislam.vision.features import describe  # noqa: E402
 
 FEATURES = 1000

@@ -32,7 +32,7 @@ from vislam.config import LoopConfig, LoopTruthConfig  # noqa: E402
 from vislam.core.geometry import invert, so3_log  # noqa: E402
 from vislam.core.messages import Frame, Keyframe, LoopCandidate, LoopDecision, LoopEdge  # noqa: E402
 from vislam.loop.detector import LoopDetector  # noqa: E402
-from vislam.run.session.reader import Session, StoredKeyframe  # noqa: E402
+from vislam.runs.session.reader import Session, StoredKeyframe  # noqa: E402
 
 RULE = LoopTruthConfig()
 

@@ -29,7 +29,7 @@ from vislam.core.messages import GraphUpdate  # noqa: E402
 from vislam.factors.factor_log import rig_from  # noqa: E402
 from vislam.mapping.mapper import Mapper  # noqa: E402
 from vislam.mapping.octree.octomap_io import encode_ot  # noqa: E402
-from vislam.run.session import Session  # noqa: E402
+from vislam.runs.session import Session  # noqa: E402
 
 KEYFRAMES = 1000
 ROOM_M = 8.0  # from one room to the next

@@ -35,7 +35,7 @@ from vislam.core.messages import (
 )
 from vislam.loop.detector import LoopDetector
 from vislam.loop.words.vocabulary import train
-from vislam.run.session import Session, SessionWriter, recall
+from vislam.runs.session import Session, SessionWriter, recall
 from vislam.slam import Slam
 
 LAP = 200  # keyframes

@@ -49,8 +49,8 @@ from vislam.mapping.dense.refine import overlapping  # noqa: E402
 from vislam.mapping.depth.image import DepthView, filter_depth, rgbd_view  # noqa: E402
 from vislam.mapping.depth.moment import DepthAtImage  # noqa: E402
 from vislam.mapping.formats.ply import read_ply, read_ply_mesh  # noqa: E402
-from vislam.run.folder import read_setup  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs.folder import read_setup  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 from vislam.sim import Simulation, open_world  # noqa: E402
 from vislam.trajectory import read_trajectory  # noqa: E402
 from vislam.trajectory.evaluation import align, associate  # noqa: E402

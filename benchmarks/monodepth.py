@@ -42,8 +42,8 @@ from vislam.core.messages import Frame  # noqa: E402
 from vislam.mapping.depth.image import mono_camera  # noqa: E402
 from vislam.mapping.depth.mono import DepthFilter, MonoDepth, SeenFrame  # noqa: E402
 from vislam.mapping.depth.mono.matching import LEAST_SCORE  # noqa: E402
-from vislam.run.session import Session  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs.session import Session  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe  # noqa: E402
 from worlds.table import camera, frame, motion, pose, view  # noqa: E402
 

@@ -39,7 +39,7 @@ from vislam.core.recording import Recording  # noqa: E402
 from vislam.mapping.depth.image import filter_depth, rgbd_view, scan_points  # noqa: E402
 from vislam.mapping.octree.occupancy import OccupancyMap  # noqa: E402
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 
 MAX_RANGE_M = 4.0
 CONFIGURATIONS = [(r, i) for r in (0.05, 0.02) for i in ("full", "discretised")]

@@ -39,7 +39,7 @@ _VISLAM = "from vislam.cli import main; main()"
 _ATE = """
 import sys, numpy as np
 from pathlib import Path
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 from vislam.trajectory import evaluate, read_tum
 print(evaluate(read_tum(Path(sys.argv[2])), open_source(sys.argv[1], 0).truth(), "se3")["ate_rmse_m"])
 """

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 VERSIONS = {"three": "0.187.0", "uplot": "1.6.32", "esbuild": "0.28.2"}
-ASSETS = Path(__file__).resolve().parent.parent / "vislam" / "run" / "report" / "assets" / "vendor"
+ASSETS = Path(__file__).resolve().parent.parent / "vislam" / "runs" / "report" / "assets" / "vendor"
 ENTRIES = {  # global name: what is bundled, the rest is shaken off
     "THREE": (
         "export { BufferAttribute, BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, "

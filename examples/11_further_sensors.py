@@ -14,7 +14,7 @@ import numpy as np
 
 from vislam import Config, Slam, open_source
 from vislam.config import FurtherSensorsConfig
-from vislam.run.further_sensors import further_readings
+from vislam.runs.further_sensors import further_readings
 from vislam.trajectory import Trajectory, evaluate
 
 WORLD = "points:cart-drive,rig=stereo,duration_s=24,camera_hz=10,tracks=80,outage_begin_s=12,outage_length_s=6"

@@ -17,8 +17,8 @@ from vislam.config import load
 from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.core.messages import Frame
 from vislam.mapping.depth.localise import Guess
-from vislam.run import execute
-from vislam.run.offline.depth_localiser import depth_localiser
+from vislam.runs import execute
+from vislam.runs.offline.depth_localiser import depth_localiser
 
 recording = open_source("sim:handheld-room,camera_hz=5,image_width_px=320,duration_s=8")
 

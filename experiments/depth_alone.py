@@ -33,7 +33,7 @@ from vislam.core.geometry import align_points, invert, se3_log, transform_points
 from vislam.core.messages import Array, Frame, Tracking  # noqa: E402
 from vislam.core.recording import Recording  # noqa: E402
 from vislam.pipeline.steps import Step  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 from vislam.slam import Slam  # noqa: E402
 from vislam.trajectory import Trajectory  # noqa: E402
 

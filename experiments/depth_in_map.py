@@ -37,9 +37,9 @@ from vislam.core.messages import Array, Frame, ImuSample, Localisation, LoopDeci
 from vislam.core.recording import Recording, WrappedRecording  # noqa: E402
 from vislam.pipeline.settings import derived  # noqa: E402
 from vislam.pipeline.steps import Step  # noqa: E402
-from vislam.run import execute, imu_noise, map_of  # noqa: E402
-from vislam.run.session import Session  # noqa: E402
-from vislam.run.sources import open_source  # noqa: E402
+from vislam.runs import execute, imu_noise, map_of  # noqa: E402
+from vislam.runs.session import Session  # noqa: E402
+from vislam.runs.sources import open_source  # noqa: E402
 from vislam.slam import Slam  # noqa: E402
 from vislam.trajectory import Trajectory  # noqa: E402
 

@@ -87,7 +87,7 @@ def main() -> None:
     from vislam.live.virtual.cart import VirtualCart
     from vislam.live.virtual.pilot import PathFollower
     from vislam.live.virtual.place import course
-    from vislam.run.folder import prepare
+    from vislam.runs.folder import prepare
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/follow_path"))

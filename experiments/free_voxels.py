@@ -56,7 +56,7 @@ Scans = list[tuple[NDArray[np.uint16], Array]]  # depth, T_map_body
 
 def scans_of_run(run: Path) -> tuple[MapConfig, DepthView, Scans]:
     """Return settings, rays, and the depth with its pose of every keyframe of a run."""
-    from vislam.run.session import Session
+    from vislam.runs.session import Session
 
     session = Session(run / "session.db")
     config = session.config().map

@@ -285,7 +285,7 @@ def small_targets() -> list[Target]:
 def run_target(folder: Path) -> list[Target]:
     """Return the targets that need a run folder, which is made here."""
     from vislam.cli import run_verb
-    from vislam.run.session import SessionWriter
+    from vislam.runs.session import SessionWriter
 
     source = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=60"
     with open(os.devnull, "w", encoding="utf-8") as null, redirect_stdout(null):
@@ -634,7 +634,7 @@ def _read_tables(folder: Path) -> None:
 
 
 def _read_run(folder: Path) -> None:
-    from vislam.run.folder import read_metrics, read_setup
+    from vislam.runs.folder import read_metrics, read_setup
 
     for arguments in (("report", str(folder)), ("loops", str(folder)), ("eval", str(folder))):
         _verb(*arguments)
@@ -643,7 +643,7 @@ def _read_run(folder: Path) -> None:
 
 
 def _read_session(folder: Path, whole: list[str]) -> None:
-    from vislam.run.session import Session, SessionWriter, has_begun, recall
+    from vislam.runs.session import Session, SessionWriter, has_begun, recall
 
     path = folder / "session.db"
     has_begun(path)

@@ -33,9 +33,9 @@ from vislam.core.files import write_json, write_text
 from vislam.core.messages import Array, Frame, Keyframe, LoopCandidate
 from vislam.loop.detector import LoopDetector
 from vislam.loop.table import LoopRow, loops_text, retrieved_text
-from vislam.run.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
-from vislam.run.report import write_loop_plot
-from vislam.run.session import Session
+from vislam.runs.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
+from vislam.runs.report import write_loop_plot
+from vislam.runs.session import Session
 
 WORLDS = ("workshop-cart", "corridor-loop", "aliased-halls")
 _START = "from vislam.cli import main; main()"

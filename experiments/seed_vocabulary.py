@@ -16,7 +16,7 @@ import cv2
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from vislam.run.offline.train_vocabulary import train_vocabulary  # noqa: E402
+from vislam.runs.offline.train_vocabulary import train_vocabulary  # noqa: E402
 
 WORLDS = {"workshop-cart": 0.5, "handheld-room": 1.0, "corridor-loop": 0.5}  # images per second: all show new things
 WORLD_SEEDS = (1, 2, 3)

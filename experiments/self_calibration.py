@@ -22,9 +22,9 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
 from vislam.datasets.camera_files import read_cameras
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.sources import open_source
 
 
 def true_rig(source: str) -> Rig:

@@ -35,12 +35,12 @@ from vislam.core.messages import Tracking
 from vislam.core.recording import Recording
 from vislam.experiment.jobs import Job, expand, unique
 from vislam.experiment.plan import load_plan
-from vislam.run import imu_noise
-from vislam.run.evidence import front_evidence, whole_evidence
-from vislam.run.folder import RunLog
-from vislam.run.metrics import initialisation
-from vislam.run.sources import measured_inertial, open_source, shaken, split_source
-from vislam.run.verdict import judge as verdict_of
+from vislam.runs import imu_noise
+from vislam.runs.evidence import front_evidence, whole_evidence
+from vislam.runs.folder import RunLog
+from vislam.runs.metrics import initialisation
+from vislam.runs.sources import measured_inertial, open_source, shaken, split_source
+from vislam.runs.verdict import judge as verdict_of
 from vislam.sim import MeasuredInertial, open_points
 from vislam.slam import Slam
 from vislam.trajectory import Trajectory, evaluate

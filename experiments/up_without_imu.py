@@ -19,9 +19,9 @@ from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
 from vislam.core.files import write_json
 from vislam.core.messages import Array
 from vislam.core.up import angle_deg
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.sources import open_source
 from vislam.trajectory import align, associate, read_tum
 
 RECORDINGS = (

@@ -22,9 +22,9 @@ from typing import Any
 from vislam.config import Config, load, validated
 from vislam.core.errors import VislamError
 from vislam.experiment.recordings import open_cached
-from vislam.run import execute
-from vislam.run.folder import prepare, read_metrics
-from vislam.run.verdict import Evidence, judge
+from vislam.runs import execute
+from vislam.runs.folder import prepare, read_metrics
+from vislam.runs.verdict import Evidence, judge
 from vislam.sim.faults.faults import FAULTS, FaultyRecording
 
 _WRONG = 3.0  # times the clean error

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from vislam import slam
 from vislam.cli import run_verb
-from vislam.run.session import Session
+from vislam.runs.session import Session
 
 SOURCE = "points:corridor-loop,duration_s=16,camera_hz=10,tracks=100"
 SETTINGS = ("--view.no-enabled", "--json")

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vislam.core.messages import NavState
-from vislam.run.folder import TRACKING_COLUMNS
+from vislam.runs.folder import TRACKING_COLUMNS
 from vislam.trajectory import Trajectory, evaluate, write_states_csv, write_tum
 
 START_NS = 1_700_000_000_000_000_000

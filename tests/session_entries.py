@@ -10,7 +10,7 @@ from pathlib import Path
 from vislam.core.memory import LoopPlace, LoopState, StartFacts
 from vislam.core.messages import LoopDecision, NavState
 from vislam.imu import ImuNoise
-from vislam.run.session.checks import checksums
+from vislam.runs.session.checks import checksums
 
 
 @contextmanager

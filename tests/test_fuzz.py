@@ -24,8 +24,8 @@ from vislam.loop.words.vocabulary import Vocabulary
 from vislam.mapping.formats.pcd import read_pcd
 from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.octree.octomap_io import read_octree
-from vislam.run.folder import read_metrics
-from vislam.run.session import Session
+from vislam.runs.folder import read_metrics
+from vislam.runs.session import Session
 from vislam.trajectory import evaluate, read_trajectory
 
 _PATH = Path(__file__).resolve().parent.parent / "experiments" / "fuzz.py"

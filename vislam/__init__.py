@@ -23,8 +23,8 @@ from vislam.core.late import late
 if TYPE_CHECKING:
     from vislam.config import Config
     from vislam.datasets import open_dataset
-    from vislam.run.loaded import LoadedRun, load_run
-    from vislam.run.sources import open_source
+    from vislam.runs.loaded import LoadedRun, load_run
+    from vislam.runs.sources import open_source
     from vislam.slam import Slam
 
 __all__ = ["Config", "LoadedRun", "Slam", "load_run", "open_dataset", "open_source"]
@@ -35,10 +35,10 @@ __getattr__ = late(
     __name__,
     {
         "Config": "vislam.config",
-        "LoadedRun": "vislam.run.loaded",
+        "LoadedRun": "vislam.runs.loaded",
         "Slam": "vislam.slam",
-        "load_run": "vislam.run.loaded",
+        "load_run": "vislam.runs.loaded",
         "open_dataset": "vislam.datasets",
-        "open_source": "vislam.run.sources",
+        "open_source": "vislam.runs.sources",
     },
 )

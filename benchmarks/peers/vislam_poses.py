@@ -19,8 +19,8 @@ import numpy as np
 
 from vislam.config import from_data
 from vislam.core.trajectory import Trajectory
-from vislam.run import imu_noise
-from vislam.run.sources import open_source
+from vislam.runs import imu_noise
+from vislam.runs.sources import open_source
 from vislam.slam import Slam
 from vislam.trajectory import write_tum
 

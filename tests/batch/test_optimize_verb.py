@@ -17,10 +17,10 @@ from session_entries import editing
 from vislam.cli import run_verb
 from vislam.config import BatchConfig, Config, load
 from vislam.core.errors import DataError, UsageError
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.offline.optimize_run import optimize
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.offline.optimize_run import optimize
+from vislam.runs.sources import open_source
 from vislam.trajectory import Trajectory, read_states_csv, read_tum, write_tum
 from worlds.session import simulate, store
 

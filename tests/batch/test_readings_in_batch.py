@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from vislam.config import BatchConfig
-from vislam.run.offline.optimize_run import optimize
+from vislam.runs.offline.optimize_run import optimize
 from vislam.sensors.toml import load_sensor_setup
 from worlds.sensed_drive import drive
 

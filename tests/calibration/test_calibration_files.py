@@ -31,7 +31,7 @@ from vislam.datasets.imu_files import (
     read_noise,
 )
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 from worlds.calibration import T0_NS, write_table
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 50.0)

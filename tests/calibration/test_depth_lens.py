@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vislam.calibration.self_calibration.depth_lens import focal_by_depth
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 from vislam.vision.depth_focal import FocalFit
 
 

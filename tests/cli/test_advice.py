@@ -21,7 +21,7 @@ def advice() -> tuple[tuple[str, str, str], ...]:
     """Return file and line, option and the word after it, of every string in the package."""
     found = []
     # colours of a page, and options of another program
-    others = {PACKAGE / "run/report/style.py", PACKAGE / "run/report/drawing.py", PACKAGE / "experiment/slurm.py"}
+    others = {PACKAGE / "runs/report/style.py", PACKAGE / "runs/report/drawing.py", PACKAGE / "experiment/slurm.py"}
     for path in sorted({*PACKAGE.rglob("*.py")} - others):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         docstrings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}

@@ -40,6 +40,6 @@ def test_a_verb_answers_for_help_before_it_loads_anything_heavy(verb: str) -> No
 
 
 def test_a_pose_graph_file_loads_neither_the_pipeline_nor_what_draws() -> None:
-    loaded = modules_after("import vislam.run.offline.optimize_graph, vislam.run.report.graph_page")
+    loaded = modules_after("import vislam.runs.offline.optimize_graph, vislam.runs.report.graph_page")
     assert not (HEAVY - {"numpy", "scipy", "numba"}) & loaded
     assert "vislam.slam" not in loaded

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from vislam.core.interrupts import EXIT_CODE, SIGNALS
-from vislam.run.folder import prepare
+from vislam.runs.folder import prepare
 
 HUNG_S = 60.0  # a generous ceiling: how long it takes is measured by hand
 SEED = 9

@@ -15,7 +15,7 @@ from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.messages import Frame, ImuSample
 from vislam.datasets.formats.eqvio import TrackOptions, TrackRecording, read_track_table
 from vislam.frontend.intake import Intake
-from vislam.run.sources import open_source, recorded_path
+from vislam.runs.sources import open_source, recorded_path
 
 HEAD = (
     "row_type,t_abs,t_rel,seq,frame_idx,landmark_id,gx,gy,gz,ax,ay,az,bgx,bgy,bgz,bax,bay,baz,u_norm,v_norm,key,value"

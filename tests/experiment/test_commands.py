@@ -14,7 +14,7 @@ from vislam.datasets.recorder import record
 from vislam.experiment.commands import check, identity, outputs_of, run_command
 from vislam.experiment.plan import load_plan
 from vislam.experiment.programs import ProgramError
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 from vislam.trajectory import read_tum
 
 # reads a EuRoC folder and stands still; knows nothing of vislam

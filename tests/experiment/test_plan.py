@@ -11,7 +11,7 @@ from vislam.experiment.jobs import JITTER, expand, unique, variants
 from vislam.experiment.plan import load_plan, plan_from_data
 from vislam.experiment.report.exports import runs_csv
 from vislam.experiment.trials import estimates, trials
-from vislam.run.sources import is_world, open_source, recorded_path, split_source
+from vislam.runs.sources import is_world, open_source, recorded_path, split_source
 
 FAILED = {"status": "failed", "reason": "lost", "run": {}, "outputs": {}}
 REPOSITORY = Path(__file__).resolve().parents[2]

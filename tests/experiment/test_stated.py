@@ -16,7 +16,7 @@ from vislam.experiment.commands import run_command
 from vislam.experiment.measures import output_measures
 from vislam.experiment.programs import ProgramError, run_program
 from vislam.experiment.stated import checked, split_stated
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 from vislam.sim import open_points
 from vislam.trajectory import read_tum
 from vislam.trajectory.states import read_states_csv

@@ -23,7 +23,7 @@ from vislam.graph.belief.consensus import Verdict
 from vislam.graph.belief.known import Known
 from vislam.graph.estimator import Estimator
 from vislam.graph.source import in_map
-from vislam.run.session import Session, SessionWriter, recall
+from vislam.runs.session import Session, SessionWriter, recall
 from vislam.window.messages import WindowUpdate
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World, rmse_m

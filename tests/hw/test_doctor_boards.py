@@ -18,8 +18,8 @@ from vislam.hw.emulator import SteppedClock, emulated_board, emulated_bus
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
 from vislam.live.sources import open_live
-from vislam.run.record import record
-from vislam.run.sources import recorded_path
+from vislam.runs.record import record
+from vislam.runs.sources import recorded_path
 from worlds.fifo_boards import FIRMWARE
 from worlds.gy85 import driving, still
 

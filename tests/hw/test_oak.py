@@ -22,7 +22,7 @@ from vislam.hw.health import Health
 from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_imu
 from vislam.hw.sensors import check_devices
 from vislam.live.sources import open_live
-from vislam.run.record import record
+from vislam.runs.record import record
 
 LONG_S = 30.0
 CAMERA = OakConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0, position_m=(0.1, 0.0, 0.2))

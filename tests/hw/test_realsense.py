@@ -24,7 +24,7 @@ from vislam.hw.health import Health
 from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import check_devices, is_video, open_inertial
 from vislam.live.sources import open_live
-from vislam.run.record import record
+from vislam.runs.record import record
 
 LONG_S = 30.0
 CAMERA = RealsenseConfig(rate_hz=30.0, reopen_s=0.01, missing_s=30.0, start_s=30.0, position_m=(0.1, 0.0, 0.2))

@@ -24,7 +24,7 @@ from vislam.datasets import open_dataset
 from vislam.datasets.recorder import Recorder
 from vislam.hw.emulator import emulated_bus, emulated_gy85
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
-from vislam.run.record import Recorded, record
+from vislam.runs.record import Recorded, record
 
 LONG_S = 60.0  # how long a test waits for what must come; never how long it takes
 WIDTH, HEIGHT = 320, 240

@@ -24,8 +24,8 @@ from vislam.datasets.sensor_files import sensor_readings
 from vislam.datasets.tables import Problems
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.live.port_readings import PortReadings
-from vislam.run.record import Recorded, record
-from vislam.run.recorded_readings import further_ports
+from vislam.runs.record import Recorded, record
+from vislam.runs.recorded_readings import further_ports
 from vislam.sensors.toml import load_sensor_setup
 
 LONG_S = 60.0  # how long a test waits for what must come; never how long it takes

@@ -23,7 +23,7 @@ from vislam.live.handed_frames import FrameHander, HandedFrames
 from vislam.live.handed_imu import HandedImu, ImuHander
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
-from vislam.run.folder import prepare
+from vislam.runs.folder import prepare
 
 LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 AMPLITUDE_M, PERIOD_S = 0.25, 3.0

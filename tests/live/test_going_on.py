@@ -25,8 +25,8 @@ from vislam.hw.health import Health
 from vislam.live.beginning import in_map, resumed
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
-from vislam.run.folder import MapChoice, prepare
-from vislam.run.session import Session
+from vislam.runs.folder import MapChoice, prepare
+from vislam.runs.session import Session
 from vislam.trajectory import read_tum
 
 WORLD = "points:corridor-loop,camera_hz=10,tracks=150"

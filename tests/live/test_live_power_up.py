@@ -21,7 +21,7 @@ from vislam.live.processes.fast import power_up
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
 from vislam.live.wire.published_pose import PublishedPose, pack, unpack
-from vislam.run.folder import prepare
+from vislam.runs.folder import prepare
 from worlds.corrections import CART_IMU, VisionWorld
 from worlds.gy85 import board
 

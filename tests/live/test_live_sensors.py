@@ -14,7 +14,7 @@ from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
 from vislam.live.status import status_line
-from vislam.run.folder import prepare
+from vislam.runs.folder import prepare
 from vislam.sensors import load_sensor_setup
 from vislam.sensors.kinds import Wheels
 

@@ -24,8 +24,8 @@ from vislam.hw.source import InertialSource
 from vislam.live import run_live
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
-from vislam.run.folder import prepare
-from vislam.run.session import Session
+from vislam.runs.folder import prepare
+from vislam.runs.session import Session
 
 _WORLD = "points:laps,rig=rgbd,camera_hz=10,duration_s=12"
 _FILES = {

@@ -26,8 +26,8 @@ from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
 from vislam.live.virtual.place import course
 from vislam.live.virtual.virtual_readings import VirtualReadings
 from vislam.live.wire.slot import SlotWriter
-from vislam.run.folder import prepare
-from vislam.run.session import Session
+from vislam.runs.folder import prepare
+from vislam.runs.session import Session
 from vislam.sensors import load_sensor_setup
 
 

@@ -18,7 +18,7 @@ from vislam.cli.verbs.web_page import WebChoice, take_web
 from vislam.core.errors import UsageError
 from vislam.live.web.address import parsed
 from vislam.live.web.station import Station
-from vislam.run.folder import prepare
+from vislam.runs.folder import prepare
 
 
 def ask(station: Station, method: str, path: str, body: dict | None = None) -> tuple[int, dict]:

@@ -37,8 +37,8 @@ from vislam.loop.evaluation import (
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
 from vislam.loop.words import Vocabulary, seed_vocabulary
-from vislam.run.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
-from vislam.run.session import Session, SessionWriter
+from vislam.runs.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
+from vislam.runs.session import Session, SessionWriter
 from vislam.trajectory import Trajectory, read_tum, write_tum
 from worlds.landmarks import LandmarkWorld, lap_poses, room
 
@@ -251,7 +251,7 @@ def test_a_score_is_normalised_by_that_of_the_keyframe_before(
 
     expected = {k: bags[k].score(bags[k - 1]) for k in np.flatnonzero(np.isfinite(told))}
     middle = float(np.median(list(expected.values())))
-    monkeypatch.setattr("vislam.run.offline.loop_evaluation._MIN_EXPECTED", middle)
+    monkeypatch.setattr("vislam.runs.offline.loop_evaluation._MIN_EXPECTED", middle)
     kept = np.flatnonzero(np.isfinite(judge_loops(tmp_path, RULE).stages["normalised"].score))
     assert kept.tolist() == [k for k, value in expected.items() if value >= middle]
 

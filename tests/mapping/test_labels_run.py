@@ -14,11 +14,11 @@ from vislam.core.errors import DataError
 from vislam.mapping.formats.ply import read_ply_rows
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer_files import read_layer
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.offline.rebuild import map_settings, rebuild
-from vislam.run.session import Session
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.offline.rebuild import map_settings, rebuild
+from vislam.runs.session import Session
+from vislam.runs.sources import open_source
 from vislam.sim import open_world
 from vislam.sim.scene import NAMES
 from vislam.sim.worlds.label_images import write_labels

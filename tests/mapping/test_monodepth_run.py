@@ -24,11 +24,11 @@ from vislam.live.wire.mail import Inbox, Outbox
 from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.octree.octomap_io import read_octree
 from vislam.pipeline.back import map_stage
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.offline.rebuild import map_settings, rebuild
-from vislam.run.session import Session
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.offline.rebuild import map_settings, rebuild
+from vislam.runs.session import Session
+from vislam.runs.sources import open_source
 from vislam.sim import open_world
 from vislam.slam import Slam
 

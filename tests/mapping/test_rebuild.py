@@ -13,10 +13,10 @@ from vislam.datasets.recorder import record
 from vislam.mapping.formats.pcd import read_pcd
 from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.octree.octomap_io import read_octree
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.offline.rebuild import map_settings, rebuild
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.offline.rebuild import map_settings, rebuild
+from vislam.runs.sources import open_source
 from vislam.sim import open_world
 
 PRODUCTS = ("cloud", "octomap", "grid", "drive")

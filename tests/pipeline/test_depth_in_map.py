@@ -11,10 +11,10 @@ from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, quaternion_xyzw_from_rotation, se3_exp, se3_log
 from vislam.loop.table import read_loops
 from vislam.pipeline.settings import derived
-from vislam.run import execute, map_of, resume
-from vislam.run.begin import told_start
-from vislam.run.folder import MapChoice, prepare, read_setup
-from vislam.run.session import Session
+from vislam.runs import execute, map_of, resume
+from vislam.runs.begin import told_start
+from vislam.runs.folder import MapChoice, prepare, read_setup
+from vislam.runs.session import Session
 from vislam.slam import Slam
 from vislam.trajectory import read_tum
 from worlds import corner

@@ -12,9 +12,9 @@ from vislam.ekf.filtering import Filtering
 from vislam.graph import PoseGraph
 from vislam.pipeline import back, front
 from vislam.pipeline.settings import derived
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.sources import open_source, without_idle_cameras
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.sources import open_source, without_idle_cameras
 from worlds.mini_recording import write_asl
 
 FLOOR = {"frontend.mode": "planar", "frontend.planar.height_m": 0.3}

@@ -15,8 +15,8 @@ from vislam.cli import run_verb
 from vislam.core.errors import UsageError
 from vislam.core.files import write_json
 from vislam.core.log import log_to
-from vislam.run.folder import prepare
-from vislam.run.viewer import recording
+from vislam.runs.folder import prepare
+from vislam.runs.viewer import recording
 
 _PATH = Path(__file__).resolve().parents[2] / "experiments" / "failures.py"
 _SPEC = importlib.util.spec_from_file_location("failures", _PATH)

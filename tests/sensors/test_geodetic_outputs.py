@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from vislam.cli import run_verb
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, NavState
-from vislam.run.geodetic_outputs import (
+from vislam.runs.geodetic_outputs import (
     COLUMNS,
     LINES,
     SIGMA_COLUMNS,
@@ -24,7 +24,7 @@ from vislam.run.geodetic_outputs import (
     most_sigmas,
     places_of,
 )
-from vislam.run.session import Session
+from vislam.runs.session import Session
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.measuring_frame import about_up
 from vislam.sensors.toml import load_sensor_setup

@@ -15,10 +15,10 @@ from vislam.cli import run_verb
 from vislam.config import load
 from vislam.core.geometry import invert
 from vislam.core.readings import Reading
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.further_sensors import drawn
-from vislam.run.sources import open_source
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.further_sensors import drawn
+from vislam.runs.sources import open_source
 from vislam.sensors.simulated import drawn_readings
 from vislam.sensors.toml import SensorSetup, load_sensor_setup
 from vislam.sensors.true_path import bodies_on

@@ -18,7 +18,7 @@ from vislam.core.memory import KeyframeEntry
 from vislam.core.messages import Array, KeyframePacket
 from vislam.core.readings import OwnStart
 from vislam.graph import PoseGraph
-from vislam.run.session import Session, SessionWriter, recall
+from vislam.runs.session import Session, SessionWriter, recall
 from vislam.sensors import Suite
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World

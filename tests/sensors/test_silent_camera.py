@@ -14,9 +14,9 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, Frame, ImuSample, Observations
 from vislam.pipeline.silence import SilentCamera, dark
-from vislam.run.further_sensors import FurtherReadings
-from vislam.run.run_input import RunInput
-from vislam.run.sources import open_source
+from vislam.runs.further_sensors import FurtherReadings
+from vislam.runs.run_input import RunInput
+from vislam.runs.sources import open_source
 from vislam.sensors.toml import sensor_setup
 from vislam.slam import Slam
 

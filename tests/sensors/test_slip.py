@@ -12,8 +12,8 @@ import pytest
 from vislam.cli import run_verb
 from vislam.core.errors import UsageError
 from vislam.pipeline.slip_watch import SlipWatch
-from vislam.run.report.run_files import read_run
-from vislam.run.report.sensor_section import sensors_section
+from vislam.runs.report.run_files import read_run
+from vislam.runs.report.sensor_section import sensors_section
 from vislam.sensors.kinds import Wheels
 from vislam.sensors.simulated import Faults, slipping
 from vislam.sensors.toml import load_sensor_setup

@@ -12,7 +12,7 @@ from tests.needs import missing
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import transform_points
 from vislam.core.messages import Array, Frame, ImuSample
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 from vislam.sim import PointRecording, open_points
 from vislam.sim.points.followed import scramble
 from vislam.sim.sensing import CONSUMER_IMU

@@ -12,7 +12,7 @@ from tests.needs import missing
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
-from vislam.run.sources import measured_inertial
+from vislam.runs.sources import measured_inertial
 from vislam.sim import MeasuredInertial
 from vislam.sim.motion.measured import MeasuredMotion
 from vislam.sim.motion.motions import cart_laps, laps, straight, turn_in_place

@@ -11,9 +11,9 @@ from vislam.config import VibrationConfig, load
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Array, ImuSample
 from vislam.core.recording import Recording
-from vislam.run import execute
-from vislam.run.folder import prepare
-from vislam.run.sources import shaken
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.sources import shaken
 from vislam.sim import open_points
 from vislam.sim.faults.vibration import ShakenRecording, Vibration
 from worlds.recordings import samples

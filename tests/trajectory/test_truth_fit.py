@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.needs import missing
 from vislam.core.geometry import transform
 from vislam.core.messages import Array
-from vislam.run.sources import measured_inertial
+from vislam.runs.sources import measured_inertial
 from vislam.sim.motion.path import wander
 from vislam.sim.motion.spline import BodySpline
 from vislam.trajectory import Trajectory

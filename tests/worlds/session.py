@@ -20,7 +20,7 @@ from vislam.core.memory import FrameEntry, GraphNews, KeyframeEntry
 from vislam.core.messages import Array, GraphUpdate, KeyframePacket, Observations
 from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe
 from vislam.factors.keys import X
-from vislam.run.session import SessionWriter
+from vislam.runs.session import SessionWriter
 from vislam.trajectory.frames import LoggedFrames
 from worlds.lap import LAP_S, T_BODY_CAM0, World
 from worlds.parts import rig_of

@@ -23,7 +23,7 @@ from vislam.core.recording import Recording
 from vislam.experiment.peers import driver_identity
 from vislam.experiment.programs import ProgramError, setup_of, write_metrics
 from vislam.experiment.stated import split_stated
-from vislam.run.cost import per_frame
+from vislam.runs.cost import per_frame
 from vislam.trajectory import read_tum, write_tum
 
 OUTPUTS = ("causal", "final")

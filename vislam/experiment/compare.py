@@ -25,7 +25,7 @@ from vislam.experiment.statistics import compare, groups
 from vislam.experiment.store import ResultStore
 from vislam.experiment.trials import Trial, table_sha256, trials
 from vislam.experiment.verify import read_manifest, verify
-from vislam.run.folder import storage
+from vislam.runs.folder import storage
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, a short note
 

@@ -10,15 +10,15 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from vislam.run.folder import fingerprint
-from vislam.run.sources import is_world, split_source
+from vislam.runs.folder import fingerprint
+from vislam.runs.sources import is_world, split_source
 
 HARNESS_VERSION = 1  # of what a job does and measures beside the code below; a new one makes all results new
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "llvmlite")
 # they show results or ask for them and cannot change a number; all other code can
-_WITHOUT_EFFECT = ("cli/", "__main__.py", "report/", "run/viewer/", "experiment/")
+_WITHOUT_EFFECT = ("cli/", "__main__.py", "report/", "runs/viewer/", "experiment/")
 _MEASURING = tuple(
     f"experiment/{name}.py" for name in ("worker", "measures", "recordings", "programs", "commands", "stated")
 )

@@ -12,7 +12,7 @@ from vislam.config import dump, from_data
 from vislam.experiment import commands, programs
 from vislam.experiment.identity import environment, sha256_of, source_identity
 from vislam.experiment.plan import Estimator, Plan, Scalar, Sequence, nested
-from vislam.run.folder import fingerprint
+from vislam.runs.folder import fingerprint
 
 JITTER = 1e-9  # relative, of gravity, from member to member: far below any sensor, far above rounding
 

@@ -17,7 +17,7 @@ from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.experiment import commands, peers
 from vislam.experiment.recordings import is_on_disk
-from vislam.run.sources import is_world, split_source
+from vislam.runs.sources import is_world, split_source
 
 Scalar = bool | int | float | str
 Settings = dict[str, Scalar]  # dotted names of the configuration, as {"graph.coupling": "tight"}

@@ -28,9 +28,9 @@ from vislam.core.trajectory import Trajectory
 from vislam.experiment.stated import checked, write_stated
 from vislam.factors.keys import nearest_rigid
 from vislam.frontend import mode_for
-from vislam.run.cost import CostMeter
-from vislam.run.drive import Progress, imu_noise
-from vislam.run.sources import shaken
+from vislam.runs.cost import CostMeter
+from vislam.runs.drive import Progress, imu_noise
+from vislam.runs.sources import shaken
 from vislam.trajectory import write_tum
 
 _DOORS = ("inertial", "frame", "answer")

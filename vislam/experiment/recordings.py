@@ -16,7 +16,7 @@ from vislam.core.recording import Recording, WrappedRecording
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.experiment.identity import code_sha256, sha256_of
-from vislam.run.sources import open_source, recorded_path
+from vislam.runs.sources import open_source, recorded_path
 
 _SIMULATOR = Path(__file__).resolve().parent.parent / "sim"
 
@@ -84,7 +84,7 @@ class TimedRecording(WrappedRecording):
         self._finished = 0
 
     def frame_done(self, _done: int, _total: int, _note: str) -> None:
-        """Note that the value that was taken last finished a frame; fits `vislam.run.Progress`."""
+        """Note that the value that was taken last finished a frame; fits `vislam.runs.Progress`."""
         self._finished += 1
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:

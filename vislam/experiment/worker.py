@@ -23,8 +23,8 @@ from vislam.experiment.identity import environment
 from vislam.experiment.measures import output_measures, run_measures
 from vislam.experiment.programs import run_program
 from vislam.experiment.recordings import TimedRecording, on_disk, open_cached
-from vislam.run import execute
-from vislam.run.folder import prepare
+from vislam.runs import execute
+from vislam.runs.folder import prepare
 
 _ORPHANED = 70
 _MAX_TRACE = 4000  # characters of a traceback that are kept
@@ -76,7 +76,7 @@ def _batch(spec: dict[str, Any], config: Config, out: Path, result: dict[str, An
     """Estimate the run again in batch, if that was asked for; time and memory of the run are those without it."""
     if not spec["batch"]:
         return []
-    from vislam.run.offline.optimize_run import optimize
+    from vislam.runs.offline.optimize_run import optimize
 
     try:
         optimize(out, config.batch)

@@ -11,9 +11,9 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
 from vislam.core.recording import Recording
-from vislam.run import check_fits, imu_noise, map_of
-from vislam.run.folder import MapChoice
-from vislam.run.session import Session, has_begun, recall
+from vislam.runs import check_fits, imu_noise, map_of
+from vislam.runs.folder import MapChoice
+from vislam.runs.session import Session, has_begun, recall
 
 
 @dataclass(frozen=True, slots=True)

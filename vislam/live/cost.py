@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from vislam.run.cost import per_frame
+from vislam.runs.cost import per_frame
 
 
 def whole_cost(metrics: Mapping[str, Any], notes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

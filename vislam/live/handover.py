@@ -55,7 +55,7 @@ class FrontEnded:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EndedGraph:
-    """The graph after it was finished, as plain values; see `vislam.run.FinalGraph`."""
+    """The graph after it was finished, as plain values; see `vislam.runs.FinalGraph`."""
 
     ids: NDArray[np.int64]
     T_map_body: Array  # [M, 4, 4]

@@ -27,9 +27,9 @@ from vislam.live.rehearsal import made_up
 from vislam.mapping.pictures.of_map import write_pictures
 from vislam.mapping.stage import MapStage
 from vislam.pipeline.back import map_stage
-from vislam.run.evidence import KeyframeWitness
-from vislam.run.show import show_map
-from vislam.run.viewer import open_viewer
+from vislam.runs.evidence import KeyframeWitness
+from vislam.runs.show import show_map
+from vislam.runs.viewer import open_viewer
 from vislam.trajectory import Trajectory, align, associate
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 

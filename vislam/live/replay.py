@@ -22,8 +22,8 @@ from vislam.live.frames import FrameSource
 from vislam.live.processes.child import Life
 from vislam.live.reading_source import ReadingSource, ReplayedReadings, refuse_unread
 from vislam.live.replayed_imu import InertialTable, ReplayedImu
-from vislam.run.further_sensors import FurtherReadings
-from vislam.run.sources import open_source
+from vislam.runs.further_sensors import FurtherReadings
+from vislam.runs.sources import open_source
 from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 

@@ -36,8 +36,8 @@ from vislam.live.reading_source import ReadingSource, live_readings
 from vislam.live.web.news import WebEnds
 from vislam.live.wire.slot import remove
 from vislam.pipeline.settings import derived
-from vislam.run import imu_noise
-from vislam.run.folder import MapChoice
+from vislam.runs import imu_noise
+from vislam.runs.folder import MapChoice
 from vislam.sensors import SensorSetup
 
 _LOG = logging.getLogger(__name__)

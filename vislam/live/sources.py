@@ -34,7 +34,7 @@ from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.place import PlaceOptions
 from vislam.live.wire.slot import remove
-from vislam.run.camera_rig import rig_of
+from vislam.runs.camera_rig import rig_of
 from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 

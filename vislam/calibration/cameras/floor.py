@@ -23,7 +23,7 @@ from vislam.core.recording import Recording
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.imu import ImuBuffer, subtract_bias
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 
 _FILES = ("floor.toml", "floor.png", "floor.json")
 _START_TILT_SIGMA_DEG = 5.0  # of where the recording's own extrinsics have the camera

@@ -19,7 +19,7 @@ from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
 from vislam.core.recording import Recording
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 
 _FILES = ("camera-imu.yaml", "camera-imu.png", "camera-imu.json")
 _MAX_ROTATION_SIGMA_RAD = np.deg2rad(0.5)

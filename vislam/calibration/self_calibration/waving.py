@@ -27,7 +27,7 @@ from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
 from vislam.core.recording import Recording
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
-from vislam.run.sources import open_source, recorded_path
+from vislam.runs.sources import open_source, recorded_path
 from vislam.vision.depth_focal import FocalFit
 
 _FILES = ("camchain.yaml", "self.png", "self.json")

@@ -16,7 +16,7 @@ from vislam.core.compiling import tell_of_compilation
 from vislam.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from vislam.run.folder import MapChoice
+    from vislam.runs.folder import MapChoice
 
 Options = TypeVar("Options")
 
@@ -85,7 +85,7 @@ def take_path(arguments: list[str], name: str) -> Path | None:
 
 def map_choice(path: Path | None, localize_only: bool, settings: Config) -> MapChoice | None:
     """Return the map that a run begins in; raises UsageError where an option needs one that is not given."""
-    from vislam.run.folder import MapChoice
+    from vislam.runs.folder import MapChoice
 
     if path is not None:
         return MapChoice(path, localize_only)

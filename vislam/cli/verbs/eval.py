@@ -85,8 +85,8 @@ def _evaluate(options: EvalOptions) -> dict[str, dict[str, Any]]:
 
 
 def _eval_loops(options: EvalOptions) -> int:
-    from vislam.run.offline.loop_evaluation import evaluate_loops
-    from vislam.run.report import write_loop_plot, write_report
+    from vislam.runs.offline.loop_evaluation import evaluate_loops
+    from vislam.runs.report import write_loop_plot, write_report
 
     answer = evaluate_loops(options.estimate, options.truth, options.reference)
     write_loop_plot(options.estimate / "loops_eval.png", {options.estimate.resolve().name: answer})

@@ -27,7 +27,7 @@ OPTIONS = (ExportOptions,)
 def main(arguments: list[str]) -> int:
     """Write the results of a run into one file."""
     options = parse(ExportOptions, arguments, "export")
-    from vislam.run.offline.export_mcap import export_mcap
+    from vislam.runs.offline.export_mcap import export_mcap
 
     exported = export_mcap(options.run, options.mcap)
     for topic, count in exported.messages.items():

@@ -22,7 +22,7 @@ from vislam.core.errors import UsageError
 if TYPE_CHECKING:
     from vislam.live.run_live import LiveRun
     from vislam.live.web.station import Station
-    from vislam.run.folder import MapChoice
+    from vislam.runs.folder import MapChoice
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> int:
     defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
     base = map_choice(options.map, options.localize_only, options.settings)
-    from vislam.run.folder import prepare
+    from vislam.runs.folder import prepare
 
     with opened(web, options.settings.live.name, options.out) as station:
         make = partial(_made, command=command, base=base, station=station)
@@ -133,7 +133,7 @@ def _resume(out: Path, arguments: list[str], command: list[str], web: WebChoice 
     from vislam.live.beginning import in_map, resumed
     from vislam.live.run_live import LiveRun
     from vislam.live.sources import open_live, stored_sensors
-    from vislam.run.folder import prepare, read_setup
+    from vislam.runs.folder import prepare, read_setup
 
     options = parse(ResumeOptions, arguments, "live")
     if web is not None and web.waits:

@@ -43,7 +43,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _list(options: LoopsOptions) -> int:
-    from vislam.run.offline.loop_undo import list_loops
+    from vislam.runs.offline.loop_undo import list_loops
 
     loops = list_loops(options.run)
     if options.json:
@@ -62,8 +62,8 @@ def _print_edges(loops: list[dict[str, Any]]) -> None:
 
 
 def _change(options: LoopsOptions) -> int:
-    from vislam.run.offline.loop_undo import change_loops
-    from vislam.run.report import write_report
+    from vislam.runs.offline.loop_undo import change_loops
+    from vislam.runs.report import write_report
 
     answer = change_loops(options.run, options.undo, options.redo)
     write_report(options.run)

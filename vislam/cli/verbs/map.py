@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _settings_of(run: Path) -> MapConfig:
-    from vislam.run.offline.rebuild import map_settings
+    from vislam.runs.offline.rebuild import map_settings
 
     return map_settings(run).map
 
@@ -92,8 +92,8 @@ def _nearest(options: MapOptions, name: str) -> int:
 
 
 def _rebuild(options: MapOptions) -> int:
-    from vislam.run.offline.rebuild import rebuild
-    from vislam.run.report import write_report
+    from vislam.runs.offline.rebuild import rebuild
+    from vislam.runs.report import write_report
 
     with progress_bar(options.source.name, "steps") as progress:
         answer = rebuild(options.source, options.settings, options.out, options.poses, progress)

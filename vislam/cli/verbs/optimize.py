@@ -72,8 +72,8 @@ def _is_graph(path: Path) -> bool:
 
 
 def _optimize_run(options: OptimizeOptions) -> int:
-    from vislam.run.offline.optimize_run import optimize
-    from vislam.run.report import write_report
+    from vislam.runs.offline.optimize_run import optimize
+    from vislam.runs.report import write_report
 
     entry = optimize(options.run, options.settings, options.out_name)
     write_report(options.run)
@@ -96,9 +96,9 @@ def _optimize_run(options: OptimizeOptions) -> int:
 
 
 def _join_sessions(options: JoinOptions) -> int:
-    from vislam.run.folder import check_writable
-    from vislam.run.offline.join_sessions import join_sessions, write_joined
-    from vislam.run.report.graph_page import write_graph_report
+    from vislam.runs.folder import check_writable
+    from vislam.runs.offline.join_sessions import join_sessions, write_joined
+    from vislam.runs.report.graph_page import write_graph_report
 
     check_writable(options.out)  # before the work, which may take minutes
     with progress_bar("loops between sessions", "keyframes") as bar:

@@ -48,9 +48,9 @@ def main(arguments: list[str]) -> int:
 def _optimize(options: PoseGraphOptions, out: Path) -> int:
     with while_importing():  # it takes longer than solving most files
         from vislam.batch.posegraph.optimize import as_stated
-        from vislam.run.folder import check_writable
-        from vislam.run.offline.optimize_graph import optimize_graph_file
-        from vislam.run.report.graph_page import write_graph_report
+        from vislam.runs.folder import check_writable
+        from vislam.runs.offline.optimize_graph import optimize_graph_file
+        from vislam.runs.report.graph_page import write_graph_report
 
     check_writable(out)  # before the work, which may take minutes
     limit = options.settings.iterations

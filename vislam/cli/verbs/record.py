@@ -46,8 +46,8 @@ def main(arguments: list[str]) -> int:
     sensors, further = load_cart(take_path(arguments, "--config"))
     options = parse(RecordOptions, arguments, "record", RecordOptions(out=tyro.MISSING, sensors=sensors))
     from vislam.live.port_readings import PortReadings
-    from vislam.run.record import record
-    from vislam.run.recorded_readings import further_ports
+    from vislam.runs.record import record
+    from vislam.runs.recorded_readings import further_ports
 
     ports = None if further.file is None else further_ports(Path(further.file), PortReadings)
     with rewritten_line() as show:

@@ -24,7 +24,7 @@ OPTIONS = (ReportOptions,)
 def main(arguments: list[str]) -> int:
     """Write the report of a run again."""
     options = parse(ReportOptions, arguments, "report")
-    from vislam.run.report import write_report
+    from vislam.runs.report import write_report
 
     print(write_report(options.run))
     return 0

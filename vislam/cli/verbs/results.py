@@ -21,7 +21,7 @@ def written_up(out: Path, command: Sequence[str], is_hurried: Callable[[], bool]
 
     An interrupt that was answered with an end in order is told by `is_hurried`.
     """
-    from vislam.run import report  # what draws is loaded by the first use, when the run has given its memory back
+    from vislam.runs import report  # what draws is loaded by the first use, when the run has given its memory back
 
     with log_to(out, command):
         try:
@@ -53,7 +53,7 @@ def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{loops['candidates']} candidates, {number(metrics['realtime_factor'], 1)} x real time"
     )
     if metrics.get("up"):
-        from vislam.run.levelled import up_sentence
+        from vislam.runs.levelled import up_sentence
 
         console.print(f"{printable(up_sentence(metrics['up']))}.", soft_wrap=True, markup=False, highlight=False)
     _print_cost(console, metrics["cost"])
@@ -90,7 +90,7 @@ def print_evaluation(results: dict[str, dict[str, Any]]) -> None:
 def _print_verdict(console: Console, verdict: dict[str, Any]) -> None:
     """Print what the run is worth, and under it what its calibration found."""
     if verdict:
-        from vislam.run.verdict import verdict_sentence
+        from vislam.runs.verdict import verdict_sentence
 
         style = "green" if verdict["state"] == "trusted" else "red"
         console.print(f"{printable(verdict_sentence(verdict))}.", style=style, soft_wrap=True, markup=False)

@@ -90,9 +90,9 @@ def main(arguments: list[str]) -> int:
 
 def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     """Go on with the run in a folder, whatever ended it."""
-    from vislam.run import resume
-    from vislam.run.folder import read_setup
-    from vislam.run.sources import open_source
+    from vislam.runs import resume
+    from vislam.runs.folder import read_setup
+    from vislam.runs.sources import open_source
 
     options = parse(ResumeOptions, arguments, "run")
     if (out / "sensors.json").is_file():
@@ -108,9 +108,9 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
 def run_source(options: RunOptions, command: list[str]) -> dict[str, Any]:
     """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
     from vislam.datasets.calibrated import with_clock
-    from vislam.run import execute
-    from vislam.run.folder import prepare
-    from vislam.run.sources import open_source
+    from vislam.runs import execute
+    from vislam.runs.folder import prepare
+    from vislam.runs.sources import open_source
 
     settings = with_clock(options.settings)
     base = map_choice(options.map, options.localize_only, settings)

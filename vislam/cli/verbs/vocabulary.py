@@ -44,7 +44,7 @@ def main(arguments: list[str]) -> int:
     """Train a vocabulary on images, or convert ORB-SLAM's."""
     options = parse(VocabularyOptions, arguments, "vocabulary")
     from vislam.loop.words import read_orbslam
-    from vislam.run.offline.train_vocabulary import train_vocabulary
+    from vislam.runs.offline.train_vocabulary import train_vocabulary
 
     if (options.from_orbslam is None) != bool(options.sources):
         raise UsageError("give either SOURCE... to train on, or --from-orbslam FILE to convert")

@@ -13,7 +13,7 @@ from vislam.datasets.camera_files import camchain_text, read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration
 from vislam.hw.library_cameras import gives_frames
 from vislam.hw.sensors import calibration_of, with_calibration
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 
 _FILES = {"camera": "camchain.yaml", "imu": "imu.yaml", "mag": "mag.yaml", "noise": "noise.yaml"}
 _NAMES = {"camera": "camera", "imu": "imu", "mag": "mag", "noise": "imu_noise"}  # of files in the settings

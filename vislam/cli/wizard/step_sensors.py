@@ -18,7 +18,7 @@ from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.library_cameras import WITH_IMU, gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import open_camera, open_inertial, with_raw_samples
 from vislam.hw.source import CapturedImage, ImageSource, InertialSource
-from vislam.run.sources import open_source
+from vislam.runs.sources import open_source
 
 Value = ImuSample | MagSample | Frame
 _NO_FRAMES_NS = 1 << 62

@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from vislam.experiment.report.plots import MAX_PANELS, PLAIN, WIDTH, titled_panels
 from vislam.experiment.statistics import Group
 from vislam.experiment.trials import BY_NAME, FROM_START, Trial
-from vislam.run.report.style import CODE, RC, svg
+from vislam.runs.report.style import CODE, RC, svg
 
 _COLORS = ("bad", "batch", "ekf", "live", "graph", "good", "warn", "muted")
 _LINES = ("-", "--", ":")  # when the colours have been used up

@@ -13,7 +13,7 @@ from vislam.experiment.report.exports import best, shown, shown_spread, variant_
 from vislam.experiment.statistics import Comparison, Group
 from vislam.experiment.trials import BY_NAME, FROM_START, Trial
 from vislam.experiment.winners import Winner, verdict
-from vislam.run.report.html import (
+from vislam.runs.report.html import (
     Cell,
     bullets,
     card,

@@ -16,7 +16,7 @@ from vislam.experiment.plan import Axis
 from vislam.experiment.report.exports import variant_text
 from vislam.experiment.statistics import Group
 from vislam.experiment.trials import BY_NAME, Trial
-from vislam.run.report.style import CODE, RC, svg
+from vislam.runs.report.style import CODE, RC, svg
 
 _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", ":", "-.")

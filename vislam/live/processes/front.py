@@ -40,8 +40,8 @@ from vislam.pipeline.back import makes_depth, seen_between
 from vislam.pipeline.front import Front
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.steps import FrontStep
-from vislam.run.evidence import front_evidence
-from vislam.run.verdict import Trust, Verdict, judge
+from vislam.runs.evidence import front_evidence
+from vislam.runs.verdict import Trust, Verdict, judge
 from vislam.sensors import Suite
 
 _LOG = logging.getLogger(__name__)

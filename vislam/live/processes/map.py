@@ -33,10 +33,10 @@ from vislam.pipeline.back import MAX_SEEN, map_stage, seen_between
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.in_map import localised
 from vislam.pipeline.steps import Finish, KeyframeStep, Step
-from vislam.run import Progress, Run, begun
-from vislam.run.folder import MapChoice
-from vislam.run.session import Session, SessionWriter
-from vislam.run.verdict import Evidence
+from vislam.runs import Progress, Run, begun
+from vislam.runs.folder import MapChoice
+from vislam.runs.session import Session, SessionWriter
+from vislam.runs.verdict import Evidence
 from vislam.trajectory import Trajectory
 
 _LOG = logging.getLogger(__name__)
@@ -181,7 +181,7 @@ class _Back:
 
 
 class FollowedPipeline:
-    """The pipeline as the other processes tell it; see `vislam.run.Pipeline`.
+    """The pipeline as the other processes tell it; see `vislam.runs.Pipeline`.
 
     Keyframes come when the graph has them, later than their frames; the frame that is at hand then carries them.
     """

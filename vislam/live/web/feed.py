@@ -14,7 +14,7 @@ from vislam.core.messages import Array
 from vislam.hw.health import Health
 from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Saved, Status, StepPicture
 from vislam.live.wire.published_pose import PublishedPose
-from vislam.run.report.page_assets import floats, packed
+from vislam.runs.report.page_assets import floats, packed
 
 MOST_POINTS = 200_000  # of the whole map
 _FEWEST_EACH = 25

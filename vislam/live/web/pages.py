@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from vislam.live.web.server import Answer
-from vislam.run.report.html import stylesheet
-from vislam.run.report.page_assets import assets
+from vislam.runs.report.html import stylesheet
+from vislam.runs.report.page_assets import assets
 
 _SHARED = ("data.js", "view.js", "layers.js", "plots.js", "vendor/three.min.js", "vendor/uplot.min.js")
 _OWN = ("live.js", "map.js", "wizard.js")

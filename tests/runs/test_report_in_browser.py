@@ -1,0 +1,269 @@
+"""The report's page in a real browser: nothing fails, nothing leaves it, nothing is cut, and its parts are linked."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from browser import CUT, FLAGS, SMALLEST
+from needs import missing
+from run_folder import LOST, PERIOD_NS, make_run
+from vislam.mapping.formats.ply import write_ply
+from vislam.mapping.semantic.classes import LabelClasses
+from vislam.mapping.semantic.layer import LabelLayer
+from vislam.mapping.semantic.layer_files import write_layer
+from vislam.mapping.semantic.votes import voxel_keys
+from vislam.runs.report import write_report
+
+PATIENCE_MS = 120_000
+COLORS = """() => {
+    const view = window.vislamReport.view, gl = view.renderer.getContext();
+    view.rest(); view.draw();
+    const w = gl.drawingBufferWidth, h = gl.drawingBufferHeight, pixels = new Uint8Array(4 * w * h);
+    gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    return new Set(new Uint32Array(pixels.buffer)).size;
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A Chromium that draws WebGL in software."""
+    sync = pytest.importorskip("playwright.sync_api")
+    path = shutil.which("chromium")
+    if path is None:
+        missing("chromium is not installed (Debian: apt install chromium)")
+    with sync.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    run = make_run(tmp_path_factory.mktemp("runs") / "cart")
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-8, -5, 0], [8, 5, 0.5], (20_000, 3)).astype(np.float32)
+    write_ply(run / "map" / "cloud.ply", points, rng.integers(0, 255, (20_000, 3), dtype=np.uint8))
+    return write_report(run)
+
+
+class Opened:
+    """A page that is ready, with what went wrong in it and what it asked of the network."""
+
+    def __init__(self, browser, path, width=1400, scheme="light", javascript=True):
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 900},
+            color_scheme=scheme,
+            has_touch=width < 500,
+            java_script_enabled=javascript,
+        )
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.faults, self.requests = [], []
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page.on("console", lambda said: said.type == "error" and self.faults.append(said.text))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.resolve().as_uri())
+        if javascript:
+            self.page.wait_for_selector("html[data-ready]")
+
+    def __enter__(self):
+        return self.page
+
+    def __exit__(self, kind, *rest):
+        self.context.close()
+        if kind is None:
+            assert self.faults == []
+            assert [url for url in self.requests[1:] if not url.startswith(("data:", "blob:"))] == []
+
+
+def move_to(page, share):
+    """Point at the first plot, at a share of its width."""
+    over = page.locator(".plot .u-over").first
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    page.mouse.move(box["x"] + share * box["width"], box["y"] + 0.5 * box["height"])
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 400])
+def test_nothing_fails_or_is_cut_and_the_map_is_drawn(browser, report, tmp_path, width, scheme):
+    with Opened(browser, report, width, scheme) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        assert page.evaluate(CUT) == []
+        assert page.evaluate(SMALLEST) >= 11.0
+        assert page.evaluate(COLORS) > 500
+        background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (min(map(int, background[4:-1].split(","))) > 128) == (scheme == "light")
+        if folder := os.environ.get("VISLAM_SCREENSHOTS"):
+            page.screenshot(path=f"{folder}/report_{width}_{scheme}.png")
+
+
+def test_pointing_at_a_plot_moves_the_camera_and_the_facts(browser, report):
+    with Opened(browser, report) as page:
+        place = "() => Array.from(window.vislamReport.view.marker.matrix.elements)"
+        before = page.evaluate(place)
+        move_to(page, (LOST[0] + 20) * PERIOD_NS * 1e-9 / 60.0)
+        page.wait_for_function("() => Number(document.documentElement.dataset.time) > 30")
+        assert page.evaluate(place) != before
+        details = page.locator("#view-details").inner_text()
+        assert "lost, 7 inliers" in details
+        assert "7 inliers of 30, image too dark" in details
+        t = float(page.evaluate("document.documentElement.dataset.time"))
+        assert f"{t:.2f} s" in details
+
+
+def test_layers_can_be_turned_off(browser, report):
+    with Opened(browser, report) as page:
+        whole = page.evaluate(COLORS)
+        page.locator("#view-layers input[name=map]").uncheck()
+        assert page.evaluate(COLORS) < 0.5 * whole
+        page.locator("#view-layers input[name=map]").check()
+        assert page.evaluate(COLORS) == whole
+
+
+def test_the_map_turns_under_the_mouse(browser, report):
+    with Opened(browser, report) as page:
+        stands = "() => window.vislamReport.view.camera.position.toArray()"
+        before, box = page.evaluate(stands), page.locator("#view-canvas").bounding_box()
+        page.mouse.move(box["x"] + 300, box["y"] + 200)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 420, box["y"] + 240, steps=4)
+        page.mouse.up()
+        page.wait_for_function(f"(before) => ({stands})().join() !== before.join()", arg=before)
+
+
+def test_a_loop_that_is_clicked_tells_its_reason(browser, report):
+    with Opened(browser, report) as page:
+        page.evaluate("window.vislamReport.view.fromAbove()")
+        at = page.evaluate(
+            "() => { const v = window.vislamReport.view, e = v.data.loops.ends;"
+            "const a = v.project(e[0], e[1], e[2]), b = v.project(e[3], e[4], e[5]);"
+            "return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]; }"
+        )
+        page.locator("#view-canvas").click(position={"x": at[0], "y": at[1]})
+        page.wait_for_selector("#view-details .loop:not([hidden])")
+        assert "verified, 3 neighbours agree" in page.locator("#view-details .loop").inner_text()
+
+
+class Fingers:
+    """What fingers on a phone's screen do, in pixels of the page."""
+
+    def __init__(self, page):
+        self.session = page.context.new_cdp_session(page)
+        self.box = page.locator("#view-canvas").bounding_box()
+
+    def move(self, *paths):
+        """Move one or more fingers, each from its first to its last place on the canvas."""
+        steps = 6
+        for k in range(steps + 1):
+            points = [
+                {"x": self.box["x"] + a[0] + k / steps * (b[0] - a[0]),
+                 "y": self.box["y"] + a[1] + k / steps * (b[1] - a[1]), "id": i}
+                for i, (a, b) in enumerate(paths)
+            ]  # fmt: skip
+            self.send("touchMove" if k else "touchStart", points)
+        self.send("touchEnd", [])
+
+    def send(self, kind, points):
+        self.session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+def test_the_map_turns_and_nears_under_fingers_and_a_tap_tells_of_a_loop(browser, report):
+    with Opened(browser, report, width=400) as page:
+        fingers, loops = Fingers(page), page.locator("#view-details .loop:not([hidden])")
+        stands = "() => window.vislamReport.view.camera.position.toArray()"
+        away = "() => { const v = window.vislamReport.view; return v.camera.position.distanceTo(v.controls.target); }"
+        before = page.evaluate(stands)
+        fingers.move([(200, 150), (280, 190)])
+        page.wait_for_function(f"(before) => ({stands})().join() !== before.join()", arg=before)
+        assert page.evaluate("window.scrollY") == 0
+        far = page.evaluate(away)
+        fingers.move([(170, 150), (90, 150)], [(230, 150), (310, 150)])
+        page.wait_for_function(f"(far) => ({away})() < 0.7 * far", arg=far)
+        assert page.evaluate("window.visualViewport.scale") == 1
+        page.locator("#view-above").tap()
+        x, y = page.evaluate(
+            "() => { const v = window.vislamReport.view, e = v.data.loops.ends;"
+            "const a = v.project(e[0], e[1], e[2]), b = v.project(e[3], e[4], e[5]);"
+            "return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]; }"
+        )
+        fingers.move([(x, y), (x, y)], [(x + 60, y), (x + 90, y)])  # one of two fingers stays where it is
+        assert loops.count() == 0
+        page.locator("#view-above").tap()
+        fingers.move([(x - 4, y - 12), (x - 2, y - 4)])  # a finger misses, and rolls
+        loops.wait_for()
+        assert page.evaluate("window.vislamReport.view.chosen.visible")
+
+
+def test_plots_zoom_together(browser, report):
+    with Opened(browser, report) as page:
+        spans = "() => window.vislamReport.plots.plots.map((p) => p.scales.x.max - p.scales.x.min)"
+        whole = page.evaluate(spans)
+        move_to(page, 0.3)
+        page.mouse.down()
+        box = page.locator(".plot .u-over").first.bounding_box()
+        page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 20, steps=4)
+        page.mouse.up()
+        page.wait_for_function(f"(span) => ({spans})().every((s) => s < 0.5 * span)", arg=whole[0])
+        page.locator("#plots-whole").click()
+        page.wait_for_function(f"(span) => ({spans})().every((s) => Math.abs(s - span) < 1e-6)", arg=whole[0])
+
+
+def test_without_javascript_the_pictures_stand(browser, report):
+    with Opened(browser, report, javascript=False) as page:
+        assert page.locator("section.still").count() == 3
+        assert all(section.is_visible() for section in page.locator("section.still").all())
+        assert not page.locator("#view").is_visible()
+
+
+def test_what_a_run_folder_says_is_never_run(browser, tmp_path):
+    run = make_run(tmp_path / "hostile")
+    evil = "</script><script>document.title='owned'</script><img src=x onerror=\"document.title='owned'\">"
+    loops = (run / "loops.csv").read_text().replace("verified", evil.replace('"', "'").replace(",", ";"))
+    (run / "loops.csv").write_text(loops)
+    tracking = (run / "tracking.csv").read_text()
+    (run / "tracking.csv").write_text(tracking.replace("image too dark", "</script><script>"))
+    (run / "metrics.json").write_text((run / "metrics.json").read_text().replace("workshop-cart", "<b>cart"))
+    with Opened(browser, write_report(run)) as page:
+        move_to(page, 0.6)
+        page.evaluate("window.vislamReport.details.onLoop(0)")
+        assert page.title() == "vislam: <b>cart"
+        assert "</script>" in page.locator("#view-details .loop").inner_text()
+
+
+def test_on_paper_the_pictures_stand_and_it_is_short(browser, report):
+    with Opened(browser, report, scheme="dark") as page:
+        page.emulate_media(media="print")
+        assert not page.locator("#view").is_visible()
+        assert page.locator("section.still").first.is_visible()
+        pages = page.pdf(format="A4").count(b"/Type /Page\n")
+        assert 1 <= pages <= 4
+
+
+def test_labels_are_shown_by_class_and_each_can_be_turned_off(browser, tmp_path):
+    run = make_run(tmp_path / "labels")
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-4, 4, 0.05)))
+    keys = np.unique(voxel_keys(np.stack([x, y, np.full_like(x, 0.01)], axis=1), 0.05))
+    labels, ones = (1 + np.arange(len(keys)) * 2 // len(keys)).astype(np.uint16), np.ones(len(keys), np.int32)
+    evil = "</script><script>document.title='owned'</script>"
+    names = LabelClasses.of({"1": {"name": "door", "color": [255, 0, 0]}, "2": evil}, "test")
+    write_layer(run / "map", LabelLayer(0.05, names, keys, labels, ones, ones))
+    red = f"""() => {{ const colors = ({COLORS.replace("new Set(new Uint32Array(pixels.buffer)).size", "pixels")})();
+        let count = 0;
+        for (let k = 0; k < colors.length; k += 4) count += colors[k] > 200 && colors[k + 1] < 60 && colors[k + 2] < 60;
+        return count; }}"""
+    for width in (1400, 400):
+        with Opened(browser, write_report(run), width) as page:
+            before = page.evaluate(red)
+            assert not page.locator(".legend.labels").is_visible()
+            page.locator("#view-layers input[name=labels]").check()
+            shown = page.evaluate(red)
+            assert shown > before + 5000
+            assert page.evaluate("document.documentElement.scrollWidth") == width
+            assert page.evaluate(CUT) == []
+            page.locator(".legend.labels label", has_text="door").locator("input").uncheck()
+            assert page.evaluate(red) < before + 0.1 * (shown - before)
+            assert evil in page.locator(".legend.labels").inner_text()
+            assert "owned" not in page.title()

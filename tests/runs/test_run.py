@@ -1,0 +1,335 @@
+"""The whole pipeline on simulated recordings: the run folder, replay, outages, damage, exit codes."""
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vislam.cli import run_verb
+from vislam.config import load
+from vislam.core.messages import Frame, ImuSample
+from vislam.datasets.recorder import record
+from vislam.runs import execute
+from vislam.runs.folder import prepare
+from vislam.runs.report.run_files import read_run
+from vislam.sim import open_world
+from vislam.trajectory import read_tum
+
+REPLAYED = ("trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum", "loops.csv", "states_graph.csv")
+FAST = {"view.enabled": False}
+
+
+class Edited:
+    """A recording whose events pass through a function first."""
+
+    def __init__(self, recording, edit):
+        self._recording, self._edit = recording, edit
+
+    def __getattr__(self, name):
+        return getattr(self._recording, name)
+
+    def events(self):
+        return self._edit(self._recording.events())
+
+
+def run(recording, out, **settings):
+    prepare(out, overwrite=False)
+    config = load(None, {**FAST, **{name.replace("__", "."): value for name, value in settings.items()}})
+    return execute(recording, config, out, "test", [])
+
+
+def room(duration_s=8.0, **options):
+    return open_world("handheld-room", duration_s=duration_s, image_width_px=320, **options)
+
+
+def cached(recording):
+    """Render once, replay often."""
+    values = list(recording.events())
+    return Edited(recording, lambda _: iter(values))
+
+
+@pytest.fixture(scope="module")
+def small_room():
+    return cached(room())
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A simulated recording on disk."""
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    record(room(6.0), folder)
+    return folder
+
+
+@pytest.fixture
+def damaged(recorded, tmp_path):
+    """A copy of the recording to break."""
+    shutil.copytree(recorded, tmp_path / "damaged")
+    return tmp_path / "damaged"
+
+
+def test_a_run_leaves_the_documented_folder(small_room, tmp_path):
+    metrics = run(small_room, tmp_path / "run", view__enabled=True)
+    names = {str(p.relative_to(tmp_path / "run")) for p in (tmp_path / "run").rglob("*") if p.is_file()}
+    assert names >= {
+        "manifest.json", "config.json", "metrics.json", "trajectory_ekf.tum", "trajectory_live.tum",
+        "trajectory_graph.tum", "trajectory_truth.tum", "states_ekf.csv", "states_graph.csv", "loops.csv",
+        "tracking.csv", "session.db", "run.rrd", "map/cloud.ply", "map/octomap.bt", "map/grid.pgm", "map/grid.yaml",
+    }  # fmt: skip
+    assert metrics["frames"] == small_room.frame_count
+    assert len(read_tum(tmp_path / "run" / "trajectory_graph.tum")) == small_room.frame_count
+    assert metrics["initialisation"]["status"] == "static"
+    cost, stages_ms = metrics["cost"], metrics["cost"]["stages_cpu_ms_per_frame"]
+    assert sum(stages_ms.values()) == pytest.approx(cost["cpu_ms_per_frame"])
+    assert {
+        "read",
+        "track",
+        "ekf",
+        "ekf predict",
+        "loop",
+        "graph",
+        "map",
+        "view",
+        "pictures",
+        "other",
+    } <= stages_ms.keys()
+    assert cost["first_pose_s"] == pytest.approx(metrics["initialisation"]["t_s"], abs=1.0)
+    assert 0.0 < cost["first_pose_cpu_s"] < cost["cpu_s"]
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
+    assert metrics["accuracy"]["ekf"]["ate_rmse_m"] < 0.03
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["view"]["enabled"] is True
+    assert read_run(tmp_path / "run").unread == {}
+
+
+def test_replay_in_fresh_processes_gives_identical_bytes(recorded, tmp_path):
+    digests = []
+    for name in ("first", "second"):
+        out = tmp_path / name
+        command = [sys.executable, "-m", "vislam", "run", str(recorded), "--out", str(out), "--view.no-enabled"]
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+        files = [*(out / f for f in REPLAYED), *sorted((out / "map").iterdir())]
+        digests.append({f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in files})
+    assert digests[0] == digests[1]
+    assert len(digests[0]) >= len(REPLAYED) + 4
+
+
+@pytest.mark.parametrize("rig", ["stereo", "mono"])
+def test_other_rigs_find_the_trajectory(rig, tmp_path):
+    metrics = run(room(10.0, rig=rig), tmp_path / "run", map__enabled=False)
+    assert metrics["mode"] == rig
+    assert metrics["accuracy"]["graph"]["coverage"] > 0.8
+    bound_m = {"stereo": 0.03, "mono": 0.25}[rig]
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < bound_m
+
+
+def test_the_imu_bridges_three_seconds_without_images(small_room, tmp_path):
+    start_ns = next(v.t_ns for v in small_room.events())
+
+    def blind(events):
+        for value in events:
+            if not (isinstance(value, Frame) and 3.0 < (value.t_ns - start_ns) * 1e-9 < 6.0):
+                yield value
+
+    metrics = run(Edited(small_room, blind), tmp_path / "run")
+    lost = metrics["counters"]["front"]["frames_lost"]
+    tracking = (tmp_path / "run" / "tracking.csv").read_text()
+    assert lost >= 1 or "relocalised" in tracking
+    assert metrics["accuracy"]["graph"]["ate_max_m"] < 0.5  # dead reckoning without the IMU would be metres off
+    states = tracking.splitlines()[-5:]
+    assert all(",ok," in row for row in states), "tracking did not recover"
+
+
+def test_an_imu_hole_of_one_second_is_counted_and_survived(small_room, tmp_path):
+    start_ns = next(v.t_ns for v in small_room.events())
+
+    def deaf(events):
+        for value in events:
+            if not (isinstance(value, ImuSample) and 4.0 < (value.t_ns - start_ns) * 1e-9 < 5.0):
+                yield value
+
+    metrics = run(Edited(small_room, deaf), tmp_path / "run", map__enabled=False)
+    assert metrics["counters"]["front"]["imu_outages"] > 0
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.05
+    assert metrics["coverage_frames"] == 1.0
+
+
+def test_duplicate_backward_and_nan_samples_are_counted_not_used(small_room, tmp_path):
+    def disturbed(events):
+        for n, value in enumerate(events):
+            yield value
+            if isinstance(value, ImuSample) and n % 97 == 0:
+                yield value
+                yield ImuSample(value.t_ns - 20_000_000, value.gyro_rad_s + 5.0, value.accel_m_s2)
+                yield ImuSample(value.t_ns + 1, value.gyro_rad_s * np.nan, value.accel_m_s2)
+
+    metrics = run(Edited(small_room, disturbed), tmp_path / "run", map__enabled=False)
+    imu = metrics["counters"]["imu"]
+    assert imu["duplicate"] > 10
+    assert imu["backward"] > 10
+    assert imu["nan"] > 10
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
+
+
+@pytest.mark.parametrize("give_up_s", [3.0, 30.0])
+def test_an_accelerometer_in_the_wrong_unit_is_told_and_done_without(small_room, tmp_path, give_up_s):
+    def halved(events):
+        for value in events:
+            if isinstance(value, ImuSample):
+                yield ImuSample(value.t_ns, value.gyro_rad_s, 0.5 * value.accel_m_s2)
+            else:
+                yield value
+
+    metrics = run(Edited(small_room, halved), tmp_path / "run", map__enabled=False, init__give_up_s=give_up_s)
+    assert metrics["initialisation"]["status"] == "none"
+    assert any(
+        "gravity was not found" in reason and "expected 9.81" in reason for reason in metrics["verdict"]["reasons"]
+    )
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
+    assert metrics["coverage_frames"] == 1.0
+
+
+def test_a_recording_cut_short_plays_to_its_end(damaged, tmp_path):
+    for name in ("cam0", "depth0", "imu0"):
+        path = damaged / "mav0" / name / "data.csv"
+        text = path.read_bytes()
+        path.write_bytes(text[: int(len(text) * 0.7)])
+    out = tmp_path / "run"
+    assert run_verb(["run", str(damaged), "--out", str(out), "--view.no-enabled"]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert 60 < metrics["frames"] < 100
+    assert metrics["problems"]
+
+
+def test_unreadable_images_are_skipped_and_reported(damaged, tmp_path):
+    images = sorted((damaged / "mav0" / "cam0" / "data").iterdir())
+    images[30].unlink()
+    images[50].write_bytes(b"not an image")
+    out = tmp_path / "run"
+    assert run_verb(["run", str(damaged), "--out", str(out), "--view.no-enabled"]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["frames"] == len(images) - 2
+    assert sum(metrics["problems"].values()) >= 2
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
+
+
+def test_calibration_for_another_image_size_is_a_data_error(damaged, tmp_path, capsys):
+    path = damaged / "mav0" / "cam0" / "sensor.yaml"
+    path.write_text(path.read_text().replace("320", "752"))
+    assert run_verb(["run", str(damaged), "--out", str(tmp_path / "run")]) == 3
+    assert "calibration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["run", "lidar:x", "--out", "{out}"], 2, "lidar"),
+        (["run", "{empty}", "--out", "{out}"], 3, "empty"),
+        (["run", "{absent}", "--out", "{out}"], 3, "does not exist"),
+        (["run", "sim:atlantis", "--out", "{out}"], 2, "atlantis"),
+        (["run", "sim:handheld-room", "--out", "{empty}/..", "--config", "{absent}"], 2, "cannot be read"),
+        (["run", "sim:handheld-room,rig=mono", "--out", "{out}", "--frontend.mode", "rgbd"], 2, "rgbd"),
+        (["dance"], 2, "no verb"),
+        (["eval", "{absent}"], 2, "reference"),
+        (["doctor", "{absent}"], 3, "does not exist"),
+        (["report", "{absent}"], 3, "absent"),
+    ],
+)
+def test_wrong_calls_end_with_one_line_and_the_documented_code(arguments, code, message, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    places = {"out": tmp_path / "out", "empty": tmp_path / "empty", "absent": tmp_path / "absent"}
+    assert run_verb([argument.format(**places) for argument in arguments]) == code
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_a_run_is_never_overwritten_by_accident(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("five years")
+    assert run_verb(["run", "sim:handheld-room", "--out", str(tmp_path / "mine"), "--overwrite"]) == 2
+    assert "is not a run" in capsys.readouterr().err
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "five years"
+
+
+def test_overwriting_leaves_nothing_of_the_old_run(tmp_path):
+    out = tmp_path / "run"
+    run(room(2.0), out)
+    assert (out / "map" / "cloud.ply").is_file()
+    prepare(out, overwrite=True)
+    assert [p for p in out.rglob("*") if p.is_file()] == []
+
+
+def test_a_full_disk_ends_with_a_storage_error_and_keeps_what_was_written(recorded, tmp_path):
+    out = tmp_path / "run"
+    script = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000));"
+        f"from vislam.cli import run_verb; sys.exit(run_verb(['run', {str(recorded)!r}, '--out', {str(out)!r},"
+        " '--view.no-enabled']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "free disk space" in done.stderr
+    assert (out / "manifest.json").is_file()
+
+
+def test_an_interrupt_keeps_what_was_computed(small_room, tmp_path):
+    def interrupted(events):
+        for n, value in enumerate(events):
+            if n == 1200:
+                raise KeyboardInterrupt
+            yield value
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Edited(small_room, interrupted), tmp_path / "run", map__enabled=False)
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["frames"] > 50
+    assert "stopped early" in metrics["warnings"][0]
+
+
+def test_evaluation_fails_on_too_little_coverage(small_room, tmp_path, capsys):
+    run(small_room, tmp_path / "run", map__enabled=False)
+    assert run_verb(["eval", str(tmp_path / "run"), "--min-coverage", "0.5"]) == 0
+    assert run_verb(["eval", str(tmp_path / "run"), "--min-coverage", "0.999"]) == 4
+    assert "covers" in capsys.readouterr().err
+
+
+def test_black_images_end_as_tracking_lost(tmp_path):
+    def dark(events):
+        for value in events:
+            if isinstance(value, Frame):
+                black = tuple(np.zeros_like(image) for image in value.images)
+                yield Frame(value.t_ns, value.index, black, None, value.depth_m)
+            else:
+                yield value
+
+    world = room(3.0)
+    prepare(tmp_path / "run", overwrite=False)
+    with pytest.raises(Exception, match="frames have a pose") as error:
+        execute(Edited(world, dark), load(None, FAST), tmp_path / "run", "test", [])
+    assert error.value.exit_code == 4
+    assert Path(tmp_path / "run" / "metrics.json").is_file()
+
+
+@pytest.mark.data
+def test_two_seconds_of_real_stereo_and_imu(data_root, tmp_path):
+    from vislam.datasets import open_dataset
+
+    recording = open_dataset(f"euroc:{data_root / 'euroc_mh01_17s'}")
+    first_ns = min(v.t_ns for v in recording.events() if isinstance(v, Frame))
+
+    def beginning(events):
+        for value in events:
+            if value.t_ns < first_ns + 5_000_000_000:
+                yield value
+
+    metrics = run(Edited(recording, beginning), tmp_path / "run", map__enabled=False)
+    assert metrics["initialisation"]["status"] == "moving"
+    assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
+    assert cv2.getNumThreads() == 1

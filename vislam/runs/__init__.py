@@ -1,0 +1,31 @@
+"""One recording through the pipeline into a run folder: the library's side of `vislam run`.
+
+`begin` starts or resumes a run, `drive` feeds the pipeline and keeps the folder, `metrics` says what came out, `show`
+what the viewer is shown.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vislam.core.late import late
+
+if TYPE_CHECKING:
+    from vislam.runs.begin import begun, check_fits, execute, map_of, resume
+    from vislam.runs.drive import Progress, Run, imu_noise
+
+__all__ = ["Progress", "Run", "begun", "check_fits", "execute", "imu_noise", "map_of", "resume"]
+
+__getattr__ = late(
+    __name__,
+    {
+        "begun": "vislam.runs.begin",
+        "check_fits": "vislam.runs.begin",
+        "execute": "vislam.runs.begin",
+        "map_of": "vislam.runs.begin",
+        "resume": "vislam.runs.begin",
+        "Progress": "vislam.runs.drive",
+        "Run": "vislam.runs.drive",
+        "imu_noise": "vislam.runs.drive",
+    },
+)

@@ -1,0 +1,204 @@
+"""Gathers the evidence of a run for its verdict: from the front half, live or not, and from the whole at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from vislam.config import Config, ImuConfig
+from vislam.core.errors import VislamError
+from vislam.core.memory import EdgeReport
+from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
+from vislam.imu import Preintegrated, preintegrate
+from vislam.pipeline.front_report import FrontReport
+from vislam.runs.folder import RunLog
+from vislam.runs.verdict import Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
+from vislam.trajectory import Trajectory, align, associate
+
+_MIN_COMPARED = 10  # poses
+_SAMPLES = 4  # of a span, at least, that says something
+_REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
+_VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
+
+
+def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
+    """Return what the front half has to say, at any time of a run."""
+    counters = report.counters
+    front, feed, ekf, live = (counters.get(name, {}) for name in ("front", "camera feed", "ekf", "live"))
+    has_imu = report.condition is not None
+    refusals = counters.get("initialisation refused", {})
+    offered = [(ekf.get(first, 0), sum(ekf.get(name, 0) for name in others)) for first, *others in _VISION]
+    evidence = Evidence(
+        mode=report.mode,
+        frames=feed.get("frames", 0),
+        frames_lost=front.get("frames_lost", 0),
+        longest_loss_s=1e-3 * front.get("longest_loss_ms", 0),
+        frames_degraded=front.get("frames_degraded", 0),
+        frames_by_depth=front.get("frames_by_depth", 0),
+        frames_missing=feed.get("missing", 0),
+        frames_repeated=feed.get("repeated", 0),
+        frames_offered=live.get("frames_offered", 0),
+        frames_dropped=live.get("frames_dropped", 0),
+        frames_left_out=live.get("frames_left_out", 0),
+        samples=live.get("samples", 0),
+        samples_missed=live.get("samples_missed", 0),
+        late_s=1e-3 * live.get("late_ms", 0),
+        busy=0.01 * live.get("busy_percent", 0),
+        core=0.01 * live.get("core_percent", 0),
+        graph_late_s=1e-3 * live.get("back_late_ms", 0),
+        has_imu=has_imu,
+        is_started=not has_imu or report.start is not None,
+        start_reason=report.refusal,
+        start_failures=sum(refusals.get(name, 0) for name in _REFUSALS),
+        innovations=report.nis,
+        keyframes=ekf.get("keyframes", 0),
+        refused=sum(refused for _, refused in offered),
+        offered=sum(taken + refused for taken, refused in offered),
+        soft_resets=ekf.get("soft_resets", 0),
+        regained={
+            name: count for key, count in ekf.items() if (name := key.removesuffix("_regained")) != key and count
+        },
+        uniform_s=report.uniform_s,
+        gravity_m_s2=imu.gravity_m_s2,
+        max_gap_s=imu.max_gap_s,
+        **_calibration(report.calibration),
+    )
+    condition, noise, told = report.condition, report.noise_ratios, report.told_noise
+    if condition is None or told is None:
+        return evidence
+    return replace(
+        evidence,
+        gyro_noise=None if noise is None else noise.gyro_quiet * told.gyro_noise_density,
+        accel_noise=None if noise is None else noise.accel_quiet * told.accel_noise_density,
+        rate_hz=condition.rate_hz if np.isfinite(condition.rate_hz) else None,
+        rate_told_hz=told.rate_hz,
+        longest_gap_s=condition.longest_gap_s,
+        saturated=condition.saturated_axes,
+        force_m_s2=condition.force_m_s2 if np.isfinite(condition.force_m_s2) else None,
+    )
+
+
+def _calibration(learned: dict[str, float]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if "camera_offset_s" in learned:
+        found["clock"] = Moved(learned["camera_offset_s"], learned["camera_offset_sigma_s"])
+    if "camera_turn_deg" in learned:
+        names = ("camera_turn_deg", "camera_turn_sigma_deg", "camera_turn_prior_deg")
+        found["rotation"] = Moved.measured(*(learned[name] for name in names))
+    return found
+
+
+class KeyframeWitness:
+    """Owns what keyframes bring that only a comparison of sensors asks for: turns by vision, inertial steps."""
+
+    def __init__(self, config: Config) -> None:
+        """Start empty."""
+        self._config = config
+        self._turns: list[TurnStep] = []
+        self._inertial: dict[int, Preintegrated] = {}  # by the keyframe at their end
+        self._rotation: Moved | None = None
+
+    def add(self, packet: KeyframePacket, update: GraphUpdate) -> None:
+        """Take a keyframe and what the graph made of it."""
+        span, vo = packet.imu, packet.vo
+        if update.details is not None and update.newest is not None:
+            self._rotation = _window_turn(update.details.get("calibration"), self._config.window.rotation_sigma_deg)
+        if span is None or packet.begins_submap or len(span.t_ns) < _SAMPLES:
+            return
+        if float(np.diff(span.t_ns).max()) * 1e-9 > self._config.imu.max_gap_s:
+            return
+        inertial = preintegrate(span)
+        self._inertial[packet.keyframe.id] = inertial
+        is_seen = vo.tracking is Tracking.OK and vo.T_keyframe_body is not None and not packet.at_rest
+        if is_seen and vo.keyframe_id == packet.keyframe.id - 1 and vo.T_keyframe_body is not None:
+            self._turns.append(TurnStep(inertial, np.ascontiguousarray(vo.T_keyframe_body[:3, :3])))
+
+    def evidence(self, ids: list[int], T_map_body: Array, states: Sequence[NavState]) -> dict[str, Any]:
+        """Return the fields of `Evidence` that come of it, for the final poses [M, 4, 4] of the keyframes."""
+        found: dict[str, Any] = {"turns": turn_agreement(self._turns)}
+        if self._rotation is not None:
+            found["rotation"] = self._rotation
+        if len(states) != len(ids):
+            return found
+        bias = {i: state.gyro_bias_rad_s for i, state in zip(ids, states, strict=True)}
+        steps = [self._without_bias(k, bias.get(k)) for k in ids[1:]]
+        imu = self._config.imu
+        sigma = self._config.verdict.accel_bias_sigma_m_s2
+        found["forces"] = force_agreement(T_map_body, steps, imu.gravity_m_s2, sigma)
+        return found
+
+    def _without_bias(self, keyframe_id: int, gyro_bias: Array | None) -> Preintegrated | None:
+        inertial = self._inertial.get(keyframe_id)
+        if inertial is None or gyro_bias is None:
+            return None
+        dR, dv, dp = inertial.corrected(gyro_bias, np.zeros(3))
+        return replace(inertial, dR=dR, dv_m_s=dv, dp_m=dp)
+
+
+def _window_turn(calibration: Any, prior_deg: float) -> Moved | None:
+    """Return by how much a window turned the camera, in degrees; None where it does not estimate that."""
+    if calibration is None or not np.all(calibration.R_cam_sigma > 0.0):
+        return None
+    turn = calibration.R_cam_correction
+    angle = float(np.linalg.norm(turn))
+    sigma = float(np.sqrt(np.sum((turn / max(angle, 1e-12) * calibration.R_cam_sigma) ** 2)))
+    return Moved.measured(float(np.rad2deg(angle)), float(np.rad2deg(sigma)), prior_deg)
+
+
+def whole_evidence(
+    front: Evidence, log: RunLog, final: Trajectory, frames_due: int, reports: Sequence[EdgeReport],
+    states: dict[int, NavState], submaps_apart: int, keyframes: dict[str, Any],
+) -> Evidence:  # fmt: skip
+    """Return the evidence of a whole run.
+
+    Args:
+        front: that of the front half.
+        log: of the run.
+        final: the final trajectory.
+        frames_due: how many frames it ought to have poses of.
+        reports: what became of the loops that were offered to the graph.
+        states: of the graph, by keyframe.
+        submaps_apart: submaps that are joined with nothing.
+        keyframes: see `KeyframeWitness.evidence`.
+    """
+    return replace(
+        front,
+        coverage=len(final) / max(frames_due, 1),
+        submaps_apart=submaps_apart,
+        sigma_m=log.worst_position_sigma_m,
+        apart=_apart(log, final, states) if front.has_imu and front.is_started else None,
+        loops_accepted=sum(report.decision is LoopDecision.ACCEPTED for report in reports),
+        loops_contradicting=contradicting(reports),
+        **keyframes,
+    )
+
+
+def contradicting(reports: Sequence[EdgeReport]) -> int:
+    """Return how many loops the graph tested and does not believe; those that wait for their submap were not tested."""
+    refused = [report for report in reports if report.decision is not LoopDecision.ACCEPTED]
+    return sum(report.decision is LoopDecision.REJECTED or isfinite(report.chi2) for report in refused)
+
+
+def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart | None:
+    """Compare filter and graph at the keyframes, each with the sigmas that it admits."""
+    odometry = log.odometry_trajectory()
+    if len(odometry) < _MIN_COMPARED or len(final) < _MIN_COMPARED:
+        return None
+    with suppress(VislamError):  # nothing in common to compare
+        pairs = associate(odometry, final)
+        errors = pairs.aligned(align(pairs, "yaw")).position_errors_m()
+        rms_m = float(np.sqrt(np.mean(errors**2)))
+        path_m = float(np.linalg.norm(np.diff(final.positions_m, axis=0), axis=1).sum())
+        admitted = [
+            np.trace(state.covariance[3:6, 3:6]) + np.trace(log.filter_state(k).covariance[3:6, 3:6])  # type: ignore[union-attr]
+            for k, state in states.items()
+            if log.filter_state(k) is not None
+        ]
+        if admitted:
+            return Apart(rms_m, rms_m / max(float(np.sqrt(np.mean(admitted))), 1e-9), path_m)
+    return None

@@ -1,0 +1,167 @@
+"""What the interactive view of a report shows: map, paths, errors, loops and small pictures, thinned and quantised.
+
+All of it comes from the run folder alone, and the same folder gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vislam.core.errors import DataError
+from vislam.core.messages import Array
+from vislam.loop.table import caption
+from vislam.mapping.formats.ply import read_ply
+from vislam.runs.report.label_data import label_data
+from vislam.runs.report.page_assets import floats, packed
+from vislam.runs.report.run_files import RunFiles
+from vislam.runs.report.scene import Scene, loop_ends
+from vislam.runs.report.thumbnails import Thumbnails, read_thumbnails
+
+MAX_POINTS = 350_000  # of the map: 3.7 MB of page
+_MAX_CLOUD_BYTES = 4 * 2**30
+_MAX_PATH = 4000  # poses of a line
+_MAX_LOOPS = 2000
+_MAX_TEXT = 400  # letters of one reason
+_FAR_QUANTILE = 0.002  # points beyond it on either side do not decide how large the picture is
+_STATES = ("ok", "degraded", "lost")
+
+
+def view_data(run: RunFiles, scene: Scene, most_points: int = MAX_POINTS) -> dict[str, Any]:
+    """Return the data of the view, ready for JSON; empty where there is no path to stand on.
+
+    Times are seconds since the start of the run, positions metres in the scene's frame. What cannot be read is left
+    out and named in `run.unread`.
+    """
+    best = next((name for name in ("batch", "graph", "live", "ekf") if len(scene.paths.get(name, ())) > 1), None)
+    if best is None:
+        return {}
+    paths = {name: path for name, path in scene.paths.items() if len(path) > 1}
+    if scene.truth is not None and len(scene.truth) > 1:
+        paths = {"truth": scene.truth, **paths}
+    pictures = read_thumbnails(run)
+    return {
+        "end_s": scene.end_s,
+        "best": best,
+        "labels": {name: scene.labels[name] for name in paths},
+        "paths": {name: _path(scene, path.t_ns, path.T_world_body, name == best) for name, path in paths.items()},
+        "errors": {
+            name: {
+                "t": floats(_thin(curve.t_s)),
+                "position": floats(_thin(curve.position_m)),
+                "rotation": floats(_thin(curve.rotation_deg)),
+            }
+            for name, curve in scene.errors.items()
+        },
+        "tracking": _tracking(run, scene),
+        "loops": _loops(run, scene),
+        "cloud": _cloud(run, scene, most_points),
+        "voxels": label_data(run, scene),
+        **_pictures(pictures, scene),
+    }
+
+
+def as_script(data: dict[str, Any]) -> str:
+    """Return the data as JSON that no parser of HTML can leave, whatever text is in it."""
+    text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _thin(values: NDArray[Any]) -> NDArray[Any]:
+    return values[:: len(values) // _MAX_PATH + 1]
+
+
+def _path(scene: Scene, t_ns: NDArray[np.int64], T: Array, with_rotation: bool) -> dict[str, str]:
+    t_ns, T = _thin(t_ns), _thin(T)
+    out = {"t": floats(scene.seconds(t_ns)), "xyz": floats(T[:, :3, 3])}
+    return {**out, "R": floats(T[:, :3, :3])} if with_rotation else out
+
+
+def _tracking(run: RunFiles, scene: Scene) -> dict[str, Any]:
+    """Return inliers and state of every frame, thinned so that no lost frame disappears between two that are not."""
+    rows = run.tracking
+    if rows is None or not len(rows.t_ns):
+        return {}
+    states = np.array([_STATES.index(state) for state in rows.tracking], np.uint8)
+    step = len(states) // _MAX_PATH + 1
+    starts = range(0, len(states), step)
+    chosen = np.array([k + int(np.argmax(states[k : k + step])) for k in starts])
+    reasons: dict[str, int] = {"": 0}
+    index = [reasons.setdefault(rows.reason[k][:_MAX_TEXT], len(reasons)) for k in chosen.tolist()]
+    return {
+        "t": floats(scene.seconds(rows.t_ns[chosen])),
+        "inliers": floats(rows.inliers[chosen]),
+        "state": packed(states[chosen], "u1"),
+        "reason": packed(np.array(index), "<u2"),
+        "reasons": list(reasons),
+    }
+
+
+def _loops(run: RunFiles, scene: Scene) -> dict[str, Any]:
+    """Return the loops with their ends on the best path; accepted ones first, so that they are never cut off."""
+    rows, ends = loop_ends(run, scene)
+    rank = {"accepted": 0, "pending": 1, "rejected": 2}
+    order = sorted(range(len(rows)), key=lambda k: (rank.get(rows[k].decision, 3), k))[:_MAX_LOOPS]
+    return {
+        "ends": floats(ends[order]),
+        "rows": [
+            {
+                "from": rows[k].from_id,
+                "to": rows[k].to_id,
+                "from_s": float(scene.seconds([rows[k].from_t_ns])[0]),
+                "to_s": float(scene.seconds([rows[k].to_t_ns])[0]),
+                "decision": rows[k].decision,
+                "text": caption(rows[k])[:_MAX_TEXT],
+            }
+            for k in order
+        ],
+    }
+
+
+def _cloud(run: RunFiles, scene: Scene, most: int) -> dict[str, Any]:
+    """Return the map's points in an order of which every beginning is an even sample of the whole."""
+    path = run.folder / "map" / "cloud.ply"
+    if not path.is_file():
+        return {}
+    try:
+        if path.stat().st_size > _MAX_CLOUD_BYTES:
+            raise DataError(f"{path} is larger than the {_MAX_CLOUD_BYTES // 2**30} GiB that a report reads")
+        points, colors = read_ply(path)
+    except (DataError, OSError) as error:
+        run.unread[f"map/{path.name}"] = str(error)
+        return {}
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if not len(finite):
+        return {}
+    chosen = finite[np.random.default_rng(0).permutation(len(finite))[:most]]
+    S = scene.S_scene_map
+    placed = points[chosen].astype(np.float64) @ S[:3, :3].T + S[:3, 3]
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    step = np.maximum(high - low, 1e-6) / 65535.0
+    red, green, blue = colors[chosen].astype(np.uint16).T
+    near = np.quantile(placed, [_FAR_QUANTILE, 1.0 - _FAR_QUANTILE], axis=0)
+    return {
+        "count": len(chosen),
+        "of": len(points),
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "near": near.tolist(),
+        "xyz": packed(np.rint((placed - low) / step), "<u2"),
+        "rgb": packed((red >> 3 << 11) | (green >> 2 << 5) | (blue >> 3), "<u2"),
+    }
+
+
+def _pictures(pictures: Thumbnails, scene: Scene) -> dict[str, Any]:
+    T = pictures.T_body_cam
+    return {
+        "pictures": [
+            {"id": i, "t": float(scene.seconds([t_ns])[0]), "jpg": base64.b64encode(jpeg).decode("ascii")}
+            for i, t_ns, jpeg in pictures.images
+        ],
+        "camera": None if T is None else T.tolist(),
+        "keyframes": floats(scene.seconds(pictures.t_ns)),
+    }

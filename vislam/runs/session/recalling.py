@@ -1,0 +1,156 @@
+"""A session as the memory that a pipeline goes on from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vislam.core import collector
+from vislam.core.memory import (
+    FrontMemory,
+    FrontNews,
+    GraphMemory,
+    PlacesMemory,
+    SlamMemory,
+    StartFacts,
+    TagSighting,
+    Tied,
+    WindowRecord,
+    at_pose,
+)
+from vislam.core.messages import Array, Frame, Keyframe, NavState
+from vislam.factors.factor_log import state_from
+from vislam.imu import ImuNoise
+from vislam.runs.session.reader import Session
+from vislam.runs.session.reading_rows import own_of
+from vislam.runs.session.schema import maybe_numbers, numbers, readable, window_of
+
+_RIGID = 1e-4  # how far R R^T may be from identity
+
+
+@collector.paused()
+def recall(session: Session) -> SlamMemory | None:
+    """Return what a pipeline goes on from; None when the session has nothing worth going on from.
+
+    That is one without a keyframe of its own, or one with an IMU whose gravity had not been found. Raises DataError
+    when the session is damaged.
+    """
+    info, newest = session.info(), session.newest()
+    with readable(session.path):
+        start, base = _start(info), info.get("map") or {}
+        if not newest or (start is None and info["imu_noise"] is not None):
+            return None
+        stored = list(session.keyframes())
+        if len(stored) <= base.get("keyframes", 0):
+            return None
+        packets = session.packets(light=True)
+        states = session.states("graph")
+        loops = session.loops()
+        T_map_body = np.array([k.T_map_body for k in stored])
+        _check_rigid(T_map_body)
+        last = stored[-1]
+        graph = GraphMemory(
+            packets=packets,
+            T_map_body=T_map_body,
+            T_odom_body=last.T_odom_body,
+            windows=_windows(session),
+            states=states,
+            loops=loops,
+            ties=_ties(session),
+            vo_scale=float(newest["vo_scale"]),
+            revision=int(newest["revision"]),
+            own=own_of(newest.get("own", [])),
+        )
+        places = PlacesMemory(
+            keyframes=[
+                Keyframe(k.id, k.t_ns, Frame(k.t_ns, k.id, ()), k.keypoints_px, k.descriptors, k.points_body_m)
+                for k in stored
+            ],
+            T_map_body=T_map_body,
+            words=session.words(),
+            tags=_tags(session),
+            next_edge_id=1 + max((loop.edge.id for loop in loops), default=-1),
+        )
+        front = FrontMemory(
+            keyframe_id=last.id,
+            t_ns=last.t_ns,
+            time_offset_s=packets[-1].time_offset_s,
+            T_odom_body=last.T_odom_body,
+            start=start,
+            state=None if start is None else _filter_state(session, states, last.id, last.T_odom_body),
+            news=_front(newest["front"]),
+        )
+        first = info.get("first_state")
+        return SlamMemory(
+            front=front,
+            first_state=None if first is None else state_from(first),
+            T_start=stored[0].T_odom_body,
+            graph=graph,
+            places=places,
+            scans=session.scans(),
+            held=int(base["keyframes"]) if base.get("localize_only") else 0,
+            map_keyframes=int(base.get("keyframes", 0)),
+        )
+
+
+def _check_rigid(T: Array) -> None:
+    """Raise ValueError where one of the poses [M, 4, 4] is no rigid motion."""
+    R = T[:, :3, :3]
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    sound = (error <= _RIGID) & np.isfinite(T).all(axis=(1, 2)) & (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    if not sound.all():
+        raise ValueError(f"the pose of keyframe {int(np.flatnonzero(~sound)[0])} is no rigid motion")
+
+
+def _start(info: dict[str, Any]) -> StartFacts | None:
+    facts = info.get("start")
+    if facts is None:
+        return None
+    return StartFacts(
+        str(facts["status"]), str(facts["reason"]), state_from(facts["last"]), float(facts["scale_sigma"]),
+        float(facts["excitation_m_s2"]), ImuNoise(**facts["noise"]), state_from(facts["first_state"]),
+        int(facts.get("begun_t_ns", 0)),
+    )  # fmt: skip
+
+
+def _front(data: dict[str, Any]) -> FrontNews:
+    camera, tilt = data["filter_camera"], data.get("tilt")
+    delay, rows = data.get("depth_delay_s"), data.get("depth_rows_s")
+    return FrontNews(
+        int(data["next_track_id"]),
+        float(data["time_offset_sigma_s"]),
+        None if data["readout_s"] is None else float(data["readout_s"]),
+        None if camera is None else np.array(camera, dtype=np.float64).reshape(8),
+        None if tilt is None else np.array(tilt, dtype=np.float64).reshape(6),
+        None if delay is None else float(delay),
+        None if rows is None else float(rows),
+    )
+
+
+def _filter_state(session: Session, states: dict[int, NavState], newest_id: int, T_odom_body: Array) -> NavState:
+    """Return the filter's state at the newest keyframe; that of the graph where the filter came later."""
+    state = session.states("filter").get(newest_id)
+    return at_pose(states[newest_id], T_odom_body) if state is None else state
+
+
+def _windows(session: Session) -> list[WindowRecord]:
+    query = (
+        "SELECT w.id, k.t_ns, w.edges, w.tilts, w.note, w.rest_from "
+        "FROM windows w JOIN keyframes k USING (id) ORDER BY id"
+    )
+    return [window_of(*row) for row in session.rows(query)]
+
+
+def _ties(session: Session) -> list[Tied]:
+    rows = session.rows("SELECT id, anchor_id, covariance FROM ties ORDER BY rowid")
+    return [Tied(i, anchor_id, numbers(blob, "<f8", (6, 6))) for i, anchor_id, blob in rows]
+
+
+def _tags(session: Session) -> dict[int, tuple[TagSighting, ...]]:
+    out: dict[int, tuple[TagSighting, ...]] = {}
+    rows = session.rows("SELECT id, tag_id, side_px, T_cam_tag, covariance FROM tags ORDER BY id, rowid")
+    for i, tag_id, side_px, T, covariance in rows:
+        poses = maybe_numbers(T, "<f8", (4, 4)), maybe_numbers(covariance, "<f8", (6, 6))
+        out[i] = (*out.get(i, ()), TagSighting(tag_id, side_px, *poses))
+    return out

@@ -1,0 +1,333 @@
+"""Writing a session, one transaction per keyframe."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, astuple
+from pathlib import Path
+from typing import Any
+
+from vislam.core.camera import Rig
+from vislam.core.database import connect
+from vislam.core.errors import DataError
+from vislam.core.memory import (
+    FrameEntry,
+    FrontNews,
+    GraphNews,
+    KeyframeEntry,
+    LoopPlace,
+    LoopState,
+    StartFacts,
+    TagSighting,
+)
+from vislam.core.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
+from vislam.factors.factor_log import rig_data, state_data
+from vislam.imu import ImuNoise
+from vislam.runs.session.checks import check_records, check_sound, checksum, checksums, has_labels, has_readings
+from vislam.runs.session.packets import packet_row
+from vislam.runs.session.reader import Session
+from vislam.runs.session.reading_rows import own_data, reading_rows, start_rows
+from vislam.runs.session.schema import (
+    APPLICATION_ID,
+    LABELS_SCHEMA,
+    READINGS_SCHEMA,
+    SCHEMA_VERSION,
+    maybe_bytes,
+    readable,
+    schema,
+    state_bytes,
+    storage,
+    to_bytes,
+    window_bytes,
+)
+
+
+class SessionWriter:
+    """Owns a session file while a run writes it."""
+
+    def __init__(self, path: Path, info: dict[str, Any], rig: Rig, noise: ImuNoise | None, gravity_m_s2: float) -> None:
+        """Create the file; `info` (config, source) is stored as JSON. Raises StorageError when it cannot be.
+
+        `noise` is None where there is no IMU.
+        """
+        self._open(path)
+        sensors = {"rig": rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
+        with storage(path), self._transaction():  # half of the tables would be a file that nobody can open again
+            self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
+            for statement in schema(SCHEMA_VERSION).split(";"):
+                self._db.execute(statement)
+            self._tell({**info, **sensors, "gravity_m_s2": gravity_m_s2, "finished": False})
+            self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+    @classmethod
+    def reopen(cls, path: Path) -> SessionWriter:
+        """Open the file of a run that was ended by whatever, to go on after its last keyframe.
+
+        Raises DataError when it is missing, not ours or damaged, StorageError when it cannot be written.
+        """
+        if not path.is_file():
+            raise DataError(f"no session at {path}; a run leaves one as session.db")
+        writer = cls.__new__(cls)
+        with readable(path):
+            probe = connect(path)  # what a write-ahead log holds is taken in
+        try:
+            check_sound(probe, path)
+            check_records(probe, path)
+        finally:
+            probe.close()
+        writer._open(path)
+        with storage(path), writer._transaction():
+            db = writer._db
+            writer._bring_up()
+            newest_id, newest_t_ns = db.execute("SELECT id, t_ns FROM keyframes ORDER BY id DESC").fetchone() or (-1, 0)
+            db.execute("DELETE FROM frames WHERE t_ns > ? OR keyframe_id > ?", (newest_t_ns, newest_id))
+            base = writer.base()
+            writer._first_id = 0 if base is None else int(base["keyframes"])
+            writer._edges = db.execute("SELECT COALESCE(MAX(number) + 1, 0) FROM edges").fetchone()[0]
+        return writer
+
+    @classmethod
+    def in_map(
+        cls, path: Path, base: Session, info: dict[str, Any], noise: ImuNoise | None, localize_only: bool,
+        with_scans: bool,
+    ) -> SessionWriter:  # fmt: skip
+        """Create the file of a run that begins in the map of another session, of which it holds a copy.
+
+        Without `with_scans` it holds no clouds of it: those of another shape could not be read with its own settings.
+        Raises StorageError when it cannot be written.
+        """
+        part = path.with_name(path.name + ".part")  # the file appears whole or not at all
+        writer = cls.__new__(cls)
+        with storage(path):
+            part.unlink(missing_ok=True)
+            writer._db = connect(part, isolation_level=None)
+            base.copy_to(writer._db)
+            with writer._transaction():
+                writer._bring_up()
+                foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans", "labels")))
+                for table in foreign:
+                    writer._db.execute(f"DELETE FROM {table}")
+                writer._db.execute("DELETE FROM states WHERE whose = 'filter'")
+                writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2', 'labels')")
+                count = writer._db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
+                origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only, **base.up()}
+                sensors = {"imu_noise": None if noise is None else asdict(noise)}
+                writer._tell({**info, **sensors, "map": origin, "finished": False})
+            writer._db.close()
+            os.replace(part, path)
+        return cls.reopen(path)
+
+    @classmethod
+    def amend(cls, path: Path, update: GraphUpdate, news: GraphNews) -> None:
+        """Store in one transaction what was decided otherwise about a run that was ended, and what that moved.
+
+        Raises DataError when the file is missing, not ours or damaged, StorageError when it cannot be written.
+        """
+        writer = cls.__new__(cls)
+        writer.path = path
+        with storage(path):
+            writer._db = connect(path, isolation_level=None)
+        try:
+            with readable(path):
+                check_sound(writer._db, path)
+                newest = json.loads(writer._db.execute("SELECT value FROM newest").fetchone()[0])
+            with storage(path), writer._transaction():
+                writer._move(update, news)
+                changed = {**newest, "revision": update.revision, "vo_scale": news.vo_scale, **_own_news(news)}
+                writer._replace("newest", [(1, json.dumps(changed))])
+        finally:
+            writer._db.close()
+
+    def _bring_up(self) -> None:
+        """Give a session of an older format the tables that it lacks."""
+        lacking = ("" if has_readings(self._db) else READINGS_SCHEMA) + ("" if has_labels(self._db) else LABELS_SCHEMA)
+        if lacking:
+            for statement in lacking.split(";"):
+                self._db.execute(statement)
+            self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+    def _open(self, path: Path) -> None:
+        self.path = path
+        self._frames: list[FrameEntry] = []
+        self._edges = 0
+        self._first_id = 0  # of the keyframes of this recording
+        with storage(path):
+            self._db = connect(path, isolation_level=None)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=NORMAL")
+
+    def base(self) -> dict[str, Any] | None:
+        """Return the map in which the run began, if it did: its path, its number of keyframes, whether it is held."""
+        row = self._db.execute("SELECT value FROM info WHERE key = 'map'").fetchone()
+        return None if row is None else dict(json.loads(row[0]))
+
+    def tell(self, entries: dict[str, Any]) -> None:
+        """Commit entries of the info table."""
+        with storage(self.path), self._transaction():
+            self._tell(entries)
+
+    def add_frame(self, frame: FrameEntry) -> None:
+        """Remember a frame; it is committed with the next keyframe, or by `close`."""
+        self._frames.append(frame)
+
+    def add(self, entry: KeyframeEntry) -> None:
+        """Commit a keyframe with all that came of it, the frames since the last, and what its update changed."""
+        packet, update, news = entry.packet, entry.update, entry.news
+        keyframe = packet.keyframe
+        poses = dict(zip(update.ids.tolist(), update.T_map_body, strict=True))
+        T_map_body = poses.get(keyframe.id, update.T_map_odom @ entry.T_odom_body)
+        row = (
+            keyframe.id, keyframe.t_ns, to_bytes(T_map_body, "<f8"), to_bytes(entry.T_odom_body, "<f8"),
+            to_bytes(keyframe.keypoints_px, "<f4"), to_bytes(keyframe.descriptors, "u1"),
+            maybe_bytes(keyframe.points_body_m, "<f4"),
+        )  # fmt: skip
+        with storage(self.path), self._transaction():
+            if keyframe.id == 0:
+                self._tell({"first_state": None if entry.start is None else state_data(entry.start.first_state)})
+            if keyframe.id == self._first_id and entry.start is not None:
+                self._tell({"start": _start_data(entry.start)})
+            self._insert("keyframes", [row])
+            self._insert("packets", [packet_row(packet, update.newest)])
+            self._insert("readings", reading_rows(packet))
+            self._insert("own_starts", start_rows(packet))
+            if entry.filter_state is not None:
+                self._put_states("filter", [(keyframe.id, entry.filter_state)])
+            scans = entry.scans.items()
+            self._insert("scans", [(i, scan.t_ns, scan.depth_png, scan.points, scan.colors) for i, scan in scans])
+            self._insert("labels", [(i, scan.labels_png) for i, scan in scans if scan.labels_png])
+            if entry.words is not None:
+                words = entry.words
+                self._replace("vocabulary", [(1, words.data, words.trained_at, words.trainings)])
+            self._insert("tags", [(keyframe.id, *_tag_row(tag)) for tag in entry.tags])
+            self._add_edges(entry.edges, keyframe.id)
+            self._insert("candidates", [(None, *_candidate_row(c)) for c in entry.candidates])
+            self._insert("retrieved", [(None, *astuple(found)) for found in entry.retrieved])
+            self._write_frames()
+            self._move(update, news)
+            moved = [(*shift, checksum((edge_id, *shift)), edge_id) for edge_id, shift in entry.shifts.items()]
+            self._db.executemany("UPDATE edges SET moved_rms_m = ?, moved_max_m = ?, crc_moved = ? WHERE id = ?", moved)
+            newest = {"revision": update.revision, "vo_scale": news.vo_scale, "front": _front_data(entry.front)}
+            self._replace("newest", [(1, json.dumps({**newest, **_own_news(news)}))])
+
+    def move(self, update: GraphUpdate, news: GraphNews) -> None:
+        """Commit what an update without a new keyframe changed."""
+        with storage(self.path), self._transaction():
+            self._move(update, news)
+
+    def close(self, finished: bool = False) -> None:
+        """Fold the write-ahead log into the file, which is then all there is, and close it.
+
+        `finished` says that the run came to its end and is not to be resumed.
+        """
+        with storage(self.path):
+            with self._transaction():
+                self._write_frames()
+                self._tell({"finished": finished})
+            with suppress(sqlite3.OperationalError):  # somebody reads it: all is committed, and the log stays beside
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                self._db.execute("PRAGMA journal_mode=DELETE")  # so that readers leave no files beside it
+            self._db.close()
+
+    def _move(self, update: GraphUpdate, news: GraphNews) -> None:
+        placed = [(int(i), to_bytes(T, "<f8")) for i, T in zip(update.ids, update.T_map_body, strict=True)]
+        rows = [(T, checksum((i, T)), i) for i, T in placed]
+        self._db.executemany("UPDATE keyframes SET T_map_body = ?, crc_pose = ? WHERE id = ?", rows)
+        states = [(state.id, _state_row(state)) for state in news.loops]
+        decided = [(*row, checksum((i, *row)), i) for i, row in states]
+        columns = (
+            "decision = ?, reason = ?, chi2 = ?, place = ?, tie_id = ?, tie_T = ?, tie_covariance = ?, crc_decided = ?"
+        )
+        self._db.executemany(f"UPDATE edges SET {columns} WHERE id = ?", decided)
+        if news.window is not None:
+            said = news.window
+            self._replace("windows", [(said.id, *window_bytes(said), said.note, said.rest_from)])
+        self._put_states("graph", news.states)
+        self._replace("ties", [(tied.id, tied.anchor_id, to_bytes(tied.covariance, "<f8")) for tied in news.ties])
+
+    def _add_edges(self, edges: Iterable[LoopEdge], offered_with: int) -> None:
+        """Add offered edges; an id that was used before is refused by the graph, and the first edge of it stays."""
+        rows = []
+        undecided = LoopState(0, LoopDecision.REJECTED, "", float("nan"), LoopPlace.OUT, None)
+        for edge in edges:
+            T, covariance = to_bytes(edge.T_from_to, "<f8"), to_bytes(edge.covariance, "<f8")
+            row = (edge.id, edge.from_id, edge.to_id, T, covariance, int(edge.has_scale), edge.inliers, edge.score)
+            rows.append((*row, offered_with, self._edges, *_state_row(undecided), None, None))
+            self._edges += 1
+        self._insert("edges", rows, or_else="OR IGNORE")
+
+    def _put_states(self, whose: str, states: Iterable[tuple[int, NavState]]) -> None:
+        self._replace("states", [(int(i), whose, state.t_ns, state_bytes(state)) for i, state in states])
+
+    def _write_frames(self) -> None:
+        self._replace("frames", [_frame_row(frame) for frame in self._frames])
+        self._frames = []
+
+    def _tell(self, entries: dict[str, Any]) -> None:
+        self._replace("info", [(key, json.dumps(value)) for key, value in entries.items()])
+
+    def _replace(self, table: str, rows: list[tuple[Any, ...]]) -> None:
+        self._insert(table, rows, or_else="OR REPLACE")
+
+    def _insert(self, table: str, rows: list[tuple[Any, ...]], or_else: str = "") -> None:
+        if rows:
+            checked = [(*row, *checksums(table, row)) for row in rows]
+            self._db.executemany(f"INSERT {or_else} INTO {table} VALUES ({', '.join('?' * len(checked[0]))})", checked)
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            self._db.execute("COMMIT")
+        except BaseException:
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
+            raise
+
+
+def _start_data(start: StartFacts) -> dict[str, Any]:
+    return {
+        "status": start.status, "reason": start.reason, "last": state_data(start.last),
+        "scale_sigma": start.scale_sigma, "excitation_m_s2": start.excitation_m_s2, "noise": asdict(start.noise),
+        "first_state": state_data(start.first_state), "begun_t_ns": start.begun_t_ns,
+    }  # fmt: skip
+
+
+def _front_data(front: FrontNews | None) -> dict[str, Any]:
+    front = front or FrontNews()
+    arrays = {"filter_camera": front.filter_camera, "tilt": front.tilt}
+    return {**asdict(front), **{name: None if array is None else array.tolist() for name, array in arrays.items()}}
+
+
+def _own_news(news: GraphNews) -> dict[str, Any]:
+    """Return the own variables of sensors as an entry of `newest`; nothing where there are none."""
+    return {"own": own_data(news.own)} if news.own else {}
+
+
+def _state_row(state: LoopState) -> tuple[Any, ...]:
+    tie = state.tie
+    tied: tuple[Any, ...] = (None, None, None)
+    if tie is not None:
+        tied = (tie.from_id, to_bytes(tie.T_from_to, "<f8"), to_bytes(tie.covariance, "<f8"))
+    return (str(state.decision), state.reason, float(state.chi2), str(state.place), *tied)
+
+
+def _tag_row(tag: TagSighting) -> tuple[Any, ...]:
+    return (tag.tag_id, tag.side_px, maybe_bytes(tag.T_cam_tag, "<f8"), maybe_bytes(tag.covariance, "<f8"))
+
+
+def _candidate_row(c: LoopCandidate) -> tuple[Any, ...]:
+    return (
+        c.from_id, c.to_id, c.source, float(c.score), int(c.inliers), str(c.decision), c.reason, float(c.sigma_m),
+        int(c.consistency), int(c.supporters), maybe_bytes(c.T_from_to, "<f8"),
+    )  # fmt: skip
+
+
+def _frame_row(f: FrameEntry) -> tuple[Any, ...]:
+    poses = (maybe_bytes(T, "<f8") for T in (f.T_keyframe_body, f.T_odom_body, f.T_map_body))
+    seen = str(f.tracking), int(f.inliers), f.vo_keyframe_id, f.reason
+    return (f.t_ns, f.keyframe_id, *poses, *seen, str(f.localisation), f.submap)

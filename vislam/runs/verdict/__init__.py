@@ -1,0 +1,21 @@
+"""What a run is worth, told without any truth: evidence in, a verdict with its reasons out."""
+
+from vislam.runs.verdict.agreement import ForceAgreement, TurnAgreement, TurnStep, force_agreement, turn_agreement
+from vislam.runs.verdict.evidence import Apart, Evidence, Innovations, Moved
+from vislam.runs.verdict.judging import Trust, Verdict, judge, verdict_sentence
+
+__all__ = [
+    "Apart",
+    "Evidence",
+    "ForceAgreement",
+    "Innovations",
+    "Moved",
+    "Trust",
+    "TurnAgreement",
+    "TurnStep",
+    "Verdict",
+    "force_agreement",
+    "judge",
+    "turn_agreement",
+    "verdict_sentence",
+]

@@ -1,0 +1,254 @@
+"""From evidence to a verdict: trusted, doubtful with reasons, or lost. Pure: the same evidence, the same verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from vislam.config import VerdictConfig
+from vislam.core.chi_square import chi_square_limit
+from vislam.runs.verdict.evidence import Evidence, Moved
+
+_MIN_FRAMES = 30  # before shares of them mean anything
+_MIN_LOOPS = 8
+_MIN_KEYFRAMES = 10
+_SOON_S = 0.05  # that things may wait, and nobody has to know
+_OWN_SHARE = 0.7  # of the time in which vision works that it has a core; below, other work has it
+_CALIBRATE = "run `vislam calibrate camera-imu`"
+
+
+class Trust(StrEnum):
+    """What a run is worth, as far as it can tell itself."""
+
+    TRUSTED = "trusted"
+    DOUBTFUL = "doubtful"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a run is worth, why, and what it found out about its sensors.
+
+    `reasons` are empty of a run that is trusted. `moved` says what calibration found beyond its own sigmas: corrected,
+    no doubt of itself.
+    """
+
+    state: Trust
+    reasons: tuple[str, ...] = ()
+    moved: tuple[str, ...] = ()
+
+
+def verdict_sentence(entry: Mapping[str, Any]) -> str:
+    """Return a verdict as one sentence without the full stop, from its entry of metrics.json."""
+    reasons = [str(reason) for reason in entry.get("reasons") or ["nothing in the run contradicts itself"]]
+    return f"{str(entry.get('state', 'unknown')).capitalize()}: {'; '.join(reasons)}"
+
+
+def judge(evidence: Evidence, config: VerdictConfig) -> Verdict:
+    """Return the verdict on a run, or on what there is of it so far."""
+    slow, lost = tuple(_slow(evidence, config)), tuple(_lost(evidence, config))
+    reasons = tuple(reason for test in _TESTS for reason in test(evidence, config))
+    state = Trust.LOST if lost else Trust.DOUBTFUL if slow or reasons else Trust.TRUSTED
+    return Verdict(state, slow + lost + reasons, tuple(_moved(evidence, config)))
+
+
+def _slow(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    """Say first that the machine did not keep up: much of what else is wrong comes of that."""
+    if not _is_slow(e, c):
+        return
+    unseen = e.frames_dropped + e.frames_left_out
+    mapped = f", {e.map_left_out} of {e.keyframes} keyframes left out of the map" if e.map_left_out else ""
+    waited = {"frames for vision": e.late_s, "for the map": e.map_late_s, "keyframes for the graph": e.graph_late_s}
+    longest = ", ".join(f"{what} {late_s:.1f} s" for what, late_s in waited.items() if late_s >= _SOON_S)
+    waits = f"; what waited longest: {longest}" if longest else ""
+    others = "other work had its core, so end that first; then " if e.core < _OWN_SHARE * e.busy else ""
+    samples = "; for samples, --live.realtime-priority 50" if _misses_samples(e, c) else ""
+    yield (
+        f"the machine is too slow for its sensors: {unseen} of {e.frames_offered} frames were not looked at "
+        f"({e.frames_dropped} dropped, {e.frames_left_out} left out in time), {e.samples_missed} of "
+        f"{e.samples + e.samples_missed} inertial samples missed{mapped}{waits}; vision worked {e.busy:.0%} of the "
+        f"time, with {e.core:.0%} of a core: {others}give it less to do (--profile pi, a lower rate of the camera, "
+        f"--map.no-enabled, --view.no-enabled){samples}"
+    )
+
+
+def _is_slow(e: Evidence, c: VerdictConfig) -> bool:
+    unseen = e.frames_dropped + e.frames_left_out
+    is_blind = e.frames_offered >= _MIN_FRAMES and unseen > c.missing_share * e.frames_offered
+    is_thin = e.keyframes >= _MIN_KEYFRAMES and e.map_left_out > c.missing_share * e.keyframes
+    return is_blind or is_thin or _misses_samples(e, c)
+
+
+def _misses_samples(e: Evidence, c: VerdictConfig) -> bool:
+    return e.samples_missed > c.missing_share * (e.samples + e.samples_missed)
+
+
+def _lost(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    if e.frames and e.coverage < c.min_coverage:
+        yield f"only {e.coverage:.0%} of the frames have a pose ({e.start_reason or 'vision was lost'})"
+
+
+def _vision(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    if e.frames < _MIN_FRAMES:
+        return
+    if e.frames_lost > c.lost_share * e.frames or e.longest_loss_s > c.lost_s:
+        yield (
+            f"vision lost {e.frames_lost} of {e.frames} frames, {e.longest_loss_s:.1f} s at once: look at tracking.csv "
+            "for when and why"
+        )
+    if e.frames_degraded > c.degraded_share * e.frames:
+        by_depth = f", {e.frames_by_depth} of them placed by depth alone" if e.frames_by_depth else ""
+        yield (
+            f"vision was weak in {e.frames_degraded} of {e.frames} frames{by_depth}: more light, texture or a sharper "
+            "lens"
+        )
+    if e.frames_missing > c.missing_share * (e.frames + e.frames_missing) and not _is_slow(e, c):
+        yield (
+            f"{e.frames_missing} of {e.frames + e.frames_missing} frames never arrived: look at the camera's cable, "
+            "its driver and the load of the machine"
+        )
+    if e.frames_repeated >= c.repeated_frames:
+        yield f"{e.frames_repeated} images repeat the one before while the body moves: the camera's driver is stuck"
+    if e.submaps_apart:
+        yield f"{e.submaps_apart} submaps are joined with nothing: return to where the camera has been"
+
+
+def _start(e: Evidence, _: VerdictConfig) -> Iterator[str]:
+    if not e.is_started:
+        yield f"gravity was not found, so inertial data were of no use: {e.start_reason}"
+    elif e.start_failures > 1:
+        yield (
+            f"vision and inertial data contradicted each other in {e.start_failures} attempts to start: check axes and "
+            f"units of the IMU, then {_CALIBRATE}"
+        )
+
+
+def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    if e.soft_resets:
+        yield (
+            f"vision contradicted the filter for so long that it gave up its certainty {e.soft_resets} times: look for "
+            "something that moves through the image, and check calibration and time offset"
+        )
+    for name, count in e.regained.items():
+        yield (
+            f"the filter refused readings of {name} until so many agreed that it moved to them, {count} times: it was "
+            "surer than it was right; look for stretches without sight, and for an IMU that is worse than told"
+        )
+    if e.offered >= _MIN_FRAMES and e.refused > c.refused_share * e.offered:
+        yield f"the filter refused {e.refused} of {e.offered} visual measurements as impossible"
+    for kind, (count, nis, degrees) in e.innovations.items():
+        # frames that share a keyframe share its errors: no more of them are independent than there are keyframes
+        share = min(e.keyframes / count, 1.0) if count else 0.0
+        independent = max(round(share * degrees), 1)
+        if share * nis > chi_square_limit(c.probability, independent):
+            yield (
+                f"innovations of {kind.replace('_', ' ')} are {nis / degrees:.1f} times what the noise that was told "
+                "explains: calibrate, or tell more noise"
+            )
+    if e.sigma_m > c.sigma_m:
+        yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst"
+    if e.uniform_s > c.uniform_s:
+        yield (
+            f"uniform motion for {e.uniform_s:.0f} s, in which one camera's scale is held by the IMU's biases alone: "
+            "accelerate now and then, or use a second camera or depth"
+        )
+
+
+def _graph(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    apart = e.apart
+    if apart is not None and apart.sigmas > c.apart_sigmas and apart.rms_m > c.apart_share * apart.path_m:
+        yield (
+            f"filter and graph are {apart.rms_m:.2f} m apart over {apart.path_m:.0f} m of way, {apart.sigmas:.1f} "
+            "times what both admit: one of them is wrong"
+        )
+    offered = e.loops_accepted + e.loops_contradicting
+    if offered >= _MIN_LOOPS and e.loops_contradicting > c.contradicting_share * offered:
+        yield f"{e.loops_contradicting} of {offered} verified loops contradict the trajectory: look at loops.csv"
+
+
+def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    if e.rotation is not None and _beyond(e.rotation, c.rotation_sigma_deg, 3, c):
+        yield f"the camera is turned by {e.rotation.by:.1f} degrees against its file: calibrate ({_CALIBRATE})"
+    if e.clock is not None and _beyond(e.clock, c.clock_sigma_s, 1, c):
+        yield f"{_clock_words(e.clock)}, beyond any driver's delay: set --init.time-offset-s, or {_CALIBRATE}"
+    turns, forces = e.turns, e.forces
+    if turns is not None and _beyond(Moved(turns.scale_error, turns.scale_sigma), c.turn_scale_sigma, 1, c):
+        yield (
+            f"vision sees turns {_percent(turns.scale_error)} than the gyroscope: focal length or gyro scale is wrong: "
+            "calibrate camera and gyroscope"
+        )
+    if forces is None:
+        return
+    if _beyond(Moved(forces.scale - 1.0, forces.scale_sigma), c.force_scale_sigma, 1, c):
+        yield (
+            f"the accelerometer's metres are {_percent(forces.scale - 1.0)} than those of vision: check baseline or "
+            "depth scale, and calibrate the accelerometer"
+        )
+    if _beyond(
+        Moved(forces.gravity_m_s2 - e.gravity_m_s2, forces.gravity_sigma_m_s2),
+        c.force_scale_sigma * e.gravity_m_s2,
+        1,
+        c,
+    ):
+        yield f"gravity along the way is {forces.gravity_m_s2:.2f} m/s2: calibrate the accelerometer"
+
+
+def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    turn_deg = math.degrees(e.gyro_noise or 0.0)  # in a second, as densities are per root of it
+    if turn_deg > c.gyro_noise_deg:
+        yield f"gyroscope noise is {turn_deg:.1f} deg after a second, even at its quietest: mount it on something soft"
+    if (speed := e.accel_noise or 0.0) > c.accel_noise_m_s:
+        yield f"accelerometer noise is {speed:.2f} m/s after a second, even at its quietest: mount it on something soft"
+    off = 0.0 if e.rate_hz is None or not e.rate_told_hz else abs(e.rate_hz / e.rate_told_hz - 1.0)
+    if (period_s := 0.0 if e.rate_hz is None else 1.0 / e.rate_hz) > e.max_gap_s:
+        yield (
+            f"inertial samples come every {period_s:.2f} s and more than {e.max_gap_s:.2f} s is an outage: filter and "
+            "graph went without them, and without the readings between them; tell their rate in the IMU's sensor file "
+            "(3 Hz at least), or raise --imu.max-gap-s, --ekf.max-gap-s, --window.imu-max-gap-s and "
+            "--graph.imu-max-gap-s"
+        )
+    elif off > c.rate_error and not _misses_samples(e, c):
+        yield f"inertial samples come at {e.rate_hz:.0f} Hz, told were {e.rate_told_hz:.0f}: look for what loses them"
+    if e.longest_gap_s > max(e.max_gap_s, 1.5 * period_s):
+        yield f"no inertial sample for {e.longest_gap_s:.2f} s: look at the cable, the bus and the load of the machine"
+    if e.saturated:
+        yield f"saturated: {', '.join(e.saturated)}; set a wider range in the sensor, or move more gently"
+    if e.force_m_s2 is not None and _beyond(Moved(e.force_m_s2 - e.gravity_m_s2, 0.0), c.accel_bias_sigma_m_s2, 1, c):
+        yield (
+            f"the accelerometer reads {e.force_m_s2:.2f} m/s2 where gravity is {e.gravity_m_s2:.2f}: check its unit, "
+            "then `vislam calibrate imu`"
+        )
+
+
+_TESTS: tuple[Callable[[Evidence, VerdictConfig], Iterator[str]], ...] = (
+    _start, _vision, _calibration, _inertial, _filter, _graph,
+)  # fmt: skip
+
+
+def _moved(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    """Tell what was estimated significantly off, though no farther than its kind usually is: it was corrected."""
+    if e.clock is not None and _beyond(e.clock, 0.0, 1, c) and not _beyond(e.clock, c.clock_sigma_s, 1, c):
+        yield f"{_clock_words(e.clock)}; corrected, --init.time-offset-s {e.clock.by:.4f} tells it from the start"
+    turn = e.rotation
+    if turn is not None and _beyond(turn, 0.0, 3, c) and not _beyond(turn, c.rotation_sigma_deg, 3, c):
+        yield f"the camera is turned by {turn.by:.2f} ± {turn.sigma:.2f} degrees against its file; corrected"
+
+
+def _beyond(moved: Moved, told_sigma: float, degrees: int, config: VerdictConfig) -> bool:
+    """Whether a number is farther off than its sigma and that of what was told explain."""
+    if not math.isfinite(moved.by) or not math.isfinite(moved.sigma):
+        return False
+    variance = max(moved.sigma**2 + told_sigma**2, 1e-24)
+    return moved.by**2 / variance > chi_square_limit(config.probability, degrees)
+
+
+def _clock_words(clock: Moved) -> str:
+    side = "early" if clock.by > 0.0 else "late"
+    return f"the camera's clock is {1e3 * abs(clock.by):.1f} ± {1e3 * clock.sigma:.1f} ms {side} against the IMU's"
+
+
+def _percent(error: float) -> str:
+    return f"{100.0 * abs(error):.1f} % {'larger' if error > 0.0 else 'smaller'}"
