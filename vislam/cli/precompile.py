@@ -15,6 +15,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
 
@@ -114,9 +115,8 @@ def _do(job: Job) -> int:
 def _stamp() -> str:
     """Return what the compiled kernels depend on: the source, Python, numba and the processor's features."""
     import llvmlite.binding
-    import numba
 
-    digest = hashlib.sha256(f"{sys.version} {numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
+    digest = hashlib.sha256(f"{sys.version} {version('numba')} {llvmlite.binding.get_host_cpu_name()}".encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -1,6 +1,6 @@
 """How kernels are compiled: `njit` as vislam uses it, which takes about half of the time that numba's own takes.
 
-What makes the difference: no entry for C, a short text where shapes do not match, less optimisation, no collector.
+What makes the difference: no entry for C, less optimisation, no collector, and what `numba_internals` replaces.
 """
 
 from __future__ import annotations
@@ -11,33 +11,13 @@ from typing import Any
 
 import numba
 from numba.core import config, event
-from numba.extending import overload
-from numba.np import arrayobj
 
-import vislam.core.kernel_loading  # noqa: F401
+from vislam.core.numba_internals import replace_internals
 
 
 def njit(**options: Any) -> Any:
     """Return numba's decorator for compiled functions, without the entry for C, through which nobody calls."""
     return numba.njit(no_cfunc_wrapper=True, **options)
-
-
-def _refuse_shapes(source: Any, goal: Any) -> None:
-    """What assigning an array to a slice calls where shapes differ; only its compiled form is ever called."""
-
-
-@overload(_refuse_shapes)
-def _refuse_shapes_compiled(source: Any, goal: Any) -> Any:
-    def refuse(source: Any, goal: Any) -> None:
-        raise ValueError("cannot assign slice from input of different size")
-
-    return refuse
-
-
-# numba 0.68 puts the shapes into the text, for which it compiles all its strings into every kernel that assigns to a
-# slice: a quarter of the time
-if hasattr(arrayobj, "raise_with_shape_context"):
-    arrayobj.raise_with_shape_context = _refuse_shapes
 
 
 class _Quicker(event.Listener):  # type: ignore[misc]
@@ -68,4 +48,5 @@ class _Quicker(event.Listener):  # type: ignore[misc]
                 gc.enable()
 
 
+replace_internals()
 event.register("numba:compile", _Quicker())

@@ -1,10 +1,15 @@
-"""Kernels that come from the cache: machine code at once, LLVM's module only for whoever inlines them."""
+"""What is replaced in numba: kernels from the cache have no LLVM module until one inlines them; one switch undoes it."""
 
+import ast
+import hashlib
+import inspect
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core import codegen
+from numba.np import arrayobj
 
 MODULE = """
 from vislam.core.jit import njit
@@ -51,3 +56,28 @@ def test_a_kernel_from_the_cache_can_be_inlined_into_one_that_is_compiled(folder
     _ask(folder, half)
     assert _ask(folder, half + area) == ["1.5", "1", "True", "6.0", "0", "False"]
     assert _ask(folder, half + area) == ["1.5", "1", "True", "6.0", "1", "True"]
+
+
+def test_the_switch_leaves_numba_as_it_is(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = ASK.format(kernel="half", arguments="3.0")
+    _ask(folder, script)
+    monkeypatch.setenv("VISLAM_PLAIN_NUMBA", "1")
+    assert _ask(folder, script) == ["1.5", "1", "False"]
+
+
+REPLACED = {  # SHA-256 of their code in numba 0.68, without comments and docstrings
+    "_unserialize": "161c0d9a4935aa36",
+    "_get_module_for_linking": "5053a3ac7254fae6",
+    "raise_with_shape_context": "1ae016537751aef6",
+}
+
+
+@pytest.mark.parametrize("name", REPLACED)
+def test_what_is_replaced_means_what_it_meant(name: str) -> None:
+    """Read what a new numba does there before its hash is written here and its version allowed in pyproject.toml."""
+    sources = (inspect.getsource(module) for module in (codegen, arrayobj))
+    functions = [n for s in sources for n in ast.walk(ast.parse(s)) if isinstance(n, ast.FunctionDef) and n.name == name]
+    (function,) = (f for f in functions if len(f.body) > 1 or name == "raise_with_shape_context")
+    if ast.get_docstring(function):
+        function.body.pop(0)
+    assert hashlib.sha256(ast.unparse(function).encode()).hexdigest()[:16] == REPLACED[name]

@@ -1,0 +1,72 @@
+"""What vislam replaces inside numba, all of it and behind one switch: `VISLAM_PLAIN_NUMBA=1` leaves numba as it is.
+
+Kernels come back from the cache as machine code alone; numba reads their LLVM modules at once, which for the kernels of
+one run takes 40 MB and a third of a second, though only a kernel that inlines them and has to be compiled needs them.
+An assignment to a slice raises a constant text: numba 0.68 puts the shapes into it, for which it compiles its strings
+into every such kernel, a quarter of the time. Results are the same bytes with and without.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import llvmlite.binding as llvm
+from numba.core import codegen
+from numba.extending import overload
+from numba.np import arrayobj
+
+_read_both = getattr(codegen.CPUCodeLibrary, "_unserialize", None)
+_module_for_linking = getattr(codegen.CPUCodeLibrary, "_get_module_for_linking", None)
+
+
+def replace_internals() -> None:
+    """Replace what is there to be replaced, unless the switch is set; where a name is missing, numba's own stays."""
+    if os.environ.get("VISLAM_PLAIN_NUMBA", "0") not in ("", "0"):
+        return
+    if hasattr(arrayobj, "raise_with_shape_context"):
+        arrayobj.raise_with_shape_context = _refuse_shapes
+    if _read_both is not None and _module_for_linking is not None and hasattr(llvm, "ObjectFileRef"):
+        codegen.CPUCodeLibrary._unserialize = classmethod(_read_code)
+        codegen.CPUCodeLibrary._get_module_for_linking = _module_when_asked
+
+
+def _refuse_shapes(source: Any, goal: Any) -> None:
+    """What assigning an array to a slice calls where shapes differ; only its compiled form is ever called."""
+
+
+@overload(_refuse_shapes)
+def _refuse_shapes_compiled(source: Any, goal: Any) -> Any:
+    def refuse(source: Any, goal: Any) -> None:
+        raise ValueError("cannot assign slice from input of different size")
+
+    return refuse
+
+
+def _read_code(cls: Any, engine: Any, state: tuple[str, str, Any]) -> Any:
+    """Return a library with its code; where its state is not what numba 0.6x writes, numba reads it."""
+    name, kind, data = state
+    symbols = _symbols(data[0]) if kind == "object" else set()
+    if not symbols:
+        return _read_both(engine, state)  # type: ignore[misc]
+    library = engine.create_library(name)
+    library.enable_object_caching()
+    library._set_compiled_object(data[0])
+    library._finalize_final_module()
+    library._codegen._engine._defined_symbols |= symbols
+    library._bitcode = data[1]
+    return library
+
+
+def _symbols(code: bytes) -> set[str]:
+    """Return the names that an object file defines or uses; numba asks for an address only of those it knows."""
+    parsed = llvm.ObjectFileRef.from_data(code)
+    tables = [section.data() for section in parsed.sections() if section.name() == b".strtab"]
+    return {name.decode() for table in tables for name in table.split(b"\0") if name}
+
+
+def _module_when_asked(library: Any) -> Any:
+    library._ensure_finalized()
+    if library._shared_module is None and hasattr(library, "_bitcode"):
+        library._shared_module = llvm.parse_bitcode(library._bitcode)
+    return _module_for_linking(library)  # type: ignore[misc]
