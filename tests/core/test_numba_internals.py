@@ -1,4 +1,4 @@
-"""What is replaced in numba: kernels from the cache have no LLVM module until one inlines them; one switch undoes it."""
+"""What is replaced in numba: cached kernels have no LLVM module until one inlines them; a switch undoes it."""
 
 import ast
 import hashlib
@@ -76,7 +76,9 @@ REPLACED = {  # SHA-256 of their code in numba 0.68, without comments and docstr
 def test_what_is_replaced_means_what_it_meant(name: str) -> None:
     """Read what a new numba does there before its hash is written here and its version allowed in pyproject.toml."""
     sources = (inspect.getsource(module) for module in (codegen, arrayobj))
-    functions = [n for s in sources for n in ast.walk(ast.parse(s)) if isinstance(n, ast.FunctionDef) and n.name == name]
+    functions = [
+        n for s in sources for n in ast.walk(ast.parse(s)) if isinstance(n, ast.FunctionDef) and n.name == name
+    ]
     (function,) = (f for f in functions if len(f.body) > 1 or name == "raise_with_shape_context")
     if ast.get_docstring(function):
         function.body.pop(0)

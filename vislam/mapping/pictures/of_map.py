@@ -36,10 +36,10 @@ def write_pictures(source: MapSource, folder: Path, path_m: NDArray[np.float64],
     if (folder / FILES["cloud"]).is_file():
         points, colors = read_ply(folder / FILES["cloud"])
         if len(points):
-            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path, octree=octree)
+            pictures["picture_cloud.png"] = render_cloud(Cloud(points, colors), path)
     if (folder / FILES["mesh"]).is_file():
         mesh = Mesh(*read_ply_mesh(folder / FILES["mesh"]))
-        pictures["picture_mesh.png"] = render_mesh(mesh, path, octree=octree)
+        pictures["picture_mesh.png"] = render_mesh(mesh, path)
     if is_level and len(octree.occupied_voxels()):  # its colours are heights
         pictures["picture_octree.png"] = render_octree(octree, path)
     with suppress(DataError):  # too large a map for a grid: that is said where the grid is written

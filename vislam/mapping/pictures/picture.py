@@ -1,42 +1,35 @@
-"""Pictures of maps for reports: a coloured cloud, a mesh or an octree from above, with trajectories drawn in.
+"""Pictures of maps for reports: a cloud, a mesh or an octree from above at an angle, with trajectories drawn in.
 
-Numpy, numba and OpenCV only, so that a report needs no viewer and no graphics driver.
+A parallel projection of points as discs into a depth buffer, shaded by eye-dome lighting (Boucheny 2009), which needs
+depth alone and makes shapes readable. numpy and OpenCV only: a report needs no viewer and no graphics driver.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vislam.core.geometry import level_rotation
 from vislam.core.messages import Array, ImageU8
-from vislam.mapping.cloud.cloud import Cloud, cells_of
+from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh
 from vislam.mapping.octree import Octree
-from vislam.mapping.pictures.raster import fill_triangles, light_onto, project_points, splat_colors, splat_depth
 
-F32 = NDArray[np.float32]
-
-_SUPERSAMPLING = 2
-_FIELD_OF_VIEW = np.deg2rad(38.0)
+SIZE = (1600, 900)  # width, height
+_ELEVATION_RAD = np.deg2rad(50.0)
 _MARGIN = 0.05  # of the picture's size, left free on each side
-_NEAR_M = 0.02
 _FARTHEST_M = 1e6  # a point beyond is damage, and no picture could show it beside the others
-_LOOK_AHEAD_VOXELS = (3.0, 6.0)  # from a surface towards the eye: past its own voxels, also at a grazing angle
-_HIDDEN_ALPHA = 0.3  # of a line behind a surface
-_EDL_STRENGTH = 60.0
-_BLENDED_M = 0.025  # depth noise of one surface seen from several keyframes
 _CEILING_ABOVE_PATH_M = 0.5
 _WALL_HEIGHT_M = 1.8  # of walls that are left standing at least
+_LARGEST_DISC_PX = 12
+_SHADOW = 12.0  # strength per share of the scene's depth
+_NOISE_M = 0.03  # steps of depth below it cast no shadow
 _PALENESS = 0.15  # of the colours of height, so that shading and lines stand out
-_PAPER = {"white": (255, 255, 255), "dark": (18, 20, 26)}
-_GRID_LINE = {"white": (226, 229, 233), "dark": (44, 48, 58)}
+_HIDDEN_ALPHA = 0.3  # of a line behind a surface
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,347 +42,169 @@ class Line:
     marks_ends: bool = True  # a ring at the start, a dot at the end
 
 
-@dataclass(frozen=True, slots=True)
-class Style:
-    """How a picture is made; heights and directions are in the map frame."""
-
-    size: tuple[int, int] = (1600, 900)  # width, height
-    background: Literal["white", "dark"] = "white"
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # opposite to gravity, where the map is not levelled
-    ceiling_m: float | None = None  # cut away what is higher along up; None: above the lines and at 1.8 m or more
-    azimuth_deg: float | None = None  # where the eye stands, seen from the middle; None: where it sees the lines best
-    elevation_deg: float = 42.0
-    floor_grid: bool = True  # lines every metre at the height of the lowest points
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _Eye:
-    """A pinhole camera: p_eye = R @ p + t; z forward."""
+class _View:
+    """A parallel projection: pixels are scale * (R @ p)[:2] + offset, depth is (R @ p)[2], larger farther away."""
 
-    R: Array
-    t: Array
-    focal_px: float
-    centre_px: Array  # [2]
+    R: Array  # [3, 3]
+    scale: float  # px per metre
+    offset_px: Array  # [2]
 
-    def see(self, points: NDArray[np.floating]) -> tuple[F32, F32]:
-        """Return pixels [N, 2] and depth [N] of points [N, 3]; meaningless where depth is not positive."""
-        rows = np.ascontiguousarray(points, dtype=np.float64)
-        pixels, z = project_points(rows, self.R, self.t, self.focal_px, self.centre_px, _NEAR_M)
-        return pixels, z
-
-    def scaled(self, factor: float) -> _Eye:
-        """Return the eye for the picture resized by a factor."""
-        return _Eye(self.R, self.t, self.focal_px * factor, (self.centre_px + 0.5) * factor - 0.5)
+    def see(self, points: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return pixels [N, 2] and depth [N] in metres of points [N, 3]."""
+        turned = np.asarray(points, dtype=np.float64) @ self.R.T
+        return turned[:, :2] * self.scale + self.offset_px, turned[:, 2]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """What a picture shows, turned so that up is z."""
-
-    points: NDArray[np.floating]  # [N, 3]
-    lines: list[Line]
-    style: Style
-    R_up: Array  # [3, 3] from the map frame
-    octree: Octree | None  # in the map frame
-
-    def seen_from(self, eye: _Eye, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return which points [N, 3] have known space in front of them, on their way to the eye."""
-        if self.octree is None:
-            return np.ones(len(points), np.bool_)
-        towards = -eye.R.T @ eye.t - points
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        known = np.zeros(len(points), np.bool_)
-        for voxels in _LOOK_AHEAD_VOXELS:
-            before = points + towards * (voxels * self.octree.resolution_m)
-            known |= ~np.isnan(self.octree.log_odds_at(before @ self.R_up))
-        return known
-
-
-@dataclass(eq=False)
-class _Canvas:
-    """What is drawn so far, at the supersampled size."""
-
-    eye: _Eye
-    depth: F32  # [H, W] infinite where nothing is
-    noise_m: float  # of the surface's depth
-    surface: F32  # [H, W, 4] colour, and 1 where anything is
-
-
-def render_cloud(
-    cloud: Cloud, lines: Sequence[Line] = (), style: Style | None = None, octree: Octree | None = None
-) -> ImageU8:
-    """Return the picture [H, W, 3] RGB of a coloured cloud, seen from above at an angle.
-
-    With the octree of the same map, surfaces that no keyframe saw from the picture's side are left out: near walls
-    open the view into their rooms.
-    """
-    style = style or Style()
-    R_up = level_rotation(np.array(style.up, dtype=np.float64))
+def render_cloud(cloud: Cloud, lines: Sequence[Line] = (), size: tuple[int, int] = SIZE) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of a coloured cloud; what is above the paths is cut away."""
     cloud = cloud.select(np.all(np.abs(cloud.points_m) < _FARTHEST_M, axis=1))  # NaN is not
-    points, lines = cloud.points_m @ R_up.T, _turned(lines, R_up)
-    below = points[:, 2] <= _ceiling_m(style, lines, points)
-    points, colors = points[below], cloud.colors[below].astype(np.float32)
-    spacing_m = _spacing_m(points)
-    scene = _Scene(points, lines, style, R_up, octree)
-    canvas = _canvas(scene)
-    pixels, z = canvas.eye.see(points)
-    ahead = (z > _NEAR_M) & scene.seen_from(canvas.eye, points)
-    pixels, z, colors = pixels[ahead], z[ahead], colors[ahead]
-    # discs close the surface; wider ones blend into each other and smooth the noise of depth
-    radius = np.clip(canvas.eye.focal_px * spacing_m[ahead] / z, 1.0, 40.0).astype(np.float32)
-    splat_depth(pixels, z, np.float32(0.8) * radius, canvas.depth)
-    canvas.noise_m = _BLENDED_M
-    canvas.surface = splat_colors(pixels, z, np.float32(1.25) * radius, colors, canvas.depth, _BLENDED_M)
-    return _finish(canvas, scene)
+    return _render(cloud.points_m, cloud.colors, _spacing_m(cloud.points_m), lines, size)
 
 
-def render_mesh(
-    mesh: Mesh, lines: Sequence[Line] = (), style: Style | None = None, octree: Octree | None = None
-) -> ImageU8:
-    """Return the picture [H, W, 3] RGB of a coloured mesh, seen from above at an angle; the octree as for a cloud."""
-    style = style or Style()
-    R_up = level_rotation(np.array(style.up, dtype=np.float64))
-    points, lines = mesh.points_m @ R_up.T, _turned(lines, R_up)
-    below = points[:, 2] <= _ceiling_m(style, lines, points)
-    triangles = mesh.triangles[below[mesh.triangles].all(axis=1)]
-    scene = _Scene(points[np.unique(triangles)], lines, style, R_up, octree)
-    canvas = _canvas(scene)
-    triangles = triangles[scene.seen_from(canvas.eye, points)[triangles].all(axis=1)]
-    _draw_triangles(canvas, points, mesh.colors.astype(np.float32), triangles)
-    return _finish(canvas, scene)
+def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), size: tuple[int, int] = SIZE) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of a coloured mesh, by its vertices; what is above the paths is cut away."""
+    return render_cloud(Cloud(mesh.points_m, mesh.colors), lines, size)
 
 
-def render_octree(octree: Octree, lines: Sequence[Line] = (), style: Style | None = None) -> ImageU8:
-    """Return the picture [H, W, 3] RGB of an octree's occupied voxels as cubes coloured by height.
-
-    Only sides that border on free space are drawn: what was never seen from a side does not hide what was.
-    """
-    style = style or Style()
-    R_up = level_rotation(np.array(style.up, dtype=np.float64))
-    lines = _turned(lines, R_up)
-    voxels = octree.occupied_voxels()
-    open_sides = _open_sides(voxels, octree)
-    centres = (voxels + 0.5) * octree.resolution_m @ R_up.T
-    below = centres[:, 2] <= _ceiling_m(style, lines, centres)
-    voxels, centres, open_sides = voxels[below], centres[below], open_sides[below]
-    scene = _Scene(centres, lines, style, R_up, octree)
-    canvas = _canvas(scene)
-    eye_voxels = (R_up.T @ (-canvas.eye.R.T @ canvas.eye.t)) / octree.resolution_m
-    corners, faces, owner, normals = _visible_faces(voxels, open_sides, eye_voxels)
-    colors = _height_colors(centres[:, 2])[owner] * (0.80 + 0.20 * (normals @ R_up.T)[:, 2:])
-    colors *= 1.0 - 0.10 * np.abs((normals @ R_up.T)[:, :1])  # the two kinds of walls differ
-    vertices = (corners * octree.resolution_m @ R_up.T).reshape(-1, 3)
-    _draw_triangles(canvas, vertices, np.repeat(colors, 4, axis=0).astype(np.float32), faces)
-    return _finish(canvas, scene)
+def render_octree(octree: Octree, lines: Sequence[Line] = (), size: tuple[int, int] = SIZE) -> ImageU8:
+    """Return the picture [H, W, 3] RGB of an octree's occupied voxels, coloured by height."""
+    centres = (octree.occupied_voxels() + 0.5) * octree.resolution_m
+    return _render(centres, None, octree.resolution_m, lines, size)
 
 
-def _open_sides(voxels: NDArray[np.int64], octree: Octree) -> NDArray[np.bool_]:
-    """Return which of the six sides [N, 6] of voxels (-x, +x, -y, +y, -z, +z) border on free space."""
-    out = np.zeros((len(voxels), 6), np.bool_)
-    for side in range(6):
-        step = np.zeros(3)
-        step[side // 2] = 2 * (side % 2) - 1
-        out[:, side] = octree.log_odds_at((voxels + 0.5 + step) * octree.resolution_m) < 0.0
-    return out
+def _render(
+    points: NDArray[np.floating], colors: NDArray[np.uint8] | None, spacing_m: float, lines: Sequence[Line],
+    size: tuple[int, int],
+) -> ImageU8:  # fmt: skip
+    paths = [line.points_m[np.isfinite(line.points_m).all(axis=1)] for line in lines]
+    below = points[:, 2] <= _ceiling_m(paths, points)
+    points = points[below]
+    shown = _height_colors(points[:, 2]) if colors is None else colors[below]
+    view = _framed(points, paths, size)
+    pixels, depth_m = view.see(points)
+    radius_px = min(max(0.75 * spacing_m * view.scale, 1.0), _LARGEST_DISC_PX)
+    image, buffer_m = _splat(np.round(pixels).astype(np.int64), depth_m, shown, radius_px, size)
+    image = _shaded(image, buffer_m)
+    for line, path in zip(lines, paths, strict=True):
+        image = _with_line(image, view, buffer_m, line, path)
+    return image
 
 
-def _visible_faces(
-    voxels: NDArray[np.int64], open_sides: NDArray[np.bool_], eye: Array
-) -> tuple[Array, NDArray[np.int32], NDArray[np.int64], Array]:
-    """Return the open faces that look at the eye: corners [F, 4, 3], triangles [2F, 3], voxel [F], normal [F, 3]."""
-    corners, owners, normals = [], [], []
-    for face in range(6):
-        axis, side = face // 2, face % 2
-        faces_eye = (eye[axis] - (voxels[:, axis] + side)) * (2 * side - 1) > 0.0
-        chosen = np.flatnonzero(open_sides[:, face] & faces_eye)
-        square = np.zeros((4, 3))
-        square[:, axis] = side
-        square[:, (axis + 1) % 3] = [0, 1, 1, 0]
-        square[:, (axis + 2) % 3] = [0, 0, 1, 1]
-        normal = np.zeros(3)
-        normal[axis] = 2 * side - 1
-        corners.append(voxels[chosen][:, None, :] + square)
-        owners.append(chosen)
-        normals.append(np.tile(normal, (len(chosen), 1)))
-    quads = np.concatenate(corners)
-    first = 4 * np.arange(len(quads))[:, None]
-    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])]).astype(np.int32)
-    return quads, triangles, np.concatenate(owners), np.concatenate(normals)
-
-
-def _height_colors(heights: Array) -> Array:
-    """Return RGB [N, 3] of heights [N]: Google's turbo map over the inner 98 % of them."""
-    if len(heights) == 0:
-        return np.zeros((0, 3))
-    low, high = np.percentile(heights, [1.0, 99.0])
-    level = np.clip((heights - low) / max(high - low, 1e-6), 0.0, 1.0)
-    shades = np.round(25 + 205 * level).astype(np.uint8)  # the map's ends are too dark to shade
-    turbo = np.asarray(cv2.applyColorMap(shades[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1], dtype=np.float64)
-    return turbo + _PALENESS * (255.0 - turbo)
-
-
-def _turned(lines: Sequence[Line], R: Array) -> list[Line]:
-    return [replace(line, points_m=line.points_m[np.isfinite(line.points_m).all(axis=1)] @ R.T) for line in lines]
-
-
-def _ceiling_m(style: Style, lines: Sequence[Line], points: NDArray[np.floating]) -> float:
-    if style.ceiling_m is not None:
-        return style.ceiling_m
-    heights = [float(line.points_m[:, 2].max()) for line in lines if len(line.points_m)]
+def _ceiling_m(paths: Sequence[Array], points: NDArray[np.floating]) -> float:
+    heights = [float(path[:, 2].max()) for path in paths if len(path)]
     if not heights or len(points) == 0:
         return np.inf
     floor = float(np.percentile(points[:: max(1, len(points) // 20000), 2], 1.0))
     return max(max(heights) + _CEILING_ABOVE_PATH_M, floor + _WALL_HEIGHT_M)
 
 
-def _spacing_m(points: NDArray[np.floating]) -> Array:
-    """Return the usual distance [N] from each point to its neighbours, from how many share a cell with it."""
+def _spacing_m(points: NDArray[np.floating]) -> float:
+    """Return the usual distance from a point to its fourth neighbour."""
     if len(points) < 2:
-        return np.full(len(points), 0.02)
-    some = points[:: max(1, len(points) // 2000)]
-    distances, _ = cKDTree(points).query(some, k=min(5, len(points)))
-    usual = max(float(np.median(np.asarray(distances)[:, -1])), 1e-3)
-    cell_m = 6.0 * usual
-    cell_of = cells_of(points, cell_m)
-    in_cell = np.bincount(cell_of)[cell_of]
-    return np.clip(cell_m / np.sqrt(in_cell), usual, 1.7 * usual)
+        return 0.02
+    distances, _ = cKDTree(points).query(points[:: max(1, len(points) // 2000)], k=min(5, len(points)))
+    return max(float(np.median(np.asarray(distances)[:, -1])), 1e-3)
 
 
-def _canvas(scene: _Scene) -> _Canvas:
-    style = scene.style
-    size = (style.size[0] * _SUPERSAMPLING, style.size[1] * _SUPERSAMPLING)
-    subject = _subject(scene.points, scene.lines)
-    azimuth_rad = _best_azimuth_rad(scene, subject) if style.azimuth_deg is None else np.deg2rad(style.azimuth_deg)
-    eye = _framed(subject, azimuth_rad, np.deg2rad(style.elevation_deg), size)
-    return _Canvas(eye, np.full(size[::-1], np.inf, np.float32), 0.0, np.zeros((*size[::-1], 4), np.float32))
+def _height_colors(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return RGB [N, 3] of heights [N]: Google's turbo map over the inner 98 % of them."""
+    if len(heights) == 0:
+        return np.zeros((0, 3), np.uint8)
+    low, high = np.percentile(heights, [1.0, 99.0])
+    level = np.clip((heights - low) / max(high - low, 1e-6), 0.0, 1.0)
+    shades = np.round(25 + 205 * level).astype(np.uint8)  # the map's ends are too dark to shade
+    turbo = np.asarray(cv2.applyColorMap(shades[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1], dtype=np.float64)
+    return (turbo + _PALENESS * (255.0 - turbo)).astype(np.uint8)
 
 
-def _subject(points: NDArray[np.floating], lines: Sequence[Line]) -> Array:
-    """Return the points [M, 3] that the picture must hold: a sample without stray ones, and the lines."""
-    parts = [np.asarray(line.points_m, dtype=np.float64) for line in lines]
+def _framed(points: NDArray[np.floating], paths: Sequence[Array], size: tuple[int, int]) -> _View:
+    """Return the view in which the longer side of a map lies across the picture, as large as its borders allow."""
+    parts = [np.asarray(path, dtype=np.float64) for path in paths]
     if len(points):
         some = np.asarray(points[:: max(1, len(points) // 5000)], dtype=np.float64)
         low, high = np.percentile(some, [0.1, 99.9], axis=0)
         parts.append(some[((some >= low) & (some <= high)).all(axis=1)])
     subject = np.concatenate(parts) if parts else np.zeros((0, 3))
-    return subject if len(subject) else np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
-
-
-def _framed(subject: Array, azimuth_rad: float, elevation_rad: float, size: tuple[int, int]) -> _Eye:
-    """Return the eye in a direction from the subject, as near as the picture's borders allow."""
-    ca, sa, ce, se = np.cos(azimuth_rad), np.sin(azimuth_rad), np.cos(elevation_rad), np.sin(elevation_rad)
-    forward = -np.array([ca * ce, sa * ce, se])
-    right = np.array([-sa, ca, 0.0])
+    if len(subject) == 0:
+        subject = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+    flat = subject[:, :2] - subject[:, :2].mean(axis=0)
+    axis = np.linalg.eigh(flat.T @ flat)[1][:, 1]
+    right = np.append(axis if axis[0] > 0.0 else -axis, 0.0)
+    ahead = np.array([-right[1], right[0], 0.0])
+    forward = np.cos(_ELEVATION_RAD) * ahead - np.sin(_ELEVATION_RAD) * np.array([0.0, 0.0, 1.0])
     R = np.stack([right, np.cross(forward, right), forward])
-    focal = 0.5 * size[1] / np.tan(0.5 * _FIELD_OF_VIEW)
-    half = (0.5 - _MARGIN) * np.array(size) / focal
-    local = subject @ R.T
-    t = -np.append(0.5 * (local[:, :2].min(axis=0) + local[:, :2].max(axis=0)), 0.0)
-    for _ in range(4):  # perspective: centring and distance depend on each other
-        shifted = local + np.append(t[:2], 0.0)
-        t[2] = float((np.abs(shifted[:, :2]) / half - shifted[:, 2:]).max()) + _NEAR_M
-        seen = shifted[:, :2] / (shifted[:, 2:] + t[2])
-        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
-        t[:2] -= middle * float(np.median(shifted[:, 2] + t[2]))
-    shifted = local + np.append(t[:2], 0.0)
-    t[2] = float((np.abs(shifted[:, :2]) / half - shifted[:, 2:]).max()) + _NEAR_M
-    return _Eye(R, t, focal, 0.5 * np.array(size) - 0.5)
+    local = subject @ R.T[:, :2]
+    low, high = local.min(axis=0), local.max(axis=0)
+    scale = float(((1.0 - 2.0 * _MARGIN) * np.array(size) / np.maximum(high - low, 0.1)).min())
+    return _View(R, scale, 0.5 * (np.array(size) - 1.0) - 0.5 * scale * (low + high))
 
 
-def _best_azimuth_rad(scene: _Scene, subject: Array) -> float:
-    """Return where to stand, of sixteen places around the subject: near to it, seeing much of map and lines."""
-    small = (scene.style.size[0] // 8, scene.style.size[1] // 8)
-    path = np.concatenate([line.points_m for line in scene.lines]) if scene.lines else subject
-    some = np.asarray(scene.points[:: max(1, len(scene.points) // 20000)], dtype=np.float64)
-    extent = float(np.linalg.norm(subject.max(axis=0) - subject.min(axis=0)))
-    best, best_score = 0.0, -np.inf
-    for azimuth in np.arange(16) * np.pi / 8.0 + np.deg2rad(5.0):
-        eye = _framed(subject, azimuth, np.deg2rad(scene.style.elevation_deg), small)
-        shown = scene.seen_from(eye, some)
-        depth = np.full(small[::-1], np.inf, np.float32)
-        pixels, z = eye.see(some[shown])
-        splat_depth(pixels, z, np.full(len(z), 1.0, np.float32), depth)
-        visible = float(_is_visible(path, eye, depth).mean()) if len(path) else 0.0
-        score = visible + extent / eye.t[2] + 3.0 * float(shown.mean() if len(shown) else 0.0)
-        if score > best_score + 1e-9:
-            best, best_score = float(azimuth), score
-    return best
+def _splat(
+    pixels: NDArray[np.int64], depth_m: Array, colors: NDArray[np.uint8], radius_px: float, size: tuple[int, int]
+) -> tuple[ImageU8, Array]:
+    """Return the picture and depth [H, W] of points drawn as discs, the nearest on top; depth is infinite elsewhere."""
+    reach = int(radius_px)
+    offsets = np.argwhere(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= radius_px) - reach
+    inside = ((pixels >= reach) & (pixels < np.array(size) - reach)).all(axis=1)
+    columns, rows = pixels[inside].T
+    depth_m, colors = depth_m[inside], colors[inside]
+    image, buffer_m = np.full((*size[::-1], 3), 255, np.uint8), np.full(size[::-1], np.inf)
+    for down, across in offsets.tolist():
+        np.minimum.at(buffer_m, (rows + down, columns + across), depth_m)
+    for down, across in offsets.tolist():
+        y, x = rows + down, columns + across
+        nearest = depth_m <= buffer_m[y, x]
+        image[y[nearest], x[nearest]] = colors[nearest]
+    return image, buffer_m
 
 
-def _is_visible(points: Array, eye: _Eye, depth: F32) -> NDArray[np.bool_]:
-    pixels, z = eye.see(points)
-    rounded = np.round(pixels).astype(np.int64)
-    x, y = np.clip(rounded[:, 0], 0, depth.shape[1] - 1), np.clip(rounded[:, 1], 0, depth.shape[0] - 1)
-    return np.asarray(z <= depth[y, x] + 0.02 * z)
-
-
-def _draw_triangles(canvas: _Canvas, points: NDArray[np.floating], colors: F32, triangles: NDArray[np.int32]) -> None:
-    pixels, z = canvas.eye.see(points)
-    ahead = (z[triangles] > _NEAR_M).all(axis=1)
-    fill_triangles(pixels, z, colors, np.ascontiguousarray(triangles[ahead]), canvas.depth, canvas.surface)
-
-
-def _finish(canvas: _Canvas, scene: _Scene) -> ImageU8:
-    """Light the surface, put it on paper, draw the lines and reduce to the asked size."""
-    style, points = scene.style, scene.points
-    paper = np.full((*canvas.depth.shape, 3), _PAPER[style.background], np.uint8)
-    if style.floor_grid and len(points):
-        _draw_floor_grid(paper, canvas.eye, points, _GRID_LINE[style.background])
-    light_onto(paper, canvas.surface, canvas.depth, _SUPERSAMPLING, _EDL_STRENGTH, canvas.noise_m)
-    image = np.asarray(cv2.resize(paper, style.size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    eye = canvas.eye.scaled(1.0 / _SUPERSAMPLING)
-    for line in scene.lines:
-        visible = _is_visible(line.points_m, canvas.eye, canvas.depth)
-        image = _with_line(image, eye, line, visible)
-    return image
-
-
-def _draw_floor_grid(image: ImageU8, eye: _Eye, points: NDArray[np.floating], color: tuple[int, int, int]) -> None:
-    """Draw a line every metre (every 5 or 25 in large maps) a little below the points."""
-    some = points[:: max(1, len(points) // 20000)]
-    low, high = np.percentile(some, [0.5, 99.5], axis=0)
-    step = next(s for s in (1.0, 5.0, 25.0, 1e9) if (high - low)[:2].max() / s <= 40.0)
-    first, last = np.floor(low[:2] / step) * step - step, np.ceil(high[:2] / step) * step + step
-    height = float(low[2])
-    for axis in (0, 1):
-        for value in np.arange(first[axis], last[axis] + 0.5 * step, step):
-            along = np.linspace(first[1 - axis], last[1 - axis], 64)
-            path = np.full((64, 3), height)
-            path[:, axis], path[:, 1 - axis] = value, along
-            _polyline(image, eye, path, color, 1.0 * _SUPERSAMPLING)
-
-
-def _with_line(image: ImageU8, eye: _Eye, line: Line, visible: NDArray[np.bool_]) -> ImageU8:
-    """Return the image with a line that has a light border; what is behind a surface shines through."""
-    if len(line.points_m) == 0:
+def _shaded(image: ImageU8, buffer_m: Array) -> ImageU8:
+    """Return the picture, darker where neighbours in eight directions, at two distances, are nearer to the eye."""
+    drawn = np.isfinite(buffer_m)
+    if not drawn.any():
         return image
+    low, high = np.percentile(buffer_m[drawn], [1.0, 99.0])
+    depth = np.where(drawn, buffer_m, 1e9)
+    hidden = np.zeros(depth.shape)
+    for reach, share in ((2, 1.0), (6, 0.5)):
+        around = np.pad(depth, reach, constant_values=1e9)
+        for down in (0, reach, 2 * reach):
+            for across in (0, reach, 2 * reach):
+                beside = around[down : down + depth.shape[0], across : across + depth.shape[1]]
+                hidden += share * np.clip(depth - beside - _NOISE_M, 0.0, 0.04 * (high - low))
+    light = np.exp(-_SHADOW / 8.0 * hidden / max(high - low, 0.1))
+    return np.where(drawn[..., None], image * light[..., None], image).astype(np.uint8)
+
+
+def _with_line(image: ImageU8, view: _View, buffer_m: Array, line: Line, path: Array) -> ImageU8:
+    """Return the picture with a path that has a light border; what is behind a surface shines through."""
+    if len(path) == 0:
+        return image
+    pixels, depth_m = view.see(path)
+    pixels = np.clip(pixels, -1e4, 1e4)
+    columns, rows = np.clip(np.round(pixels), 0, np.array(buffer_m.shape[::-1]) - 1).astype(np.int64).T
+    visible = depth_m <= buffer_m[rows, columns] + _NOISE_M
     behind = image.copy()
-    _polyline(behind, eye, line.points_m, line.color, line.width_px)
+    _polyline(behind, pixels, line.color, line.width_px)
     image = np.asarray(cv2.addWeighted(behind, _HIDDEN_ALPHA, image, 1.0 - _HIDDEN_ALPHA, 0.0), dtype=np.uint8)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]]).astype(np.int8)))
     for color, extra in (((255, 255, 255), 2.0), (line.color, 0.0)):
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
-            _polyline(image, eye, line.points_m[start:stop], color, line.width_px + extra)
+            _polyline(image, pixels[start:stop], color, line.width_px + extra)
     if line.marks_ends:
-        pixels, z = eye.see(line.points_m[[0, -1]])
-        for pixel, fill in zip(pixels[z > _NEAR_M], ((255, 255, 255), line.color), strict=False):
-            _disc(image, pixel, 2.4 * line.width_px, (255, 255, 255))
-            _disc(image, pixel, 1.9 * line.width_px, line.color)
-            _disc(image, pixel, 1.0 * line.width_px, fill)
+        draw_ends(image, pixels, line)
     return image
 
 
-def _polyline(image: ImageU8, eye: _Eye, path: Array, color: tuple[int, int, int], width: float) -> None:
-    pixels, z = eye.see(path)
-    limit = 4.0 * max(image.shape)  # OpenCV's fixed-point coordinates
-    good = (z > _NEAR_M) & (np.abs(pixels) < limit).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        fixed = np.round(pixels[start:stop] * 16.0).astype(np.int32)
-        cv2.polylines(image, [fixed], False, color, max(1, round(width)), cv2.LINE_AA, 4)
+def draw_ends(image: ImageU8, pixels: Array, line: Line) -> None:
+    """Draw a ring at the first and a dot at the last of the pixels [N, 2] of a path."""
+    for pixel, fill in ((pixels[0], (255, 255, 255)), (pixels[-1], line.color)):
+        centre = (round(float(pixel[0]) * 16), round(float(pixel[1]) * 16))
+        for color, radius in (((255, 255, 255), 2.6), (line.color, 2.0), (fill, 1.1)):
+            cv2.circle(image, centre, round(radius * line.width_px * 16), color, -1, cv2.LINE_AA, 4)
 
 
-def _disc(image: ImageU8, pixel: F32, radius: float, color: tuple[int, int, int]) -> None:
-    centre = (round(float(pixel[0]) * 16), round(float(pixel[1]) * 16))
-    if max(map(abs, centre)) < 64 * max(image.shape):
-        cv2.circle(image, centre, round(radius * 16), color, -1, cv2.LINE_AA, 4)
+def _polyline(image: ImageU8, pixels: Array, color: tuple[int, int, int], width: float) -> None:
+    fixed = np.round(pixels * 16.0).astype(np.int32)  # OpenCV's fixed-point coordinates
+    cv2.polylines(image, [fixed], False, color, max(1, round(width)), cv2.LINE_AA, 4)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.core.messages import ImageU8
 from vislam.mapping.drive.drive import Drive, DriveGrid
-from vislam.mapping.pictures.picture import Line
+from vislam.mapping.pictures.picture import Line, draw_ends
 
 _COLORS = {
     Drive.UNKNOWN: (232, 234, 238), Drive.FREE: (196, 231, 203), Drive.OBSTACLE: (52, 58, 70),
@@ -71,10 +71,7 @@ def _draw(image: ImageU8, pixels: NDArray[np.float64], line: Line) -> None:
     for color, width in (((255, 255, 255), line.width_px + 2.0), (line.color, line.width_px)):
         cv2.polylines(image, [fixed], False, color, max(1, round(width)), cv2.LINE_AA, 4)
     if line.marks_ends:
-        for place, fill in ((fixed[0], (255, 255, 255)), (fixed[-1], line.color)):
-            for color, radius in (((255, 255, 255), 2.8), (line.color, 2.2), (fill, 1.2)):
-                centre = (int(place[0]), int(place[1]))
-                cv2.circle(image, centre, round(radius * line.width_px * 16), color, -1, cv2.LINE_AA, 4)
+        draw_ends(image, fixed / 16.0, line)
 
 
 def _with_legend(image: ImageU8, grid: DriveGrid, scale: int) -> ImageU8:
