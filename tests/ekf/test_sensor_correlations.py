@@ -62,7 +62,7 @@ def test_a_marked_place_stays_the_clone_that_was_taken_there(rig) -> None:
         ekf.predict(sample)
         while i < len(flight.frames) and flight.frames[i][0] <= sample.t_ns - 10_000_000:
             ekf.update_vision(motion_of(flight.frames[i][0]), flight.frames[i][1])
-            window = ekf._state.window
+            window = mc.inside(ekf).window
             stamps = [frame.t_ns for frame in window.frames]
             if marked_ns in stamps:
                 at = CLONES + 6 * stamps.index(marked_ns)
@@ -84,7 +84,7 @@ def test_a_marked_place_stays_the_clone_that_was_taken_there(rig) -> None:
     assert most < 0.03
     assert ekf.counters["points_started"] > 20
     assert ekf.counters["tracks_used"] > 200
-    assert not ekf._state.window.P[-1].any()  # the speed's scale has not begun
+    assert not mc.inside(ekf).window.P[-1].any()  # the speed's scale has not begun
 
 
 def test_a_marked_place_stays_the_keyframe_that_was_taken_there() -> None:
@@ -104,11 +104,11 @@ def test_a_marked_place_stays_the_keyframe_that_was_taken_there() -> None:
                 mc.deliver(ekf, vo, begins)
                 if begins is not None:
                     mark(ekf, vo.t_ns)
-                P = ekf._state.P
+                P = mc.inside(ekf).P
                 sigmas = np.sqrt(np.diag(P))
                 apart = np.abs(P[21:] - P[18:21]) / np.outer(sigmas[21:], sigmas)
                 most = max(most, apart.max())
-                np.testing.assert_allclose(ekf.own("mark")[0], ekf._state.x[16:19], atol=1e-3)
+                np.testing.assert_allclose(ekf.own("mark")[0], mc.inside(ekf).x[16:19], atol=1e-3)
                 compared += 1
         print(f"{compared} times, {most:.4f} apart")
         assert most < 0.03
@@ -122,7 +122,7 @@ def test_a_new_keyframe_shares_all_errors_of_the_body() -> None:
     run = SensedRun.make(30, 2.0, sensors, {"speed": 20, "fix": 30})
     _, ekf = list(run.replay(made("loose", Suite(sensors))))[-1]
     assert ekf.add_keyframe(7, ekf.state().t_ns).accepted
-    P = ekf._state.P
+    P = mc.inside(ekf).P
     assert np.abs(P[21:, 3:6]).min() > 1e-7
     np.testing.assert_allclose(P[15:21], P[0:6], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(P[:, 15:21], P[:, 0:6], rtol=1e-9, atol=1e-15)

@@ -26,9 +26,9 @@ EVERY = {"fix": 40, "height": 20, "beacon": 20, "speed": 20}
 
 def numbers(ekf: Ekf | MsckfEkf) -> list[Array]:
     """Return copies of all that a filter estimates."""
-    state, own = ekf.state(), ekf._state.own
-    P = ekf._state.P if isinstance(ekf, Ekf) else ekf._state.window.P
-    return [a.copy() for a in (ekf._state.x, state.covariance, P, own.values, own.covariance)]
+    state, own = ekf.state(), mc.inside(ekf).own
+    P = mc.inside(ekf).P if isinstance(ekf, Ekf) else mc.inside(ekf).window.P
+    return [a.copy() for a in (mc.inside(ekf).x, state.covariance, P, own.values, own.covariance)]
 
 
 def assert_same_bytes(before: list[Array], after: list[Array]) -> None:
@@ -287,8 +287,8 @@ def test_a_second_start_forgets_what_was_known_of_own_variables_only(kind: str) 
     at = len(P) - 1  # speed is the last
     assert not P[at, :at].any()
     ekf.initialise(ekf.state())
-    assert not ekf._state.own.since_ns
-    assert not ekf._state.own.covariance.any()
+    assert not mc.inside(ekf).own.since_ns
+    assert not mc.inside(ekf).own.covariance.any()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -335,7 +335,7 @@ def test_a_filter_without_sensors_is_as_it_was_byte_for_byte(kind: str) -> None:
     with_sensors, bare = full.state(), without.state()
     np.testing.assert_allclose(with_sensors.T_world_body, bare.T_world_body, atol=1e-12)
     np.testing.assert_allclose(with_sensors.covariance, bare.covariance, rtol=1e-9, atol=1e-15)
-    assert not full._state.own.covariance.any()
+    assert not mc.inside(full).own.covariance.any()
 
 
 @pytest.mark.parametrize(("kind", "name"), [("loose", "vo"), ("loose", "bias"), ("tight", "tracks"), ("tight", "hold")])

@@ -104,24 +104,56 @@ def test_stopping_cancels_the_array(cluster, specs, tmp_path):
     assert (cluster / "cancelled").read_text() == "4711"
 
 
-def test_the_array_has_the_time_of_its_jobs_unless_one_asks_otherwise(cluster, specs, tmp_path):
-    def script(options):
-        place = slurm._written(specs, options, tmp_path, None, tmp_path / "slurm")
-        return (place / "array000000.sh").read_text()
+@pytest.fixture
+def answers(cluster, monkeypatch):
+    """A cluster that runs nothing, and whose squeue answers this in turn on stderr, the last for ever."""
+    monkeypatch.setattr(slurm, "_GRACE_S", 0.0)
+    (cluster / "sbatch").write_text("#!/bin/sh\necho 4711\n")
 
-    assert "#SBATCH --array=0-3\n" in script("")
-    assert "#SBATCH --time=10\n" in script("")  # 300 s and five minutes
-    assert "--time" not in script("--time=60")
+    def take(*lines):
+        cases = "".join(f"{n}) echo '{line}' >&2; exit 1;;\n" for n, line in enumerate(lines[:-1]))
+        count = f"n=$(cat {cluster}/asked 2>/dev/null || echo 0); echo $((n + 1)) >{cluster}/asked"
+        (cluster / "squeue").write_text(
+            f"#!/bin/sh\n{count}\ncase $n in\n{cases}*) echo '{lines[-1]}' >&2; exit 1;;\nesac\n"
+        )
+
+    return take
 
 
-def test_more_jobs_than_an_array_holds_are_several(cluster, specs, tmp_path, monkeypatch):
+GONE = "slurm_load_jobs error: Invalid job id specified"
+
+
+def scripts(specs, options, folder):
+    """The scripts that sbatch gets of jobs on a cluster that runs nothing."""
+    run = run_on_slurm(specs, options, folder, None, folder / "slurm", poll_s=0.0)
+    assert next(run)[1]["status"] == "failed"
+    run.close()
+    return [path.read_text() for path in sorted((folder / "slurm").glob("*/array*.sh"))]
+
+
+def test_the_array_has_the_time_of_its_jobs_unless_one_asks_otherwise(answers, specs, tmp_path):
+    answers(GONE)
+    (script,) = scripts(specs, "", tmp_path)
+    assert "#SBATCH --array=0-3\n" in script
+    assert "#SBATCH --time=10\n" in script  # 300 s and five minutes
+    (script,) = scripts(specs, "--time=60", tmp_path / "else")
+    assert "--time" not in script
+
+
+def test_more_jobs_than_an_array_holds_are_several(answers, specs, tmp_path, monkeypatch):
+    answers(GONE)
     monkeypatch.setattr(slurm, "_LARGEST", 3)
-    place = slurm._written(specs, "", tmp_path, None, tmp_path / "slurm")
-    first, second = ((place / f"array00000{n}.sh").read_text() for n in (0, 3))
+    first, second = scripts(specs, "", tmp_path)
     assert "--array=0-2\n" in first
     assert "number=$((0 + SLURM_ARRAY_TASK_ID))" in first
     assert "--array=0-0\n" in second
     assert "number=$((3 + SLURM_ARRAY_TASK_ID))" in second
+
+
+def test_a_scheduler_that_does_not_answer_is_no_end(cluster, answers, specs, tmp_path):
+    answers("slurm_load_jobs error: Unable to contact slurm controller", "timed out", GONE)
+    assert len(scripts(specs, "", tmp_path)) == 1
+    assert int((cluster / "asked").read_text()) == 4  # twice without an answer, and twice gone
 
 
 def test_no_cluster_and_a_refusal_are_told(cluster, specs, tmp_path, monkeypatch):
@@ -131,17 +163,6 @@ def test_no_cluster_and_a_refusal_are_told(cluster, specs, tmp_path, monkeypatch
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UsageError, match=r"--engine slurm needs sbatch: .* run this on a machine that submits"):
         next(run_on_slurm(specs, "", tmp_path, None, tmp_path / "slurm"))
-
-
-def test_a_scheduler_that_does_not_answer_is_no_end(cluster):
-    (cluster / "running").touch()
-    assert slurm._runs(["4711", "4712"])
-    (cluster / "running").unlink()
-    assert not slurm._runs(["4711", "4712"])
-    (cluster / "squeue").write_text("#!/bin/sh\necho 'slurm_load_jobs error: Invalid job id specified' >&2; exit 1\n")
-    assert not slurm._runs(["4711", "4712"])
-    (cluster / "squeue").write_text("#!/bin/sh\necho 'Unable to contact slurm controller' >&2; exit 1\n")
-    assert slurm._runs(["4711", "4712"])
 
 
 def test_options_for_sbatch_without_slurm_are_refused(tmp_path, capsys):

@@ -57,7 +57,7 @@ def test_what_the_second_camera_sees_is_told_as_the_first_would() -> None:
     assert len(seen[14].track_ids) > 40 and camera.contains(seen[14].pixels_px).all()
     _, a, b = np.intersect1d(seen[11].track_ids, seen[14].track_ids, return_indices=True)
     assert len(a) > 30
-    exact = world._draw(0, invert(T_body_cam) @ poses[11] @ T_body_cam)[1]
+    exact = world.draw(0, invert(T_body_cam) @ poses[11] @ T_body_cam)[1]
     before = seen[11].pixels_px[a]
     z = exact[before[:, 1].round().astype(int), before[:, 0].round().astype(int)]
     points = transform_points(poses[11] @ T_body_cam, camera.unproject(before) * z[:, None])

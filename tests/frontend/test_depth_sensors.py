@@ -75,7 +75,7 @@ def test_triangulation_is_exact(seed: int) -> None:
 def test_stereo_measures_inverse_depth(known: bool) -> None:
     world = World("stereo")
     frame = world.frame(0, np.eye(4))
-    z = world._draw(0, np.eye(4))[1]
+    z = world.draw(0, np.eye(4))[1]
     pixels = detect_corners(frame.images[0], 200, 40, 8.0, np.empty((0, 2)), 1.0)
     true_rho = 1.0 / z[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
     expected = true_rho * 1.2 if known else np.full(len(pixels), np.nan)

@@ -128,7 +128,7 @@ def test_metric_keyframes_carry_points_and_depths() -> None:
         in_cam = (points[known] - T_BODY_CAM[:3, 3]) @ T_BODY_CAM[:3, :3]
         assert np.allclose(world.rig.cameras[0].project(in_cam), pixels[known], atol=1e-6)
         truth_z = 1.0 / in_cam[:, 2]
-        exact = world._draw(0, invert(T_BODY_CAM) @ poses[last.keyframe.frame.index] @ T_BODY_CAM)[1]
+        exact = world.draw(0, invert(T_BODY_CAM) @ poses[last.keyframe.frame.index] @ T_BODY_CAM)[1]
         z = exact[pixels[known, 1].round().astype(int), pixels[known, 0].round().astype(int)]
         assert np.median(np.abs(truth_z - 1.0 / z)) < 0.01
         assert last.observations.depth_m is not None and np.isfinite(last.observations.depth_m).mean() > 0.5

@@ -44,7 +44,8 @@ class Outcome:
         self.injected = offered[1] / sum(offered)
         self.error_m = rmse_m(graph.poses(), world.truth)
         says = f"{offered} offered, false kept {self.false_kept}, true {self.true_share:.2f}, rmse {self.error_m:.3f} m"
-        print(f"group {group}: {says}, sigmas of odometry times {graph._estimator.vo_scale:.1f}")
+        assert self.updates[-1].details is not None
+        print(f"group {group}: {says}, sigmas of odometry times {self.updates[-1].details['vo_scale']:.1f}")
 
 
 def world_of(drift: str) -> World:

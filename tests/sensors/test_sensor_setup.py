@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -178,19 +177,19 @@ def test_what_cannot_be_a_kind_is_refused(kind: str, cls: type, message: str) ->
         register(kind, cls)
 
 
-class Package:
-    name = "somebodys-sensors"
-
-
-def installed(monkeypatch: pytest.MonkeyPatch, *values: str) -> None:
-    points = [importlib.metadata.EntryPoint("tilt", v, "vislam.sensors")._for(Package()) for v in values]  # type: ignore[attr-defined]
-    everything = importlib.metadata.EntryPoints(points)
-    monkeypatch.setattr(importlib.metadata, "entry_points", everything.select)
+def installed(monkeypatch: pytest.MonkeyPatch, folder: Path, *values: str) -> None:
+    """Install packages, one for each value, that bring a kind `tilt`."""
+    for n, value in enumerate(values):
+        package = folder / f"sensors_{n}-1.0.dist-info"
+        package.mkdir()
+        (package / "METADATA").write_text(f"Metadata-Version: 2.1\nName: sensors-{n}\nVersion: 1.0\n")
+        (package / "entry_points.txt").write_text(f"[vislam.sensors]\ntilt = {value}\n")
+    monkeypatch.syspath_prepend(str(folder))
 
 
 @pytest.mark.usefixtures("kinds")
-def test_an_installed_package_brings_a_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(monkeypatch, f"{__name__}:Tilt")
+def test_an_installed_package_brings_a_kind(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    installed(monkeypatch, tmp_path, f"{__name__}:Tilt")
     assert kind_class("tilt").__name__ == "Tilt"
 
 
@@ -198,12 +197,14 @@ def test_an_installed_package_brings_a_kind(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (["no_such_module:Tilt"], "package somebodys-sensors cannot be loaded from 'no_such_module:Tilt'"),
-        ([f"{__name__}:GOOD"], "of package somebodys-sensors: .* is no subclass"),
-        (["a:b", "c:d"], "several packages: somebodys-sensors, somebodys-sensors"),
+        (["no_such_module:Tilt"], "package sensors-0 cannot be loaded from 'no_such_module:Tilt'"),
+        ([f"{__name__}:GOOD"], "of package sensors-0: .* is no subclass"),
+        (["a:b", "c:d"], "several packages: sensors-., sensors-"),
     ],
 )
-def test_a_broken_package_is_named(monkeypatch: pytest.MonkeyPatch, values: list[str], message: str) -> None:
-    installed(monkeypatch, *values)
+def test_a_broken_package_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, values: list[str], message: str
+) -> None:
+    installed(monkeypatch, tmp_path, *values)
     with pytest.raises(UsageError, match=message):
         kind_class("tilt")

@@ -61,7 +61,7 @@ class World:
             u, v = np.meshgrid(np.arange(cam.width, dtype=float), np.arange(cam.height, dtype=float))
             self._rays.append(cam.unproject(np.column_stack([u.ravel(), v.ravel()])))
 
-    def _draw(self, index: int, T_world_cam: Array) -> tuple[np.ndarray, np.ndarray]:
+    def draw(self, index: int, T_world_cam: Array) -> tuple[np.ndarray, np.ndarray]:
         cam = self.rig.cameras[index]
         directions = self._rays[index] @ T_world_cam[:3, :3].T
         nearest, grey = np.full(len(directions), np.inf), np.zeros(len(directions), np.float32)
@@ -84,7 +84,7 @@ class World:
     def frame(self, index: int, T_world_body: Array, t_ns: int | None = None) -> Frame:
         """Draw one frame; the world is cam0 of the identity pose."""
         drawn = [
-            self._draw(i, invert(T_BODY_CAM) @ T_world_body @ T_body_cam)
+            self.draw(i, invert(T_BODY_CAM) @ T_world_body @ T_body_cam)
             for i, T_body_cam in enumerate(self.rig.T_body_cams)
         ]
         depth = None

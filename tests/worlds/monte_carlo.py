@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from vislam.config import EkfConfig
 from vislam.core.geometry import invert, quaternion_wxyz, se3_adjoint, so3_exp, transform
 from vislam.core.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
-from vislam.ekf import Ekf
+from vislam.ekf import Ekf, MsckfEkf
 from vislam.ekf.loose import kernels
 from vislam.imu import ImuNoise
 from worlds.motion import NS, T0_NS, Motion, relative_vo, state_error
@@ -136,6 +136,11 @@ def drive(motion: str, seed: int, duration_s: float, noise: ImuNoise = IMU) -> D
     return Drive(t_ns, ideal + biases + rng.normal(size=(count, 6)) * white, truth, biases)
 
 
+def inside(ekf: Ekf | MsckfEkf) -> Any:
+    """Return the state within a filter, of which `state()` and `own()` show a part: clones and correlations, too."""
+    return ekf._state
+
+
 def soak(duration_s: float, config: EkfConfig, seed: int = 3) -> tuple[float, dict[str, int]]:
     """Drive long, with vision late and lossy; return the smallest eigenvalue that P ever had, and the counters.
 
@@ -147,7 +152,7 @@ def soak(duration_s: float, config: EkfConfig, seed: int = 3) -> tuple[float, di
     for ekf, _, k in replay(scenario, config, seed):
         if k % 10:
             continue
-        P = ekf._state.P
+        P = inside(ekf).P
         assert np.isfinite(P).all()
         assert np.array_equal(P, P.T)
         sigmas = np.sqrt(np.diag(P))
