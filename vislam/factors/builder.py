@@ -86,7 +86,7 @@ class Builder:
         if record.T_previous_body is not None:
             factors.append(self._visual(record, before, guess, vo_scale))
         if integrated is not None and self._preintegrator is not None:
-            factors.append(self._preintegrator.factor(record.id, integrated))
+            factors.append(self._preintegrator.factor(record.id - 1, record.id, integrated))
             if integrated.outage_s > 0.0:
                 notes.append(f"IMU outage of {integrated.outage_s:.2f} s bridged")
         elif has_imu and self._preintegrator is not None:

@@ -132,7 +132,7 @@ def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> Keyfram
         if vo.keyframe_id != previous.id:
             raise DataError(f"{what}: its odometry is relative to keyframe {vo.keyframe_id}, expected {previous.id}")
         T, covariance = vo.T_keyframe_body, vo.covariance
-    imu = None if packet.imu is None else _checked_span(packet.imu, previous.t_ns, keyframe.t_ns, what)
+    imu = None if packet.imu is None else checked_span(packet.imu, previous.t_ns, keyframe.t_ns, what)
     degraded = vo.tracking is Tracking.DEGRADED
     rest_from = None
     if packet.at_rest:
@@ -181,7 +181,8 @@ def checked_poses(T: Sequence[Array], whats: Sequence[str]) -> Array:
     return nearest_rigid(matrices)
 
 
-def _checked_span(span: ImuSpan, t0_ns: int, t1_ns: int, what: str) -> ImuSpan:
+def checked_span(span: ImuSpan, t0_ns: int, t1_ns: int, what: str) -> ImuSpan:
+    """Return inertial samples as arrays of float; DataError naming `what` when they cannot belong to [t0_ns, t1_ns]."""
     t: NDArray[np.int64] = np.array(span.t_ns, dtype=np.int64)
     gyro = np.array(span.gyro_rad_s, dtype=np.float64)
     accel = np.array(span.accel_m_s2, dtype=np.float64)

@@ -8,7 +8,7 @@ import numpy as np
 from vislam.core.messages import Array
 
 _INDEX_BITS = 56
-_POSE, _VELOCITY, _BIAS, _OWN, _WALKING = (ord(c) << _INDEX_BITS for c in "xvbow")
+_POSE, _VELOCITY, _BIAS, _POINT, _OWN, _WALKING = (ord(c) << _INDEX_BITS for c in "xvblow")
 _VARIABLE_BITS = 40  # above the id of a keyframe
 
 
@@ -25,6 +25,11 @@ def V(i: int) -> int:
 def B(i: int) -> int:
     """Return the key of keyframe i's IMU biases."""
     return _BIAS | i
+
+
+def L(n: int) -> int:
+    """Return the key of landmark n, a point in map."""
+    return _POINT | n
 
 
 def own_key(n: int) -> int:

@@ -71,9 +71,9 @@ class Preintegrator:
                 pim.integrateMeasurement(mean_accel[i], mean_gyro[i], step_s)
         return Preintegrated(pim, float(t_s[-1] - t_s[0]), outage_s)
 
-    def factor(self, k: int, integrated: Preintegrated) -> gtsam.GalileanCombinedImuFactor:
-        """Return the factor between keyframes k - 1 and k."""
-        return gtsam.GalileanCombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), integrated.pim)
+    def factor(self, i: int, j: int, integrated: Preintegrated) -> gtsam.GalileanCombinedImuFactor:
+        """Return the factor between two keyframes."""
+        return gtsam.GalileanCombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), integrated.pim)
 
     def bias_walk_sigmas(self, duration_s: float) -> Array:
         """Return the sigmas [6] of the bias change over a time, accelerometer first as in gtsam."""

@@ -66,6 +66,7 @@ class IncrementalSolver:
         pose = np.repeat([config.relinearize_rotation_rad, config.relinearize_translation_m], 3)
         thresholds.insert(("x", pose))
         thresholds.insert(("v", np.full(3, config.relinearize_velocity_m_s)))
+        thresholds.insert(("l", np.full(3, config.relinearize_translation_m)))
         thresholds.insert(("b", np.full(6, config.relinearize_bias)))
         for letter in "ow":
             thresholds.insert((letter, np.full(1, RELINEARIZE_OWN)))
@@ -115,6 +116,7 @@ class BatchSolver:
         self.reads_all = True
         self._graph = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
+        self._marginals: gtsam.Marginals | None = None  # of the estimate as it is
 
     def update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: int | None = None
@@ -139,6 +141,7 @@ class BatchSolver:
 
     def iterate(self, count: int) -> None:
         """See Solver; keeps the values it has when even LM fails."""
+        self._marginals = None
         try:
             self._values = optimize(self._graph, self._values, count)
         except FAILURES:
@@ -150,8 +153,9 @@ class BatchSolver:
 
     def joint_covariance(self, keys: list[int]) -> Array:
         """See Solver."""
-        joint = gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(keys)
-        return np.asarray(joint.fullMatrix())
+        if self._marginals is None:
+            self._marginals = gtsam.Marginals(self._graph, self._values)
+        return np.asarray(self._marginals.jointMarginalCovariance(keys).fullMatrix())
 
 
 def optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:

@@ -119,7 +119,7 @@ class Chain:
         bias = values.atConstantBias(B(k - 1))
         integrated = self._preintegrator.integrate(record.imu, before.t_ns, record.t_ns, bias)
         if integrated is not None:
-            factors.append(self._preintegrator.factor(k, integrated))
+            factors.append(self._preintegrator.factor(k - 1, k, integrated))
             return True
         walk = self._preintegrator.bias_walk_sigmas(duration_s)
         factors.append(motion.loose_velocity(k, self._slope(k), self._config.lost_speed_sigma_m_s))
