@@ -42,10 +42,10 @@ from worlds.parts import GRAVITY_M_S2  # noqa: E402
 DT = 1.0 / mc.IMU.rate_hz
 SIGMAS = np.array(
     [
-        mc.IMU.gyro_noise_density,
-        mc.IMU.accel_noise_density,
-        mc.IMU.gyro_bias_walk,
-        mc.IMU.accel_bias_walk,
+        mc.IMU.gyroscope_noise_density,
+        mc.IMU.accelerometer_noise_density,
+        mc.IMU.gyroscope_random_walk,
+        mc.IMU.accelerometer_random_walk,
         0.0,
         0.0,
     ]

@@ -95,11 +95,11 @@ class Peer:
         self.smart_params.setLandmarkDistanceThreshold(30.0)
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
         noise = World.noise
-        params.setGyroscopeCovariance(np.eye(3) * noise.gyro_noise_density**2)
-        params.setAccelerometerCovariance(np.eye(3) * noise.accel_noise_density**2)
+        params.setGyroscopeCovariance(np.eye(3) * noise.gyroscope_noise_density**2)
+        params.setAccelerometerCovariance(np.eye(3) * noise.accelerometer_noise_density**2)
         params.setIntegrationCovariance(np.eye(3) * 1e-8)
-        params.setBiasOmegaCovariance(np.eye(3) * noise.gyro_bias_walk**2)
-        params.setBiasAccCovariance(np.eye(3) * noise.accel_bias_walk**2)
+        params.setBiasOmegaCovariance(np.eye(3) * noise.gyroscope_random_walk**2)
+        params.setBiasAccCovariance(np.eye(3) * noise.accelerometer_random_walk**2)
         self.params = params
         self.tracks: dict[int, Track] = {}
         self.names: dict[int, int] = {}  # the front end's id -> ours: a track starts again under a new name

@@ -146,7 +146,7 @@ class Drive:
         gravity = config.imu.gravity_m_s2
         self.filter = Filtering(config.ekf, table.noise, gravity, _NO_RIG, suite)
         self.buffer = ImuBuffer(config.imu)
-        self.intake = ReadingIntake(suite, self.filter, self.buffer, gravity, table.noise.accel_noise_density)
+        self.intake = ReadingIntake(suite, self.filter, self.buffer, gravity, table.noise.accelerometer_noise_density)
         self.graph = PoseGraph(config.graph, table.noise, gravity, _NO_RIG, config.window, suite)
         self._table, self._has_car = table, assumption == "car"
         self._car_ns = 0

@@ -118,7 +118,9 @@ class Drive:
         noise = ImuNoise(0.01, 0.5, 1e-4, 1e-4, 1.0 / period_s)
         self.filter = Filtering(config.ekf, noise, self.gravity_m_s2, _NO_RIG, suite)
         self.buffer = ImuBuffer(config.imu)
-        self.intake = ReadingIntake(suite, self.filter, self.buffer, self.gravity_m_s2, noise.accel_noise_density)
+        self.intake = ReadingIntake(
+            suite, self.filter, self.buffer, self.gravity_m_s2, noise.accelerometer_noise_density
+        )
         self.graph = PoseGraph(config.graph, noise, self.gravity_m_s2, _NO_RIG, config.window, suite)
         self._plaza, self._suite = plaza, suite
         self.cpu_s = {"filter": 0.0, "graph": 0.0}

@@ -70,8 +70,8 @@ def test_the_verb_writes_a_file_that_kalibr_and_the_config_take(
     assert answer["driving"]["accel_typical"] == pytest.approx(3.0, rel=0.1)
     assert 1.7 < answer["driving"]["accel_quiet"] < 3.0  # the quietest of 120 windows of 25 samples
     written = read_noise(out / "noise.yaml")
-    assert written.gyro_noise_density == pytest.approx(answer["written"]["gyro_noise_density"])
-    assert written.accel_noise_density > 1.7 * answer["model"]["accel_noise_density"]
+    assert written.gyroscope_noise_density == pytest.approx(answer["written"]["gyroscope_noise_density"])
+    assert written.accelerometer_noise_density > 1.7 * answer["model"]["accelerometer_noise_density"]
     assert written.rate_hz == pytest.approx(50.0)
     picture = cv2.imread(str(out / "noise.png"))
     assert picture is not None and picture.std() > 10.0

@@ -187,7 +187,7 @@ def calibration_files(folder: Path) -> CalibrationConfig:
     texts = {
         "camera": camchain_text([CameraCalibration(new, T, 0.012, 0.0005)], ""),
         "imu": imu_calibration_text(CALIBRATION, ""),
-        "imu_noise": imu_noise_text(replace(NOISE, accel_noise_density=0.5), ""),
+        "imu_noise": imu_noise_text(replace(NOISE, accelerometer_noise_density=0.5), ""),
         "mag": mag_calibration_text(MagCalibration(np.array([10.0, 20.0, 20.0]), 3.0 * np.eye(3)), ""),
     }
     for name, text in texts.items():
@@ -199,7 +199,7 @@ def test_a_recording_is_seen_with_the_files_that_are_named(tmp_path: Path) -> No
     recording = open_dataset(str(raw_recording(tmp_path / "r")), calibration_files(tmp_path / "c"))
     assert recording.rig.cameras[0].fx == 77.0
     assert recording.rig.T_body_cams[0] == pytest.approx(se3_exp(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])))
-    assert recording.imu_noise == replace(NOISE, accel_noise_density=0.5)
+    assert recording.imu_noise == replace(NOISE, accelerometer_noise_density=0.5)
     events = list(recording.events())
     imu = next(value for value in events if isinstance(value, ImuSample))
     mag = next(value for value in events if isinstance(value, MagSample))

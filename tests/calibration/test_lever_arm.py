@@ -46,8 +46,8 @@ def stretch(seed: int, turns: float) -> tuple[Piece, list[ImuSample], float]:
     (R0, P0), (R, P), (R1, P1) = body(t_s - STEP_S), body(t_s), body(t_s + STEP_S)
     forces = np.einsum("nji,nj->ni", R, (P1 - 2.0 * P + P0) / STEP_S**2 - gravity) + BIAS_M_S2
     rates = np.array([so3_log(np.ascontiguousarray(a.T @ b)) for a, b in zip(R0, R1, strict=True)]) / (2.0 * STEP_S)
-    forces += rng.normal(0.0, NOISE.accel_noise_density * 200.0**0.5, forces.shape)
-    rates += rng.normal(0.0, NOISE.gyro_noise_density * 200.0**0.5, rates.shape)
+    forces += rng.normal(0.0, NOISE.accelerometer_noise_density * 200.0**0.5, forces.shape)
+    rates += rng.normal(0.0, NOISE.gyroscope_noise_density * 200.0**0.5, rates.shape)
     stamps = begin_ns + np.round((t_s + OFFSET_S) * 1e9).astype(np.int64)
     samples = [ImuSample(int(t), w, f) for t, w, f in zip(stamps, rates, forces, strict=True)]
     keys_s = np.linspace(0.0, 4.0, 16)

@@ -47,7 +47,7 @@ def test_stereo_recording_gives_what_was_written(tmp_path: Path) -> None:
     assert camera.distortion == "radtan" and camera.coefficients == (-0.1, 0.01, 1e-4, 2e-4)
     np.testing.assert_allclose(recording.rig.T_cam0_cam1[:3, 3], [0.1, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(recording.rig.T_body_cams[0][:3, :3], R_BODY_CAM)
-    assert recording.imu_noise is not None and recording.imu_noise.accel_bias_walk == 3e-3
+    assert recording.imu_noise is not None and recording.imu_noise.accelerometer_random_walk == 3e-3
     frames = frames_of(recording)
     assert [f.t_ns for f in frames] == [BEGIN_NS + i * FRAME_NS for i in range(6)]
     assert [f.index for f in frames] == list(range(6))

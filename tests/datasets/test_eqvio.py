@@ -67,7 +67,7 @@ def test_samples_and_tracks_come_as_they_were_written(tmp_path: Path) -> None:
     assert recording.rig.T_body_cams[0][:3, 3] == pytest.approx([-0.02, -0.06, 0.01])
     noise = recording.imu_noise
     assert noise is not None and noise.rate_hz == pytest.approx(100.0)
-    assert [noise.gyro_noise_density, noise.accel_noise_density] == pytest.approx([2e-4, 1e-2])
+    assert [noise.gyroscope_noise_density, noise.accelerometer_noise_density] == pytest.approx([2e-4, 1e-2])
     assert recording.truth() is None
     later = [event for event in recording.events(5_500_000_000) if isinstance(event, Frame)]
     assert [frame.index for frame in later] == list(range(10, 40))

@@ -131,7 +131,7 @@ def test_prediction_is_preintegration() -> None:
     motion = Motion.random(2)
     samples = motion.samples(0.5)[0]
     T, v, *_ = motion.at(0.0)
-    ekf = Ekf(EkfConfig(), replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0), GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), replace(EUROC_NOISE, gyroscope_random_walk=0.0, accelerometer_random_walk=0.0), GRAVITY_M_S2)
     ekf.predict(samples[0])
     ekf.initialise(NavState(T0_NS, T, v, np.zeros(3), np.zeros(3), np.zeros((15, 15))))
     for s in samples[1:]:
@@ -669,8 +669,8 @@ def test_rest_holds_the_pose_at_which_it_began_through_keyframes_and_a_missed_fr
     sigmas = np.repeat([0.01, 0.001, 0.05, 0.02, 0.1], 3)
     ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     per_sample = np.sqrt(EUROC_NOISE.rate_hz) * np.repeat([3.0, 1.0], 3)
-    per_sample[:3] *= EUROC_NOISE.gyro_noise_density
-    per_sample[3:] *= EUROC_NOISE.accel_noise_density
+    per_sample[:3] *= EUROC_NOISE.gyroscope_noise_density
+    per_sample[3:] *= EUROC_NOISE.accelerometer_noise_density
     vo_sigmas = np.repeat([np.deg2rad(0.05), 0.004], 3)
     keyframe, at_begin = 0, None
     assert ekf.add_keyframe(0, T0_NS).accepted

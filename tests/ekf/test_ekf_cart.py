@@ -160,8 +160,8 @@ def test_noise_that_is_told_late_counts_from_when_it_began() -> None:
     assert before is not None and after is not None and plain is not None and calmer is not None
     assert before.covariance == pytest.approx(plain.covariance, rel=1e-9, abs=1e-15)
     grown = np.diag(after.covariance - before.covariance) - np.diag(calmer.covariance - plain.covariance)
-    assert grown[6] == pytest.approx(0.6 * NOISE.accel_noise_density**2 * (20.0**2 - 1.0), rel=0.05)
-    assert grown[2] == pytest.approx(0.6 * NOISE.gyro_noise_density**2 * (3.0**2 - 1.0), rel=0.05)
+    assert grown[6] == pytest.approx(0.6 * NOISE.accelerometer_noise_density**2 * (20.0**2 - 1.0), rel=0.05)
+    assert grown[2] == pytest.approx(0.6 * NOISE.gyroscope_noise_density**2 * (3.0**2 - 1.0), rel=0.05)
 
 
 def test_noise_that_is_no_number_is_refused() -> None:

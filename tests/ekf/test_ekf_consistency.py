@@ -164,7 +164,7 @@ def test_real_inertial_data_with_vision_made_from_truth(data_root, name: str, at
     ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
     ekf.initialise(NavState(start_ns, T, real.velocity(start_ns), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     i, nis, speed_chi2, seen, true = 0, [], [], [], []
-    floor = NoiseFloor(replace(EUROC_NOISE, gyro_scale_sigma=0.003, accel_scale_sigma=0.01))
+    floor = NoiseFloor(replace(EUROC_NOISE, gyroscope_scale_sigma=0.003, accelerometer_scale_sigma=0.01))
     for sample in real.samples:
         ekf.predict(sample)
         if floor.add(sample):

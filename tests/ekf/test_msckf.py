@@ -233,7 +233,7 @@ def test_standing_still_does_not_drift() -> None:
     ekf.initialise(NavState(begin, T, np.zeros(3), np.zeros(3), np.zeros(3), np.diag(SIGMAS**2)))
     landmarks_px = rng.uniform([10, 10], [740, 470], (150, 2))
     force = T[:3, :3].T @ np.array([0.0, 0.0, GRAVITY_M_S2])
-    white = np.repeat([CHEAP.gyro_noise_density, CHEAP.accel_noise_density], 3) * np.sqrt(CHEAP.rate_hz)
+    white = np.repeat([CHEAP.gyroscope_noise_density, CHEAP.accelerometer_noise_density], 3) * np.sqrt(CHEAP.rate_hz)
     first = None
     for k in range(1, 6001):
         values = np.concatenate((np.zeros(3), force)) + bias + rng.normal(size=6) * white

@@ -23,7 +23,12 @@ NS = 1_000_000_000
 
 def too_sure(kind: str, suite: Suite) -> Ekf | MsckfEkf:
     """Return a filter that is told an IMU ten times as good as it is."""
-    names = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
+    names = (
+        "gyroscope_noise_density",
+        "accelerometer_noise_density",
+        "gyroscope_random_walk",
+        "accelerometer_random_walk",
+    )
     imu = replace(mc.IMU, **{name: 0.1 * getattr(mc.IMU, name) for name in names})
     if kind == "loose":
         return Ekf(mc.honest(), imu, GRAVITY_M_S2, suite=suite)

@@ -42,7 +42,7 @@ def test_covariance_is_honest() -> None:
     """Mean squared error per degree of freedom of position and velocity over many seconds of noise."""
     d2 = []
     world = World(150.0, keyframe_hz=1.0, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), walk=False, seed=5)
-    noise = replace(EUROC_NOISE, gyro_bias_walk=0.0, accel_bias_walk=0.0)  # as in this world
+    noise = replace(EUROC_NOISE, gyroscope_random_walk=0.0, accelerometer_random_walk=0.0)  # as in this world
     integrator = Preintegrator(GraphConfig(imu_integration_sigma=1e-6), noise, GRAVITY_M_S2)
     for k in range(1, world.count):
         done = integrator.integrate(world.span(k), world.t_ns(k - 1), world.t_ns(k), NO_BIAS)
@@ -116,5 +116,5 @@ def test_bias_walk_is_floored_against_gtsams_pivot_test() -> None:
     tiny = ImuNoise(1e-4, 1e-3, 1e-9, 1e-9, 200.0)
     config = GraphConfig()
     integrator = Preintegrator(config, tiny, GRAVITY_M_S2)
-    assert integrator.gyro_bias_walk == config.gyro_bias_walk_floor
-    assert integrator.accel_bias_walk == config.accel_bias_walk_floor
+    assert integrator.gyroscope_random_walk == config.gyro_bias_walk_floor
+    assert integrator.accelerometer_random_walk == config.accel_bias_walk_floor

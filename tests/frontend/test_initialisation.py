@@ -41,7 +41,7 @@ class Feed:
     @staticmethod
     def still(duration_s: float = 2.0, gravity: float = GRAVITY_M_S2) -> Feed:
         rng, up = np.random.default_rng(2), RESTING[2, :3]
-        white = np.repeat([QUIET.gyro_noise_density, QUIET.accel_noise_density], 3) * np.sqrt(200.0)
+        white = np.repeat([QUIET.gyroscope_noise_density, QUIET.accelerometer_noise_density], 3) * np.sqrt(200.0)
         level = np.concatenate([GYRO_BIAS, gravity * up])
         samples = []
         for k in range(int(duration_s * 200) + 1):

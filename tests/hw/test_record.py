@@ -127,7 +127,7 @@ def test_samples_are_raw_on_disk_and_calibrated_when_read(tty: Path, sensors: Se
     assert np.mean([s.gyro_rad_s for s in imu], axis=0) == pytest.approx([0.0, 0.0, -0.5], abs=0.01)
     assert np.mean([s.accel_m_s2 for s in imu], axis=0) == pytest.approx([0.0, 0.0, 19.61], abs=0.1)
     assert np.mean([s.field_ut for s in mag], axis=0) == pytest.approx([15.0, 0.0, -43.0], abs=0.5)
-    assert open_dataset(str(tmp_path / "r")).imu_noise.accel_noise_density == 0.01
+    assert open_dataset(str(tmp_path / "r")).imu_noise.accelerometer_noise_density == 0.01
     assert open_dataset(str(tmp_path / "r")).imu_noise.rate_hz == 400.0
 
 

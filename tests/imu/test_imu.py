@@ -130,7 +130,7 @@ def test_preintegration_covariance_is_honest() -> None:
     motion, rng, runs = Motion.random(5), np.random.default_rng(11), 400
     clean = to_span(motion.samples(0.5)[0])
     ideal = preintegrate(clean)
-    white = np.array([EUROC_NOISE.gyro_noise_density, EUROC_NOISE.accel_noise_density]) * np.sqrt(200.0)
+    white = np.array([EUROC_NOISE.gyroscope_noise_density, EUROC_NOISE.accelerometer_noise_density]) * np.sqrt(200.0)
     total = 0.0
     for _ in range(runs):
         gyro = clean.gyro_rad_s + rng.normal(size=clean.gyro_rad_s.shape) * white[0]
@@ -222,7 +222,7 @@ def test_a_smooth_start_ends_rest_by_the_speed_that_it_gains() -> None:
     rng = np.random.default_rng(3)
     t_s = 0.005 * np.arange(6601)
     speed = np.where(t_s > 30.0, 0.15 * (t_s - 30.0) ** 2, 0.0)
-    white = np.array([EUROC_NOISE.gyro_noise_density, EUROC_NOISE.accel_noise_density]) * np.sqrt(200.0)
+    white = np.array([EUROC_NOISE.gyroscope_noise_density, EUROC_NOISE.accelerometer_noise_density]) * np.sqrt(200.0)
     samples = [
         ImuSample(
             T0_NS + 5_000_000 * k,

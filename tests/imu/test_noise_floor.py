@@ -34,8 +34,8 @@ def ride(noise: ImuNoise, seconds: float = 10.0) -> list[ImuSample]:
         samples.append(
             ImuSample(
                 round(k / RATE_HZ * NS),
-                rate + noise.gyro_noise_density * white[:3],
-                force + noise.accel_noise_density * white[3:],
+                rate + noise.gyroscope_noise_density * white[:3],
+                force + noise.accelerometer_noise_density * white[3:],
             )
         )
     return samples
@@ -51,8 +51,8 @@ def floor(model: ImuNoise, samples: list[ImuSample]) -> NoiseFloor:
 def scaled(factor: float) -> ImuNoise:
     return replace(
         TRUE,
-        gyro_noise_density=factor * TRUE.gyro_noise_density,
-        accel_noise_density=factor * TRUE.accel_noise_density,
+        gyroscope_noise_density=factor * TRUE.gyroscope_noise_density,
+        accelerometer_noise_density=factor * TRUE.accelerometer_noise_density,
     )
 
 
@@ -86,7 +86,7 @@ def test_vibration_above_the_band_of_motion_is_not_white_noise() -> None:
     assert calm.ratios is not None
     assert rough.ratios is not None
     second_difference = np.std(np.diff([s.accel_m_s2 for s in shaken(ride(TRUE), 0.3, 5.0)], n=2, axis=0))
-    assert second_difference / np.sqrt(6.0) > 5.0 * TRUE.accel_noise_density * np.sqrt(RATE_HZ)
+    assert second_difference / np.sqrt(6.0) > 5.0 * TRUE.accelerometer_noise_density * np.sqrt(RATE_HZ)
     assert rough.ratios.accel_typical < 1.3 * calm.ratios.accel_typical
     assert rough.ratios.gyro_typical < 1.3 * calm.ratios.gyro_typical
 
@@ -100,8 +100,12 @@ def test_a_model_that_cannot_be_right_is_told_and_never_lowered(factor: float) -
     assert "gyroscope" in warnings[0]
     assert "accelerometer" in warnings[1]
     used = found.at_least_seen()
-    assert used.gyro_noise_density == pytest.approx(max(model.gyro_noise_density, TRUE.gyro_noise_density), rel=0.2)
-    assert used.accel_noise_density == pytest.approx(max(model.accel_noise_density, TRUE.accel_noise_density), rel=0.2)
+    assert used.gyroscope_noise_density == pytest.approx(
+        max(model.gyroscope_noise_density, TRUE.gyroscope_noise_density), rel=0.2
+    )
+    assert used.accelerometer_noise_density == pytest.approx(
+        max(model.accelerometer_noise_density, TRUE.accelerometer_noise_density), rel=0.2
+    )
 
 
 def test_a_right_model_gives_no_warning_and_stays() -> None:

@@ -214,7 +214,9 @@ def test_a_cart_that_stands_while_the_camera_is_away_does_not_drift() -> None:
     """Rest from inertial data alone: offered while the filter sees no speed, and the other twin is told."""
     rng = np.random.default_rng(8)
     world = VisionWorld.make(seed=6, duration_s=3.0)
-    white = np.repeat([CART_IMU.gyro_noise_density, CART_IMU.accel_noise_density], 3) * np.sqrt(CART_IMU.rate_hz)
+    white = np.repeat([CART_IMU.gyroscope_noise_density, CART_IMU.accelerometer_noise_density], 3) * np.sqrt(
+        CART_IMU.rate_hz
+    )
     values = np.array([0.01, -0.02, 0.005, 0.02, -0.03, GRAVITY_M_S2 + 0.02]) + rng.normal(size=(4000, 6)) * white
     samples = [ImuSample(T0_NS + k * 10_000_000, v[:3].copy(), v[3:].copy()) for k, v in enumerate(values)]
     still = replace(world.start.state, T_world_body=np.eye(4), velocity_world_m_s=np.zeros(3))

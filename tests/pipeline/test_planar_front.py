@@ -58,8 +58,8 @@ def cart(
     record = sense_imu(motion.at(imu_s), GY85_IMU, 9.81, np.random.default_rng(seed), True, GY85_TURN_ON)
     drives = (imu_s > 2.0)[:, None] * np.sqrt((shaking**2 - 1.0) * GY85_IMU.rate_hz)
     white = np.random.default_rng([seed, 1]).normal(size=(2, len(imu_s), 3)) * drives
-    gyros = record.gyro_rad_s + GY85_IMU.gyro_noise_density * white[0]
-    accels = record.accel_m_s2 + GY85_IMU.accel_noise_density * white[1]
+    gyros = record.gyro_rad_s + GY85_IMU.gyroscope_noise_density * white[0]
+    accels = record.accel_m_s2 + GY85_IMU.accelerometer_noise_density * white[1]
     samples = tuple(
         ImuSample(t, gyro, accel) for t, gyro, accel in zip(stamp_ns(imu_s).tolist(), gyros, accels, strict=True)
     )

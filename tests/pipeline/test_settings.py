@@ -96,7 +96,7 @@ def test_over_a_floor_the_height_says_how_sure_metres_are():
 
 def test_what_is_told_is_not_made_surer():
     source = recording()
-    noise = replace(source.imu_noise, accel_scale_sigma=0.01)
+    noise = replace(source.imu_noise, accelerometer_scale_sigma=0.01)
     config = Config()
     assert derived(config, source.rig, noise).graph.scale_sigma == 0.01
     told = replace(config, graph=replace(config.graph, scale_sigma=0.05))

@@ -326,6 +326,15 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
         Session(tmp_path / "session.db")
 
 
+def test_noise_under_the_names_before_those_of_kalibr_is_read(tmp_path):
+    writer, *_ = write_three(tmp_path / "session.db")
+    old = {"gyro_noise_density": 1.7e-4, "accel_noise_density": 2.0e-3, "gyro_bias_walk": 1.9393e-5}
+    writer.tell({"imu_noise": old | {"accel_bias_walk": 3.0e-3, "rate_hz": 200.0, "gyro_scale_sigma": None}})
+    writer.close()
+    with closing(Session(tmp_path / "session.db")) as session:
+        assert session.factor_log().noise == NOISE
+
+
 def test_a_place_that_cannot_be_written_is_a_storage_error(tmp_path):
     with pytest.raises(StorageError, match="cannot be written"):
         SessionWriter(tmp_path / "absent" / "session.db", {}, RIG, None, 9.81)

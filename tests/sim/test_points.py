@@ -224,11 +224,11 @@ def test_person_fills_a_part_of_the_image_and_moves_together() -> None:
 def test_told_imu_noise_is_off_by_the_factor() -> None:
     recording = open_points("still", duration_s=5.0, imu_noise_factor=0.1)
     assert recording.imu_noise is not None
-    assert recording.imu_noise.gyro_noise_density == pytest.approx(0.1 * CONSUMER_IMU.gyro_noise_density)
-    assert recording.imu_noise.accel_bias_walk == pytest.approx(0.1 * CONSUMER_IMU.accel_bias_walk)
+    assert recording.imu_noise.gyroscope_noise_density == pytest.approx(0.1 * CONSUMER_IMU.gyroscope_noise_density)
+    assert recording.imu_noise.accelerometer_random_walk == pytest.approx(0.1 * CONSUMER_IMU.accelerometer_random_walk)
     assert recording.imu_noise.rate_hz == CONSUMER_IMU.rate_hz
     gyro = np.array([sample.gyro_rad_s for sample in samples(recording)])
-    assert gyro.std(axis=0).mean() == pytest.approx(CONSUMER_IMU.gyro_noise_density * np.sqrt(200.0), rel=0.05)
+    assert gyro.std(axis=0).mean() == pytest.approx(CONSUMER_IMU.gyroscope_noise_density * np.sqrt(200.0), rel=0.05)
 
 
 def test_exact_imu_is_exact_and_biases_walk_across_pieces() -> None:
@@ -240,11 +240,11 @@ def test_exact_imu_is_exact_and_biases_walk_across_pieces() -> None:
     stamps = np.array([s.t_ns for s in sensed])
     states = recording.true_states(stamps)
     steps = np.diff(states.accel_bias_m_s2, axis=0)
-    expected = CONSUMER_IMU.accel_bias_walk / np.sqrt(CONSUMER_IMU.rate_hz)
+    expected = CONSUMER_IMU.accelerometer_random_walk / np.sqrt(CONSUMER_IMU.rate_hz)
     assert steps.std() == pytest.approx(expected, rel=0.05) and np.abs(steps).max() < 6.0 * expected  # no seam
     force = np.array([s.accel_m_s2 for s in sensed]) - states.accel_bias_m_s2
     up = states.T_world_body[:, 2, :3] * 9.81
-    assert (force - up).std() == pytest.approx(CONSUMER_IMU.accel_noise_density * np.sqrt(200.0), rel=0.03)
+    assert (force - up).std() == pytest.approx(CONSUMER_IMU.accelerometer_noise_density * np.sqrt(200.0), rel=0.03)
     assert np.abs((force - up).mean(axis=0)).max() < 2e-3
 
 

@@ -103,7 +103,7 @@ def test_gyroscope_and_motion_agree_over_a_frame(data_root: Path, name: str) -> 
     late = motion.at(begin_s + 0.005).T_world_body[:, :3, :3].transpose(0, 2, 1)
     late_rad = angles_rad(turns.transpose(0, 2, 1) @ late @ motion.at(begin_s + step_s + 0.005).T_world_body[:, :3, :3])
     rms, rms_late = np.sqrt(np.mean(error_rad**2)), np.sqrt(np.mean(late_rad**2))
-    noise_rad = np.sqrt(3 * step_s) * data.noise.gyro_noise_density
+    noise_rad = np.sqrt(3 * step_s) * data.noise.gyroscope_noise_density
     print(f"{name}: {rms * 1e6:.0f} urad rms over 50 ms, white noise explains {noise_rad * 1e6:.0f}, late {rms_late}")
     assert rms < 3.0 * noise_rad  # the rest: the bias wanders, and the truth has noise of its own
     assert rms * FX_PX < 0.1

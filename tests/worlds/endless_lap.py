@@ -106,8 +106,8 @@ class LapWorld:
         per = round(_IMU_HZ / self.keyframe_hz)
         n = np.arange((k - 1) * per, k * per + 1)
         at, noise, rng = n % (round(self.lap_s * _IMU_HZ)), self.noise, self.rng
-        walk = np.repeat([noise.gyro_bias_walk, noise.accel_bias_walk], 3) / np.sqrt(_IMU_HZ)
-        white = np.repeat([noise.gyro_noise_density, noise.accel_noise_density], 3) * np.sqrt(_IMU_HZ)
+        walk = np.repeat([noise.gyroscope_random_walk, noise.accelerometer_random_walk], 3) / np.sqrt(_IMU_HZ)
+        white = np.repeat([noise.gyroscope_noise_density, noise.accelerometer_noise_density], 3) * np.sqrt(_IMU_HZ)
         biases = bias + np.cumsum(rng.normal(size=(len(n), 6)) * walk, axis=0)
         values = np.hstack([self.gyro[at], self.accel[at]]) + biases + rng.normal(size=(len(n), 6)) * white
         t_ns = np.round(n * (1e9 / _IMU_HZ)).astype(np.int64)

@@ -82,14 +82,18 @@ class World:
         gyro, force = ideal_imu(lambda s: position(s, self.scale_m), rotation, t)
         n = self.noise
         walk = float(self.walk) * np.sqrt(dt)
-        self.true_gyro_bias = self.gyro_bias + np.cumsum(self.rng.normal(size=(len(t), 3)) * n.gyro_bias_walk * walk, 0)
+        self.true_gyro_bias = self.gyro_bias + np.cumsum(
+            self.rng.normal(size=(len(t), 3)) * n.gyroscope_random_walk * walk, 0
+        )
         self.true_accel_bias = self.accel_bias + np.cumsum(
-            self.rng.normal(size=(len(t), 3)) * n.accel_bias_walk * walk, 0
+            self.rng.normal(size=(len(t), 3)) * n.accelerometer_random_walk * walk, 0
         )
         self.imu_t_ns = np.round(t * 1e9).astype(np.int64)
         white = 1.0 / np.sqrt(dt)
-        self.gyro = gyro + self.true_gyro_bias + self.rng.normal(size=(len(t), 3)) * n.gyro_noise_density * white
-        self.accel = force + self.true_accel_bias + self.rng.normal(size=(len(t), 3)) * n.accel_noise_density * white
+        self.gyro = gyro + self.true_gyro_bias + self.rng.normal(size=(len(t), 3)) * n.gyroscope_noise_density * white
+        self.accel = (
+            force + self.true_accel_bias + self.rng.normal(size=(len(t), 3)) * n.accelerometer_noise_density * white
+        )
 
     def t_ns(self, k: int) -> int:
         return round(self.times_s[k] * 1e9)

@@ -130,8 +130,8 @@ def drive(motion: str, seed: int, duration_s: float, noise: ImuNoise = IMU) -> D
     truth = np.empty((count, 10))
     nothing = np.zeros((kernels.ERRORS, kernels.ERRORS))
     kernels.predict_run(x, nothing, t_ns, ideal, np.zeros(count), truth, np.zeros(6), GRAVITY_M_S2)
-    white = np.repeat([noise.gyro_noise_density, noise.accel_noise_density], 3) * np.sqrt(noise.rate_hz)
-    walk = np.repeat([noise.gyro_bias_walk, noise.accel_bias_walk], 3) / np.sqrt(noise.rate_hz)
+    white = np.repeat([noise.gyroscope_noise_density, noise.accelerometer_noise_density], 3) * np.sqrt(noise.rate_hz)
+    walk = np.repeat([noise.gyroscope_random_walk, noise.accelerometer_random_walk], 3) / np.sqrt(noise.rate_hz)
     biases = np.cumsum(rng.normal(size=(count, 6)) * walk, axis=0)
     return Drive(t_ns, ideal + biases + rng.normal(size=(count, 6)) * white, truth, biases)
 

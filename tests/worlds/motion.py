@@ -81,8 +81,8 @@ class Motion:
         biases = np.repeat(bias[None], count, axis=0)
         if noise is not None:
             assert rng is not None
-            white = np.repeat([noise.gyro_noise_density, noise.accel_noise_density], 3) * np.sqrt(rate_hz)
-            walk = np.repeat([noise.gyro_bias_walk, noise.accel_bias_walk], 3) / np.sqrt(rate_hz)
+            white = np.repeat([noise.gyroscope_noise_density, noise.accelerometer_noise_density], 3) * np.sqrt(rate_hz)
+            walk = np.repeat([noise.gyroscope_random_walk, noise.accelerometer_random_walk], 3) / np.sqrt(rate_hz)
             biases = biases + np.cumsum(rng.normal(size=(count, 6)) * walk, axis=0)
             ideal = ideal + rng.normal(size=(count, 6)) * white
         values = ideal + biases

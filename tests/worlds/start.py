@@ -85,7 +85,9 @@ class Start:
 
     def _samples(self, rng: np.random.Generator) -> list[ImuSample]:
         count, rate = round(self.duration_s * 200) + 1, 200.0
-        white = np.repeat([self.noise.gyro_noise_density, self.noise.accel_noise_density], 3) * np.sqrt(rate)
+        white = np.repeat([self.noise.gyroscope_noise_density, self.noise.accelerometer_noise_density], 3) * np.sqrt(
+            rate
+        )
         values = np.array([np.concatenate(self.at(k / rate)[2:]) for k in range(count)])
         if self.shaken is not None:
             until_s, factor = self.shaken

@@ -22,10 +22,10 @@ class ImuConfig:
     """Inertial noise; None keeps what the recording's own sensor file says."""
 
     enabled: bool = True  # off: vision alone, as if the recording had no IMU
-    gyro_noise_density: NonNegative | None = None  # rad/s/sqrt(Hz)
-    accel_noise_density: NonNegative | None = None  # m/s^2/sqrt(Hz)
-    gyro_bias_walk: NonNegative | None = None  # rad/s^2/sqrt(Hz)
-    accel_bias_walk: NonNegative | None = None  # m/s^3/sqrt(Hz)
+    gyroscope_noise_density: NonNegative | None = None  # rad/s/sqrt(Hz)
+    accelerometer_noise_density: NonNegative | None = None  # m/s^2/sqrt(Hz)
+    gyroscope_random_walk: NonNegative | None = None  # rad/s^2/sqrt(Hz)
+    accelerometer_random_walk: NonNegative | None = None  # m/s^3/sqrt(Hz)
     # relative errors of scale factor and alignment, where the sensor's file has no ..._scale_sigma of its own
     gyro_scale_prior: NonNegative = 0.003  # of a calibrated MEMS gyroscope: data sheets give 0.2 to 1 %
     accel_scale_prior: NonNegative = 0.01  # of a calibrated MEMS accelerometer: 0.5 to 1 % against motion capture

@@ -206,10 +206,10 @@ class SensorsConfig:
     realsense: RealsenseConfig = field(default_factory=RealsenseConfig)
     oak: OakConfig = field(default_factory=OakConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    gyro_noise_density: NonNegative = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
-    accel_noise_density: NonNegative = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis
-    gyro_bias_walk: NonNegative = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet tells it
-    accel_bias_walk: NonNegative = 2e-4  # m/s^3/sqrt(Hz), as well
+    gyroscope_noise_density: NonNegative = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
+    accelerometer_noise_density: NonNegative = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis
+    gyroscope_random_walk: NonNegative = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet tells it
+    accelerometer_random_walk: NonNegative = 2e-4  # m/s^3/sqrt(Hz), as well
     # horizontal field of view without a camera file; webcams have 60 to 80
     hfov_deg: Annotated[float, Range(0.0, 180.0, without_low=True, without_high=True)] = 70.0
 

@@ -16,16 +16,16 @@ _LONGEST_GAP_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class ImuNoise:
-    """Continuous-time noise model of an IMU, as in EuRoC's and Kalibr's files."""
+    """Continuous-time noise model of an IMU, by the names of Kalibr's files."""
 
-    gyro_noise_density: float  # rad/s/sqrt(Hz)
-    accel_noise_density: float  # m/s^2/sqrt(Hz)
-    gyro_bias_walk: float  # rad/s^2/sqrt(Hz)
-    accel_bias_walk: float  # m/s^3/sqrt(Hz)
+    gyroscope_noise_density: float  # rad/s/sqrt(Hz)
+    accelerometer_noise_density: float  # m/s^2/sqrt(Hz)
+    gyroscope_random_walk: float  # rad/s^2/sqrt(Hz)
+    accelerometer_random_walk: float  # m/s^3/sqrt(Hz)
     rate_hz: float
     # relative, of scale factors and misalignment that calibration left; None: not known, see `ImuConfig`
-    gyro_scale_sigma: float | None = None
-    accel_scale_sigma: float | None = None
+    gyroscope_scale_sigma: float | None = None
+    accelerometer_scale_sigma: float | None = None
 
     def gap_s(self, told_s: float) -> float:
         """Return how long a hole between samples is no outage: as told, and one and a half periods of a slow IMU.

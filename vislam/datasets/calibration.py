@@ -34,13 +34,10 @@ MODELS: dict[str, Distortion] = {
 MODEL_NAMES: dict[Distortion, str] = {
     "radtan": "radial-tangential", "equidistant": "equidistant", "none": "none", "rational": "rational_polynomial",
 }  # fmt: skip
-NOISE_KEYS = {
-    "gyro_noise_density": "gyroscope_noise_density",
-    "accel_noise_density": "accelerometer_noise_density",
-    "gyro_bias_walk": "gyroscope_random_walk",
-    "accel_bias_walk": "accelerometer_random_walk",
-}
-SCALE_KEYS = {"gyro_scale_sigma": "gyroscope_scale_sigma", "accel_scale_sigma": "accelerometer_scale_sigma"}  # ours
+NOISE_KEYS = (  # of Kalibr, and the names in `ImuNoise`
+    "gyroscope_noise_density", "accelerometer_noise_density", "gyroscope_random_walk", "accelerometer_random_walk",
+)  # fmt: skip
+SCALE_KEYS = ("gyroscope_scale_sigma", "accelerometer_scale_sigma")  # ours
 CAMERA_EXAMPLE = (
     "T_BS: {rows: 4, cols: 4, data: [16 numbers]}, resolution: [640, 480], intrinsics: [fx, fy, cx, cy], "
     "distortion_model: radial-tangential, distortion_coefficients: [k1, k2, p1, p2]"
@@ -189,14 +186,14 @@ def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> 
 def parse_noise(data: Mapping[str, Any], rate_key: str, path: Path) -> ImuNoise:
     """Return the noise model in the keys that ASL and Kalibr share; raises DataError naming the key."""
     values: dict[str, float] = {}
-    for name, key in NOISE_KEYS.items():
-        value = optional_positive(data, key, path, allow_zero=name.endswith("walk"))
+    for key in NOISE_KEYS:
+        value = optional_positive(data, key, path, allow_zero=key.endswith("walk"))
         if value is None:
-            raise DataError(f"{path}: no '{key}'; an IMU's file holds {', '.join(NOISE_KEYS.values())} and {rate_key}")
-        values[name] = value
-    gyro_scale, accel_scale = (optional_positive(data, key, path, allow_zero=True) for key in SCALE_KEYS.values())
+            raise DataError(f"{path}: no '{key}'; an IMU's file holds {', '.join(NOISE_KEYS)} and {rate_key}")
+        values[key] = value
+    gyro, accel = (optional_positive(data, key, path, allow_zero=True) for key in SCALE_KEYS)
     rate_hz = optional_positive(data, rate_key, path) or 0.0
-    return ImuNoise(**values, rate_hz=rate_hz, gyro_scale_sigma=gyro_scale, accel_scale_sigma=accel_scale)
+    return ImuNoise(**values, rate_hz=rate_hz, gyroscope_scale_sigma=gyro, accelerometer_scale_sigma=accel)
 
 
 def optional_positive(data: Mapping[str, Any], key: str, path: Path, allow_zero: bool = False) -> float | None:
@@ -244,8 +241,8 @@ def camera_text(camera: Camera, T_body_cam: Array | None, comment: str) -> str:
 
 def imu_text(noise: ImuNoise, comment: str) -> str:
     """Return the sensor file of an IMU that is the body frame."""
-    keys = NOISE_KEYS | {name: key for name, key in SCALE_KEYS.items() if getattr(noise, name) is not None}
-    lines = [f"{key}: {float(getattr(noise, name))!r}\n" for name, key in keys.items()]
+    known = [key for key in (*NOISE_KEYS, *SCALE_KEYS) if getattr(noise, key) is not None]
+    lines = [f"{key}: {float(getattr(noise, key))!r}\n" for key in known]
     rate = f"rate_hz: {float(noise.rate_hz)!r}\n" if noise.rate_hz > 0.0 else ""
     return f"sensor_type: imu\ncomment: {json.dumps(comment)}\n{pose_text(np.eye(4))}{rate}{''.join(lines)}"
 

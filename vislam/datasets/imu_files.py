@@ -30,10 +30,10 @@ def imu_noise_text(noise: ImuNoise, comment: str) -> str:
         f"# {' '.join(comment.split())}\n"
         f"rostopic: /imu0\n"
         f"update_rate: {float(noise.rate_hz)!r}  # Hz\n"
-        f"gyroscope_noise_density: {float(noise.gyro_noise_density)!r}  # rad/s/sqrt(Hz)\n"
-        f"gyroscope_random_walk: {float(noise.gyro_bias_walk)!r}  # rad/s^2/sqrt(Hz)\n"
-        f"accelerometer_noise_density: {float(noise.accel_noise_density)!r}  # m/s^2/sqrt(Hz)\n"
-        f"accelerometer_random_walk: {float(noise.accel_bias_walk)!r}  # m/s^3/sqrt(Hz)\n"
+        f"gyroscope_noise_density: {float(noise.gyroscope_noise_density)!r}  # rad/s/sqrt(Hz)\n"
+        f"gyroscope_random_walk: {float(noise.gyroscope_random_walk)!r}  # rad/s^2/sqrt(Hz)\n"
+        f"accelerometer_noise_density: {float(noise.accelerometer_noise_density)!r}  # m/s^2/sqrt(Hz)\n"
+        f"accelerometer_random_walk: {float(noise.accelerometer_random_walk)!r}  # m/s^3/sqrt(Hz)\n"
     )
 
 

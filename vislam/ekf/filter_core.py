@@ -91,8 +91,8 @@ def nominal(state: NavState) -> Array:
 
 def imu_sigmas(config: EkfConfig, noise: ImuNoise) -> Array:
     """Return what a step takes [6]: densities of gyro and accel, their bias walks, rate and force unseen in a hole."""
-    white = [noise.gyro_noise_density, noise.accel_noise_density]
-    walks = [noise.gyro_bias_walk, noise.accel_bias_walk]
+    white = [noise.gyroscope_noise_density, noise.accelerometer_noise_density]
+    walks = [noise.gyroscope_random_walk, noise.accelerometer_random_walk]
     return np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
 
 

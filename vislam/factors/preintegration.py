@@ -36,10 +36,10 @@ class Preintegrator:
         self._config = config
         self._max_gap_s = noise.gap_s(config.imu_max_gap_s)
         self._gravity_m_s2 = gravity_m_s2
-        self._gyro_density = noise.gyro_noise_density
-        self._accel_density = noise.accel_noise_density
-        self.gyro_bias_walk = max(noise.gyro_bias_walk, config.gyro_bias_walk_floor)
-        self.accel_bias_walk = max(noise.accel_bias_walk, config.accel_bias_walk_floor)
+        self._gyro_density = noise.gyroscope_noise_density
+        self._accel_density = noise.accelerometer_noise_density
+        self.gyroscope_random_walk = max(noise.gyroscope_random_walk, config.gyro_bias_walk_floor)
+        self.accelerometer_random_walk = max(noise.accelerometer_random_walk, config.accel_bias_walk_floor)
 
     def integrate(
         self, span: ImuSpan | None, t0_ns: int, t1_ns: int, bias: gtsam.imuBias.ConstantBias
@@ -78,14 +78,14 @@ class Preintegrator:
     def bias_walk_sigmas(self, duration_s: float) -> Array:
         """Return the sigmas [6] of the bias change over a time, accelerometer first as in gtsam."""
         root = np.sqrt(duration_s)
-        return np.repeat([self.accel_bias_walk * root, self.gyro_bias_walk * root], 3)
+        return np.repeat([self.accelerometer_random_walk * root, self.gyroscope_random_walk * root], 3)
 
     def _params(self, white: tuple[float, float]) -> gtsam.PreintegrationCombinedParams:
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(self._gravity_m_s2)
         self._set_white_noise(params, *white)
         params.setIntegrationCovariance(np.eye(3) * self._config.imu_integration_sigma**2)
-        params.setBiasOmegaCovariance(np.eye(3) * self.gyro_bias_walk**2)
-        params.setBiasAccCovariance(np.eye(3) * self.accel_bias_walk**2)
+        params.setBiasOmegaCovariance(np.eye(3) * self.gyroscope_random_walk**2)
+        params.setBiasAccCovariance(np.eye(3) * self.accelerometer_random_walk**2)
         return params
 
     @staticmethod

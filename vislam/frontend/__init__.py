@@ -57,7 +57,7 @@ def lasting_scale_sigma(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None
     """
     mode, planar = mode_for(config, rig), config.planar
     if mode == "mono":
-        return 0.0 if noise is None else noise.accel_scale_sigma or 0.0
+        return 0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0
     if mode != "planar" or planar.height_m is None:
         return 0.0
     return planar.height_sigma_m / planar.height_m

@@ -76,7 +76,7 @@ class NoiseFloor:
         self._times: NDArray[np.int64] = np.empty(self._size, dtype=np.int64)
         self._filled = 0
         self._spectra: deque[Array] = deque(maxlen=_AVERAGED)  # [bands, 2] variance density of gyro and accel
-        self._scale_sigmas = np.array([noise.gyro_scale_sigma or 0.0, noise.accel_scale_sigma or 0.0])
+        self._scale_sigmas = np.array([noise.gyroscope_scale_sigma or 0.0, noise.accelerometer_scale_sigma or 0.0])
         self._motions: deque[Array] = deque(maxlen=_AVERAGED)  # [2] variance of rates and forces in a window
         self._floors: list[tuple[float, float]] = []  # density of gyro and accel over the model's, per window
         self.now = SeenNoise(0, AS_MODELLED)
@@ -127,8 +127,8 @@ class NoiseFloor:
         if ratios is None:
             return {}
         model, now = self._model, self.now.scale
-        gyro = model.gyro_noise_density, ratios.gyro_quiet, ratios.gyro_typical, now.gyro
-        accel = model.accel_noise_density, ratios.accel_quiet, ratios.accel_typical, now.accel
+        gyro = model.gyroscope_noise_density, ratios.gyro_quiet, ratios.gyro_typical, now.gyro
+        accel = model.accelerometer_noise_density, ratios.accel_quiet, ratios.accel_typical, now.accel
         return {
             name: {"told": told, "quietest": told * quiet, "typical": told * typical, "used_last": told * last}
             for name, (told, quiet, typical, last) in (("gyro", gyro), ("accel", accel))
@@ -141,8 +141,8 @@ class NoiseFloor:
             return self._model
         return replace(
             self._model,
-            gyro_noise_density=self._model.gyro_noise_density * max(1.0, ratios.gyro_typical),
-            accel_noise_density=self._model.accel_noise_density * max(1.0, ratios.accel_typical),
+            gyroscope_noise_density=self._model.gyroscope_noise_density * max(1.0, ratios.gyro_typical),
+            accelerometer_noise_density=self._model.accelerometer_noise_density * max(1.0, ratios.accel_typical),
         )
 
     def warnings(self, tolerance: float) -> list[str]:
@@ -155,19 +155,20 @@ class NoiseFloor:
             return []
         found = []
         for name, quiet, density in (
-            ("gyroscope", ratios.gyro_quiet, self._model.gyro_noise_density),
-            ("accelerometer", ratios.accel_quiet, self._model.accel_noise_density),
+            ("gyroscope", ratios.gyro_quiet, self._model.gyroscope_noise_density),
+            ("accelerometer", ratios.accel_quiet, self._model.accelerometer_noise_density),
         ):
-            setting = "imu.gyro-noise-density" if name == "gyroscope" else "imu.accel-noise-density"
             if quiet > _SHAKEN * tolerance:
                 found.append(
                     f"{name} noise: even the quietest second has {quiet:.0f} times the model's {density:.2g}; check "
-                    f"the unit of the sensor and how it is mounted, or set --{setting} {density * quiet:.2g}"
+                    f"the unit of the sensor and how it is mounted, or set --imu.{name}-noise-density "
+                    f"{density * quiet:.2g}"
                 )
             elif quiet < 1.0 / tolerance:
                 found.append(
                     f"{name} noise: a second has only {quiet:.2f} times the model's {density:.2g}; unless the "
-                    f"sensor filters strongly, the model is too large: set --{setting} {density * quiet:.2g}"
+                    f"sensor filters strongly, the model is too large: set --imu.{name}-noise-density "
+                    f"{density * quiet:.2g}"
                 )
         return found
 
@@ -183,7 +184,9 @@ class NoiseFloor:
     def _follow(self, newest_t_ns: int) -> bool:
         """Return whether the floor, as the last windows or the newest alone show it, is news."""
         quietest = np.maximum(np.mean(self._spectra, axis=0).min(axis=0), self._spectra[-1].min(axis=0))
-        model = np.maximum([self._model.gyro_noise_density, self._model.accel_noise_density], np.finfo(float).tiny)
+        model = np.maximum(
+            [self._model.gyroscope_noise_density, self._model.accelerometer_noise_density], np.finfo(float).tiny
+        )
         gyro, accel = (_CHANCE * np.sqrt(quietest) / model).tolist()
         self._floors.append((gyro, accel))
         by_motion = self._scale_sigmas**2 * np.mean(self._motions, axis=0) / (2.0 * _MOTION_HZ) / model**2

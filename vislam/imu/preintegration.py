@@ -76,7 +76,10 @@ def preintegrate(
     accel_bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
     densities = (0.0, 0.0)
     if noise is not None:
-        densities = noise.gyro_noise_density * span.noise.gyro, noise.accel_noise_density * span.noise.accel
+        densities = (
+            noise.gyroscope_noise_density * span.noise.gyro,
+            noise.accelerometer_noise_density * span.noise.accel,
+        )
     dR, dv, dp, J_gyro, J_accel, covariance = _integrate(
         span.t_ns, span.gyro_rad_s, span.accel_m_s2, gyro_bias, accel_bias, *densities
     )

@@ -39,10 +39,10 @@ class RestDetector:
         self._force: Array = np.zeros(3)  # mean [3] of this rest before the spans, fading; m/s^2 ...
         self._force_s = 0.0  # ... and over how long
         self._set_off = False  # the last rest ended by speed gained, so the next one has to show that force is steady
-        self._accel_density = noise.accel_noise_density
+        self._accel_density = noise.accelerometer_noise_density
         per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
-        self._gyro_white_std = per_sample * noise.gyro_noise_density
-        self._accel_white_std = per_sample * noise.accel_noise_density
+        self._gyro_white_std = per_sample * noise.gyroscope_noise_density
+        self._accel_white_std = per_sample * noise.accelerometer_noise_density
 
     def clear(self) -> None:
         """Forget what was seen, as after a hole in the data."""

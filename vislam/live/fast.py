@@ -194,7 +194,7 @@ class FastPath:
                 base = self._alone.base(self._gyro)
             resets, newest_ns = 0, self._buffer.newest_t_ns or 0
         else:
-            variance = self._noise.gyro_noise_density**2 * self._noise.rate_hz
+            variance = self._noise.gyroscope_noise_density**2 * self._noise.rate_hz
             base, newest_ns = of_base(state, self._gyro, variance, self._offset), state.t_ns
             base, T_map_odom = self._shown_base(base, state)
         T, velocity, rate, pose_covariance, twist_covariance = base

@@ -114,7 +114,7 @@ class InertialOnly:
         assert self._attitude is not None
         tilt = self._attitude.tilt_sigma_rad**2
         unknown = [np.inf] * 3
-        rate_variance = self._bias_sigma_rad_s**2 + self._noise.gyro_noise_density**2 * self._noise.rate_hz
+        rate_variance = self._bias_sigma_rad_s**2 + self._noise.gyroscope_noise_density**2 * self._noise.rate_hz
         return (
             transform(self._attitude.R_world_body, np.zeros(3)), np.zeros(3),
             gyro_rad_s - self._attitude.gyro_bias_rad_s, np.diag([*unknown, tilt, tilt, np.inf]),

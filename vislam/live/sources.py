@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
-from vislam.datasets.imu_files import read_noise
 from vislam.hw.library_cameras import WITH_IMU, frame_config, gives_frames, open_frame_camera, reads_own_imu
 from vislam.hw.reading_port import check_port
 from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
@@ -35,6 +33,7 @@ from vislam.live.virtual.cart import VirtualCart
 from vislam.live.virtual.place import PlaceOptions
 from vislam.live.wire.slot import remove
 from vislam.runs.camera_rig import rig_of
+from vislam.runs.record import noise_of
 from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 
@@ -123,13 +122,7 @@ class CartSensors:
         self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
         calibration = config.calibration.camera
         self.rig = _rig(camera, sensors, calibration, self._is_inside) if self.has_camera else NO_CAMERA
-        rate_hz = rate_of(inertial, sensors)
-        self.imu_noise: ImuNoise | None = ImuNoise(
-            sensors.gyro_noise_density, sensors.accel_noise_density, sensors.gyro_bias_walk, sensors.accel_bias_walk,
-            rate_hz,
-        )  # fmt: skip
-        if config.calibration.imu_noise is not None:
-            self.imu_noise = replace(read_noise(Path(config.calibration.imu_noise)), rate_hz=rate_hz)
+        self.imu_noise: ImuNoise | None = noise_of(config.calibration, sensors, rate_of(inertial, sensors))
         self.frame_count, self.problems = 0, dict[str, int]()
         self.duration_s: float | None = None
         self._inertial, self._camera, self._sensors = inertial, camera, sensors

@@ -104,7 +104,7 @@ class Front:
             self.ekf_coupling = self._filter.coupling
         self._readings: ReadingIntake | None = None
         if suite is not None and len(suite):
-            buffer, density = (None, 0.0) if noise is None else (self._buffer, noise.accel_noise_density)
+            buffer, density = (None, 0.0) if noise is None else (self._buffer, noise.accelerometer_noise_density)
             has_window = config.graph.coupling == "tight"
             self._readings = ReadingIntake(suite, self._filter, buffer, config.imu.gravity_m_s2, density, has_window)
         self._waypoints = Waypoints()
@@ -450,7 +450,7 @@ class Front:
         is_blind = self.config.ekf.vision == "none"  # nothing corrects it, and the graph's bias is not to turn it
         if is_blind or state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
             return Estimate(after, after, 0.0), state
-        walk = 0.0 if self.noise is None else self.noise.gyro_bias_walk
+        walk = 0.0 if self.noise is None else self.noise.gyroscope_random_walk
         gyro_bias, sigma_rad_s = surer_gyro_bias(last, self._graph_state, walk)
         before = _uncorrected(replace(last, gyro_bias_rad_s=gyro_bias), span, self.config.imu.gravity_m_s2, at_rest)
         return Estimate(before, after, sigma_rad_s), state

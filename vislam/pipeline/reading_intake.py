@@ -56,11 +56,11 @@ class ReadingIntake:
 
     def __init__(
         self, suite: Suite, filtering: Filtering | None, buffer: ImuBuffer | None, gravity_m_s2: float,
-        accel_noise_density: float = 0.0, has_window: bool = False,
+        accelerometer_noise_density: float = 0.0, has_window: bool = False,
     ) -> None:  # fmt: skip
         """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data.
 
-        `accel_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
+        `accelerometer_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
         `has_window` says that behind keyframes comes a sliding window.
         """
         became = (
@@ -72,7 +72,7 @@ class ReadingIntake:
         self._of_magnetometer = [name for name in suite.names if suite[name].from_magnetometer]
         self._filter, self._buffer = filtering, buffer
         self._gravity = gravity_m_s2 if buffer is not None else 0.0
-        self._accel_density = accel_noise_density
+        self._accel_density = accelerometer_noise_density
         self._has_window = has_window
         self._waiting: deque[Reading] = deque()
         self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}

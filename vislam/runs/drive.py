@@ -61,10 +61,11 @@ def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
         return None
     overrides = {name: value for name in asdict(recorded) if (value := getattr(config, name, None)) is not None}
     noise = ImuNoise(**{**asdict(recorded), **overrides})
+    gyro, accel = noise.gyroscope_scale_sigma, noise.accelerometer_scale_sigma
     return replace(
         noise,
-        gyro_scale_sigma=config.gyro_scale_prior if noise.gyro_scale_sigma is None else noise.gyro_scale_sigma,
-        accel_scale_sigma=config.accel_scale_prior if noise.accel_scale_sigma is None else noise.accel_scale_sigma,
+        gyroscope_scale_sigma=config.gyro_scale_prior if gyro is None else gyro,
+        accelerometer_scale_sigma=config.accel_scale_prior if accel is None else accel,
     )
 
 

@@ -73,8 +73,8 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
         return evidence
     return replace(
         evidence,
-        gyro_noise=None if noise is None else noise.gyro_quiet * told.gyro_noise_density,
-        accel_noise=None if noise is None else noise.accel_quiet * told.accel_noise_density,
+        gyro_noise=None if noise is None else noise.gyro_quiet * told.gyroscope_noise_density,
+        accel_noise=None if noise is None else noise.accel_quiet * told.accelerometer_noise_density,
         rate_hz=condition.rate_hz if np.isfinite(condition.rate_hz) else None,
         rate_told_hz=told.rate_hz,
         longest_gap_s=condition.longest_gap_s,

@@ -133,7 +133,7 @@ def record(
         first = None if images is None else _first_image(images, camera)
         rig, notes = (None, ()) if first is None else own_rig or _rig(first, files, sensors.hfov_deg)
         notes = (*notes, *_camera_notes(images), *_stamp_notes(imu, inertial))
-        noise = None if inertial is None else _noise(files, sensors, inertial.rate_hz)
+        noise = None if inertial is None else noise_of(files, sensors, inertial.rate_hz)
         imu_calibration, mag_calibration = _calibrations(files, calibration_of(imu, sensors))
         with Recorder(
             out, rig, noise, image_format=config.image_format, comment=f"vislam record, {imu}, {camera}",
@@ -394,11 +394,18 @@ def _camera_notes(images: Images | None) -> tuple[str, ...]:
     )
 
 
-def _noise(files: CalibrationConfig, sensors: SensorsConfig, rate_hz: float) -> ImuNoise:
+def noise_of(files: CalibrationConfig, sensors: SensorsConfig, rate_hz: float) -> ImuNoise:
+    """Return the noise of a live IMU: of its calibration file where there is one, or as the sensors file states it."""
     if files.imu_noise is not None:
         return replace(read_noise(Path(files.imu_noise)), rate_hz=rate_hz)
     s = sensors
-    return ImuNoise(s.gyro_noise_density, s.accel_noise_density, s.gyro_bias_walk, s.accel_bias_walk, rate_hz)
+    return ImuNoise(
+        s.gyroscope_noise_density,
+        s.accelerometer_noise_density,
+        s.gyroscope_random_walk,
+        s.accelerometer_random_walk,
+        rate_hz,
+    )
 
 
 def _calibrations(files: CalibrationConfig, known: SensorCalibration) -> tuple[ImuCalibration, MagCalibration]:

@@ -15,22 +15,22 @@ from vislam.sim.motion.spline import Motion
 GAMMA = 2.2  # between linear light and the display values of images
 
 CONSUMER_IMU = ImuNoise(
-    gyro_noise_density=4.0e-4,  # about 0.02 deg/s/sqrt(Hz), between a phone's and a GY-85's gyro
-    accel_noise_density=3.0e-3,
-    gyro_bias_walk=2.0e-5,
-    accel_bias_walk=3.0e-4,
+    gyroscope_noise_density=4.0e-4,  # about 0.02 deg/s/sqrt(Hz), between a phone's and a GY-85's gyro
+    accelerometer_noise_density=3.0e-3,
+    gyroscope_random_walk=2.0e-5,
+    accelerometer_random_walk=3.0e-4,
     rate_hz=200.0,
-    gyro_scale_sigma=0.0,  # noise and biases are all that is simulated
-    accel_scale_sigma=0.0,
+    gyroscope_scale_sigma=0.0,  # noise and biases are all that is simulated
+    accelerometer_scale_sigma=0.0,
 )
 GY85_IMU = ImuNoise(
-    gyro_noise_density=5.2e-4,  # ITG3205: 0.03 deg/s/sqrt(Hz)
-    accel_noise_density=6.0e-3,  # ADXL345: 1.1 LSB of 3.9 mg rms at 100 Hz
-    gyro_bias_walk=3.0e-5,
-    accel_bias_walk=4.0e-4,
+    gyroscope_noise_density=5.2e-4,  # ITG3205: 0.03 deg/s/sqrt(Hz)
+    accelerometer_noise_density=6.0e-3,  # ADXL345: 1.1 LSB of 3.9 mg rms at 100 Hz
+    gyroscope_random_walk=3.0e-5,
+    accelerometer_random_walk=4.0e-4,
     rate_hz=200.0,
-    gyro_scale_sigma=0.0,  # noise and biases are all that is simulated
-    accel_scale_sigma=0.0,
+    gyroscope_scale_sigma=0.0,  # noise and biases are all that is simulated
+    accelerometer_scale_sigma=0.0,
 )
 
 
@@ -75,12 +75,12 @@ def sense_imu(
     if not disturbed:
         return ImuRecord(gyro.copy(), accel, np.zeros((count, 3)), np.zeros((count, 3)))
     step = 1.0 / np.sqrt(noise.rate_hz)
-    gyro_walk = np.cumsum(rng.normal(0.0, noise.gyro_bias_walk * step, (count, 3)), axis=0)
-    accel_walk = np.cumsum(rng.normal(0.0, noise.accel_bias_walk * step, (count, 3)), axis=0)
+    gyro_walk = np.cumsum(rng.normal(0.0, noise.gyroscope_random_walk * step, (count, 3)), axis=0)
+    accel_walk = np.cumsum(rng.normal(0.0, noise.accelerometer_random_walk * step, (count, 3)), axis=0)
     gyro_bias = rng.normal(0.0, turn_on.gyro_rad_s, 3) + gyro_walk
     accel_bias = rng.normal(0.0, turn_on.accel_m_s2, 3) + accel_walk
-    gyro = gyro + gyro_bias + rng.normal(0.0, noise.gyro_noise_density / step, (count, 3))
-    accel = accel + accel_bias + rng.normal(0.0, noise.accel_noise_density / step, (count, 3))
+    gyro = gyro + gyro_bias + rng.normal(0.0, noise.gyroscope_noise_density / step, (count, 3))
+    accel = accel + accel_bias + rng.normal(0.0, noise.accelerometer_noise_density / step, (count, 3))
     return ImuRecord(gyro, accel, gyro_bias, accel_bias)
 
 

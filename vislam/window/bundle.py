@@ -261,7 +261,7 @@ def _states(problem: BundleProblem) -> Array:
 def _links(problem: BundleProblem, noise: ImuNoise) -> Links:
     spans, n = problem.spans, len(problem.spans)
     dt = np.array([s.dt_s for s in spans])
-    walk = np.repeat([noise.gyro_bias_walk, noise.accel_bias_walk], 3)
+    walk = np.repeat([noise.gyroscope_random_walk, noise.accelerometer_random_walk], 3)
     none: NDArray[np.float64] = np.zeros(n)
     return Links(
         inertial=np.ones(n, dtype=np.bool_),

@@ -82,7 +82,7 @@ class LinkStore:
         links.inertial[k], links.dt[k], links.told[k] = inertial, dt_s, False
         links.guess_weight[k], links.velocity_weight[k], links.rest_weight[k + 1] = 0.0, 0.0, 0.0
         if self._noise is not None:
-            walk = np.repeat([self._noise.gyro_bias_walk, self._noise.accel_bias_walk], 3)
+            walk = np.repeat([self._noise.gyroscope_random_walk, self._noise.accelerometer_random_walk], 3)
             links.walk_information[k] = 1.0 / (np.maximum(walk, 1e-9) ** 2 * dt_s)
         if inertial:
             self.integrate(k, bias)

@@ -165,7 +165,7 @@ def _lines(found: NoiseCalibration, written: ImuNoise) -> list[str]:
         lines.append(
             f"driving: white noise {r.gyro_quiet:.1f} (gyro), {r.accel_quiet:.1f} (accel) times that in the quietest "
             f"half second, {r.gyro_typical:.1f} and {r.accel_typical:.1f} in the usual one; written: "
-            f"{written.gyro_noise_density:.2e} and {written.accel_noise_density:.2e}"
+            f"{written.gyroscope_noise_density:.2e} and {written.accelerometer_noise_density:.2e}"
         )
     return [*lines, *_statements(found)]
 
@@ -183,7 +183,7 @@ def draw(figure: Figure, colors: Mapping[str, str], found: NoiseCalibration) -> 
             axes.plot(smooth, fit.deviation(smooth), style, linewidth=1.2, color=color, label=_label(fit, "xyz"[k]))
         if found.driving is not None:
             ratio = (found.driving.gyro_typical, found.driving.accel_typical)[sensor]
-            density = (found.model.gyro_noise_density, found.model.accel_noise_density)[sensor]
+            density = (found.model.gyroscope_noise_density, found.model.accelerometer_noise_density)[sensor]
             axes.axhline(
                 ratio * density * np.sqrt(found.model.rate_hz), color=colors["warn"], linestyle=":",
                 label="one sample while driving, usual",

@@ -113,7 +113,7 @@ def _rows(piece: Piece, shared: Shared, series: ImuSeries, noise: ImuNoise) -> _
         A[i, :, _OWN + 3 :] = -to_bias
         b[i] = R[i + 1] @ second.dp_m / t12 + R[i] @ (first.dv_m_s - first.dp_m / t01)
         span_s = 0.5 * (t01 + t12)
-        inertial[i] = noise.accel_noise_density**2 * span_s + (_ATTITUDE_RAD * _GRAVITY_M_S2 * span_s) ** 2
+        inertial[i] = noise.accelerometer_noise_density**2 * span_s + (_ATTITUDE_RAD * _GRAVITY_M_S2 * span_s) ** 2
     return _Rows(A.reshape(3 * n, -1), b.ravel(), by_place, inertial)
 
 

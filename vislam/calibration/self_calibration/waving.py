@@ -129,8 +129,8 @@ def _with_imu(result: SelfResult, recording: Recording, samples: list[ImuSample]
         zero_ns,
         np.array([(sample.t_ns - zero_ns) * 1e-9 for sample in samples]),
         np.array([sample.gyro_rad_s for sample in samples]),
-        noise.gyro_noise_density,
-        noise.gyro_scale_sigma or _GYRO_SCALE,
+        noise.gyroscope_noise_density,
+        noise.gyroscope_scale_sigma or _GYRO_SCALE,
     )
     joint = with_gyro(result.solution, gyro)
     if isinstance(joint, str):

@@ -16,9 +16,10 @@ from vislam.config.ranges import Setting, settings_of
 
 COMMON = (
     "frontend.mode", "frontend.max_tracks", "frontend.readout_s", "frontend.planar.height_m", "calibration.camera",
-    "calibration.imu", "calibration.imu_noise", "imu.enabled", "imu.gyro_noise_density", "imu.accel_noise_density",
-    "ekf.coupling", "window.keyframes", "loop.enabled", "loop.vocabulary", "loop.tag_size_m", "map.enabled",
-    "map.resolution_m", "map.max_range_m", "map.products", "map.mono_depth.enabled", "view.enabled", "up", "seed",
+    "calibration.imu", "calibration.imu_noise", "imu.enabled", "imu.gyroscope_noise_density",
+    "imu.accelerometer_noise_density", "ekf.coupling", "window.keyframes", "loop.enabled", "loop.vocabulary",
+    "loop.tag_size_m", "map.enabled", "map.resolution_m", "map.max_range_m", "map.products", "map.mono_depth.enabled",
+    "view.enabled", "up", "seed",
 )  # fmt: skip
 _COLUMN = 40
 _WIDEST = 120

@@ -75,7 +75,7 @@ class LooseCore:
         self._gravity = gravity_m_s2
         self._told_sigmas = imu_sigmas(config, noise)
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
-        self._white_rate_sigma = float(noise.gyro_noise_density * np.sqrt(noise.rate_hz))
+        self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
         self._limits = np.array([0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)])
         self._axle = np.array(config.axle_m, dtype=np.float64)
         self._floor_sigma = float(config.floor_sigma_m or 0.0)

@@ -92,7 +92,7 @@ class Updater:
         self._least = 2 if rig.is_stereo or rig.has_depth else config.tight_min_observations
         most = features.ROWS_MAX * (config.tight_clones + 2)
         self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
-        self._white_rate_sigma = float(noise.gyro_noise_density * np.sqrt(noise.rate_hz))
+        self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
         self._reset_sigmas = reset_sigmas(config)
 
     # -- a frame -----------------------------------------------------------------------------------------------------

@@ -35,8 +35,8 @@ def rest_covariance(span: ImuSpan, R: Array, gravity_m_s2: float, config: InitCo
     Tilt and accelerometer bias cannot be told apart; their correlation says so.
     """
     rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
-    sigma_gyro = np.sqrt(rest_variance(span.gyro_rad_s, rested_s)) + noise.gyro_noise_density
-    sigma_force = np.sqrt(rest_variance(span.accel_m_s2, rested_s)) + noise.accel_noise_density
+    sigma_gyro = np.sqrt(rest_variance(span.gyro_rad_s, rested_s)) + noise.gyroscope_noise_density
+    sigma_force = np.sqrt(rest_variance(span.accel_m_s2, rested_s)) + noise.accelerometer_noise_density
     information = np.zeros((6, 6))  # rotation, accel bias
     heading = R[2]  # rotation about the vertical, on the body side
     information[:3, :3] = np.outer(heading, heading) / _CHOSEN**2 + np.eye(3)  # and tilt within 1 rad

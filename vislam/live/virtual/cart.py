@@ -37,7 +37,7 @@ _TRUTH_STEP_S = 0.01
 _COLUMNS = 8
 _FRAMES_MISSED = 4  # in a row: then vision counts as lost, however slow the camera is
 # the data sheets' noise, with what quantisation to 3.9 mg and 0.07 deg/s adds
-NOISE = ImuNoise(5.4e-4, 7.0e-3, 3.0e-5, 4.0e-4, 200.0, gyro_scale_sigma=0.0, accel_scale_sigma=0.0)
+NOISE = ImuNoise(5.4e-4, 7.0e-3, 3.0e-5, 4.0e-4, 200.0, gyroscope_scale_sigma=0.0, accelerometer_scale_sigma=0.0)
 
 
 class VirtualCart:

@@ -29,7 +29,6 @@ from vislam.core.messages import (
     Tracking,
 )
 from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
-from vislam.imu import ImuNoise
 from vislam.runs.session.checks import check_records, check_sound, has_labels, has_readings
 from vislam.runs.session.packets import LIGHT_COLUMNS, packet_of
 from vislam.runs.session.reading_rows import readings_of, starts_of
@@ -37,6 +36,7 @@ from vislam.runs.session.schema import (
     DESCRIPTOR_BYTES,
     from_bytes,
     maybe_numbers,
+    noise_of,
     numbers,
     readable,
     state_of,
@@ -293,7 +293,7 @@ class Session:
             noise, first = info["imu_noise"], info.get("first_state")
             return FactorLog(
                 rig=rig_from(info["rig"]),
-                noise=None if noise is None else ImuNoise(**noise),
+                noise=None if noise is None else noise_of(noise),
                 gravity_m_s2=float(info["gravity_m_s2"]),
                 first_state=None if first is None else state_from(first),
                 keyframes=self._logged_keyframes(),

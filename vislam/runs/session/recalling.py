@@ -21,10 +21,9 @@ from vislam.core.memory import (
 )
 from vislam.core.messages import Array, Frame, Keyframe, NavState
 from vislam.factors.factor_log import state_from
-from vislam.imu import ImuNoise
 from vislam.runs.session.reader import Session
 from vislam.runs.session.reading_rows import own_of
-from vislam.runs.session.schema import maybe_numbers, numbers, readable, window_of
+from vislam.runs.session.schema import maybe_numbers, noise_of, numbers, readable, window_of
 
 _RIGID = 1e-4  # how far R R^T may be from identity
 
@@ -109,7 +108,7 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
         return None
     return StartFacts(
         str(facts["status"]), str(facts["reason"]), state_from(facts["last"]), float(facts["scale_sigma"]),
-        float(facts["excitation_m_s2"]), ImuNoise(**facts["noise"]), state_from(facts["first_state"]),
+        float(facts["excitation_m_s2"]), noise_of(facts["noise"]), state_from(facts["first_state"]),
         int(facts.get("begun_t_ns", 0)),
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError, StorageError
+from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array, NavState
 
@@ -24,6 +25,14 @@ _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is 
 _STATE_NUMBERS = 250
 _EDGE_NUMBERS = 55
 _TILT_NUMBERS = 5
+_OLD_NOISE_NAMES = {  # before format 10 was released
+    "gyro_noise_density": "gyroscope_noise_density",
+    "accel_noise_density": "accelerometer_noise_density",
+    "gyro_bias_walk": "gyroscope_random_walk",
+    "accel_bias_walk": "accelerometer_random_walk",
+    "gyro_scale_sigma": "gyroscope_scale_sigma",
+    "accel_scale_sigma": "accelerometer_scale_sigma",
+}
 
 SCHEMA = """
 CREATE TABLE info (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL);
@@ -180,6 +189,11 @@ def window_of(
         note,
         rest_from,
     )
+
+
+def noise_of(stored: dict[str, Any]) -> ImuNoise:
+    """Return a stored noise model, also under the names that sessions had before those of Kalibr."""
+    return ImuNoise(**{_OLD_NOISE_NAMES.get(name, name): value for name, value in stored.items()})
 
 
 @contextmanager

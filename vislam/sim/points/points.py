@@ -262,10 +262,10 @@ class PointRecording:
 def _told(noise: ImuNoise, factor: float) -> ImuNoise:
     return replace(
         noise,
-        gyro_noise_density=noise.gyro_noise_density * factor,
-        accel_noise_density=noise.accel_noise_density * factor,
-        gyro_bias_walk=noise.gyro_bias_walk * factor,
-        accel_bias_walk=noise.accel_bias_walk * factor,
+        gyroscope_noise_density=noise.gyroscope_noise_density * factor,
+        accelerometer_noise_density=noise.accelerometer_noise_density * factor,
+        gyroscope_random_walk=noise.gyroscope_random_walk * factor,
+        accelerometer_random_walk=noise.accelerometer_random_walk * factor,
     )
 
 
