@@ -37,7 +37,7 @@ from vislam.core.messages import Array, ImuSample  # noqa: E402
 from vislam.ekf import Ekf  # noqa: E402
 from vislam.ekf.loose import kernels  # noqa: E402
 from worlds import monte_carlo as mc  # noqa: E402
-from worlds.parts import GRAVITY_M_S2  # noqa: E402
+from worlds.parts import GRAVITY_M_S2, MACHINE  # noqa: E402
 
 DT = 1.0 / mc.IMU.rate_hz
 SIGMAS = np.array(
@@ -192,7 +192,7 @@ def _whole_filter() -> dict[str, float]:
     for delay_s in (0.0, 0.1, 0.25):
         scenario = mc.Scenario("", delay_s=delay_s, duration_s=20.0)
         rng = np.random.default_rng(1)
-        ekf = Ekf(mc.honest(), mc.IMU, GRAVITY_M_S2)
+        ekf = Ekf(mc.honest(), mc.IMU, MACHINE)
         ekf.initialise(mc.start(way, scenario.start_sigmas, rng))
         deliveries, i, in_vision, frames = list(mc.vision(scenario, way, rng)), 0, 0.0, 0
         begin = time.process_time()

@@ -61,14 +61,13 @@ def correct(connection, seconds: float, ready, go, epoch) -> None:
 
 def close_loops(connection, stop, grown, closed) -> None:
     """Build a graph of 1,000 keyframes, then add more and close a loop over 1,000 with every tenth."""
-    from vislam.config import GraphConfig, WindowConfig
+    from vislam.config import GraphConfig, MachineConfig, WindowConfig
     from vislam.graph import PoseGraph
     from vislam.live.notices import MapMoved
     from worlds.lap import RIG, World
-    from worlds.parts import GRAVITY_M_S2
 
     world = World(duration_s=2.0 * KEYFRAMES / 5.0)
-    graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, MachineConfig(), RIG, WindowConfig())
     graph.initialise(world.initial_state(), world.truth[0])
     T_odom_body = world.truth[0]
     for k in range(2 * KEYFRAMES):

@@ -42,7 +42,7 @@ from vislam.graph import PoseGraph  # noqa: E402
 from vislam.graph.replay import EdgeGraph  # noqa: E402
 from worlds.endless_lap import STEREO, LapWorld, cart_round, window_of_truth  # noqa: E402
 from worlds.lap import packet_of  # noqa: E402
-from worlds.parts import GRAVITY_M_S2  # noqa: E402
+from worlds.parts import MACHINE  # noqa: E402
 
 RESULTS = ROOT / "results" / "long_run"
 
@@ -108,7 +108,7 @@ def hour(coupling: str, minutes: float, loop_every: int, tracks: int) -> None:
     config = GraphConfig(coupling="tight" if coupling == "tight" else "loose")
     if coupling == "tight" and tracks == 0:
         vislam.window.SlidingWindow = lambda *_: window_of_truth(world, count)
-    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, STEREO, WindowConfig())
+    graph = PoseGraph(config, world.noise, MACHINE, STEREO, WindowConfig())
     graph.initialise(world.initial_state())
     meter = Meter(f"{minutes:.0f} min {coupling}, loop every {loop_every}, {tracks} tracks")
     truth = []
@@ -150,7 +150,7 @@ def _rounds(name: str, config: GraphConfig, count: int, tracks: int, seed: int) 
     real = vislam.window.SlidingWindow
     if tracks == 0:
         vislam.window.SlidingWindow = lambda *_: window_of_truth(world, count)
-    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, STEREO, WindowConfig())
+    graph = PoseGraph(config, world.noise, MACHINE, STEREO, WindowConfig())
     vislam.window.SlidingWindow = real
     graph.initialise(world.initial_state())
     meter, truth, offered, causal = Meter(f"room, {name}, {count} keyframes, {tracks} tracks"), [], 0, []
@@ -186,7 +186,7 @@ def chain(kilometres: float, step_m: float) -> None:
     graph = PoseGraph(
         GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0),
         None,
-        9.81,
+        MACHINE,
         STEREO,
         WindowConfig(),
     )

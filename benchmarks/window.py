@@ -38,7 +38,7 @@ from vislam.config import WindowConfig  # noqa: E402
 from vislam.core.messages import Array, KeyframePacket, NavState  # noqa: E402
 from vislam.window import SlidingWindow  # noqa: E402
 from worlds.motion import Motion, state_error  # noqa: E402
-from worlds.parts import GRAVITY_M_S2  # noqa: E402
+from worlds.parts import GRAVITY_M_S2, MACHINE  # noqa: E402
 from worlds.room import MONO, PINHOLE, START_SIGMAS, T_BODY_CAM0, World, start_state  # noqa: E402
 
 WARM_UP = 20  # keyframes before times count: compilation, and a window that is not full yet
@@ -52,7 +52,7 @@ def world(seed: int, args: argparse.Namespace) -> World:
 
 def run_ours(packets: list[KeyframePacket], start: NavState, keyframes: int) -> tuple[Array, list[float]]:
     """Return positions [N, 3] as they were when each keyframe was the newest, and seconds of CPU for each."""
-    window = SlidingWindow(replace(WindowConfig(), keyframes=keyframes), MONO, World.noise, GRAVITY_M_S2)
+    window = SlidingWindow(replace(WindowConfig(), keyframes=keyframes), MONO, World.noise, MACHINE)
     window.initialise(start)
     positions, times = [], []
     for packet in packets:
@@ -300,7 +300,7 @@ def nees(args: argparse.Namespace) -> None:
     config = replace(WindowConfig(), keyframes=args.keyframes)
     for seed in range(args.runs):
         packets, truths = world(seed, args).packets()
-        window = SlidingWindow(config, MONO, World.noise, GRAVITY_M_S2)
+        window = SlidingWindow(config, MONO, World.noise, MACHINE)
         window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
         for packet in packets:
             newest = window.add(packet).newest

@@ -8,7 +8,7 @@ owes is a covariance that says so. Rest is information: somebody who knows that 
 
 import numpy as np
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.core.messages import ImuSample, NavState
 from vislam.ekf import Ekf
 from vislam.sim import open_points
@@ -31,7 +31,7 @@ start = NavState(
 
 def dead_reckoned(rest_until_s: float) -> list[tuple[float, float]]:
     """Return error and sigma of the position after each second of motion, told of the rest before it or not."""
-    ekf = Ekf(EkfConfig(), world.imu_noise, gravity_m_s2=9.81)
+    ekf = Ekf(EkfConfig(), world.imu_noise, MachineConfig())
     ekf.initialise(start)
     out = []
     for k, sample in enumerate(samples[:-1]):

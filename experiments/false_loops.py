@@ -22,7 +22,7 @@ import numpy as np
 from vislam.batch.posegraph.files import read_pose_graph
 from vislam.batch.posegraph.optimize import optimize_pose_graph
 from vislam.batch.posegraph.problem import PoseGraphProblem
-from vislam.config import GraphConfig, WindowConfig
+from vislam.config import GraphConfig, MachineConfig, WindowConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import align_points, invert, se3_adjoint, se3_exp, transform_points
 from vislam.core.messages import (
@@ -150,7 +150,7 @@ class Outcome:
     """The file's keyframes through the graph, with false loops in groups; group 0: without."""
 
     def __init__(self, file: PoseGraphFile, group: int, claimed: float, seed: int) -> None:
-        self.graph = PoseGraph(_CONFIG, None, 9.81, _RIG, WindowConfig())
+        self.graph = PoseGraph(_CONFIG, None, MachineConfig(), _RIG, WindowConfig())
         self.graph.initialise(None, file.truth[0])
         false = FalseLoops(0.5, group, seed, file.in_plane(_FALSE_SIGMAS)) if group else None
         self.offered: dict[int, LoopEdge] = {}

@@ -60,9 +60,9 @@ _START_SIGMAS = (0.05, 0.05, 0.1, 0.5, 0.5, 0.5, 1.0, 1.0, 1.0, *[1e-3] * 3, *[0
 _SETTINGS = {
     "graph.coupling": "loose", "ekf.coupling": "loose",
     "graph.gauge_sigma_m": 0.5, "graph.gauge_sigma_rad": 0.1,  # the world is that of the fixes: no free choice
-    "graph.imu_max_outage_s": 2.0,  # the holes of the inertial data last 1.6 s
-    **dict.fromkeys(("ekf.gap_accel_m_s2", "graph.outage_accel_sigma_m_s2"), 1.0),  # a car in traffic
-    **dict.fromkeys(("ekf.gap_gyro_rad_s", "graph.outage_gyro_sigma_rad_s"), 0.1),
+    "machine.max_outage_s": 2.0,  # the holes of the inertial data last 1.6 s
+    **dict.fromkeys(("ekf.gap_accel_m_s2", "machine.outage_accel_sigma_m_s2"), 1.0),  # a car in traffic
+    **dict.fromkeys(("ekf.gap_gyro_rad_s", "machine.outage_gyro_sigma_rad_s"), 0.1),
 }  # fmt: skip
 
 
@@ -143,11 +143,11 @@ class Drive:
         fixes = Position(PositionSettings(sigma_m=sigma_m, sigma_up_m=sigma_m, frame="known"))
         fixes.gate_probability = 1.0 - 1e-6  # nothing else would bring a filter back that has gated a good one
         suite = Suite({"gnss": fixes} | ({"car": Twist(_CAR)} if assumption == "car" else {}))
-        gravity = config.imu.gravity_m_s2
-        self.filter = Filtering(config.ekf, table.noise, gravity, _NO_RIG, suite)
-        self.buffer = ImuBuffer(config.imu)
+        gravity = config.machine.gravity_m_s2
+        self.filter = Filtering(config.ekf, table.noise, config.machine, _NO_RIG, suite)
+        self.buffer = ImuBuffer(config.imu, config.machine)
         self.intake = ReadingIntake(suite, self.filter, self.buffer, gravity, table.noise.accelerometer_noise_density)
-        self.graph = PoseGraph(config.graph, table.noise, gravity, _NO_RIG, config.window, suite)
+        self.graph = PoseGraph(config.graph, table.noise, config.machine, _NO_RIG, config.window, suite)
         self._table, self._has_car = table, assumption == "car"
         self._car_ns = 0
         self.cpu_s = {"filter": 0.0, "graph": 0.0}

@@ -41,7 +41,7 @@ from vislam.trajectory import Trajectory
 
 _SETTINGS = {
     "graph.coupling": "loose", "ekf.coupling": "loose",
-    "imu.max_gap_s": 1.0, "ekf.max_gap_s": 1.0, "graph.imu_max_gap_s": 1.0,  # samples come five times a second
+    "machine.max_gap_s": 1.0,  # samples come five times a second
 }  # fmt: skip
 _STEP_NS = 1_000_000_000  # between keyframes
 _FRAME = 4  # of the own variables of ranges: heading and place of their frame
@@ -113,15 +113,15 @@ class Drive:
     def __init__(self, plaza: Plaza, suite: Suite) -> None:
         """Set both up, knowing nothing of where the robot starts but that it stands."""
         self.config = config = load(None, _SETTINGS)
-        self.gravity_m_s2 = config.imu.gravity_m_s2
+        self.gravity_m_s2 = config.machine.gravity_m_s2
         period_s = float(np.median(np.diff(plaza.t_ns))) * 1e-9
         noise = ImuNoise(0.01, 0.5, 1e-4, 1e-4, 1.0 / period_s)
-        self.filter = Filtering(config.ekf, noise, self.gravity_m_s2, _NO_RIG, suite)
-        self.buffer = ImuBuffer(config.imu)
+        self.filter = Filtering(config.ekf, noise, config.machine, _NO_RIG, suite)
+        self.buffer = ImuBuffer(config.imu, config.machine)
         self.intake = ReadingIntake(
             suite, self.filter, self.buffer, self.gravity_m_s2, noise.accelerometer_noise_density
         )
-        self.graph = PoseGraph(config.graph, noise, self.gravity_m_s2, _NO_RIG, config.window, suite)
+        self.graph = PoseGraph(config.graph, noise, config.machine, _NO_RIG, config.window, suite)
         self._plaza, self._suite = plaza, suite
         self.cpu_s = {"filter": 0.0, "graph": 0.0}
         self.covariances: list[Array] = []  # [2, 2] of the filter's places among the anchors, of each keyframe

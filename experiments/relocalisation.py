@@ -113,7 +113,7 @@ def make_map(recording: Recording, config: Config) -> SavedMap:
 
 def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGraph:
     """Return a graph with the map's keyframes, held where they are."""
-    graph = PoseGraph(replace(config.graph, coupling="loose"), None, 9.81, recording.rig, config.window)
+    graph = PoseGraph(replace(config.graph, coupling="loose"), None, config.machine, recording.rig, config.window)
     graph.initialise(None, known.T_map_body[0])
     packets = []
     for k, T in enumerate(known.T_map_body):

@@ -125,7 +125,7 @@ def run(job: Job, overrides: Callable[[dict], dict]) -> Start:
     if slam.back is not None:
         graph = slam.back.graph
         states = graph.states()
-        final = log.final_trajectory([int(i) for i in graph.ids], graph.poses(), states, config.imu)
+        final = log.final_trajectory([int(i) for i in graph.ids], graph.poses(), states, config.machine)
         end_sigma = stated_scale_sigma(states)
     return judged(job, config, slam, log, final, recording.truth(), end_sigma, lost)
 
@@ -146,7 +146,7 @@ def judged(
     errors: dict[str, float | None] = {}
     with suppress(DataError):  # without a trajectory there is nothing to compare
         errors = evaluate(final, truth, front.alignment) if truth is not None else {}
-    evidence = whole_evidence(front_evidence(front, config.imu), log, final, [], {}, 0, {})
+    evidence = whole_evidence(front_evidence(front, config.machine), log, final, [], {}, 0, {})
     told = list(verdict_of(evidence, config.verdict).reasons)
     is_lost = bool(lost) or log.newest_tracking is Tracking.LOST
     begins = begun["status"] in BEGUN

@@ -2,7 +2,8 @@ import json
 
 import pytest
 
-from vislam.config import Config, dump, from_data, load
+from vislam.cli import run_verb
+from vislam.config import Config, dump, from_data, load, recorded
 from vislam.config.profiles import PROFILES
 from vislam.core.errors import UsageError
 
@@ -14,10 +15,10 @@ def test_defaults_survive_a_round_trip_through_json():
 
 def test_file_and_overrides_are_layered(tmp_path):
     path = tmp_path / "vislam.toml"
-    path.write_text("seed = 3\n[imu]\ngravity_m_s2 = 9.79\n[loop]\nenabled = false\n", encoding="utf-8")
-    config = load(path, {"imu.gravity_m_s2": 9.83, "frontend.mode": "mono"})
+    path.write_text("seed = 3\n[machine]\ngravity_m_s2 = 9.79\n[loop]\nenabled = false\n", encoding="utf-8")
+    config = load(path, {"machine.gravity_m_s2": 9.83, "frontend.mode": "mono"})
     assert config.seed == 3
-    assert config.imu.gravity_m_s2 == 9.83
+    assert config.machine.gravity_m_s2 == 9.83
     assert config.loop.enabled is False
     assert config.frontend.mode == "mono"
 
@@ -61,3 +62,29 @@ def test_a_profile_lies_below_file_and_options(tmp_path):
 @pytest.mark.parametrize("name", PROFILES)
 def test_loading_a_profile_twice_gives_the_same(name):
     assert load(profile_name=name) == load(profile_name=name)
+
+
+def test_names_of_earlier_versions_are_understood_in_files(tmp_path, caplog):
+    path = tmp_path / "old.toml"
+    path.write_text("[imu]\ngravity_m_s2 = 9.79\n[ekf]\nnonholonomic = true\naxle_m = [-0.3, 0, 0]\n", encoding="utf-8")
+    machine = load(path).machine
+    assert (machine.gravity_m_s2, machine.slip_sigma_m_s, machine.axle_m) == (9.79, 0.02, (-0.3, 0.0, 0.0))
+    assert "imu.gravity_m_s2 is now machine.gravity_m_s2" in caplog.text
+    path.write_text("[ekf]\nfloor_sigma_m = 0.01\n[graph]\nfloor_sigma_m = 0.02\n", encoding="utf-8")
+    with pytest.raises(UsageError, match=r"both are now machine\.floor_sigma_m"):
+        load(path)
+
+
+def test_settings_recorded_by_an_earlier_version_are_read():
+    stored = json.loads(json.dumps(dump(Config())))
+    del stored["machine"]
+    stored["imu"] |= {"gravity_m_s2": 9.8, "max_gap_s": 0.1}
+    stored["graph"] |= {"imu_max_outage_s": 2.0, "no_longer_a_setting": 3}
+    stored["window"] |= {"imu_max_outage_s": 1.0}
+    config = from_data(recorded(stored, "config.json"), "config.json")
+    assert (config.machine.gravity_m_s2, config.machine.max_outage_s) == (9.8, 2.0)
+
+
+def test_an_option_that_moved_says_where(capsys):
+    assert run_verb(["run", "tum:X", "--out", "OUT", "--ekf.no-nonholonomic"]) == 2
+    assert "--ekf.no-nonholonomic is now --machine.slip-sigma-m-s" in capsys.readouterr().err

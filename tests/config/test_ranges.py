@@ -84,7 +84,7 @@ def test_every_number_among_the_options_of_a_verb_has_a_range(verb: str) -> None
         ("optimize X.g2o --iterations -1", "--iterations is -1; allowed is 1 or more"),
         ("optimize X --iterations -1", "--iterations is -1; allowed is 1 or more"),
         ("run tum:X --out OUT --ekf.gate-probability 2", "is 2; allowed is more than 0 and less than 1"),
-        ("run tum:X --out OUT --imu.gravity-m-s2 nan", "--imu.gravity-m-s2 is nan; allowed is more than 0"),
+        ("run tum:X --out OUT --machine.gravity-m-s2 nan", "--machine.gravity-m-s2 is nan; allowed is more than 0"),
         ("live --out OUT --sensors.webcam.width-px 0", "--sensors.webcam.width-px is 0; allowed is 1 or more"),
         ("calibrate camera X --rows -2", "--rows is -2; allowed is 1 or more"),
         ("map X --query nan 0 0", "--query is nan; allowed is any finite number"),

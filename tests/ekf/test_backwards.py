@@ -12,7 +12,7 @@ from vislam.ekf.tight.backwards import EarlyFrames, known_from
 from vislam.imu.series import ImuSeries
 from worlds.flight import CHEAP, SIGMAS, Flight
 from worlds.motion import T0_NS, state_error
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 CONFIG = EkfConfig()
 _SAMPLE = 1600  # the state is found 8 s into the flight
@@ -32,7 +32,7 @@ def before(flight: Flight, first: NavState, blind: bool = False) -> dict[int, Na
     series = ImuSeries()
     for sample in flight.samples:
         series.append(sample)
-    early = EarlyFrames(CONFIG, flight.rig, GRAVITY_M_S2)
+    early = EarlyFrames(CONFIG, flight.rig, MACHINE)
     for t_ns, seen in flight.frames:
         if not blind:
             early.see(t_ns, seen, False)

@@ -31,7 +31,7 @@ from vislam.imu import preintegrate
 from vislam.vision.relative_motion import camera_displacement, direction_residual, metric_residual
 from worlds import monte_carlo as mc
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, SimulatedVision, to_span
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 LEVER = np.array([0.1, -0.05, 0.2])
 NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
@@ -104,7 +104,7 @@ def step(
 ) -> tuple[Array, Array]:
     x, P = x.copy(), P.copy()
     sigmas = np.array([white, white, 0.0, 0.0, 0.5, 2.0])
-    kernels.predict(x, P, s0, s1, dt, gap_s, sigmas, GRAVITY_M_S2)
+    kernels.predict(x, P, s0, s1, dt, gap_s, sigmas, MACHINE)
     return x, P
 
 
@@ -131,7 +131,7 @@ def test_prediction_is_preintegration() -> None:
     motion = Motion.random(2)
     samples = motion.samples(0.5)[0]
     T, v, *_ = motion.at(0.0)
-    ekf = Ekf(EkfConfig(), replace(EUROC_NOISE, gyroscope_random_walk=0.0, accelerometer_random_walk=0.0), GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), replace(EUROC_NOISE, gyroscope_random_walk=0.0, accelerometer_random_walk=0.0), MACHINE)
     ekf.predict(samples[0])
     ekf.initialise(NavState(T0_NS, T, v, np.zeros(3), np.zeros(3), np.zeros((15, 15))))
     for s in samples[1:]:
@@ -305,7 +305,7 @@ class Scene:
 
     def ekf(self, **config: float) -> Ekf:
         settings = EkfConfig(**{"vo_inflation": 1.0, **config})
-        ekf = Ekf(settings, EUROC_NOISE, GRAVITY_M_S2)
+        ekf = Ekf(settings, EUROC_NOISE, MACHINE)
         ekf.initialise(self.start())
         return ekf
 
@@ -404,7 +404,7 @@ def test_measurement_ahead_of_the_imu_waits(scene: Scene) -> None:
 
 
 def test_start_in_the_past_runs_through_the_samples(scene: Scene) -> None:
-    first, later = scene.ekf(), Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2)
+    first, later = scene.ekf(), Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, MACHINE)
     for s in scene.samples[:200]:
         first.predict(s)
         later.predict(s)
@@ -420,14 +420,14 @@ def test_start_can_place_the_keyframe(scene: Scene) -> None:
     source = scene.run(scene.ekf())
     state = source.state_at(scene.stamps[i])
     assert state is not None
-    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     for s in scene.samples:
         ekf.predict(s)
     ekf.initialise(state, scene.motions[i])
     for k in (i + 1, i + 2):
         result = ekf.update_vo(scene.motions[k])
         assert result.accepted, result.reason
-    blind = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    blind = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     blind.predict(scene.samples[-1])
     blind.initialise(state)
     assert not blind.update_vo(scene.motions[i + 1]).accepted
@@ -600,7 +600,7 @@ def test_too_late_and_too_early() -> None:
     assert ekf.counters["too_late"] == 1
     assert ekf.pose_at(T0_NS + NS) is None
     assert ekf.pose_at(scene.samples[-1].t_ns + 1) is None
-    fresh = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    fresh = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     assert not fresh.update_zero_velocity(0).accepted
     assert fresh.pose_at(0) is None
     with pytest.raises(ValueError, match="initialise"):
@@ -646,7 +646,7 @@ def test_sustained_rejection_widens_the_covariance_without_a_jump() -> None:
 
 def test_zero_velocity_stops_the_drift_and_shows_the_gyro_bias() -> None:
     bias = np.array([0.01, -0.02, 0.03])
-    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     sigmas = np.repeat([0.01, 0.001, 0.05, 0.05, 0.1], 3)
     ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     for k in range(1, 2001):
@@ -665,7 +665,7 @@ def test_zero_velocity_stops_the_drift_and_shows_the_gyro_bias() -> None:
 def test_rest_holds_the_pose_at_which_it_began_through_keyframes_and_a_missed_frame() -> None:
     """A minute, 5 keyframes a second, vision relative to each with its own error; every 50th frame is not told."""
     rng = np.random.default_rng(21)
-    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     sigmas = np.repeat([0.01, 0.001, 0.05, 0.02, 0.1], 3)
     ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     per_sample = np.sqrt(EUROC_NOISE.rate_hz) * np.repeat([3.0, 1.0], 3)
@@ -700,7 +700,7 @@ def test_rest_holds_the_pose_at_which_it_began_through_keyframes_and_a_missed_fr
 
 
 def test_rest_that_was_left_unseen_does_not_pull_back() -> None:
-    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     sigmas = np.repeat([0.01, 0.001, 0.05, 0.01, 0.1], 3)
     ekf.initialise(NavState(T0_NS, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     ekf.add_keyframe(0, T0_NS)
@@ -759,7 +759,7 @@ CAMERA = transform(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, -0.05, 0.
 def test_directions_alone_keep_attitude_and_slow_the_drift() -> None:
     scene = Scene(seed=3, camera=CAMERA)
     free, seen = scene.ekf(), scene.ekf()
-    seen = Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
+    seen = Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, MACHINE, CAMERA)
     seen.initialise(scene.ekf().state())
     scene.run(seen)
     for s in scene.samples:
@@ -772,7 +772,7 @@ def test_directions_alone_keep_attitude_and_slow_the_drift() -> None:
 
 def test_direction_from_behind_is_refused_and_no_parallax_gives_rotation() -> None:
     scene = Scene(seed=3, camera=CAMERA)
-    ekf = Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, GRAVITY_M_S2, CAMERA)
+    ekf = Ekf(EkfConfig(vo_inflation=1.0), EUROC_NOISE, MACHINE, CAMERA)
     ekf.initialise(scene.ekf().state())
     scene.run(ekf)
     last = scene.motions[-1]

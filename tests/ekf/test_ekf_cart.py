@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.core.geometry import invert, so3_exp, transform
 from vislam.core.messages import Array, ImuSample, NavState, NoiseScale, Observations, Tracking, VoMeasurement
 from vislam.ekf import Correction, Ekf
@@ -20,7 +20,7 @@ NOISE = ImuNoise(5e-4, 6e-3, 3e-5, 4e-4, 200.0)
 GRAVITY_M_S2 = 9.81
 AXLE_M = np.array([-0.3, 0.05, -0.1])
 SPEED_M_S, TURN_RAD_S = 0.8, 0.3
-CART = EkfConfig(nonholonomic=True, axle_m=(-0.3, 0.05, -0.1))
+CART = MachineConfig(slip_sigma_m_s=0.02, axle_m=(-0.3, 0.05, -0.1))
 
 
 def perturbed(x: Array, d: Array) -> Array:
@@ -58,10 +58,10 @@ def cart(t_s: float) -> tuple[Array, Array, Array, Array]:
     return transform(R, axle + R @ lever), velocity, rate, force
 
 
-def drive(config: EkfConfig, seed: int, seconds: float = 12.0) -> tuple[Ekf, NavState]:
+def drive(machine: MachineConfig, seed: int, seconds: float = 12.0) -> tuple[Ekf, NavState]:
     """Let a filter that has no vision follow a cart."""
     rng = np.random.default_rng(seed)
-    ekf = Ekf(config, NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), NOISE, machine)
     T, velocity, _, _ = cart(0.0)
     sigmas = np.repeat([0.005, 1e-3, 0.02, 5e-4, 0.03], 3)
     sigmas[2] = 1e-4
@@ -74,7 +74,7 @@ def drive(config: EkfConfig, seed: int, seconds: float = 12.0) -> tuple[Ekf, Nav
         white = np.sqrt(NOISE.rate_hz) * rng.normal(0.0, np.repeat([5e-4, 6e-3], 3))
         t_ns = round(k * 1e9 / NOISE.rate_hz)
         ekf.predict(ImuSample(t_ns, rate + bias_gyro + white[:3], force + bias_accel + white[3:]))
-        if config.nonholonomic and k % 20 == 0:
+        if machine.slip_sigma_m_s is not None and k % 20 == 0:
             ekf.update_nonholonomic(t_ns)
     return ekf, ekf.state()
 
@@ -86,7 +86,7 @@ def error(state: NavState, seconds: float = 12.0) -> float:
 def test_wheels_hold_the_drift_without_vision() -> None:
     free, wheels, floor = [], [], []
     for seed in range(6):
-        free.append(error(drive(replace(CART, nonholonomic=False), seed)[1]))
+        free.append(error(drive(replace(CART, slip_sigma_m_s=None), seed)[1]))
         ekf, state = drive(CART, seed)
         wheels.append(error(state))
         assert ekf.counters["nonholonomic_accepted"] > 100
@@ -115,7 +115,7 @@ def test_a_cart_that_is_carried_sideways_is_gated() -> None:
 
 def exactly_known() -> tuple[Ekf, Array, Array]:
     """Return a filter at the true state, and the rate and force that a cart in its turn always has."""
-    ekf = Ekf(CART, NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), NOISE, CART)
     T, velocity, rate, force = cart(0.0)
     ekf.initialise(NavState(0, T, velocity, np.zeros(3), np.zeros(3), np.eye(15) * 1e-4))
     return ekf, rate, force

@@ -18,7 +18,7 @@ from vislam.ekf import Ekf
 from vislam.imu import NoiseFloor
 from worlds import monte_carlo as mc
 from worlds.motion import EUROC_NOISE, RealMotion, SimulatedVision
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 RUNS, FIRST_SEED = 10, 5000
 SCENARIOS = {scenario.name: scenario for scenario in mc.SCENARIOS}
@@ -161,7 +161,7 @@ def test_real_inertial_data_with_vision_made_from_truth(data_root, name: str, at
     T = real.pose(start_ns)
     T[:3, :3] = T[:3, :3] @ so3_exp(np.deg2rad([2.0, 0.0, 0.0]))
     sigmas = np.repeat([0.04, 0.001, 0.1, 0.1, 0.2], 3)
-    ekf = Ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2)
+    ekf = Ekf(EkfConfig(), EUROC_NOISE, MACHINE)
     ekf.initialise(NavState(start_ns, T, real.velocity(start_ns), np.zeros(3), np.zeros(3), np.diag(sigmas**2)))
     i, nis, speed_chi2, seen, true = 0, [], [], [], []
     floor = NoiseFloor(replace(EUROC_NOISE, gyroscope_scale_sigma=0.003, accelerometer_scale_sigma=0.01))

@@ -12,7 +12,7 @@ from vislam.core.messages import Array, ImuSample, NavState, VoMeasurement
 from vislam.ekf import Ekf, UpdateResult
 from worlds import monte_carlo as mc
 from worlds.motion import NS
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 SCENARIO = mc.Scenario("3 s", duration_s=3.0)
 SEED = 77
@@ -28,7 +28,7 @@ class Bench:
     def __init__(self, config: EkfConfig | None = None) -> None:
         self.way = mc.drive("hand", SEED, 3.0)
         rng = np.random.default_rng(SEED)
-        self.ekf = Ekf(config or mc.honest(), mc.IMU, GRAVITY_M_S2)
+        self.ekf = Ekf(config or mc.honest(), mc.IMU, MACHINE)
         self.ekf.initialise(mc.start(self.way, mc.START_SIGMAS, rng))
         self.frames = [(vo, begins) for _, vo, begins in mc.vision(SCENARIO, self.way, rng)]
         self.k, self.i = -1, 0

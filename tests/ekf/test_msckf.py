@@ -19,7 +19,7 @@ from vislam.sim.points.points import open_points
 from vislam.trajectory import Trajectory, align, associate, ate
 from worlds.flight import CHEAP, MONO, RGBD, SIGMAS, STEREO, Flight, motion_of
 from worlds.motion import EUROC_NOISE, NS, T0_NS
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 NOTHING = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 
@@ -120,7 +120,7 @@ def test_a_start_in_the_past_catches_up() -> None:
     flight = Flight.make(4, 2.0)
     usual, late = (
         flight.filter(),
-        MsckfEkf(EkfConfig(tight_point_inflation=1.0), CHEAP, GRAVITY_M_S2, MONO),
+        MsckfEkf(EkfConfig(tight_point_inflation=1.0), CHEAP, MACHINE, MONO),
     )
     for sample in flight.samples:
         late.predict(sample)
@@ -262,7 +262,7 @@ def test_motion_after_rest_is_followed() -> None:
     recording = open_points("laps", seed=4, rig="mono", duration_s=10.0)
     noise = recording.imu_noise
     assert noise is not None
-    ekf = MsckfEkf(EkfConfig(coupling="tight"), noise, GRAVITY_M_S2, recording.rig)
+    ekf = MsckfEkf(EkfConfig(coupling="tight"), noise, MACHINE, recording.rig)
     truth = recording.motion.at(np.arange(0.0, 10.0, 0.01))
     errors_m = []
     for value in recording.events():
@@ -286,8 +286,8 @@ def test_motion_after_rest_is_followed() -> None:
 
 
 def test_the_configuration_chooses_the_filter() -> None:
-    loose = make_ekf(EkfConfig(), EUROC_NOISE, GRAVITY_M_S2, MONO)
-    tight = make_ekf(EkfConfig(coupling="tight"), EUROC_NOISE, GRAVITY_M_S2, STEREO)
+    loose = make_ekf(EkfConfig(), EUROC_NOISE, MACHINE, MONO)
+    tight = make_ekf(EkfConfig(coupling="tight"), EUROC_NOISE, MACHINE, STEREO)
     assert isinstance(loose, Ekf) and isinstance(tight, MsckfEkf)
 
 

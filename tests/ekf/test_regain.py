@@ -14,7 +14,7 @@ from vislam.ekf.regain import Refused, Watch
 from vislam.sensors import Suite
 from worlds import monte_carlo as mc
 from worlds.flight import MONO
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.sensed_paths import KINDS, EkfConfig, Fix, SensedRun, Speed
 
 SECOND = int(mc.IMU.rate_hz)
@@ -31,14 +31,14 @@ def too_sure(kind: str, suite: Suite) -> Ekf | MsckfEkf:
     )
     imu = replace(mc.IMU, **{name: 0.1 * getattr(mc.IMU, name) for name in names})
     if kind == "loose":
-        return Ekf(mc.honest(), imu, GRAVITY_M_S2, suite=suite)
-    return MsckfEkf(EkfConfig(coupling="tight"), imu, GRAVITY_M_S2, MONO, suite)
+        return Ekf(mc.honest(), imu, MACHINE, suite=suite)
+    return MsckfEkf(EkfConfig(coupling="tight"), imu, MACHINE, MONO, suite)
 
 
 def honest(kind: str, suite: Suite) -> Ekf | MsckfEkf:
     if kind == "loose":
-        return Ekf(mc.honest(), mc.IMU, GRAVITY_M_S2, suite=suite)
-    return MsckfEkf(EkfConfig(coupling="tight"), mc.IMU, GRAVITY_M_S2, MONO, suite)
+        return Ekf(mc.honest(), mc.IMU, MACHINE, suite=suite)
+    return MsckfEkf(EkfConfig(coupling="tight"), mc.IMU, MACHINE, MONO, suite)
 
 
 def fixes(sigma_m: float = 0.5, regain_m: float = 1000.0) -> Fix:

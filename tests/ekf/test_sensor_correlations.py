@@ -19,7 +19,7 @@ from vislam.sensors import BodyState, Sensor, Suite, Variable
 from worlds import monte_carlo as mc
 from worlds.flight import CHEAP, MONO, SIGMAS, STEREO, Flight, motion_of
 from worlds.motion import NS, T0_NS, state_error
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.sensed_paths import KINDS, Fix, SensedRun, Speed, every_sensor, made
 
 PLACE = (Variable("x_m", 10.0), Variable("y_m", 10.0), Variable("z_m", 10.0))
@@ -55,7 +55,7 @@ def test_a_marked_place_stays_the_clone_that_was_taken_there(rig) -> None:
     flight = Flight.make(2, 4.0, rig, sigmas=0.1 * SIGMAS, outliers=0.05)
     suite = Suite({"mark": Mark(), "speed": Speed()})
     config = load(None, {"ekf.coupling": "tight", "ekf.tight_time_offset": False}).ekf  # a mark is by the IMU's clock
-    ekf = MsckfEkf(config, CHEAP, GRAVITY_M_S2, rig, suite)
+    ekf = MsckfEkf(config, CHEAP, MACHINE, rig, suite)
     ekf.initialise(flight.start)
     marked_ns, compared, i, most = 0, 0, 0, 0.0
     for sample in flight.samples:
@@ -93,7 +93,7 @@ def test_a_marked_place_stays_the_keyframe_that_was_taken_there() -> None:
         scenario = mc.Scenario("", metric=metric, duration_s=6.0)
         way, rng = mc.drive("hand", 21, 6.0), np.random.default_rng(4)
         config = mc.honest(odom="corrected", vo_shared_fraction=0.0)
-        ekf = Ekf(config, mc.IMU, GRAVITY_M_S2, None if metric else mc.CAMERA, Suite({"mark": Mark()}))
+        ekf = Ekf(config, mc.IMU, MACHINE, None if metric else mc.CAMERA, Suite({"mark": Mark()}))
         ekf.initialise(mc.start(way, 0.1 * mc.START_SIGMAS, rng))
         frames, compared = list(mc.vision(scenario, way, rng)), 0
         most = 0.0
@@ -179,7 +179,7 @@ def test_a_camera_whose_clock_is_off_does_not_spoil_readings(offset_s: float) ->
         flight = Flight.make(seed, 5.0, offset_s=offset_s)
         fine = Fix()
         fine.sigma_m = 0.002
-        ekf = MsckfEkf(load(None, {"ekf.coupling": "tight"}).ekf, CHEAP, GRAVITY_M_S2, MONO, Suite({"fix": fine}))
+        ekf = MsckfEkf(load(None, {"ekf.coupling": "tight"}).ekf, CHEAP, MACHINE, MONO, Suite({"fix": fine}))
         ekf.initialise(flight.start, None, CameraCalibration(offset_s, 1e-4, np.zeros(3), np.full(3, 1e-3)))
         rng = np.random.default_rng(seed)
         i = 0
@@ -208,7 +208,7 @@ def test_the_filter_of_a_run_remembers_what_it_told_of_sensors(coupling: str) ->
     config = load(None, {"ekf.coupling": coupling}).ekf
     sensors = every_sensor()
     run = SensedRun.make(33, 1.0, sensors, {"fix": 40, "height": 20, "beacon": 20, "speed": 20})
-    filtering, twin = (Filtering(config, mc.IMU, GRAVITY_M_S2, MONO, Suite(every_sensor())) for _ in range(2))
+    filtering, twin = (Filtering(config, mc.IMU, MACHINE, MONO, Suite(every_sensor())) for _ in range(2))
     for one in (filtering, twin):
         one.ekf.initialise(run.start)
         for k in range(len(run.way.t_ns)):

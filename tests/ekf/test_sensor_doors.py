@@ -18,7 +18,7 @@ from vislam.sensors.kinds.anchor_range import AnchorRange, AnchorRangeSettings
 from worlds import monte_carlo as mc
 from worlds.flight import MONO
 from worlds.motion import T0_NS
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.sensed_paths import KINDS, Fix, Height, SensedRun, Speed, every_sensor, made
 
 EVERY = {"fix": 40, "height": 20, "beacon": 20, "speed": 20}
@@ -314,9 +314,9 @@ def test_own_variables_walk_between_readings(kind: str) -> None:
 def test_a_filter_without_sensors_is_as_it_was_byte_for_byte(kind: str) -> None:
     config = EkfConfig(coupling=kind)  # type: ignore[arg-type]
     plain, empty, full = (
-        make_ekf(config, mc.IMU, GRAVITY_M_S2, MONO, suite=suite) for suite in (None, Suite(), Suite(every_sensor()))
+        make_ekf(config, mc.IMU, MACHINE, MONO, suite=suite) for suite in (None, Suite(), Suite(every_sensor()))
     )
-    without = make_ekf(config, mc.IMU, GRAVITY_M_S2, MONO)
+    without = make_ekf(config, mc.IMU, MACHINE, MONO)
     run = SensedRun.make(16, 2.0, {}, {})
     for ekf in (without, plain, empty, full):
         for k, _ in run.replay(ekf):

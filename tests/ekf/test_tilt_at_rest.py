@@ -11,7 +11,7 @@ from vislam.ekf import MsckfEkf
 from vislam.sim.sensing import CONSUMER_IMU
 from worlds.flight import MONO, Landmarks, motion_of
 from worlds.motion import levelled, state_error, still
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 RATE = 200
 
@@ -23,7 +23,7 @@ def rested(seed: int, duration_s: float) -> tuple[Array, Array, Array, Array]:
     T = motion.pose(0.0)
     gyro_bias, accel_bias = rng.normal(size=3) * 0.006, rng.normal(size=3) * 0.06
     samples, biases = motion.samples(duration_s, RATE, CONSUMER_IMU, rng, gyro_bias, accel_bias)
-    ekf = MsckfEkf(EkfConfig(), CONSUMER_IMU, GRAVITY_M_S2, MONO)
+    ekf = MsckfEkf(EkfConfig(), CONSUMER_IMU, MACHINE, MONO)
     ekf.initialise(levelled(rng, T, gyro_bias, accel_bias))
     world = Landmarks(MONO, rng, tracks=30, sigma_px=0.5)
     tilts, sigmas, tests = [], [], []

@@ -120,10 +120,10 @@ def test_settings_of_estimator_win_over_sequence_over_plan(tmp_path):
 def test_members_differ_in_gravity_alone_and_the_first_not_at_all(tmp_path):
     first, second = expand(load(tmp_path, GOOD))[:2]
     assert (first.member, second.member) == (0, 1)
-    assert first.config["imu"]["gravity_m_s2"] == 9.81
-    assert second.config["imu"]["gravity_m_s2"] == pytest.approx(9.81 * (1 + JITTER), rel=1e-15)
-    assert second.config["imu"]["gravity_m_s2"] != 9.81
-    second.config["imu"]["gravity_m_s2"] = 9.81
+    assert first.config["machine"]["gravity_m_s2"] == 9.81
+    assert second.config["machine"]["gravity_m_s2"] == pytest.approx(9.81 * (1 + JITTER), rel=1e-15)
+    assert second.config["machine"]["gravity_m_s2"] != 9.81
+    second.config["machine"]["gravity_m_s2"] = 9.81
     assert first.config == second.config
 
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
 
-from vislam.config import GraphConfig, WindowConfig
+from vislam.config import GraphConfig, MachineConfig, WindowConfig
 from vislam.core.geometry import se3_exp
 from vislam.core.messages import KeyframePacket
 from vislam.factors import motion
 from vislam.factors.keys import V, X
 from vislam.graph import PoseGraph
 from worlds.lap import RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)
 
@@ -60,14 +58,16 @@ def test_a_graph_takes_them_and_the_floor_holds_the_height(imu: bool) -> None:
     packets = [world.packet(k, imu=imu) for k in range(world.count)]
     plain = run(world, packets, EXACT, imu)
     # the world's body rises and falls by 0.3 m: a floor that hard would be wrong, a soft one changes nothing
-    soft = run(world, packets, replace(EXACT, floor_sigma_m=30.0, nonholonomic_sigma_m_s=100.0), imu)
+    soft = run(world, packets, EXACT, imu, MachineConfig(floor_sigma_m=30.0, slip_sigma_m_s=100.0))
     assert rmse_m(plain, soft) < 0.002
-    hard = run(world, packets, replace(EXACT, floor_sigma_m=0.001), imu)
+    hard = run(world, packets, EXACT, imu, MachineConfig(floor_sigma_m=0.001))
     assert np.abs(hard[:, 2, 3]).max() < 0.02 < np.abs(plain[:, 2, 3]).max()
 
 
-def run(world: World, packets: list[KeyframePacket], config: GraphConfig, imu: bool) -> np.ndarray:
-    graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
+def run(
+    world: World, packets: list[KeyframePacket], config: GraphConfig, imu: bool, machine: MachineConfig = MACHINE
+) -> np.ndarray:
+    graph = PoseGraph(config, world.noise if imu else None, machine, RIG, WindowConfig())
     graph.initialise(world.initial_state() if imu else None)
     for packet in packets:
         assert not graph.add(packet, []).note

@@ -4,20 +4,20 @@ import gtsam
 import numpy as np
 import pytest
 
-from vislam.config import GraphConfig, WindowConfig
+from vislam.config import GraphConfig, MachineConfig, WindowConfig
 from vislam.core.messages import ImuSpan
 from vislam.factors.preintegration import Preintegrator
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from worlds.lap import EUROC_NOISE, RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 SILENT = ImuNoise(1e-12, 1e-12, 1e-12, 1e-12, 200.0)
 NO_BIAS = gtsam.imuBias.ConstantBias()
 
 
 def _preintegrator(**changes: float) -> Preintegrator:
-    return Preintegrator(GraphConfig(**changes), EUROC_NOISE, GRAVITY_M_S2)
+    return Preintegrator(GraphConfig(), EUROC_NOISE, MachineConfig(**changes))
 
 
 def _whole_span(world: World) -> ImuSpan:
@@ -43,7 +43,7 @@ def test_covariance_is_honest() -> None:
     d2 = []
     world = World(150.0, keyframe_hz=1.0, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), walk=False, seed=5)
     noise = replace(EUROC_NOISE, gyroscope_random_walk=0.0, accelerometer_random_walk=0.0)  # as in this world
-    integrator = Preintegrator(GraphConfig(imu_integration_sigma=1e-6), noise, GRAVITY_M_S2)
+    integrator = Preintegrator(GraphConfig(imu_integration_sigma=1e-6), noise, MACHINE)
     for k in range(1, world.count):
         done = integrator.integrate(world.span(k), world.t_ns(k - 1), world.t_ns(k), NO_BIAS)
         assert done is not None
@@ -85,7 +85,7 @@ def test_uncovered_ends_count_as_outage_and_long_ones_drop_the_factor() -> None:
     done = _preintegrator().integrate(cut, 0, world.t_ns(15), NO_BIAS)
     assert done is not None and done.outage_s == pytest.approx(0.4)
     assert done.duration_s == pytest.approx(3.0)
-    assert _preintegrator(imu_max_outage_s=0.3).integrate(cut, 0, world.t_ns(15), NO_BIAS) is None
+    assert _preintegrator(max_outage_s=0.3).integrate(cut, 0, world.t_ns(15), NO_BIAS) is None
     assert _preintegrator().integrate(None, 0, 1, NO_BIAS) is None
     outside = ImuSpan(span.t_ns[:1], span.gyro_rad_s[:1], span.accel_m_s2[:1])
     assert _preintegrator().integrate(outside, 10**9, 2 * 10**9, NO_BIAS) is None
@@ -99,7 +99,7 @@ def test_a_slow_imu_carries_keyframes_where_vision_is_lost_once_its_rate_is_told
     errors_m, notes = {}, {}
     for rate_hz in (imu_hz, 200.0):
         config = GraphConfig(coupling="loose")
-        graph = PoseGraph(config, replace(noise, rate_hz=rate_hz), GRAVITY_M_S2, RIG, WindowConfig())
+        graph = PoseGraph(config, replace(noise, rate_hz=rate_hz), MACHINE, RIG, WindowConfig())
         graph.initialise(world.initial_state(0.02, 0.15))
         said = [graph.add(packet).note for packet in packets]
         errors_m[rate_hz], notes[rate_hz] = rmse_m(graph.poses(), world.truth), said
@@ -115,6 +115,6 @@ def test_a_slow_imu_carries_keyframes_where_vision_is_lost_once_its_rate_is_told
 def test_bias_walk_is_floored_against_gtsams_pivot_test() -> None:
     tiny = ImuNoise(1e-4, 1e-3, 1e-9, 1e-9, 200.0)
     config = GraphConfig()
-    integrator = Preintegrator(config, tiny, GRAVITY_M_S2)
+    integrator = Preintegrator(config, tiny, MACHINE)
     assert integrator.gyroscope_random_walk == config.gyro_bias_walk_floor
     assert integrator.accelerometer_random_walk == config.accel_bias_walk_floor

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vislam.config import ImuConfig, InitConfig
+from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.geometry import invert, level_rotation, so3_exp, so3_log, transform
 from vislam.core.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
 from vislam.frontend.start.initialisation import Initialisation, Initialiser
@@ -24,7 +24,7 @@ class Feed:
     """Samples and visual motions for an initialiser, frame by frame."""
 
     def __init__(self, samples: list[ImuSample], stamps: list[int], motions: list[VoMeasurement]) -> None:
-        self.buffer = ImuBuffer(ImuConfig())
+        self.buffer = ImuBuffer(ImuConfig(), MachineConfig())
         for sample in samples:
             self.buffer.add(sample)
         self.stamps, self.motions = stamps, motions
@@ -192,7 +192,7 @@ def test_answer_fits_the_visual_chain() -> None:
 
 
 def test_wrong_unit_of_the_accelerometer_fails() -> None:
-    feed, wrong = Feed.moving(4), ImuBuffer(ImuConfig())
+    feed, wrong = Feed.moving(4), ImuBuffer(ImuConfig(), MachineConfig())
     for sample in Motion.random(4).samples(3.0, 200.0)[0]:
         wrong.add(ImuSample(sample.t_ns, sample.gyro_rad_s, sample.accel_m_s2 / GRAVITY_M_S2))  # in g
     feed.buffer = wrong

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vislam.config import ImuConfig, InitConfig
+from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.messages import ImuSample
 from vislam.frontend.start.initialisation import Initialisation, Phase
 from vislam.imu import ImuBuffer
@@ -129,7 +129,7 @@ def test_nobody_who_accelerates_is_told_to() -> None:
 
 
 def test_an_accelerometer_in_g_is_never_started_from() -> None:
-    start, wrong = Start("moving", 2, duration_s=3.0), ImuBuffer(ImuConfig())
+    start, wrong = Start("moving", 2, duration_s=3.0), ImuBuffer(ImuConfig(), MachineConfig())
     for sample in start.samples:
         wrong.add(ImuSample(sample.t_ns, sample.gyro_rad_s, sample.accel_m_s2 / GRAVITY_M_S2))
     start.buffer = wrong
@@ -166,7 +166,7 @@ def test_a_clock_that_is_corrected_costs_no_frame_of_the_window(shift_ns: int) -
     """At both ends of it there are no inertial data for the new times yet, or any more."""
     start = Start("moving", 2)
     search = initialiser(start)
-    buffer = ImuBuffer(ImuConfig())
+    buffer = ImuBuffer(ImuConfig(), MachineConfig())
     samples = iter(start.samples)
     for i, (vo, observations, still) in enumerate(start.frames[:25]):
         while buffer.newest_t_ns is None or buffer.newest_t_ns <= start.stamps[i]:

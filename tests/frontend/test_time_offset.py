@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vislam import open_dataset
-from vislam.config import ImuConfig, InitConfig, from_data
+from vislam.config import ImuConfig, InitConfig, MachineConfig, from_data
 from vislam.core.clock import StageClock
 from vislam.core.geometry import so3_exp, transform
 from vislam.core.messages import Frame, VoMeasurement
@@ -72,7 +72,7 @@ def test_switched_off_nothing_is_estimated() -> None:
 
 def follow(start: Start, config: InitConfig, is_started: bool = False) -> tuple[CameraClock, list[int]]:
     """Let a clock see a whole start; inertial data come as they would, to just behind the frame."""
-    clock, buffer, stamps = CameraClock(config), ImuBuffer(ImuConfig()), []
+    clock, buffer, stamps = CameraClock(config), ImuBuffer(ImuConfig(), MachineConfig()), []
     samples = iter(start.samples)
     for k, (vo, _, _) in enumerate(start.frames):
         frame = clock.in_imu_time(Frame(vo.t_ns, k, ()))

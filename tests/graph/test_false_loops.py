@@ -13,7 +13,7 @@ from vislam.core.messages import GraphUpdate, LoopDecision
 from vislam.graph import PoseGraph
 from vislam.loop.injection import FIRST_ID, FalseLoops
 from worlds.lap import RIG, World, rmse_m, with_vo
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 CONFIG = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
 
@@ -23,7 +23,7 @@ class Outcome:
 
     def __init__(self, world: World, group: int, claimed: float = 1.0) -> None:
         """`group` 0: only true loops; `claimed`: what odometry says of its sigmas, over the truth."""
-        graph = PoseGraph(CONFIG, None, GRAVITY_M_S2, RIG, WindowConfig())
+        graph = PoseGraph(CONFIG, None, MACHINE, RIG, WindowConfig())
         graph.initialise(None, world.truth[0])
         false = FalseLoops(0.5, group, 1) if group else None
         self.updates: list[GraphUpdate] = []
@@ -67,7 +67,7 @@ def test_no_false_loop_survives_and_the_true_ones_do(drift: str) -> None:
 
 def test_a_false_loop_that_came_first_is_taken_out_again_and_the_map_follows() -> None:
     world = world_of("low")
-    graph = PoseGraph(CONFIG, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(CONFIG, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None, world.truth[0])
     right = world.loop(FIRST_ID, 4, 103)
     T = right.T_from_to.copy()
@@ -97,7 +97,7 @@ def test_of_two_that_contradict_only_each_other_the_one_nearer_to_odometry_stays
         T_odometry = T_odometry @ packet.vo.T_keyframe_body
     right = world.loop(0, 4, 103)
     said = {"near": np.array([0.05, 0.0, 0.0]), "far": np.array([-0.05, 0.2, -0.15])}
-    graph = PoseGraph(CONFIG, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(CONFIG, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None, world.truth[0])
     for k, packet in enumerate(packets):
         edges = []

@@ -7,7 +7,7 @@ import pytest
 from vislam.config import GraphConfig, WindowConfig
 from vislam.graph import PoseGraph
 from worlds.lap import RIG, World
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.solvers import WatchedSolvers, poses_in
 
 
@@ -16,7 +16,7 @@ def test_keyframes_with_velocities_stay_in_the_solver_however_dense_loops_are(
 ) -> None:
     world, watched = World(36.0, seed=3), WatchedSolvers(monkeypatch)
     config = GraphConfig(coupling="loose", freeze_keyframes=10, freeze_after=20, anchor_after=5)
-    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, world.noise, MACHINE, RIG, WindowConfig())
     graph.initialise(world.initial_state())
     for k in range(world.count):
         graph.add(world.packet(k), [world.loop(k, k - 100, k)] if k > 102 else [])

@@ -15,13 +15,13 @@ from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision, Loop
 from vislam.factors.journal import KeyframeRecord, LoopRecord, StartRecord
 from vislam.graph import PoseGraph
 from worlds.lap import RIG, World, packet_of, rmse_m, with_vo
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)  # the simulation tells its sigmas honestly
 
 
 def graph_of(world: World, imu: bool = True, config: GraphConfig = EXACT) -> PoseGraph:
-    graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, world.noise if imu else None, MACHINE, RIG, WindowConfig())
     graph.initialise(world.initial_state() if imu else None)
     return graph
 
@@ -194,7 +194,7 @@ def test_mono_recovers_scale_from_the_imu() -> None:
 
 def test_mono_recovers_scale_from_a_wrong_first_velocity() -> None:
     world = World(30.0, mono=True)
-    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(EXACT, world.noise, MACHINE, RIG, WindowConfig())
     state = world.initial_state()
     covariance = state.covariance.copy()
     covariance[6:9, 6:9] = np.eye(3) * 3.0**2
@@ -210,7 +210,7 @@ def test_mono_recovers_scale_from_a_wrong_first_velocity() -> None:
 
 def test_mono_without_imu_stays_connected_at_the_scale_of_its_guess() -> None:
     world = World(20.0, mono=True)
-    graph = PoseGraph(EXACT, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(EXACT, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None)
     for k in range(world.count):
         graph.add(world.packet(k, imu=False))
@@ -377,9 +377,9 @@ def test_two_runs_give_the_same_bytes() -> None:
 def test_usage_errors_say_what_to_do() -> None:
     world = World(2.0)
     with pytest.raises(UsageError, match="initialise"):
-        PoseGraph(EXACT, None, GRAVITY_M_S2, RIG, WindowConfig()).add(world.packet(0))
+        PoseGraph(EXACT, None, MACHINE, RIG, WindowConfig()).add(world.packet(0))
     with pytest.raises(UsageError, match="exactly when it has an IMU"):
-        PoseGraph(EXACT, world.noise, GRAVITY_M_S2, RIG, WindowConfig()).initialise(None)
+        PoseGraph(EXACT, world.noise, MACHINE, RIG, WindowConfig()).initialise(None)
     graph = graph_of(world)
     graph.add(world.packet(0))
     with pytest.raises(UsageError, match="once"):
@@ -400,7 +400,7 @@ def test_long_open_loop_chain_survives_gtsams_pivot_test() -> None:
     sigmas = np.array([0.002] * 3 + [0.01] * 3)
     covariance = np.diag(sigmas**2)
     config = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
-    graph = PoseGraph(config, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None)
     truth, chain, notes = [np.eye(4)], [np.eye(4)], []
     step = transform(np.eye(3), np.array([1.0, 0.0, 0.0]))

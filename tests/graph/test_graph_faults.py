@@ -13,7 +13,7 @@ from vislam.core.messages import ImuSpan, KeyframePacket, LoopDecision, LoopEdge
 from vislam.factors import solvers as solver_module
 from vislam.graph import PoseGraph
 from worlds.lap import RIG, World, rmse_m, with_vo
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.solvers import POISON, Review, WatchedSolvers
 
 EXACT = GraphConfig(coupling="loose", vo_inflation=1.0)
@@ -25,7 +25,7 @@ def world() -> World:
 
 
 def started(world: World, count: int) -> PoseGraph:
-    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(EXACT, world.noise, MACHINE, RIG, WindowConfig())
     graph.initialise(world.initial_state())
     for k in range(count):
         graph.add(world.packet(k))
@@ -81,7 +81,7 @@ def test_bad_packet_is_refused_before_anything_is_touched(world: World, name: st
 
 
 def test_bad_initial_states_are_refused(world: World) -> None:
-    graph = PoseGraph(EXACT, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(EXACT, world.noise, MACHINE, RIG, WindowConfig())
     state = world.initial_state()
     with pytest.raises(DataError, match="velocity"):
         graph.initialise(replace(state, velocity_world_m_s=np.array([0.0, np.nan, 0.0])))
@@ -226,7 +226,7 @@ def test_long_gap_in_images_and_imu(world: World) -> None:
 def test_a_loop_that_cannot_be_true_is_taken_out_again(world: World) -> None:
     """With a gate that lets everything pass, the optimised graph itself contradicts a gross outlier."""
     config = replace(EXACT, loop_gate_probability=1.0 - 1e-16)
-    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, world.noise, MACHINE, RIG, WindowConfig())
     graph.initialise(world.initial_state())
     for k in range(110):
         graph.add(world.packet(k))

@@ -16,7 +16,7 @@ from vislam.core.geometry import invert, so3_exp, transform
 from vislam.core.messages import Array, GraphUpdate, LoopDecision, LoopEdge, Submaps
 from vislam.graph import PoseGraph
 from worlds.lap import RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.solvers import Review
 
 LOST = 150  # the first keyframe after the loss
@@ -27,7 +27,7 @@ TILTED = transform(so3_exp(np.array([0.4, -0.3, 1.2])), np.array([9.0, -7.0, 0.5
 
 def loose(world: World, imu: bool) -> PoseGraph:
     config = GraphConfig(coupling="loose", vo_inflation=1.0)
-    graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, world.noise if imu else None, MACHINE, RIG, WindowConfig())
     graph.initialise(world.initial_state() if imu else None, world.truth[0])
     return graph
 

@@ -26,7 +26,7 @@ from vislam.runs.session import Session, SessionWriter, recall
 from vislam.window.messages import WindowUpdate
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 from worlds.solvers import Places, Review, WatchedSolvers, factors, poses_in
 
 TIGHT = GraphConfig(
@@ -45,7 +45,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[PoseGraph, Fake
     def build(world: World, imu: bool = True, config: GraphConfig = TIGHT, **kwargs: float):
         window = FakeWindow(world, imu=imu, **kwargs)
         monkeypatch.setattr("vislam.window.SlidingWindow", lambda *_: window, raising=False)
-        graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
+        graph = PoseGraph(config, world.noise if imu else None, MACHINE, RIG, WindowConfig())
         graph.initialise(world.initial_state() if imu else None, None if imu else world.truth[0])
         return graph, window
 
@@ -416,7 +416,7 @@ def test_loops_that_contradict_the_window_teach_distrust(make) -> None:
 def test_the_journal_alone_rebuilds_the_graph(world: World, make) -> None:
     graph, _ = make(world)
     feed(graph, world, 0, 100)
-    odometry = WindowOdometry(TIGHT)
+    odometry = WindowOdometry(TIGHT, MACHINE)
     again: Estimator[LoopModel] = Estimator(TIGHT, odometry)
     for record in graph.journal:
         if isinstance(record, StartRecord):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.config import ImuConfig, InitConfig
+from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp, so3_log
 from vislam.core.messages import ImuSample, ImuSpan
@@ -21,7 +21,7 @@ def sample(t_ns: int, value: float = 0.0) -> ImuSample:
 
 
 def filled(rate_hz: float = 100.0, duration_s: float = 2.0, **config: float) -> ImuBuffer:
-    buffer = ImuBuffer(ImuConfig(**config))
+    buffer = ImuBuffer(ImuConfig(**config), MachineConfig())
     for k in range(round(duration_s * rate_hz) + 1):
         assert buffer.add(sample(T0_NS + round(k * NS / rate_hz), float(k % 500)))
     return buffer
@@ -48,7 +48,7 @@ def test_span_that_is_not_covered(begin: int, end: int) -> None:
 
 
 def test_empty_buffer() -> None:
-    buffer = ImuBuffer(ImuConfig())
+    buffer = ImuBuffer(ImuConfig(), MachineConfig())
     assert buffer.newest_t_ns is None
     assert buffer.oldest_t_ns is None
     assert buffer.span(0, 1) is None
@@ -145,7 +145,7 @@ def test_preintegration_covariance_is_honest() -> None:
 @settings(max_examples=40)
 @given(cut=st.integers(5_000_001, 495_000_000), seed=st.integers(0, 5), shift=st.integers(-(10**15), 10**15))
 def test_spans_compose_and_do_not_know_the_date(cut: int, seed: int, shift: int) -> None:
-    buffer = ImuBuffer(ImuConfig())
+    buffer = ImuBuffer(ImuConfig(), MachineConfig())
     for s in Motion.random(seed).samples(0.5)[0]:
         buffer.add(s)
     end = T0_NS + NS // 2

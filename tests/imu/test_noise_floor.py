@@ -10,7 +10,7 @@ import pytest
 
 from vislam.calibration.inertial.noise import driving_floor
 from vislam.calibration.inertial.tables import read_inertial
-from vislam.config import ImuConfig
+from vislam.config import ImuConfig, MachineConfig
 from vislam.core.messages import AS_MODELLED, ImuSample
 from vislam.datasets import open_dataset
 from vislam.imu import ImuBuffer, ImuNoise, NoiseFloor, join, preintegrate
@@ -156,7 +156,7 @@ def test_the_scale_follows_a_ride_that_becomes_noisy_and_calm_again() -> None:
 
 
 def test_spans_carry_the_noise_that_was_seen_and_preintegration_goes_by_it() -> None:
-    buffer = ImuBuffer(ImuConfig(), TRUE)
+    buffer = ImuBuffer(ImuConfig(), MachineConfig(), TRUE)
     for sample in ride(scaled(8.0), 5.0):
         buffer.add(sample)
     span = buffer.span(2 * NS, 3 * NS)

@@ -24,7 +24,7 @@ from vislam.live.processes.fast import Messages
 from vislam.live.wire.published_pose import PublishedPose
 from worlds.corrections import CART_IMU, CONFIG, VisionWorld
 from worlds.motion import T0_NS
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 _WELL = lambda: Health(0)  # noqa: E731
 _LATE_NS = 90_000_000
@@ -60,7 +60,7 @@ def true_position(world: VisionWorld, t_ns: int) -> np.ndarray:
 
 def test_it_agrees_with_a_filter_that_got_everything_in_time(world: VisionWorld) -> None:
     """The twin beside vision hears of frames at once; this one late. They have to agree or `odom` is two frames."""
-    twin = Ekf(CONFIG.ekf, CART_IMU, GRAVITY_M_S2, np.eye(4))
+    twin = Ekf(CONFIG.ekf, CART_IMU, MACHINE, np.eye(4))
     events = sorted([*world.samples, *world.corrections], key=lambda e: (e.t_ns, isinstance(e, Correction)))
     for event in events:
         if isinstance(event, ImuSample):

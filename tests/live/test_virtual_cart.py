@@ -151,7 +151,7 @@ def test_the_virtual_cart_tells_its_wheels_and_its_camera() -> None:
     source, settings = open_live("virtual-cart,imu_out=2:3/4:5,camera_hz=5", Config(), SensorsConfig())
     assert isinstance(source, VirtualCart)
     assert source.options.imu_out == ((2.0, 3.0), (4.0, 5.0))
-    assert settings.ekf.nonholonomic
+    assert settings.machine.slip_sigma_m_s == 0.02
     assert settings.frontend.planar.height_m == pytest.approx(0.6)
     with pytest.raises(DataError, match="live"):
         next(iter(source.events()))

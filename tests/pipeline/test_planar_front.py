@@ -79,9 +79,9 @@ def cart(
     return Cart(tuple(frames), samples, poses)
 
 
-def config(**ekf: object) -> Config:
+def config(**machine: object) -> Config:
     frontend = {"planar": {"height_m": HEIGHT_M}, "described_features": 50}
-    return from_data({"frontend": frontend, "ekf": dict(ekf)}, "test")
+    return from_data({"frontend": frontend, "machine": dict(machine)}, "test")
 
 
 def run(made: Cart, chosen: Config) -> tuple[Front, list[FrontStep]]:
@@ -171,7 +171,7 @@ def test_it_stays_where_it_stands() -> None:
 def test_wheels_carry_it_over_a_floor_without_texture() -> None:
     made = cart(9.0, 0.6, blank=(45, 65))
     ends = {}
-    for name, chosen in (("alone", config()), ("wheels", config(nonholonomic=True, floor_sigma_m=0.01))):
+    for name, chosen in (("alone", config()), ("wheels", config(slip_sigma_m_s=0.02, floor_sigma_m=0.01))):
         front, steps = run(made, chosen)
         assert front.counters["frames_lost"] >= 18
         lost = steps[60].state

@@ -19,7 +19,7 @@ from vislam.runs.offline.loop_undo import change_loops, list_loops
 from vislam.runs.session import Session, SessionWriter, recall
 from vislam.trajectory import read_tum
 from worlds.lap import RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 GRAPH = GraphConfig(coupling="loose", vo_inflation=1.0)
 BEFORE, CLOSES = 100, 120  # keyframes of one lap; the only loops end at the second
@@ -32,7 +32,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, World]:
     run.mkdir()
     world = World(28.0, seed=6, vo_sigma_rad=np.deg2rad(0.4), vo_sigma_m=0.01)
     writer = SessionWriter(run / "session.db", {"config": asdict(Config(graph=GRAPH))}, RIG, None, GRAVITY_M_S2)
-    graph = PoseGraph(GRAPH, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(GRAPH, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None, world.truth[0])
     for k in range(world.count):
         edges = [world.loop(0, 20, k), world.loop(1, 21, k)] if k == CLOSES else []
@@ -67,7 +67,7 @@ def test_an_edge_is_undone_stays_undone_and_comes_back(finished, capsys) -> None
     places = {loop.edge.id: loop.state.place for loop in memory.graph.loops}
     assert places[0] is places[1] is LoopPlace.UNDONE
     np.testing.assert_allclose(memory.graph.T_map_body, without, atol=1e-5)
-    again = PoseGraph(GRAPH, None, GRAVITY_M_S2, RIG, WindowConfig())  # what a resumed run, or one on this map, does
+    again = PoseGraph(GRAPH, None, MACHINE, RIG, WindowConfig())  # what a resumed run, or one on this map, does
     again.initialise(None, world.truth[0])
     again.restore(memory.graph)
     again.finish()

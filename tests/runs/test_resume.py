@@ -29,7 +29,7 @@ from vislam.runs.sources import open_source
 from vislam.trajectory import read_tum
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 LOOSE = GraphConfig(coupling="loose", vo_inflation=1.0)
 TIGHT = GraphConfig(coupling="tight", window_inflation=1.0)
@@ -43,7 +43,7 @@ SEED = 1
 
 def make_graph(world: World, config: GraphConfig, imu: bool, monkeypatch: pytest.MonkeyPatch) -> PoseGraph:
     monkeypatch.setattr("vislam.window.SlidingWindow", lambda *_: FakeWindow(world, imu=imu), raising=False)
-    graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, world.noise if imu else None, MACHINE, RIG, WindowConfig())
     graph.initialise(world.initial_state() if imu else None, None if imu else world.truth[0])
     return graph
 

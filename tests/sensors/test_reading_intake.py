@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.config import ImuConfig
+from vislam.config import ImuConfig, MachineConfig
 from vislam.core.geometry import transform
 from vislam.core.messages import ImuSample, KeyframePacket, NavState, no_observations
 from vislam.core.readings import OwnStart, Reading
@@ -248,7 +248,7 @@ def pose(t_s: float):
 
 def true_buffer(length_s: float) -> ImuBuffer:
     """Exact samples at 200 Hz from 0 s on."""
-    buffer = ImuBuffer(ImuConfig())
+    buffer = ImuBuffer(ImuConfig(), MachineConfig())
     for k in range(round(200 * length_s) + 1):
         gyro, accel = ideal_imu(place, attitude, np.array([k / 200.0]))
         assert buffer.add(ImuSample(k * 5 * MS, gyro[0], accel[0]))

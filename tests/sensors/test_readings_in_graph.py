@@ -21,7 +21,7 @@ from vislam.graph import PoseGraph
 from vislam.sensors import BodyState, Sensor, Suite
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World, rmse_m
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.sensed import Fixes, Range, Speed, pose_error, reading_at, station_at, with_readings
 from worlds.solvers import WatchedSolvers, poses_in
 
@@ -56,7 +56,7 @@ class Drive:
         self.world, self.sensors, self.own, self.imu = world, sensors, own, imu
         self.rng = np.random.default_rng(world.seed + 1000)
         self.packets: list[KeyframePacket] = []
-        self.graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig(), Suite(sensors))
+        self.graph = PoseGraph(config, world.noise if imu else None, MACHINE, RIG, WindowConfig(), Suite(sensors))
         self.graph.initialise(world.initial_state() if imu else None, None if imu else world.truth[0])
 
     def packet(self, k: int, starts: tuple[OwnStart, ...] = (), share: float = 0.4) -> KeyframePacket:
@@ -269,7 +269,7 @@ def test_a_factor_costs_its_robust_loss_and_is_linearised_as_gtsam_would() -> No
 def test_without_readings_a_suite_changes_no_bit() -> None:
     def poses(suite: Suite | None) -> bytes:
         world = World(30.0, seed=2)
-        graph = PoseGraph(LOOSE, world.noise, GRAVITY_M_S2, RIG, WindowConfig(), suite)
+        graph = PoseGraph(LOOSE, world.noise, MACHINE, RIG, WindowConfig(), suite)
         graph.initialise(world.initial_state())
         for k in range(world.count):
             graph.add(world.packet(k), [world.loop(k, k - 100, k)] if k > 105 and k % 5 == 0 else [])

@@ -22,7 +22,7 @@ from vislam.runs.session import Session, SessionWriter, recall
 from vislam.sensors import Suite
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 from worlds.sensed import Fixes, Speed, reading_at, with_readings
 
 LOOSE = GraphConfig(coupling="loose")
@@ -46,7 +46,7 @@ def packets_of(world: World, imu: bool = True) -> list[KeyframePacket]:
 
 
 def graph_of(world: World, config: GraphConfig, imu: bool, suite: Suite | None) -> PoseGraph:
-    graph = PoseGraph(config, world.noise if imu else None, GRAVITY_M_S2, RIG, WindowConfig(), suite)
+    graph = PoseGraph(config, world.noise if imu else None, MACHINE, RIG, WindowConfig(), suite)
     graph.initialise(world.initial_state() if imu else None, None if imu else world.truth[0])
     return graph
 

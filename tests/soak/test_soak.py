@@ -18,7 +18,7 @@ from vislam.graph import PoseGraph
 from vislam.graph.replay import Between, EdgeGraph
 from worlds.endless_lap import STEREO, LapWorld, window_of_truth
 from worlds.lap import RIG, packet_of
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 
 @pytest.mark.data
@@ -62,7 +62,7 @@ def test_open_loop_chain_as_far_as_gtsam_throws(step_m: float) -> None:
     covariance = np.diag(sigmas**2)
     step = transform(np.eye(3), np.array([step_m, 0.0, 0.0]))
     config = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
-    graph = PoseGraph(config, None, GRAVITY_M_S2, RIG, WindowConfig())
+    graph = PoseGraph(config, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None)
     chain, notes = np.eye(4), []
     for k in range(count):
@@ -85,7 +85,7 @@ def test_minutes_of_keyframes_with_loops(coupling: str, minutes: float) -> None:
     """Loose is long enough for poses to be read back in parts."""
     world = LapWorld(seed=5, tracks=40)
     config = GraphConfig(coupling="tight" if coupling == "tight" else "loose")
-    graph = PoseGraph(config, world.noise, GRAVITY_M_S2, STEREO, WindowConfig())
+    graph = PoseGraph(config, world.noise, MACHINE, STEREO, WindowConfig())
     graph.initialise(world.initial_state())
     count = round(minutes * 60.0 * world.keyframe_hz)
     truth, most_read, seen = [], 0, {}
@@ -116,7 +116,7 @@ def test_loops_to_any_earlier_visit_tie_to_few_keyframes(monkeypatch: pytest.Mon
         fake = window_of_truth(world, count)
         monkeypatch.setattr(vislam.window, "SlidingWindow", lambda *_, fake=fake: fake)
         graph = PoseGraph(
-            GraphConfig(coupling="tight", anchor_after=after), world.noise, GRAVITY_M_S2, STEREO, WindowConfig()
+            GraphConfig(coupling="tight", anchor_after=after), world.noise, MACHINE, STEREO, WindowConfig()
         )
         graph.initialise(world.initial_state())
         truth = []

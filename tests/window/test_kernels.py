@@ -12,7 +12,7 @@ from vislam.window.equations.layout import CALIBRATION, Camera, Links, Normal, S
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import TrackTable
 from worlds.motion import EUROC_NOISE, Motion
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 from worlds.room import RGBD, STEREO, World, start_state, told_way
 
 
@@ -31,7 +31,7 @@ def make_scene(rig, seed: int) -> Scene:
     packets, truths = world.packets()
     rng = np.random.default_rng(seed)
     config = WindowConfig()
-    tracks, links = TrackTable(config, rig), LinkStore(config, EUROC_NOISE, GRAVITY_M_S2)
+    tracks, links = TrackTable(config, rig), LinkStore(config, EUROC_NOISE, MACHINE)
     X = []
     for packet, truth in zip(packets, truths, strict=True):
         state = start_state(truth, packet.keyframe.t_ns, rng)

@@ -13,7 +13,7 @@ from vislam.sim.sensing import CONSUMER_IMU
 from vislam.window import SlidingWindow
 from vislam.window.one_scale import at_first_scale
 from worlds.motion import NS, T0_NS, Motion, levelled, state_error, still
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 from worlds.room import MONO, World, start_state
 
 _SPEED_UP_S = 2.0
@@ -55,7 +55,7 @@ def test_the_first_turn_after_a_long_straight_way_is_believed_as_far_as_it_tells
         motion = Corner(np.zeros((2, 3, 3)), np.zeros((2, 3, 3)))
         world = World(motion, MONO, seed, duration_s=25.0, room_m=(40.0, 12.0, 2.5))
         packets, truths = world.packets()
-        window = SlidingWindow(WindowConfig(), world.rig, world.noise, GRAVITY_M_S2)
+        window = SlidingWindow(WindowConfig(), world.rig, world.noise, MACHINE)
         T, _, bias = truths[0]
         start = levelled(np.random.default_rng(seed + 1000), T, bias[:3], bias[3:])
         window.initialise(replace(start, t_ns=packets[0].keyframe.t_ns))
@@ -77,7 +77,7 @@ def test_scale_that_nothing_shows_is_not_learnt_from_noise() -> None:
             Ahead(np.zeros((2, 3, 3)), np.zeros((2, 3, 3))), MONO, seed, duration_s=25.0, room_m=(40.0, 4.0, 2.5)
         )
         packets, truths = world.packets()
-        window = SlidingWindow(WindowConfig(), world.rig, world.noise, GRAVITY_M_S2)
+        window = SlidingWindow(WindowConfig(), world.rig, world.noise, MACHINE)
         window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
         states = [window.add(p).newest for p in packets]
         for k in (60, 80, 100, len(states) - 1):
@@ -116,7 +116,7 @@ def test_a_minute_and_a_half_at_rest_tells_nothing_of_tilt() -> None:
     packets, truths = world.packets()
     T, _, bias = truths[0]
     start = levelled(np.random.default_rng(1), T, bias[:3], bias[3:])
-    window = SlidingWindow(WindowConfig(), world.rig, world.noise, GRAVITY_M_S2)
+    window = SlidingWindow(WindowConfig(), world.rig, world.noise, MACHINE)
     window.initialise(replace(start, t_ns=packets[0].keyframe.t_ns))
     tilts, sigmas, tests = [], [], []
     for packet, truth in zip(packets, truths, strict=True):

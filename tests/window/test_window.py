@@ -15,7 +15,7 @@ from vislam.core.geometry import invert, se3_log
 from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
 from vislam.window import SlidingWindow, WindowUpdate, gate
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 from worlds.room import MONO, RGBD, STEREO, World, packet, start_state, told_way
 
 HONEST = replace(WindowConfig(), keyframes=8)  # the simulated sensor has no vibration
@@ -25,7 +25,7 @@ def run(
     world: World, config: WindowConfig = HONEST, seed: int = 0
 ) -> tuple[list[WindowUpdate], list[tuple[Array, Array, Array]], SlidingWindow]:
     packets, truths = world.packets()
-    window = SlidingWindow(config, world.rig, world.noise, GRAVITY_M_S2)
+    window = SlidingWindow(config, world.rig, world.noise, MACHINE)
     window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
     return [window.add(p) for p in packets], truths, window
 
@@ -57,7 +57,7 @@ def test_tracks_that_scatter_twice_as_much_count_as_if_told_so(rig: Rig) -> None
     told = replace(config, sigma_px=1.0, right_sigma_px=1.4, depth_sigma_rho=6e-3)
     ends = []
     for settings, noise in ((told, 1.0), (config, 2.0)):
-        window = SlidingWindow(settings, rig, EUROC_NOISE, GRAVITY_M_S2)
+        window = SlidingWindow(settings, rig, EUROC_NOISE, MACHINE)
         window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1003)))
         for p in packets:
             update = window.add(replace(p, observations=replace(p.observations, noise=noise)))
@@ -141,7 +141,7 @@ def test_outliers_are_taken_out() -> None:
 def test_without_an_imu_stereo_is_bundle_adjustment() -> None:
     world = World(Motion.random(6, 0.7), STEREO, 6, duration_s=6.0, keyframe_hz=8.0, sigma_px=0.3)
     packets, truths = world.packets()
-    window = SlidingWindow(replace(HONEST, sigma_px=0.3, right_sigma_px=0.3), STEREO, None, GRAVITY_M_S2)
+    window = SlidingWindow(replace(HONEST, sigma_px=0.3, right_sigma_px=0.3), STEREO, None, MACHINE)
     window.initialise(None, truths[0][0])
     updates = [window.add(replace(p, imu=None)) for p in packets]
     assert position_rmse(updates, truths) < 0.01 * path_m(truths)
@@ -171,7 +171,7 @@ def test_inertial_data_bridges_lost_vision_and_vision_bridges_lost_inertial_data
     hole = packets[32].imu
     inside = (np.arange(len(hole.t_ns)) < 5) | (np.arange(len(hole.t_ns)) > 33)
     packets[32] = replace(packets[32], imu=ImuSpan(hole.t_ns[inside], hole.gyro_rad_s[inside], hole.accel_m_s2[inside]))
-    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, GRAVITY_M_S2)
+    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, MACHINE)
     window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(8)))
     updates = [window.add(p) for p in packets]
     assert all(u.note == "" for u in updates)
@@ -192,7 +192,7 @@ def test_what_other_sensors_tell_of_motion_stands_in_for_lost_vision(rig: Rig) -
         seen = [replace(p, observations=nothing) if k in blind else p for k, p in enumerate(packets)]
         scale = 1.0 + 0.005 * rng.normal()
         for tells, sigmas in ((True, told_sigma), (False, alone_sigma)):
-            window = SlidingWindow(HONEST, rig, EUROC_NOISE, GRAVITY_M_S2)
+            window = SlidingWindow(HONEST, rig, EUROC_NOISE, MACHINE)
             window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
             for k, p in enumerate(seen):
                 ways = (
@@ -235,7 +235,7 @@ def test_bad_input_is_refused_before_anything_is_touched() -> None:
     world = World(Motion.random(9), MONO, 9, duration_s=3.0, tracks=40)
     clean, truths, _ = run(world)
     packets, _ = world.packets()
-    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, GRAVITY_M_S2)
+    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, MACHINE)
     with pytest.raises(UsageError, match="initialise"):
         window.add(packets[0])
     start = start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1000))
@@ -254,7 +254,7 @@ def test_bad_input_is_refused_before_anything_is_touched() -> None:
 def test_a_window_without_solution_restarts_and_goes_on() -> None:
     world = World(Motion.random(10), MONO, 10, duration_s=6.0, tracks=40)
     packets, truths = world.packets()
-    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, GRAVITY_M_S2)
+    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, MACHINE)
     window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(0)))
     seen: list[tuple[int, int]] = []
     broken = packets[14].imu  # a force that no arithmetic survives
@@ -273,7 +273,7 @@ def test_a_window_without_solution_restarts_and_goes_on() -> None:
 def test_memory_and_work_stay_bounded() -> None:
     packets, truths = World(Motion.random(11), MONO, 11, duration_s=20.0, tracks=40).packets()
     assert max(p.observations.track_ids.max() for p in packets) > 350  # nine times those of a frame
-    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, GRAVITY_M_S2)
+    window = SlidingWindow(HONEST, MONO, EUROC_NOISE, MACHINE)
     window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1000)))
     sizes = []
     for p in packets:
@@ -285,13 +285,13 @@ def test_memory_and_work_stay_bounded() -> None:
 
 def test_one_camera_alone_is_refused() -> None:
     with pytest.raises(UsageError, match="scale"):
-        SlidingWindow(HONEST, MONO, None, GRAVITY_M_S2)
+        SlidingWindow(HONEST, MONO, None, MACHINE)
     with pytest.raises(UsageError, match="at least 3"):
-        SlidingWindow(replace(HONEST, keyframes=2), STEREO, None, GRAVITY_M_S2)
+        SlidingWindow(replace(HONEST, keyframes=2), STEREO, None, MACHINE)
 
 
 def test_an_empty_frame_is_no_error() -> None:
-    window = SlidingWindow(HONEST, STEREO, None, GRAVITY_M_S2)
+    window = SlidingWindow(HONEST, STEREO, None, MACHINE)
     window.initialise(None, np.eye(4))
     nothing = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
     for k in range(12):
@@ -317,7 +317,7 @@ def with_a_crowd(packets: list[KeyframePacket], first: int, again: int) -> list[
 
 def test_a_crowd_that_contradicts_the_expectation_does_not_take_over() -> None:
     packets, truths = World(Motion.random(1), MONO, 1, duration_s=9.0).packets()
-    window = SlidingWindow(WindowConfig(), MONO, EUROC_NOISE, GRAVITY_M_S2)
+    window = SlidingWindow(WindowConfig(), MONO, EUROC_NOISE, MACHINE)
     window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1001)))
     updates = [window.add(p) for p in with_a_crowd(packets, 27, 30)]
     assert updates[30].rejected_tracks >= 38
@@ -327,7 +327,7 @@ def test_a_crowd_that_contradicts_the_expectation_does_not_take_over() -> None:
 def test_a_wrong_expectation_gives_in() -> None:
     """A turn that only the IMU felt: vision is refused at first, and believed when it keeps saying the same."""
     packets, truths = World(Motion.random(1), STEREO, 1, duration_s=7.0).packets()
-    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, GRAVITY_M_S2)
+    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, MACHINE)
     window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1001)))
     wrong = packets[20].imu
     assert wrong is not None

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vislam.config import Config, EkfConfig, ImuConfig
+from vislam.config import Config, EkfConfig
 from vislam.core.messages import ImuSample, NavState, Observations
 from vislam.ekf import Correction
 from vislam.imu import ImuNoise
 from vislam.live.notices import Start
 from worlds.motion import T0_NS, Motion, SimulatedVision
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 CART_IMU = ImuNoise(5e-4, 5e-3, 2e-5, 3e-4, 100.0)
-CONFIG = Config(imu=ImuConfig(gravity_m_s2=GRAVITY_M_S2), ekf=EkfConfig(vo_inflation=1.0))
+CONFIG = Config(machine=MACHINE, ekf=EkfConfig(vo_inflation=1.0))
 NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
 

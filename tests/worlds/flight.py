@@ -14,7 +14,7 @@ from vislam.core.messages import Array, ImuSample, NavState, Observations, Track
 from vislam.ekf import MsckfEkf
 from vislam.imu import ImuNoise
 from worlds.motion import NS, T0_NS, Motion, state_error
-from worlds.parts import EUROC_CAMERA, GRAVITY_M_S2, R_BODY_CAM, along_x, on_walls, rig_of
+from worlds.parts import EUROC_CAMERA, MACHINE, R_BODY_CAM, along_x, on_walls, rig_of
 
 CHEAP = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3, 200.0)
 SIGMAS = np.repeat([0.02, 0.001, 0.05, 0.02, 0.1], 3)
@@ -133,7 +133,7 @@ class Flight:
     def filter(self, noise: ImuNoise = CHEAP, rig: Rig | None = None, **settings: object) -> MsckfEkf:
         """Return a filter started at the flight's first state."""
         config = EkfConfig(**{"tight_point_inflation": 1.0, **settings})  # type: ignore[arg-type]
-        ekf = MsckfEkf(config, noise, GRAVITY_M_S2, self.rig if rig is None else rig)
+        ekf = MsckfEkf(config, noise, MACHINE, self.rig if rig is None else rig)
         ekf.initialise(self.start)
         return ekf
 

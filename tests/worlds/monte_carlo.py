@@ -22,7 +22,7 @@ from vislam.ekf import Ekf, MsckfEkf
 from vislam.ekf.loose import kernels
 from vislam.imu import ImuNoise
 from worlds.motion import NS, T0_NS, Motion, relative_vo, state_error
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import GRAVITY_M_S2, MACHINE
 
 IMU = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3, 200.0)  # of the class of a GY-85
 CAMERA = transform(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, -0.05, 0.2]))
@@ -165,7 +165,7 @@ def replay(scenario: Scenario, config: EkfConfig, seed: int) -> Iterator[tuple[E
     """Run the filter once and yield it after every sample k. The start is drawn from the covariance it is given."""
     way = drive(scenario.motion, seed, scenario.duration_s)
     rng = np.random.default_rng([seed, 1])
-    ekf = Ekf(config, IMU, GRAVITY_M_S2, None if scenario.metric else CAMERA)
+    ekf = Ekf(config, IMU, MACHINE, None if scenario.metric else CAMERA)
     ekf.initialise(start(way, scenario.start_sigmas, rng))
     deliveries = sorted(vision(scenario, way, rng), key=lambda delivery: delivery[0])
     i = 0

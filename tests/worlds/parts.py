@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vislam.config import MachineConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import transform
 from vislam.core.messages import Array, Frame, Keyframe
 
-GRAVITY_M_S2 = 9.81
+MACHINE = MachineConfig()
+GRAVITY_M_S2 = MACHINE.gravity_m_s2
 R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x forward, y left, z up
 EUROC_CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0)
 

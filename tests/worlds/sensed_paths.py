@@ -14,7 +14,7 @@ from vislam.ekf import Ekf, MsckfEkf
 from vislam.sensors import BodyState, Sensor, Suite, Variable
 from worlds import monte_carlo as mc
 from worlds.flight import MONO
-from worlds.parts import GRAVITY_M_S2
+from worlds.parts import MACHINE
 
 KINDS = ("loose", "tight")
 
@@ -86,8 +86,8 @@ def every_sensor() -> dict[str, Sensor]:
 def made(kind: str, suite: Suite | None, **settings: object) -> Ekf | MsckfEkf:
     """Return a filter that has not begun."""
     if kind == "loose":
-        return Ekf(mc.honest(**settings), mc.IMU, GRAVITY_M_S2, suite=suite)
-    return MsckfEkf(EkfConfig(coupling="tight", **settings), mc.IMU, GRAVITY_M_S2, MONO, suite)  # type: ignore[arg-type]
+        return Ekf(mc.honest(**settings), mc.IMU, MACHINE, suite=suite)
+    return MsckfEkf(EkfConfig(coupling="tight", **settings), mc.IMU, MACHINE, MONO, suite)  # type: ignore[arg-type]
 
 
 @dataclass

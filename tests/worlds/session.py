@@ -102,7 +102,7 @@ def _drifting(world: World) -> Array:
 def _with_pose_graph(log: FactorLog, false: set[int]) -> FactorLog:
     """Return the log with the optimum of IMU, odometry and true loops as the run's own poses."""
     config = Config()
-    chain = Chain(log, config.graph)
+    chain = Chain(log, config.graph, config.machine)
     loops = Loops([e for e in log.edges if e.edge.id not in false], chain, config.graph, T_BODY_CAM0[:3, 3])
     loops.choose(chain, config.batch)
     values = chain.initial()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vislam.config import ImuConfig, InitConfig
+from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.geometry import invert, so3_exp, transform, transform_points
 from vislam.core.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 from vislam.frontend.start.initialisation import Initialisation, Initialiser
@@ -49,7 +49,7 @@ class Start:
         rng = np.random.default_rng([self.seed, KINDS.index(self.kind)])
         self.gyro_bias, self.accel_bias = rng.normal(0.0, 0.04, 3), rng.normal(0.0, 0.08, 3)
         self.at = self._motion(rng)
-        self.buffer = ImuBuffer(ImuConfig())
+        self.buffer = ImuBuffer(ImuConfig(), MachineConfig())
         self.samples = self._samples(rng)
         for sample in self.samples:
             self.buffer.add(sample)

@@ -126,7 +126,7 @@ class ImuOptions:
     rest_s: Positive = 2.0
     """A pose counts when it was held so long"""
     gravity_m_s2: Positive = 9.81
-    """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as imu.gravity_m_s2 of the config"""
+    """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as machine.gravity_m_s2 of the config"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
     json: bool = False

@@ -17,7 +17,9 @@ from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig
 from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig, VibrationConfig
 from vislam.config.live import LiveConfig, ViewConfig
 from vislam.config.loop import LoopConfig, LoopTruthConfig
+from vislam.config.machine import USUAL_SLIP_M_S, MachineConfig
 from vislam.config.mapping import DriveConfig, LabelConfig, MapConfig, MapProduct, MonoDepthConfig
+from vislam.config.moved import known, renamed
 from vislam.config.profiles import merged, profile
 from vislam.config.ranges import Whole, check_ranges
 from vislam.config.sensors import (
@@ -45,6 +47,7 @@ from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 
 __all__ = [
+    "USUAL_SLIP_M_S",
     "AttitudeConfig",
     "Axes",
     "BatchConfig",
@@ -68,6 +71,7 @@ __all__ = [
     "LiveConfig",
     "LoopConfig",
     "LoopTruthConfig",
+    "MachineConfig",
     "MapConfig",
     "MapProduct",
     "Matrix3",
@@ -94,6 +98,7 @@ __all__ = [
     "load",
     "load_cart",
     "load_sensors",
+    "recorded",
     "validated",
 ]
 
@@ -107,6 +112,7 @@ class Config:
     seed: Whole = 0  # of every random choice in the pipeline
     up: str = "auto"  # without an IMU: X,Y,Z in the first camera's axes, camera (as its first image has it) or none
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    machine: MachineConfig = field(default_factory=MachineConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
     sensors: FurtherSensorsConfig = field(default_factory=FurtherSensorsConfig)
     frontend: FrontEndConfig = field(default_factory=FrontEndConfig)
@@ -171,8 +177,19 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 def from_data(data: dict[str, Any], source: str) -> Config:
     """Build a configuration from plain nested data; unknown and ill-typed fields raise UsageError with `source`."""
+    data = renamed(data, source)
     _refuse_unknown(data, Config, source)
     return validated(Config, data, source)
+
+
+def recorded(data: Any, source: str) -> dict[str, Any]:
+    """Return the settings that a run of this version or an earlier one wrote down, by the names of this version.
+
+    What is a setting no longer is left out. Raises UsageError where they are no settings or contradict each other.
+    """
+    if not isinstance(data, dict):
+        raise UsageError(f"{source} holds no settings; run the recording again")
+    return known(renamed(data, source), dump(Config()))
 
 
 def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Options:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability, Share, Whole
+from vislam.config.ranges import Count, NonNegative, Positive, Probability, Share, Whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +19,8 @@ class EkfConfig:
     odom: Literal["continuous", "corrected"] = "continuous"  # corrected: 3-30 % less error, 5 cm steps at a first turn
     history_s: Positive = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
     checkpoint_s: Positive = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
-    max_gap_s: NonNegative = 0.1  # a longer hole in the samples is bridged with the two sigmas below, and counted
-    gap_gyro_rad_s: NonNegative = 0.5  # what the rate may have been inside a hole, against its interpolation
+    # what the rate may have been inside a hole longer than machine.max_gap_s, against its interpolation
+    gap_gyro_rad_s: NonNegative = 0.5
     gap_accel_m_s2: NonNegative = 2.0  # the same for specific force
     # on sigmas of vision's motion, which miss model errors; over a floor frontend.planar's
     vo_inflation: Positive = 1.5
@@ -41,10 +41,6 @@ class EkfConfig:
     reset_accel_bias_m_s2: NonNegative = 0.2
     zero_velocity_sigma_m_s: NonNegative = 0.02  # a vehicle "at rest" still sways
     zero_rate_sigma_rad_s: NonNegative = 0.005  # one gyro sample at rest against the bias
-    nonholonomic: bool = False  # a cart: its axle goes neither sideways nor up; loose coupling only
-    nonholonomic_sigma_m_s: NonNegative = 0.02  # slip, and the mounting of the IMU: 1 degree at 1 m/s
-    axle_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # middle of the axle that does not steer, in the body frame
-    floor_sigma_m: NonNegative | None = None  # a cart on one level floor: its height varies by so much; None: not used
     rest_sigma_m: NonNegative = 0.002  # sway against the pose at which rest began
     rest_sigma_deg: NonNegative = 0.05
     vision_delay_s: NonNegative = 0.0  # for experiments: vision reaches the filter so much later than it was seen
@@ -101,17 +97,8 @@ class WindowConfig:
     rho_sigma_1_m: Positive = 10.0  # prior of inverse depth: only keeps points without parallax from running away
     split_min: Whole = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
 
-    imu_max_gap_s: NonNegative = 0.1  # a longer hole is an outage
-    imu_max_outage_s: NonNegative = 1.0  # bridged up to here with the two sigmas below; longer ones drop the factor
-    outage_accel_sigma_m_s2: NonNegative = 3.0  # what nobody measured during an outage
-    outage_gyro_sigma_rad_s: NonNegative = 1.0
     reintegrate_gyro_rad_s: NonNegative = 0.005  # bias change after which first-order correction is not enough
     reintegrate_accel_m_s2: NonNegative = 0.05
-    lost_speed_sigma_m_s: NonNegative = 1.0  # without IMU data the body is assumed to go on as before, this loosely
-    lost_rate_sigma_deg_s: NonNegative = 30.0
-    rest_speed_sigma_m_s: NonNegative = 0.005
-    rest_sigma_m: NonNegative = 0.001  # motion between two keyframes at rest
-    rest_sigma_deg: NonNegative = 0.05
 
     gauge_sigma_m: NonNegative = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
     gauge_sigma_rad: NonNegative = 1e-3
@@ -182,20 +169,6 @@ class GraphConfig:
     tilt_floor_deg: NonNegative = 0.1  # an accelerometer's scale and misalignment, which the window does not estimate
     huber_k: Positive = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
     imu_integration_sigma: NonNegative = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
-    imu_max_gap_s: NonNegative = 0.1  # a longer hole is an outage
-    # outages up to this are bridged with the sigmas below, longer ones drop the factor
-    imu_max_outage_s: NonNegative = 1.0
-    outage_accel_sigma_m_s2: NonNegative = 3.0  # what nobody measured during an outage
-    outage_gyro_sigma_rad_s: NonNegative = 1.0
-    # without vision and IMU the body is assumed to go on as before, this loosely
-    lost_speed_sigma_m_s: NonNegative = 1.0
-    lost_rate_sigma_deg_s: NonNegative = 30.0
-    rest_speed_sigma_m_s: NonNegative = 0.005
-    rest_sigma_m: NonNegative = 0.001  # sway of a keyframe at rest against the one at which rest began
-    rest_sigma_deg: NonNegative = 0.05
-    floor_sigma_m: NonNegative | None = None  # a cart on one level floor: keyframes are at one height; None: not used
-    nonholonomic_sigma_m_s: NonNegative | None = None  # a cart: slip of its axle, with loose coupling; None: not used
-    axle_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # as in `ekf`
 
     loop_gate_probability: Probability = 0.999  # chi-square of a loop against the joint covariance of its two keyframes
     loop_cauchy_k: Positive = 2.0  # whitened norm

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
-from vislam.config import ImuConfig
+from vislam.config import MachineConfig
 from vislam.datasets.tables import Problems, Row
 
 Rows = Iterator[Row[list[float]]]
@@ -34,7 +34,7 @@ def paired(rates: Rows, forces: Rows, problems: Problems, what: str) -> Rows:
         problems: where to count.
         what: names the recording in what is counted.
     """
-    longest_ns = round(ImuConfig().max_gap_s * 1e9)
+    longest_ns = round(MachineConfig().max_gap_s * 1e9)
     before: Row[list[float]] | None = None
     after = next(forces, None)
     for t_ns, rate in rates:

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import ImuConfig
+from vislam.config import MachineConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
@@ -329,7 +329,7 @@ def gap_limit_s(t_ns: NDArray[np.int64]) -> float:
 
 def imu_gap_limit_s(rate_hz: float) -> float:
     """Return how long a hole between inertial samples is usual: what spans are interpolated over, or a few periods."""
-    return max(ImuConfig().max_gap_s, _USUAL_PERIODS / rate_hz if rate_hz > 0.0 else 0.0)
+    return max(MachineConfig().max_gap_s, _USUAL_PERIODS / rate_hz if rate_hz > 0.0 else 0.0)
 
 
 class _GapWatch:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.ekf.correction import Correction, Hint
 from vislam.ekf.loose.filter import Ekf
 from vislam.ekf.tight import CameraCalibration, MsckfEkf
@@ -19,12 +19,12 @@ __all__ = ["CameraCalibration", "Correction", "Ekf", "Hint", "MsckfEkf", "Update
 
 
 def make_ekf(
-    config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None = None
+    config: EkfConfig, noise: ImuNoise, machine: MachineConfig, rig: Rig, suite: Suite | None = None
 ) -> Ekf | MsckfEkf:
     """Return the filter that `config.coupling` asks for: loose takes motions of visual odometry, tight takes tracks.
 
     Both take readings of the sensors of `suite`, if there are any.
     """
     if config.coupling == "tight":
-        return MsckfEkf(config, noise, gravity_m_s2, rig, suite)
-    return Ekf(config, noise, gravity_m_s2, rig.T_body_cams[0], suite)
+        return MsckfEkf(config, noise, machine, rig, suite)
+    return Ekf(config, noise, machine, rig.T_body_cams[0], suite)

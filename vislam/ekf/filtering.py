@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.core.geometry import invert
 from vislam.core.messages import (
     AS_MODELLED,
@@ -44,12 +44,13 @@ class Filtering:
     """
 
     def __init__(
-        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None = None
+        self, config: EkfConfig, noise: ImuNoise, machine: MachineConfig, rig: Rig, suite: Suite | None = None
     ) -> None:
         """Make the filter that `config.coupling` asks for; `suite`: sensors other than IMU and camera."""
         self.coupling = config.coupling
         self._config = config
-        self.ekf: Ekf | MsckfEkf = make_ekf(config, gravity_m_s2=gravity_m_s2, rig=rig, noise=noise, suite=suite)
+        self._has_wheels = machine.slip_sigma_m_s is not None
+        self.ekf: Ekf | MsckfEkf = make_ekf(config, noise, machine, rig, suite)
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._told: list[Correction] = []  # since somebody asked
         self._told_readings: deque[ToldReading] = deque(maxlen=_MOST_TOLD)  # since somebody asked, if anybody does
@@ -93,7 +94,7 @@ class Filtering:
         if self._config.vision == "none":  # nor that the body rests: a camera has to agree to that
             vo = replace(vo, T_keyframe_body=None, tracking=Tracking.LOST)
             observations, at_rest, keyframe_id = no_observations(), False, None
-        on_wheels = self._config.nonholonomic and not at_rest
+        on_wheels = self._has_wheels and not at_rest
         news = None
         if noise.scale != self._noise_told:
             self._noise_told, news = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))

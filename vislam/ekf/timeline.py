@@ -41,13 +41,16 @@ class Timeline(Generic[S, M]):
     Until it is begun, samples are only kept; a state in the past is then brought to the present through them.
     """
 
-    def __init__(self, core: Core[S, M], state: S, config: EkfConfig, history_s: float) -> None:
-        """Set up an uninitialised filter of which `state` is a placeholder."""
+    def __init__(self, core: Core[S, M], state: S, config: EkfConfig, history_s: float, max_gap_s: float) -> None:
+        """Set up an uninitialised filter of which `state` is a placeholder.
+
+        A hole in the samples longer than `max_gap_s` is bridged with the filter's gap sigmas, and counted.
+        """
         self._core = core
         self._state = state
         self._checkpoint_ns = round(config.checkpoint_s * _NS)
         self._history_ns = round(history_s * _NS)
-        self._max_gap_ns = round(config.max_gap_s * _NS)
+        self._max_gap_ns = round(max_gap_s * _NS)
         self._series = ImuSeries(extra=10)  # beside each sample, x[:10] as of the last run through it
         self._history: History[S, M] | None = None
         self._t_ns = 0

@@ -74,7 +74,7 @@ def expand(plan: Plan) -> list[Job]:
             resolved = from_data(nested({**settings, **estimator.config, **varied}, where), where)
             for seed, member in itertools.product(plan.seeds, range(plan.members)):
                 config = dump(resolved) | {"seed": seed}
-                config["imu"]["gravity_m_s2"] *= 1.0 + member * JITTER
+                config["machine"]["gravity_m_s2"] *= 1.0 + member * JITTER
                 batch = "batch" in estimator.compared
                 files = [fingerprint(Path(name)) for name in config["calibration"].values() if name is not None]
                 if (shaking := config["imu"]["vibration"]["recording"]) is not None:

@@ -138,7 +138,7 @@ def run_program(
 def setup_of(recording: Recording, config: Config) -> Setup:
     """Return what an estimator may know before the first measurement."""
     rig, noise = recording.rig, imu_noise(config.imu, recording.imu_noise)
-    return Setup(rig, noise, config.imu.gravity_m_s2, mode_for(config.frontend, rig), config.seed)
+    return Setup(rig, noise, config.machine.gravity_m_s2, mode_for(config.frontend, rig), config.seed)
 
 
 def write_metrics(out: Path, name: str, setup: Setup, t_ns: Sequence[int], cost: Mapping[str, Any]) -> dict[str, Any]:

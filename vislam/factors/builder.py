@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, MachineConfig
 from vislam.core.geometry import invert, transform
 from vislam.core.messages import Array
 from vislam.factors import motion
@@ -47,11 +47,12 @@ class Step:
 class Builder:
     """Knows the sensors; holds no state of the run."""
 
-    def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, lever_m: Array) -> None:
+    def __init__(self, config: GraphConfig, noise: ImuNoise | None, machine: MachineConfig, lever_m: Array) -> None:
         """Set up for a rig: `lever_m` [3] is cam0 in the body frame."""
         self._config = config
+        self._machine = machine
         self._lever_m = lever_m
-        self._preintegrator = None if noise is None else Preintegrator(config, noise, gravity_m_s2)
+        self._preintegrator = None if noise is None else Preintegrator(config, noise, machine)
 
     def start(self, record: StartRecord) -> tuple[list[gtsam.NonlinearFactor], Guess]:
         """Return the priors and state of keyframe 0."""
@@ -75,7 +76,7 @@ class Builder:
         `vo_scale` multiplies the sigma of visual odometry: what loops taught about it. `floor_m` is the height in map
         at which a floor keeps the body. Every variable gets at least one factor that bounds it, whatever is missing.
         """
-        config = self._config
+        machine = self._machine
         duration_s = (record.t_ns - previous.t_ns) * 1e-9
         integrated = None
         if has_imu and self._preintegrator is not None:
@@ -93,17 +94,17 @@ class Builder:
             factors += self._without_imu(record, guess, duration_s)
             notes.append("IMU missing over the span")
         unscaled = not record.has_scale and integrated is None
-        loose_rad = np.deg2rad(config.lost_rate_sigma_deg_s) * duration_s
-        loose_m = config.lost_speed_sigma_m_s * duration_s
+        loose_rad = np.deg2rad(machine.lost_rate_sigma_deg_s) * duration_s
+        loose_m = machine.lost_speed_sigma_m_s * duration_s
         if (record.T_previous_body is None and integrated is None) or unscaled:
             T = invert(before.T_map_body) @ guess.T_map_body
             factors.append(motion.loose_motion(record.id, T, loose_rad, loose_m))
         if record.T_previous_body is None:
             notes.append("vision lost, bridged by " + ("IMU" if integrated is not None else "constant motion"))
         if record.rest_from is not None:
-            factors.append(motion.no_motion(record.rest_from, record.id, config))
+            factors.append(motion.no_motion(record.rest_from, record.id, machine))
             if has_imu:
-                factors.append(motion.zero_velocity(record.id, config.rest_speed_sigma_m_s))
+                factors.append(motion.zero_velocity(record.id, machine.rest_speed_sigma_m_s))
         factors += self._on_wheels(record, before, has_imu, floor_m)
         if record.covariance is None or not record.has_scale:
             variances = (loose_rad**2, loose_m**2)
@@ -116,13 +117,13 @@ class Builder:
         self, record: KeyframeRecord, before: Guess, has_imu: bool, floor_m: float
     ) -> list[gtsam.NonlinearFactor]:
         """Return what is known of a cart on its floor, where the configuration says that this is one."""
-        config, out = self._config, list[gtsam.NonlinearFactor]()
-        if config.floor_sigma_m is not None:
-            out.append(motion.on_floor(record.id, floor_m, config.floor_sigma_m))
-        if config.nonholonomic_sigma_m_s is not None and has_imu and record.imu is not None and len(record.imu.t_ns):
+        machine, out = self._machine, list[gtsam.NonlinearFactor]()
+        if machine.floor_sigma_m is not None:
+            out.append(motion.on_floor(record.id, floor_m, machine.floor_sigma_m))
+        if machine.slip_sigma_m_s is not None and has_imu and record.imu is not None and len(record.imu.t_ns):
             rate = record.imu.gyro_rad_s[-1] - np.array(before.bias.gyroscope())
-            by_turn = np.cross(rate, np.array(config.axle_m))
-            out.append(motion.nonholonomic(record.id, by_turn, config.nonholonomic_sigma_m_s))
+            by_turn = np.cross(rate, np.array(machine.axle_m))
+            out.append(motion.nonholonomic(record.id, by_turn, machine.slip_sigma_m_s))
         return out
 
     def _visual_covariance(self, record: KeyframeRecord, vo_scale: float) -> Array:
@@ -153,7 +154,8 @@ class Builder:
         """Keep velocity and biases bounded where the IMU factor had to be dropped."""
         assert self._preintegrator is not None
         walk = self._preintegrator.bias_walk_sigmas(duration_s)
-        sigma_m_s = self._config.submap_speed_sigma_m_s if record.begins_submap else self._config.lost_speed_sigma_m_s
+        lost_m_s = self._machine.lost_speed_sigma_m_s
+        sigma_m_s = self._config.submap_speed_sigma_m_s if record.begins_submap else lost_m_s
         speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, sigma_m_s)
         return [speed, motion.bias_walk(record.id, walk)]
 

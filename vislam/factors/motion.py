@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from vislam.config import GraphConfig
+from vislam.config import MachineConfig
 from vislam.core.geometry import skew
 from vislam.core.messages import Array
 from vislam.factors.keys import B, V, X
@@ -17,12 +17,12 @@ def zero_velocity(k: int, sigma_m_s: float) -> gtsam.PriorFactorVector:
     return gtsam.PriorFactorVector(V(k), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma_m_s))
 
 
-def no_motion(rest_from: int, k: int, config: GraphConfig) -> gtsam.BetweenFactorPose3:
+def no_motion(rest_from: int, k: int, machine: MachineConfig) -> gtsam.BetweenFactorPose3:
     """Return the factor that keyframe k is where rest began.
 
     From one keyframe of a rest to the next, as many small errors as there are keyframes would add up.
     """
-    spread = np.repeat([np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m], 3)
+    spread = np.repeat([np.deg2rad(machine.rest_sigma_deg), machine.rest_sigma_m], 3)
     return gtsam.BetweenFactorPose3(X(rest_from), X(k), gtsam.Pose3(), sigmas(spread))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, MachineConfig
 from vislam.core.messages import Array, ImuSpan
 from vislam.factors.keys import B, V, X
 from vislam.imu import ImuNoise
@@ -31,11 +31,11 @@ class Preintegrated:
 class Preintegrator:
     """Turns IMU spans into combined factors."""
 
-    def __init__(self, config: GraphConfig, noise: ImuNoise, gravity_m_s2: float) -> None:
+    def __init__(self, config: GraphConfig, noise: ImuNoise, machine: MachineConfig) -> None:
         """Set up the noise of the IMU, its walks floored as `config` says; spans scale the white part."""
         self._config = config
-        self._max_gap_s = noise.gap_s(config.imu_max_gap_s)
-        self._gravity_m_s2 = gravity_m_s2
+        self._machine = machine
+        self._max_gap_s = noise.gap_s(machine.max_gap_s)
         self._gyro_density = noise.gyroscope_noise_density
         self._accel_density = noise.accelerometer_noise_density
         self.gyroscope_random_walk = max(noise.gyroscope_random_walk, config.gyro_bias_walk_floor)
@@ -46,9 +46,9 @@ class Preintegrator:
     ) -> Preintegrated | None:
         """Return the span integrated over [t0_ns, t1_ns] at `bias`; None when it is missing or has too long an outage.
 
-        Between samples the mean of both ends is integrated. Where samples are more than `imu_max_gap_s` apart, or more
-        than is usual for a slow IMU, or an end is not covered, the missing motion is interpolated and carries the
-        outage sigmas of the configuration.
+        Between samples the mean of both ends is integrated. Where samples are more than `machine.max_gap_s` apart, or
+        more than is usual for a slow IMU, or an end is not covered, the missing motion is interpolated and carries the
+        outage sigmas of `machine`.
         """
         if span is None or len(span.t_ns) == 0:
             return None
@@ -56,7 +56,7 @@ class Preintegrator:
         dt = np.diff(t_s)
         outage = dt > self._max_gap_s
         outage_s = float(dt[outage].sum())
-        if len(dt) == 0 or outage_s > self._config.imu_max_outage_s:
+        if len(dt) == 0 or outage_s > self._machine.max_outage_s:
             return None
         white = self._gyro_density * span.noise.gyro, self._accel_density * span.noise.accel
         params = self._params(white)
@@ -81,7 +81,7 @@ class Preintegrator:
         return np.repeat([self.accelerometer_random_walk * root, self.gyroscope_random_walk * root], 3)
 
     def _params(self, white: tuple[float, float]) -> gtsam.PreintegrationCombinedParams:
-        params = gtsam.PreintegrationCombinedParams.MakeSharedU(self._gravity_m_s2)
+        params = gtsam.PreintegrationCombinedParams.MakeSharedU(self._machine.gravity_m_s2)
         self._set_white_noise(params, *white)
         params.setIntegrationCovariance(np.eye(3) * self._config.imu_integration_sigma**2)
         params.setBiasOmegaCovariance(np.eye(3) * self.gyroscope_random_walk**2)
@@ -118,8 +118,8 @@ class Preintegrator:
 
         A density s * sqrt(duration) makes velocity uncertain by s * duration in the end, as an unknown constant would.
         """
-        config, root = self._config, np.sqrt(duration_s)
-        self._set_white_noise(params, config.outage_gyro_sigma_rad_s * root, config.outage_accel_sigma_m_s2 * root)
+        machine, root = self._machine, np.sqrt(duration_s)
+        self._set_white_noise(params, machine.outage_gyro_sigma_rad_s * root, machine.outage_accel_sigma_m_s2 * root)
         steps = max(1, int(np.ceil(duration_s / _BRIDGE_STEP_S)))
         for alpha in (np.arange(steps) + 0.5) / steps:
             pim.integrateMeasurement(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, MachineConfig
 from vislam.core.geometry import se3_log
 from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array
@@ -27,9 +27,10 @@ _UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 class WindowOdometry:
     """Records of a window, turned into factors; see `vislam.factors.odometry.Odometry`."""
 
-    def __init__(self, config: GraphConfig) -> None:
+    def __init__(self, config: GraphConfig, machine: MachineConfig) -> None:
         """Start empty."""
         self._config = config
+        self._machine = machine
         self._start: StartRecord | None = None
         self._newest: WindowRecord | None = None
         self._t_ns: list[int] = []
@@ -99,9 +100,9 @@ class WindowOdometry:
             named["tilt", k] = self._gravity_factor(self._tilts[k])
         rest_from, still = self._rest_from[k], list[gtsam.NonlinearFactor]()
         if rest_from is not None:
-            still.append(no_motion(rest_from, k, self._config))
-        if self._config.floor_sigma_m is not None and self._start is not None:
-            still.append(on_floor(k, float(self._start.T_map_body[2, 3]), self._config.floor_sigma_m))
+            still.append(no_motion(rest_from, k, self._machine))
+        if self._machine.floor_sigma_m is not None and self._start is not None:
+            still.append(on_floor(k, float(self._start.T_map_body[2, 3]), self._machine.floor_sigma_m))
         note = self._newest.note if k == self._newest.id else ""
         guess = Guess(T, before.velocity_map_m_s, before.bias)
         return Step(still, guess, *_variances(covariance), note=note, named=named)

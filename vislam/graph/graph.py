@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, MachineConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.memory import EdgeReport
@@ -74,7 +74,8 @@ class Graph:
     def __init__(self, *, rig: Rig | None = None, imu: ImuNoise | None = None, gravity_m_s2: float = 9.81) -> None:
         """Start empty; views need the cameras of a `rig`, inertial samples the noise of the `imu`."""
         self._rig = rig
-        self._preintegrator = None if imu is None else Preintegrator(_CONFIG, imu, gravity_m_s2)
+        machine = MachineConfig(gravity_m_s2=gravity_m_s2)
+        self._preintegrator = None if imu is None else Preintegrator(_CONFIG, imu, machine)
         self._count = 0
         self._landmarks = 0
         self._given: dict[int, Array] = {}  # first guesses, by key

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import GraphConfig, WindowConfig
+from vislam.config import GraphConfig, MachineConfig, WindowConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert
@@ -50,8 +50,8 @@ class PoseGraph:
     """
 
     def __init__(
-        self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, rig: Rig, window: WindowConfig,
-        suite: Suite | None = None,
+        self, config: GraphConfig, noise: ImuNoise | None, machine: MachineConfig, rig: Rig,
+        window: WindowConfig, suite: Suite | None = None,
     ) -> None:  # fmt: skip
         """Set up for a rig; without `noise` there is no IMU and only poses are estimated.
 
@@ -64,9 +64,9 @@ class PoseGraph:
         if config.coupling == "tight":
             from vislam.window import SlidingWindow  # compiles a good deal, which loose coupling need not wait for
 
-            self._source = WindowSource(config, SlidingWindow(window, rig, noise, gravity_m_s2))
+            self._source = WindowSource(config, machine, SlidingWindow(window, rig, noise, machine))
         else:
-            self._source = MotionSource(config, noise, gravity_m_s2, self._lever_m)
+            self._source = MotionSource(config, noise, machine, self._lever_m)
         self.readings = Readings(suite or Suite(), config)
         self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, self.readings)
         self._start: StartRecord | None = None

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, MachineConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, se3_exp, se3_log, skew
@@ -91,9 +91,9 @@ class Source(Protocol):
 class MotionSource:
     """Loose coupling: the graph itself estimates velocities and biases."""
 
-    def __init__(self, config: GraphConfig, noise: ImuNoise | None, gravity_m_s2: float, lever_m: Array) -> None:
+    def __init__(self, config: GraphConfig, noise: ImuNoise | None, machine: MachineConfig, lever_m: Array) -> None:
         """Start empty."""
-        self._odometry = MotionOdometry(Builder(config, noise, gravity_m_s2, lever_m))
+        self._odometry = MotionOdometry(Builder(config, noise, machine, lever_m))
         self._newest_id = -1
 
     @property
@@ -174,10 +174,11 @@ class WindowSource:
     tells goes into the edge as well.
     """
 
-    def __init__(self, config: GraphConfig, window: Window) -> None:
+    def __init__(self, config: GraphConfig, machine: MachineConfig, window: Window) -> None:
         """Start empty."""
         self._config = config
-        self._odometry = WindowOdometry(config)
+        self._machine = machine
+        self._odometry = WindowOdometry(config, machine)
         self._window = window
         self._local: list[NavState | None] = []  # of each keyframe in the window's frame, settled or as it was newest
         self._fresh: dict[int, NavState] = {}  # of those, since `take_states`
@@ -339,13 +340,13 @@ class WindowSource:
 
     def _stand_in(self, record: KeyframeRecord) -> EdgeRecord:
         """Return an edge to the newest keyframe where the window gave none: from odometry, else as before, loosely."""
-        config = self._config
+        machine = self._machine
         if record.T_previous_body is not None and record.covariance is not None and record.has_scale:
             weak = record.begins_submap
             return EdgeRecord(record.id, record.T_previous_body, record.covariance, weak, weak)
         last = self._odometry.edge(record.id - 1)
         T = np.eye(4) if last is None else last.T_previous_body
-        rad, m = np.deg2rad(config.lost_rate_sigma_deg_s), config.lost_speed_sigma_m_s  # of a second, the usual gap
+        rad, m = np.deg2rad(machine.lost_rate_sigma_deg_s), machine.lost_speed_sigma_m_s  # of a second, the usual gap
         return EdgeRecord(record.id, T, np.diag(np.repeat([rad**2, m**2], 3)), False)
 
 

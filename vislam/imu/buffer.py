@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vislam.config import ImuConfig
+from vislam.config import ImuConfig, MachineConfig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import ImuSample, ImuSpan
 from vislam.imu.noise_floor import NoiseFloor
@@ -20,18 +20,18 @@ class ImuBuffer:
 
     Attributes:
         counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than
-            `config.max_gap_s`.
+            `machine.max_gap_s`.
         noise_floor: what the samples show of their noise; None without a model to compare with.
         outages: spans that `unbroken` could not give.
     """
 
-    def __init__(self, config: ImuConfig, noise: ImuNoise | None = None) -> None:
+    def __init__(self, config: ImuConfig, machine: MachineConfig, noise: ImuNoise | None = None) -> None:
         """Start empty; with a noise model the spans tell what the samples show against it."""
         self.noise_floor = None if noise is None else NoiseFloor(noise)
         self.outages = 0
         self._series = ImuSeries()
         self._buffer_ns = round(config.buffer_s * _NS)
-        self._max_gap_ns = round(config.max_gap_s * _NS)
+        self._max_gap_ns = round(machine.max_gap_s * _NS)
         self._samples = 0
         self._gaps = 0
         self._forget_at_ns = 0
@@ -78,7 +78,7 @@ class ImuBuffer:
         return replace(span, noise=self.noise_floor.between(t0_ns, t1_ns))
 
     def unbroken(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
-        """Return `span`, or None, and count it, where a hole in it is longer than `config.max_gap_s`."""
+        """Return `span`, or None, and count it, where a hole in it is longer than `machine.max_gap_s`."""
         if self.gap_s(t0_ns, t1_ns) > self._max_gap_ns / _NS:
             self.outages += 1
             return None

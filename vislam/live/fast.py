@@ -57,8 +57,8 @@ class FastPath:
         self._noise = noise
         self._T_body_camera = T_body_camera
         self._publish = publish
-        self._ekf = Ekf(config.ekf, noise, config.imu.gravity_m_s2, T_body_camera, suite=suite)
-        self._buffer = ImuBuffer(config.imu)
+        self._ekf = Ekf(config.ekf, noise, config.machine, T_body_camera, suite)
+        self._buffer = ImuBuffer(config.imu, config.machine)
         self._is_mag_calibrated = is_mag_calibrated
         self._alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
         self._rest = RestDetector(config.init, noise)
@@ -261,7 +261,7 @@ class FastPath:
             self._settled_variance = self._ekf.position_variance_m2
 
     def _look_for_rest(self, t_ns: int) -> Hint | None:
-        """Hold the drift while vision is away: by rest, or by wheels where `ekf.nonholonomic` says that there are any.
+        """Hold the drift while vision is away: by rest, or by wheels where `machine.slip_sigma_m_s` is set.
 
         Still inertial data mean rest where the filter itself sees no speed: an IMU alone cannot tell rest from uniform
         motion, so a filter that is not sure of its speed is not told.
@@ -279,7 +279,7 @@ class FastPath:
         is_slow = float(np.linalg.norm(state.velocity_world_m_s)) < limit and self._velocity_sigma(state) < limit
         hint = Hint(t_ns, at_rest=rests and is_slow)
         self._at_rest = hint.at_rest
-        if not hint.at_rest and not self._config.ekf.nonholonomic:
+        if not hint.at_rest and self._config.machine.slip_sigma_m_s is None:
             return None
         hint.apply(self._ekf)
         self.counters["rests_without_vision" if hint.at_rest else "wheels_without_vision"] += 1

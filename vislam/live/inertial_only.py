@@ -63,14 +63,14 @@ class InertialOnly:
         span = buffer.span(max(begin_ns, buffer.oldest_t_ns), newest_ns)
         if span is None:
             return None
-        found = power_up(span, self._config.power_up, self._config.imu.gravity_m_s2, temperature_c, self._memory)
+        found = power_up(span, self._config.power_up, self._config.machine.gravity_m_s2, temperature_c, self._memory)
         if isinstance(found, Refusal):
             self.refusal = found.reason
             return None
         self.zero, self.refusal = found, ""
         if not self._is_over:
             self._attitude = AttitudeFilter(
-                self._config.attitude, self._config.imu.gravity_m_s2, found.R_level_body, found.gyro_bias_rad_s
+                self._config.attitude, self._config.machine.gravity_m_s2, found.R_level_body, found.gyro_bias_rad_s
             )
         self._bias_sigma_rad_s = found.gyro_bias_sigma_rad_s
         norms = [float(np.linalg.norm(field.field_ut)) for field in self._fields if field.t_ns >= int(span.t_ns[0])]

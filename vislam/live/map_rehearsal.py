@@ -51,7 +51,7 @@ def rehearse_map(config: Config, rig: Rig) -> None:
         folder = Path(name)
         with open_viewer(folder / "run.rrd", config.view.enabled, rig, config.view) as viewer:
             for k, frame in enumerate(frames):
-                odometry = OdometryKeyframe(_packet(k, frame, config.imu.gravity_m_s2), T_map_body[k])
+                odometry = OdometryKeyframe(_packet(k, frame, config.machine.gravity_m_s2), T_map_body[k])
                 update = GraphUpdate(k, np.array([k]), T_map_body[k : k + 1], np.eye(4), None)
                 witness.add(odometry.packet, update)
                 viewer.log_frame(frame, no_observations(), Tracking.OK)

@@ -85,7 +85,7 @@ def made_up(config: Config, rig: Rig) -> Iterator[ImuSample | Frame]:
     coarse = rng.integers(0, 255, (camera.height // 8 + 1, width // 8 + 2), np.uint8)
     wall = np.kron(coarse, np.ones((8, 8), np.uint8))
     depth = np.full((camera.height, camera.width), _DEPTH_M, np.float32) if rig.has_depth else None
-    aside, gravity = rig.T_body_cams[0][:3, 0], np.array([0.0, 0.0, config.imu.gravity_m_s2])
+    aside, gravity = rig.T_body_cams[0][:3, 0], np.array([0.0, 0.0, config.machine.gravity_m_s2])
     for k in range(_FRAMES):
         for j in range(_SAMPLES):
             t_ns = (k * _SAMPLES + j) * _FRAME_NS // _SAMPLES

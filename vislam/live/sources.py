@@ -52,7 +52,7 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
     """
     kind, _, rest = asked.partition(",")
     if kind == "virtual-cart":
-        cart = VirtualCart(_place_options(rest), config.imu.gravity_m_s2)
+        cart = VirtualCart(_place_options(rest), config.machine.gravity_m_s2)
         return cart, cart.settings(config)
     if asked.startswith("replay:"):
         replay = ReplaySource(asked.removeprefix("replay:"), config.seed, calibration=config.calibration)

@@ -61,9 +61,7 @@ class Back:
         """
         self._has_gravity = has_gravity = first_state is not None
         graph = config.graph if has_gravity else without_gravity(config.graph, rig)
-        self.graph = PoseGraph(
-            graph, noise if has_gravity else None, config.imu.gravity_m_s2, rig, config.window, suite
-        )
+        self.graph = PoseGraph(graph, noise if has_gravity else None, config.machine, rig, config.window, suite)
         self.graph.initialise(first_state, T_map_body)
         self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self._false = None

@@ -94,19 +94,21 @@ class Front:
         self.feed, self._track_noise = CameraFeed(), NoiseUsed()
         self._filter: Filtering | None = None
         if noise is not None:
-            self._buffer = ImuBuffer(config.imu, noise)
+            self._buffer = ImuBuffer(config.imu, config.machine, noise)
             self.condition = ConditionWatch()
             self._rest = RestDetector(config.init, noise)
             self._stillness = Stillness(config.init)
-            self._filter = Filtering(config.ekf, noise, config.imu.gravity_m_s2, rig, suite)
-            early = EarlyFrames(config.ekf, rig, config.imu.gravity_m_s2) if self.frontend.mode == "mono" else None
+            self._filter = Filtering(config.ekf, noise, config.machine, rig, suite)
+            early = EarlyFrames(config.ekf, rig, config.machine) if self.frontend.mode == "mono" else None
             self._gravity = GravityWait(config, rig, noise, self._filter, self._buffer, early)
             self.ekf_coupling = self._filter.coupling
         self._readings: ReadingIntake | None = None
         if suite is not None and len(suite):
             buffer, density = (None, 0.0) if noise is None else (self._buffer, noise.accelerometer_noise_density)
             has_window = config.graph.coupling == "tight"
-            self._readings = ReadingIntake(suite, self._filter, buffer, config.imu.gravity_m_s2, density, has_window)
+            self._readings = ReadingIntake(
+                suite, self._filter, buffer, config.machine.gravity_m_s2, density, has_window
+            )
         self._waypoints = Waypoints()
         self._published = in_odom(config)
         self._last_state: NavState | None = None  # at the last frame
@@ -452,7 +454,7 @@ class Front:
             return Estimate(after, after, 0.0), state
         walk = 0.0 if self.noise is None else self.noise.gyroscope_random_walk
         gyro_bias, sigma_rad_s = surer_gyro_bias(last, self._graph_state, walk)
-        before = _uncorrected(replace(last, gyro_bias_rad_s=gyro_bias), span, self.config.imu.gravity_m_s2, at_rest)
+        before = _uncorrected(replace(last, gyro_bias_rad_s=gyro_bias), span, self.config.machine.gravity_m_s2, at_rest)
         return Estimate(before, after, sigma_rad_s), state
 
     def _publish(self, t_ns: int, estimate: Estimate | None) -> Array | None:

@@ -71,7 +71,7 @@ class GravityWait:
         self._waiting = WaitingKeyframes()
         self._early = early
         self._initialiser = Initialiser(
-            config.init, noise, config.imu.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
+            config.init, noise, config.machine.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
             config.frontend.track_sigma_px, config.window,
         )  # fmt: skip
 
@@ -196,7 +196,7 @@ class GravityWait:
             span = self._buffer.unbroken(max(oldest_ns, self._buffer.oldest_t_ns), vo.t_ns)
         if span is None:
             return None
-        return level_at_once(span, vo.t_ns, T_vo_body, self._config.imu.gravity_m_s2, self._config.init)
+        return level_at_once(span, vo.t_ns, T_vo_body, self._config.machine.gravity_m_s2, self._config.init)
 
     def _release(self, T_odom_vo: Array) -> Released:
         """Return the waiting keyframes in `odom`, and settle the state of the first.

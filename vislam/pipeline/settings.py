@@ -27,10 +27,13 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
     lasting = lasting_scale_sigma(config.frontend, rig, noise)
     by_imu = noise is not None and not rig.is_stereo and not rig.has_depth
-    config = config if noise is None else _for_slow(config, noise)
     graph = replace(config.graph, scale_sigma=max(config.graph.scale_sigma, lasting), edges_share_scale=by_imu)
+    machine = config.machine
+    if noise is not None:  # the time between any two samples of a slow IMU is no outage
+        machine = replace(machine, max_gap_s=noise.gap_s(machine.max_gap_s))
     return replace(
         config,
+        machine=machine,
         frontend=replace(config.frontend, mode=mode),
         ekf=config.ekf if noise is None else _filter(config, mode, lasting),
         window=replace(config.window, readout_s=readout_s),
@@ -69,23 +72,12 @@ def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
     return replace(graph, coupling=coupling, edges_share_scale=False)
 
 
-def _for_slow(config: Config, noise: ImuNoise) -> Config:
-    """Return the configuration for the rate of an IMU: the time between any two samples of a slow one is no outage."""
-    return replace(
-        config,
-        imu=replace(config.imu, max_gap_s=noise.gap_s(config.imu.max_gap_s)),
-        ekf=replace(config.ekf, max_gap_s=noise.gap_s(config.ekf.max_gap_s)),
-        window=replace(config.window, imu_max_gap_s=noise.gap_s(config.window.imu_max_gap_s)),
-        graph=replace(config.graph, imu_max_gap_s=noise.gap_s(config.graph.imu_max_gap_s)),
-    )
-
-
 def _filter(config: Config, mode: str, lasting_scale_sigma: float) -> EkfConfig:
     coupling = config.ekf.coupling
     if coupling == "auto":
         coupling = "tight" if mode == "mono" else "loose"
-    if config.ekf.nonholonomic and coupling == "tight":
-        raise UsageError("--ekf.nonholonomic needs --ekf.coupling loose, which has no use for tracks")
+    if config.machine.slip_sigma_m_s is not None and coupling == "tight":
+        raise UsageError("--machine.slip-sigma-m-s needs --ekf.coupling loose, which has no use for tracks")
     readout_s = config.ekf.tight_readout_s
     return replace(
         config.ekf,

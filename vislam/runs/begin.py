@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.config import Config
+from vislam.config import Config, recorded
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert, rotation_from_quaternion_xyzw, transform
 from vislam.core.memory import SlamMemory
@@ -103,7 +103,7 @@ def begun(
     make = make or partial(Run, recording, config, out)
     if base is None:
         write_setup(out, config, source, command)
-        return make(SessionWriter(path, info, recording.rig, noise, config.imu.gravity_m_s2))
+        return make(SessionWriter(path, info, recording.rig, noise, config.machine.gravity_m_s2))
     stored = Session(base.session)
     try:
         memory = map_of(stored, recording, config, noise, base.localize_only)
@@ -147,7 +147,8 @@ def map_of(
     count = len(memory.graph.packets)
     T_guess = told_start(config.loop.start_in_map, stored_level(stored.info()).T_level_map)
     memory = replace(memory, held=count if is_held else 0, map_keyframes=count, T_guess=T_guess)
-    was, now = (stored.info().get("config") or {}).get("map") or {}, json.loads(json.dumps(asdict(config.map)))
+    was = recorded(stored.info().get("config") or {}, str(stored.path)).get("map") or {}
+    now = json.loads(json.dumps(asdict(config.map)))
     if any(was.get(name) != now[name] for name in _SHAPING):
         return replace(memory, scans={})
     return memory

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import Config, ImuConfig
+from vislam.config import Config, ImuConfig, recorded
 from vislam.core import interrupts
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
@@ -118,7 +118,9 @@ class Run:
     def go_on(self, stored: Session) -> bool:
         """Go on after the last keyframe, as `resume`, though the run may have come to its end."""
         info = stored.info()
-        if not _still(info.get("config") or {}, json.loads(json.dumps(asdict(self.config)))):
+        if not _still(
+            recorded(info.get("config") or {}, str(stored.path)), json.loads(json.dumps(asdict(self.config)))
+        ):
             raise UsageError(f"{self.out / 'config.json'} was changed since the run began; start a new run")
         memory = recall(stored)
         if memory is None:
@@ -283,14 +285,14 @@ class Run:
         """Write states and tables; return the final trajectory, the loop candidates and the counts of decisions."""
         graph = None if self.slam.back is None else self.slam.back.graph
         if graph is None:
-            nothing = self.log.final_trajectory([], np.zeros((0, 4, 4)), [], self.config.imu)
+            nothing = self.log.final_trajectory([], np.zeros((0, 4, 4)), [], self.config.machine)
             return nothing, [], self.log.write_tables(self.out, [])
         ids = [int(i) for i in graph.ids]
         states = graph.states()
         self.log.write_states(self.out, ids, states)
         rows = self.log.loop_rows({report.loop_id: report for report in graph.edge_reports()})
         loops = self.log.write_tables(self.out, rows)
-        final = self.log.final_trajectory(ids, graph.poses(), states, self.config.imu)
+        final = self.log.final_trajectory(ids, graph.poses(), states, self.config.machine)
         from_ns = self.slam.front.report().scaled_from_ns
         if from_ns is not None:
             final, warning = in_metres(final, from_ns, int(self.log.stamps_ns[0]))
@@ -363,7 +365,7 @@ class Run:
 
     def _evidence(self, report: FrontReport, final: Trajectory) -> Evidence:
         """Gather what speaks for and against the run."""
-        front = front_evidence(report, self.config.imu)
+        front = front_evidence(report, self.config.machine)
         graph = None if self.slam.back is None else self.slam.back.graph
         if graph is None:
             return whole_evidence(front, self.log, final, self._frames_due, [], {}, 0, {})

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.config import Config, ImuConfig
+from vislam.config import Config, MachineConfig
 from vislam.core.errors import VislamError
 from vislam.core.memory import EdgeReport
 from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
@@ -26,7 +26,7 @@ _REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors t
 _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
 
 
-def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
+def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
     """Return what the front half has to say, at any time of a run."""
     counters = report.counters
     front, feed, ekf, live = (counters.get(name, {}) for name in ("front", "camera feed", "ekf", "live"))
@@ -64,8 +64,8 @@ def front_evidence(report: FrontReport, imu: ImuConfig) -> Evidence:
             name: count for key, count in ekf.items() if (name := key.removesuffix("_regained")) != key and count
         },
         uniform_s=report.uniform_s,
-        gravity_m_s2=imu.gravity_m_s2,
-        max_gap_s=imu.max_gap_s,
+        gravity_m_s2=machine.gravity_m_s2,
+        max_gap_s=machine.max_gap_s,
         **_calibration(report.calibration),
     )
     condition, noise, told = report.condition, report.noise_ratios, report.told_noise
@@ -110,7 +110,7 @@ class KeyframeWitness:
             self._rotation = _window_turn(update.details.get("calibration"), self._config.window.rotation_sigma_deg)
         if span is None or packet.begins_submap or len(span.t_ns) < _SAMPLES:
             return
-        if float(np.diff(span.t_ns).max()) * 1e-9 > self._config.imu.max_gap_s:
+        if float(np.diff(span.t_ns).max()) * 1e-9 > self._config.machine.max_gap_s:
             return
         inertial = preintegrate(span)
         self._inertial[packet.keyframe.id] = inertial
@@ -127,9 +127,9 @@ class KeyframeWitness:
             return found
         bias = {i: state.gyro_bias_rad_s for i, state in zip(ids, states, strict=True)}
         steps = [self._without_bias(k, bias.get(k)) for k in ids[1:]]
-        imu = self._config.imu
+        gravity_m_s2 = self._config.machine.gravity_m_s2
         sigma = self._config.verdict.accel_bias_sigma_m_s2
-        found["forces"] = force_agreement(T_map_body, steps, imu.gravity_m_s2, sigma)
+        found["forces"] = force_agreement(T_map_body, steps, gravity_m_s2, sigma)
         return found
 
     def _without_bias(self, keyframe_id: int, gyro_bias: Array | None) -> Preintegrated | None:

@@ -17,7 +17,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import Config, ImuConfig, dump, from_data
+from vislam.config import Config, MachineConfig, dump, from_data, recorded
 from vislam.core.errors import DataError, StorageError, UsageError
 from vislam.core.files import write_json, write_text
 from vislam.core.log import FILE_NAME, is_written_to
@@ -132,7 +132,8 @@ def read_setup(out: Path) -> tuple[str, Config, MapChoice | None]:
         choice = None if base is None else MapChoice(Path(base["path"]), bool(base["localize_only"]))
     except (KeyError, TypeError) as error:
         raise DataError(f"{out / 'manifest.json'} names no sound map; start the run anew with --overwrite") from error
-    return source, from_data(settings, str(out / "config.json")), choice
+    where = str(out / "config.json")
+    return source, from_data(recorded(settings, where), where), choice
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -373,7 +374,9 @@ class RunLog:
         rms = float(np.sqrt(square / max(known, 1)))
         self._shifts |= dict.fromkeys(update.accepted_loop_ids, (rms, largest))
 
-    def final_trajectory(self, ids: list[int], T_map_body: Array, states: list[NavState], imu: ImuConfig) -> Trajectory:
+    def final_trajectory(
+        self, ids: list[int], T_map_body: Array, states: list[NavState], machine: MachineConfig
+    ) -> Trajectory:
         """Return the pose of every frame from the final poses of the keyframes that they were tracked against.
 
         Frames whose motion since their keyframe is unknown are carried by the IMU between `states` (of the keyframes,
@@ -381,7 +384,7 @@ class RunLog:
         """
         keyframe_ids = np.array([frame.keyframe_id for frame in self._frames], dtype=np.int64)
         frames = LoggedFrames(self.stamps_ns, keyframe_ids, [frame.T_keyframe_body for frame in self._frames])
-        frames = frames.carried_by_imu(states, self._spans, imu.gravity_m_s2, imu.max_gap_s)
+        frames = frames.carried_by_imu(states, self._spans, machine.gravity_m_s2, machine.max_gap_s)
         poses = dict(zip(ids, T_map_body, strict=True))
         return frames.placed(self._keyframe_t_ns, {i: poses[i] for i in ids if i in self._keyframe_t_ns})
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import WindowConfig
+from vislam.config import MachineConfig, WindowConfig
 from vislam.core.geometry import transform
 from vislam.core.messages import Array, ImuSpan
 from vislam.core.readings import Motion
@@ -22,12 +22,13 @@ _DAMP = 1e-18  # on the covariance of a span of one short step, whose position p
 class LinkStore:
     """Owns the links of the window, and the spans they came from so that they can be integrated again."""
 
-    def __init__(self, config: WindowConfig, noise: ImuNoise | None, gravity_m_s2: float) -> None:
+    def __init__(self, config: WindowConfig, noise: ImuNoise | None, machine: MachineConfig) -> None:
         """Start empty; without `noise` there is no IMU."""
         self._config = config
+        self._machine = machine
         self._noise = noise
-        self._max_gap_s = config.imu_max_gap_s if noise is None else noise.gap_s(config.imu_max_gap_s)
-        self._gravity_m_s2 = gravity_m_s2
+        self._max_gap_s = machine.max_gap_s if noise is None else noise.gap_s(machine.max_gap_s)
+        self._gravity_m_s2 = machine.gravity_m_s2
         self._spans: list[ImuSpan | None] = []
         self._motions: list[Sequence[Motion]] = []
         size = config.keyframes + 2
@@ -65,7 +66,7 @@ class LinkStore:
         """Return whether a span can be integrated: there, and without too long an outage."""
         if span is None or len(span.t_ns) < 2 or self._noise is None:
             return False
-        return float(self._holes_s(span).sum()) <= self._config.imu_max_outage_s
+        return float(self._holes_s(span).sum()) <= self._machine.max_outage_s
 
     def push(
         self, span: ImuSpan | None, dt_s: float, bias: Array, guess: Array, at_rest: bool, motions: Sequence[Motion]
@@ -75,7 +76,7 @@ class LinkStore:
         `guess` [4, 4] is the motion that is assumed, loosely, where there is no inertial data; `bias` [6] is taken off.
         `motions` is what further sensors say of it, see `hear`.
         """
-        k, links, config = len(self._spans), self._links, self._config
+        k, links, machine = len(self._spans), self._links, self._machine
         inertial = self.usable(span)
         self._spans.append(span if inertial else None)
         self._motions.append(motions)
@@ -88,13 +89,13 @@ class LinkStore:
             self.integrate(k, bias)
         else:
             links.guess[k] = guess
-            links.guess_weight[k, 0] = 1.0 / (np.deg2rad(config.lost_rate_sigma_deg_s) * dt_s)
-            links.guess_weight[k, 1] = 1.0 / (config.lost_speed_sigma_m_s * dt_s)
-            links.velocity_weight[k] = 1.0 / config.lost_speed_sigma_m_s
+            links.guess_weight[k, 0] = 1.0 / (np.deg2rad(machine.lost_rate_sigma_deg_s) * dt_s)
+            links.guess_weight[k, 1] = 1.0 / (machine.lost_speed_sigma_m_s * dt_s)
+            links.velocity_weight[k] = 1.0 / machine.lost_speed_sigma_m_s
         if at_rest:
             links.guess[k] = np.eye(4)
-            links.guess_weight[k] = 1.0 / np.deg2rad(config.rest_sigma_deg), 1.0 / config.rest_sigma_m
-            links.rest_weight[k + 1] = 1.0 / config.rest_speed_sigma_m_s
+            links.guess_weight[k] = 1.0 / np.deg2rad(machine.rest_sigma_deg), 1.0 / machine.rest_sigma_m
+            links.rest_weight[k + 1] = 1.0 / machine.rest_speed_sigma_m_s
         return inertial
 
     def integrate(self, k: int, bias: Array) -> None:
@@ -162,8 +163,8 @@ class LinkStore:
         for i in np.flatnonzero(holes).tolist():
             hole = float(holes[i])
             after = duration_s - float(span.t_ns[i + 1] - span.t_ns[0]) * 1e-9
-            turned = self._config.outage_gyro_sigma_rad_s * hole
-            pushed = self._config.outage_accel_sigma_m_s2 * hole
+            turned = self._machine.outage_gyro_sigma_rad_s * hole
+            pushed = self._machine.outage_accel_sigma_m_s2 * hole
             by_push = np.zeros((9, 3))
             by_push[_VELOCITY], by_push[_POSITION] = np.eye(3), np.eye(3) * (0.5 * hole + after)
             out += pushed**2 * (by_push @ by_push.T)

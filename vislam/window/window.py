@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vislam.config import WindowConfig
+from vislam.config import MachineConfig, WindowConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert
@@ -55,7 +55,7 @@ _UNSURE_EFFORT = 5  # times the iterations
 class SlidingWindow:
     """Owns the states, observations, links and prior of the newest keyframes."""
 
-    def __init__(self, config: WindowConfig, rig: Rig, noise: ImuNoise | None, gravity_m_s2: float) -> None:
+    def __init__(self, config: WindowConfig, rig: Rig, noise: ImuNoise | None, machine: MachineConfig) -> None:
         """Start empty; without `noise` there is no IMU and the window holds poses alone."""
         if config.keyframes < 3:
             raise UsageError(f"a window needs at least 3 keyframes, got --window.keyframes {config.keyframes}")
@@ -66,10 +66,10 @@ class SlidingWindow:
         self._config = config
         self._rig = rig
         self._noise = noise
-        self._gravity_m_s2 = gravity_m_s2
+        self._gravity_m_s2 = machine.gravity_m_s2
         self._measures_scale = rig.is_stereo or rig.has_depth
         self._T_cam0_cams = np.array([invert(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]])
-        self._links = LinkStore(config, noise, gravity_m_s2)
+        self._links = LinkStore(config, noise, machine)
         self._room = Room()
         self._start: NavState | None = None
         self._T_start: Array | None = None

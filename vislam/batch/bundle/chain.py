@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import GraphConfig
+from vislam.config import GraphConfig, MachineConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
@@ -30,18 +31,19 @@ class Chain:
     Raises DataError when a keyframe of the log cannot be used.
     """
 
-    def __init__(self, log: FactorLog, config: GraphConfig) -> None:
+    def __init__(self, log: FactorLog, config: GraphConfig, machine: MachineConfig) -> None:
         """Check everything in the log but its tracks."""
         if not log.keyframes:
             raise DataError("the run has no keyframe to optimise; see tracking.csv for why none was taken")
         self._config = config
+        self._machine = replace(machine, gravity_m_s2=log.gravity_m_s2)
         self._lever_m = log.rig.T_body_cams[0][:3, 3]
         self.has_imu = log.first_state is not None and log.noise is not None
         first = log.first_state if self.has_imu else None
         self.start = start_record(first, _rigid(log.keyframes[0].T_map_body, "keyframe 0"))
         self._preintegrator = None
         if self.has_imu and log.noise is not None:
-            self._preintegrator = Preintegrator(config, log.noise, log.gravity_m_s2)
+            self._preintegrator = Preintegrator(config, log.noise, self._machine)
         self.records: list[KeyframeRecord] = []
         for keyframe in log.keyframes:
             self.records.append(keyframe_record(keyframe.packet, self.records[-1] if self.records else None))
@@ -88,9 +90,9 @@ class Chain:
                 tied.append(k)
                 factors += self._odometry_factors(record, values, duration_s, has_imu)
             if record.rest_from is not None:
-                factors.append(motion.no_motion(record.rest_from, k, self._config))
+                factors.append(motion.no_motion(record.rest_from, k, self._machine))
                 if self.has_imu:
-                    factors.append(motion.zero_velocity(k, self._config.rest_speed_sigma_m_s))
+                    factors.append(motion.zero_velocity(k, self._machine.rest_speed_sigma_m_s))
         return factors, tied
 
     def odometry_edges(self, scale_sigma: float) -> list[gtsam.BetweenFactorPose3]:
@@ -122,7 +124,7 @@ class Chain:
             factors.append(self._preintegrator.factor(k - 1, k, integrated))
             return True
         walk = self._preintegrator.bias_walk_sigmas(duration_s)
-        factors.append(motion.loose_velocity(k, self._slope(k), self._config.lost_speed_sigma_m_s))
+        factors.append(motion.loose_velocity(k, self._slope(k), self._machine.lost_speed_sigma_m_s))
         factors.append(motion.bias_walk(k, walk))
         return False
 
@@ -163,8 +165,8 @@ class Chain:
         return motion.loose_motion(k, T, np.deg2rad(config.submap_sigma_deg), config.submap_sigma_m)
 
     def _loose(self, duration_s: float) -> tuple[float, float]:
-        config = self._config
-        return np.deg2rad(config.lost_rate_sigma_deg_s) * duration_s, config.lost_speed_sigma_m_s * duration_s
+        machine = self._machine
+        return np.deg2rad(machine.lost_rate_sigma_deg_s) * duration_s, machine.lost_speed_sigma_m_s * duration_s
 
     def _slope(self, k: int) -> Array:
         """Return the velocity [3] of keyframe k in map by differences of the run's poses."""

@@ -174,7 +174,7 @@ def _driven(recording: Recording, options: FloorOptions, planar: PlanarConfig, k
     """Pass over the recording once; the gyroscope counts where its bias is `known`."""
     config = Config()
     frontend = PlanarFrontEnd(replace(config.frontend, mode="planar", planar=planar), recording.rig, config.seed)
-    clock, buffer = CameraClock(config.init), ImuBuffer(replace(config.imu, buffer_s=60.0))
+    clock, buffer = CameraClock(config.init), ImuBuffer(replace(config.imu, buffer_s=60.0), config.machine)
     bias = None if known is None else known.gyro_bias_rad_s
     shift_ns = 0 if known is None else round(known.offset_s * 1e9)
     poses, said, reasons, lost = [], [], list[str](), 0

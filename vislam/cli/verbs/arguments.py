@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 from vislam.cli.verbs import VERBS
 from vislam.cli.verbs.brief import Brief, brief_help
 from vislam.config import Config
+from vislam.config.moved import refuse_moved
 from vislam.config.ranges import check_ranges
 from vislam.core.collector import while_importing
 from vislam.core.compiling import tell_of_compilation
@@ -37,6 +38,7 @@ def parse(
         print(brief_help(verb, options, brief))
         raise SystemExit(0)
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
+    refuse_moved(arguments)
     import tyro
 
     start = tyro.MISSING_NONPROP if default is None else default

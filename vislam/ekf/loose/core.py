@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vislam.config import EkfConfig
+from vislam.config import USUAL_SLIP_M_S, EkfConfig, MachineConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, quaternion_wxyz, skew
 from vislam.core.messages import Array, NavState, NoiseScale, VoMeasurement
@@ -66,19 +66,21 @@ class LooseCore:
     """Moves and corrects a `LooseState`, as `ekf.core.Core` has it."""
 
     def __init__(
-        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None, suite: Suite | None
-    ) -> None:
+        self, config: EkfConfig, noise: ImuNoise, machine: MachineConfig, T_body_camera: Array | None,
+        suite: Suite | None,
+    ) -> None:  # fmt: skip
         self.sensing = Sensing(suite, _COUNTERS)
         self.counters = (*_COUNTERS, *self.sensing.counters)
         own = self.sensing.suite.size
         self._config = config
-        self._gravity = gravity_m_s2
+        self._gravity = float(machine.gravity_m_s2)
         self._told_sigmas = imu_sigmas(config, noise)
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
         self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
         self._limits = np.array([0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)])
-        self._axle = np.array(config.axle_m, dtype=np.float64)
-        self._floor_sigma = float(config.floor_sigma_m or 0.0)
+        self._axle = np.array(machine.axle_m, dtype=np.float64)
+        self._floor_sigma = float(machine.floor_sigma_m or 0.0)
+        self._slip_sigma_m_s = float(USUAL_SLIP_M_S if machine.slip_sigma_m_s is None else machine.slip_sigma_m_s)
         self._vo_variance = float(config.vo_inflation) ** 2
         self._fraction = float(config.vo_shared_fraction)
         self._nothing = np.zeros((6, 6))
@@ -162,9 +164,9 @@ class LooseCore:
         elif isinstance(what, AtRest):
             state.ledger = self._apply_rest(state, event.t_ns, gyro_rad_s, out)
         elif isinstance(what, OnWheels):
-            sigma_m_s = float(self._config.nonholonomic_sigma_m_s)
             floor_z_m = state.ledger.floor_z_m
-            known = on_wheels(state.x, gyro_rad_s, self._axle, sigma_m_s, floor_z_m, self._floor_sigma)
+            slip_m_s = self._slip_sigma_m_s
+            known = on_wheels(state.x, gyro_rad_s, self._axle, slip_m_s, floor_z_m, self._floor_sigma)
             self._correct(state, known, self._all, "nonholonomic", out)
         elif isinstance(what, Reading):
             correct_by_reading(self.sensing, state, what, gyro_rad_s, out)

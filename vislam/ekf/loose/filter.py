@@ -15,7 +15,7 @@ depends only on the set of measurements, not on when they came.
 
 from __future__ import annotations
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.core.messages import Array, NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf.history import AtRest, Event
 from vislam.ekf.loose.core import LooseCore, LooseMeasurement
@@ -36,7 +36,7 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
     """
 
     def __init__(
-        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, T_body_camera: Array | None = None,
+        self, config: EkfConfig, noise: ImuNoise, machine: MachineConfig, T_body_camera: Array | None = None,
         suite: Suite | None = None,
     ) -> None:  # fmt: skip
         """Set up an uninitialised filter.
@@ -44,13 +44,13 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
         Args:
             config: see `EkfConfig`.
             noise: of the IMU, until `follow_noise` tells what the samples show.
-            gravity_m_s2: magnitude, down in `odom`.
+            machine: gravity is down in `odom`; slip, axle and floor are used by `update_nonholonomic`.
             T_body_camera: [4, 4]; its lever arm turns a direction seen by one camera into motion of the body.
                 None: camera and IMU coincide. Not used for metric visual odometry.
             suite: sensors other than IMU and camera; None: there are none.
         """
-        self._loose = LooseCore(config, noise, float(gravity_m_s2), T_body_camera, suite)
-        super().__init__(self._loose, self._loose.blank(), config, config.history_s)
+        self._loose = LooseCore(config, noise, machine, T_body_camera, suite)
+        super().__init__(self._loose, self._loose.blank(), config, config.history_s, machine.max_gap_s)
 
     @property
     def position_variance_m2(self) -> float:
@@ -99,7 +99,7 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
     def update_nonholonomic(self, t_ns: int) -> UpdateResult:
         """Tell the filter that a cart's axle goes neither sideways nor up at `t_ns`, and that its floor is level.
 
-        See `ekf.nonholonomic_sigma_m_s`, `ekf.axle_m` and `ekf.floor_sigma_m`. Ten times a second is enough: slip goes
-        on for a while, and more of the same would be taken for news.
+        See `machine.slip_sigma_m_s`, `machine.axle_m` and `machine.floor_sigma_m`. Ten times a second is enough: slip
+        goes on for a while, and more of the same would be taken for new evidence.
         """
         return self._insert(Event(t_ns, OnWheels()))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.core.messages import ImuSample, ImuSpan, NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf.tight.filter import MsckfEkf
 from vislam.imu import ImuNoise
@@ -39,9 +39,9 @@ class Sighting:
 class EarlyFrames:
     """Owns what frames saw while there was no state, and tells where they were once there is one."""
 
-    def __init__(self, config: EkfConfig, rig: Rig, gravity_m_s2: float) -> None:
+    def __init__(self, config: EkfConfig, rig: Rig, machine: MachineConfig) -> None:
         """Start empty; see `states_before`."""
-        self._config, self._rig, self._gravity_m_s2 = config, rig, gravity_m_s2
+        self._config, self._rig, self._machine = config, rig, machine
         self._seen: list[Sighting] = []
 
     def see(self, t_ns: int, observations: Observations, at_rest: bool) -> None:
@@ -71,7 +71,7 @@ class EarlyFrames:
         for frame in self._seen:
             if not seen or frame.t_ns in wanted or frame.t_ns - seen[-1].t_ns >= _SPACING_NS:
                 seen.append(frame)
-        states = states_before(first, span, seen, self._config, noise, self._rig, self._gravity_m_s2)
+        states = states_before(first, span, seen, self._config, noise, self._rig, self._machine)
         return {t_ns: states[t_ns] for t_ns in wanted if t_ns in states}
 
 
@@ -90,7 +90,7 @@ def known_from(first: NavState, states: dict[int, NavState]) -> int:
 
 def states_before(
     state: NavState, span: ImuSpan, seen: Sequence[Sighting], config: EkfConfig, noise: ImuNoise, rig: Rig,
-    gravity_m_s2: float,
+    machine: MachineConfig,
 ) -> dict[int, NavState]:  # fmt: skip
     """Return the states at the times of frames older than a state, by time.
 
@@ -101,10 +101,10 @@ def states_before(
         config: of the tight filter.
         noise: of the IMU.
         rig: the cameras.
-        gravity_m_s2: magnitude.
+        machine: gravity is down in the frame of the state.
     """
     readout_s = config.tight_readout_s
-    ekf = MsckfEkf(replace(config, tight_readout_s=None if readout_s is None else -readout_s), noise, gravity_m_s2, rig)
+    ekf = MsckfEkf(replace(config, tight_readout_s=None if readout_s is None else -readout_s), noise, machine, rig)
     mirror_ns = 2 * state.t_ns
     samples = [
         ImuSample(mirror_ns - t_ns, -gyro, accel)

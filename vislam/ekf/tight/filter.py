@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, MachineConfig
 from vislam.core.geometry import so3_log
 from vislam.core.messages import NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf.history import AtRest, Event
@@ -34,21 +34,21 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
     """The timeline with the tight core. Times of states are by the IMU's clock, those of frames by the camera's."""
 
     def __init__(
-        self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig, suite: Suite | None = None
+        self, config: EkfConfig, noise: ImuNoise, machine: MachineConfig, rig: Rig, suite: Suite | None = None
     ) -> None:
         """Set up an uninitialised filter.
 
         Args:
             config: see `EkfConfig`.
             noise: of the IMU, until `follow_noise` tells what the samples show.
-            gravity_m_s2: magnitude, down in `odom`.
+            machine: gravity is down in `odom`.
             rig: cameras; observations may also hold right pixels (two cameras) or depth.
             suite: sensors other than IMU and camera; None: there are none.
         """
         self._rig = rig
         self._readout_s = config.tight_readout_s or 0.0
-        self._tight = TightCore(config, noise, float(gravity_m_s2), rig, suite)
-        super().__init__(self._tight, self._tight.blank(), config, config.tight_history_s)
+        self._tight = TightCore(config, noise, float(machine.gravity_m_s2), rig, suite)
+        super().__init__(self._tight, self._tight.blank(), config, config.tight_history_s, machine.max_gap_s)
 
     @property
     def calibration(self) -> CameraCalibration:

@@ -143,12 +143,12 @@ def power_up(fast: FastPath, source: InertialSource) -> None:
 
 def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:
     """Run all that is compiled once: the first sample and the first frame must not wait for a compiler."""
-    rest = np.array([0.0, 0.0, config.imu.gravity_m_s2])
+    rest = np.array([0.0, 0.0, config.machine.gravity_m_s2])
     dt_ns = round(_NS / noise.rate_hz)
     fast = FastPath(config, noise, T_body_camera, _ignore)
     keyframe = VoMeasurement(60 * dt_ns, 0, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 100)
     state = NavState(keyframe.t_ns, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(15) * 1e-4)
-    attitude = AttitudeFilter(config.attitude, config.imu.gravity_m_s2, np.eye(3), np.zeros(3))
+    attitude = AttitudeFilter(config.attitude, config.machine.gravity_m_s2, np.eye(3), np.zeros(3))
     for k in (1, 2):
         attitude.add(ImuSample(k * dt_ns, np.zeros(3), rest), MagSample(k * dt_ns, np.array([20.0, 0.0, -42.0])))
     for k in range(1, 200):

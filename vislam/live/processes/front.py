@@ -237,7 +237,7 @@ class FrontProcess:
         if self.front.initialisation is None or t_ns - self._judged_t_ns < _JUDGE_NS:
             return
         self._judged_t_ns = t_ns
-        verdict = judge(front_evidence(self._report(), self._config.imu), self._config.verdict)
+        verdict = judge(front_evidence(self._report(), self._config.machine), self._config.verdict)
         if verdict.state != self._verdict.state:
             self._send(Doubted(verdict.state is not Trust.TRUSTED))
         if verdict != self._verdict:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.config import Config, Gy85Config
+from vislam.config import USUAL_SLIP_M_S, Config, Gy85Config
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.imu import ImuNoise
@@ -62,7 +62,7 @@ class VirtualCart:
         """Return the settings with what this cart knows of itself: wheels, and how high its one camera is."""
         timeout_s = max(config.live.vision_timeout_s, _FRAMES_MISSED / self.options.camera_hz)
         live = replace(config.live, vision_timeout_s=timeout_s)
-        config = replace(config, ekf=replace(config.ekf, nonholonomic=True), live=live)
+        config = replace(config, machine=replace(config.machine, slip_sigma_m_s=USUAL_SLIP_M_S), live=live)
         front = config.frontend
         if self.rig.has_depth or front.mode not in ("auto", "planar") or front.planar.height_m is not None:
             return config

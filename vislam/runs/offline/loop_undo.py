@@ -143,7 +143,7 @@ def _optimise(config: Config, info: dict[str, Any], memory: SlamMemory) -> _Redo
     start = memory.front.start
     noise, first = (None, None) if start is None else (start.noise, start.first_state)
     suite = suite_of(config.sensors)
-    graph = PoseGraph(config.graph, noise, float(info["gravity_m_s2"]), rig_from(info["rig"]), config.window, suite)
+    graph = PoseGraph(config.graph, noise, config.machine, rig_from(info["rig"]), config.window, suite)
     graph.initialise(first, memory.T_start)
     graph.restore(memory.graph)
     return _Redone(graph, graph.finish(), graph.take_news(), config)
@@ -153,7 +153,7 @@ def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any], leve
     """Write the trajectory, states, loops and metrics of the run again; return the names of the files."""
     graph, states = redone.graph, redone.graph.states()
     ids = graph.ids.tolist()
-    estimated = log.final_trajectory(ids, graph.poses(), states, redone.config.imu)
+    estimated = log.final_trajectory(ids, graph.poses(), states, redone.config.machine)
     final = level.trajectory(estimated)
     if (run / "trajectory_graph.tum").is_file() and not (run / _FIRST).exists():
         shutil.copyfile(run / "trajectory_graph.tum", run / _FIRST)

@@ -132,7 +132,7 @@ def together(parts: list[Edges]) -> Edges:
 
 def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> list[tuple[Array, Array]]:
     """Return odometry and its information as the window of tight coupling summarised it."""
-    odometry = WindowOdometry(config.graph)
+    odometry = WindowOdometry(config.graph, config.machine)
     for window in memory.graph.windows:
         odometry.append(window)
     poses = memory.graph.T_map_body
@@ -152,5 +152,5 @@ def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> list[tu
 
 def _of_chain(log: FactorLog, config: Config) -> list[tuple[Array, Array]]:
     """Return odometry and its information as vision measured it: loose coupling has no window."""
-    factors = Chain(log, config.graph).odometry_edges(config.batch.unscaled_odometry_sigma)
+    factors = Chain(log, config.graph, config.machine).odometry_edges(config.batch.unscaled_odometry_sigma)
     return [measurement_of(factor) for factor in factors]

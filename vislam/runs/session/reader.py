@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import Config, from_data
+from vislam.config import Config, from_data, recorded
 from vislam.core.database import connect
 from vislam.core.errors import DataError, UsageError
 from vislam.core.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, PackedScan, Tie, WordsMemory
@@ -125,7 +125,7 @@ class Session:
     def config(self) -> Config:
         """Return the settings of the run; raises DataError when they are damaged, or of another version."""
         try:
-            return from_data(self.info()["config"], source=str(self.path))
+            return from_data(recorded(self.info()["config"], str(self.path)), str(self.path))
         except (KeyError, TypeError, AttributeError, UsageError) as error:
             raise DataError(
                 f"{error}; the settings stored with the run are of another version, run it again"
