@@ -1,4 +1,4 @@
-"""Check that every relative link in README.md and docs/ leads to a file, and every #anchor to a heading."""
+"""Check that every relative link in README, benchmarks/ and docs/ leads to a file, and every #anchor to a heading."""
 
 import re
 import sys
@@ -32,7 +32,7 @@ def broken_links(page: Path) -> list[str]:
 
 def main() -> int:
     """Print what is broken; return the exit code."""
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    pages = [ROOT / "README.md", *sorted((ROOT / "benchmarks").glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
     problems = [problem for page in pages for problem in broken_links(page)]
     sys.stderr.writelines(problem + "\n" for problem in problems)
     return 1 if problems else 0

@@ -39,7 +39,8 @@ def private_words(page: Path) -> list[str]:
 
 def main() -> int:
     """Print what was found; return the exit code."""
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    roots = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "RESULTS.md"]
+    pages = [*roots, *sorted((ROOT / "docs").rglob("*.md"))]
     problems = [problem for page in pages for problem in private_words(page)]
     sys.stderr.writelines(problem + "\n" for problem in problems)
     return 1 if problems else 0

@@ -131,7 +131,7 @@ class Vocabulary:
 def depth_for(descriptors: int, branching: int, most: int) -> int:
     """Return how many levels leave each word at least five of so many descriptors: 1 to `most`.
 
-    Words that are rarer know their training images by heart and nothing else (measured: docs/loops.md).
+    Words that are rarer know their training images by heart and nothing else (measured: benchmarks/RESULTS.md).
     """
     depth = 1
     while depth < most and branching ** (depth + 1) * _PER_WORD <= descriptors:
