@@ -1,8 +1,8 @@
 """Inertial data: noise model, calibration, spans, preintegration, rest detection, power-up, attitude without vision.
 
 Compiled by hand: 300 lines. Peers: gtsam's preintegration, not measured for time, and the library `vqf`, whose errors
-of inclination stand beside ours in benchmarks/RESULTS.md, its time not. The process that publishes the pose must not load
-gtsam; `vqf` is to be preferred if it takes a changing interval and is as good on carts.
+of inclination stand beside ours in benchmarks/RESULTS.md, its time not. The process that publishes the pose must not
+load gtsam; `vqf` is to be preferred if it takes a changing interval and is as good on carts.
 """
 
 from vislam.core.imu_noise import ImuCalibration, ImuNoise, MagCalibration

@@ -1,9 +1,9 @@
 """Finding keyframes that look alike: a vocabulary trained on the run's own keyframes, over an inverted index.
 
 A small vocabulary that was trained on simulated images serves the first keyframes, or one that the user names. The
-run's own words find more as long as they know most of its keyframes (docs/loops.md), so they are trained again and
-again, in a thread whose compiled parts run beside the rest. What a training was started with and when it is taken over
-are counted in keyframes, so a replay gives the same bytes however long a training took.
+run's own words find more as long as they know most of its keyframes (benchmarks/RESULTS.md), so they are trained again
+and again, in a thread whose compiled parts run beside the rest. What a training was started with and when it is taken
+over are counted in keyframes, so a replay gives the same bytes however long a training took.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The occupancy octree: insertion, correction, queries and OctoMap's files.
 
 Compiled by hand: 710 lines. Peer: OctoMap 1.9.7 in C++, -O3, which takes 4.9 to 36 times the CPU time per frame; its
-files are the same byte for byte (benchmarks/RESULTS.md). To be dropped if OctoMap or a successor comes as a wheel, takes
-scans at less than twice these times, and lets a keyframe be taken back.
+files are the same byte for byte (benchmarks/RESULTS.md). To be dropped if OctoMap or a successor comes as a wheel,
+takes scans at less than twice these times, and lets a keyframe be taken back.
 """
 
 from vislam.mapping.octree.blocks import find_slot
