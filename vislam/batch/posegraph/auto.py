@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 
 from vislam.batch.posegraph.gnc import doubtful_edges, joining_edges, reject_false_edges
 from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
-from vislam.batch.posegraph.optimize import Decision
-from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
 from vislam.batch.posegraph.robust import Kernel, kernel_route
 from vislam.batch.posegraph.solver import Progress, levenberg_marquardt
 from vislam.batch.posegraph.starts import odometry_start

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.batch.posegraph.auto import decide, decide_by_kernel
+from vislam.batch.posegraph.gnc import reject_false_edges
 from vislam.batch.posegraph.growing import grown_start
-from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
+from vislam.batch.posegraph.problem import Decision, Ids, PoseGraphProblem
+from vislam.batch.posegraph.sightings import reject_false_sightings, told_undetermined, undetermined_landmarks
 from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
 from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
 from vislam.batch.posegraph.structure import Structure
@@ -41,17 +44,6 @@ class PoseGraphSolution:
     def rejected(self) -> NDArray[np.int64]:
         """Indices of the edges that were found false."""
         return np.flatnonzero(self.weights == 0.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Decision:
-    """Which edges to believe, and why."""
-
-    poses: Array | None  # [N, d + 1, d + 1] near their optimum; None: not known
-    weights: Array  # [E] 1 kept, 0 rejected
-    reason: str  # the method that was taken and what speaks for it
-    undecided: NDArray[np.int64] = field(default_factory=lambda: np.array([], dtype=np.int64))  # edges left out so
-    warning: str = ""  # empty where everything was decided
 
 
 def optimize_pose_graph(
@@ -107,10 +99,6 @@ def as_stated(problem: PoseGraphProblem, weights: NDArray[np.float64]) -> tuple[
 
 def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress | None) -> Decision:
     """Return what the route that was asked for says about the edges."""
-    from vislam.batch.posegraph.auto import decide, decide_by_kernel
-    from vislam.batch.posegraph.gnc import reject_false_edges
-    from vislam.batch.posegraph.sightings import reject_false_sightings
-
     if not structure.problem.of_poses:
         return reject_false_sightings(structure.problem, config, progress)
     if config.robust == "auto":
@@ -124,8 +112,6 @@ def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> li
     """Return what is to be told of landmarks."""
     if not problem.is_point.any():
         return []
-    from vislam.batch.posegraph.sightings import told_undetermined, undetermined_landmarks
-
     free = undetermined_landmarks(problem, poses, weights)
     return [told_undetermined(free)] if len(free) else []
 

@@ -147,3 +147,14 @@ class PoseGraphProblem:
     def with_poses(self, poses: Array) -> PoseGraphProblem:
         """Return the problem with other poses to start from."""
         return replace(self, poses=np.ascontiguousarray(poses, dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """Which edges to believe, and why."""
+
+    poses: Array | None  # [N, d + 1, d + 1] near their optimum; None: not known
+    weights: Array  # [E] 1 kept, 0 rejected
+    reason: str  # the method that was taken and what speaks for it
+    undecided: NDArray[np.int64] = field(default_factory=lambda: np.array([], dtype=np.int64))  # edges left out so
+    warning: str = ""  # empty where everything was decided
