@@ -9,8 +9,7 @@ from vislam.config import load
 from vislam.core.jit import njit
 from vislam.live import map_rehearsal, rehearsal
 from vislam.live.map_rehearsal import rehearse_map
-from vislam.live.processes.child import Flag, Life, Signals
-from vislam.live.processes.measured import measured
+from vislam.live.processes.child import Flag, Life, Signals, measured
 from vislam.live.virtual.cart import NOISE
 from vislam.live.virtual.place import PlaceOptions, virtual_rig
 from vislam.loop.words import database

@@ -21,7 +21,7 @@ from vislam.runs.session import Session
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
 from vislam.sim.scene import NAMES
-from vislam.sim.worlds.label_images import write_labels
+from vislam.sim.worlds.simulation import write_labels
 from vislam.slam import Slam
 
 WORLD = {"duration_s": 4.0, "camera_hz": 5.0, "image_width_px": 160}

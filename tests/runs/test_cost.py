@@ -10,8 +10,7 @@ from numba.core import event
 
 from vislam.core import cpu
 from vislam.core.clock import StageClock
-from vislam.live.cost import whole_cost
-from vislam.runs.cost import CostMeter, per_frame
+from vislam.runs.cost import CostMeter, per_frame, whole_cost
 
 
 @pytest.fixture

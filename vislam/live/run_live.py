@@ -23,20 +23,19 @@ from vislam.core.recording import Recording
 from vislam.hw.source import InertialSource
 from vislam.live.beginning import Beginning
 from vislam.live.bridges import translator
-from vislam.live.cost import whole_cost
 from vislam.live.frames import FrameSource
 from vislam.live.kept_bias import KeptBias
 from vislam.live.processes import back as back_process
 from vislam.live.processes import fast as fast_process
 from vislam.live.processes import front as front_process
 from vislam.live.processes import map as map_process
-from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded
-from vislam.live.processes.measured import measured
+from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded, measured
 from vislam.live.reading_source import ReadingSource, live_readings
 from vislam.live.web.news import WebEnds
 from vislam.live.wire.slot import remove
 from vislam.pipeline.settings import derived
 from vislam.runs import imu_noise
+from vislam.runs.cost import whole_cost
 from vislam.runs.folder import MapChoice
 from vislam.sensors import SensorSetup
 

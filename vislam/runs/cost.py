@@ -53,3 +53,16 @@ def per_frame(whole_s: float, frames: int, stages_s: Mapping[str, float]) -> dic
         "cpu_ms_per_frame": 1e3 * whole_s / frames if frames else None,
         "stages_cpu_ms_per_frame": {name: 1e3 * part_s / frames for name, part_s in parts_s.items()} if frames else {},
     }
+
+
+def whole_cost(metrics: Mapping[str, Any], notes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the cost of a live run: the sum of its processes, without those that play its sensors.
+
+    Memory is the sum of what each had at most; pages that they share count in each.
+    """
+    each = {role: told["cost"] for role, told in notes.items() if "cost" in told}
+    sums = {name: sum(cost[name] for cost in each.values()) for name in ("cpu_s", "compile_cpu_s", "peak_memory_mb")}
+    stages_s = {name: stage["cpu_s"] for name, stage in metrics["timing_ms"].items()}
+    spent = per_frame(sums["cpu_s"], metrics["frames"], stages_s)
+    apart = {"before_cpu_s": None, "first_pose_cpu_s": None}  # processes begin and see the first pose at their own time
+    return {**metrics["cost"], **sums, **spent, **apart, "processes": each}

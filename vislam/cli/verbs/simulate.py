@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> int:
 def _simulate_recording(options: SimulateOptions) -> int:
     from vislam.datasets.recorder import record
     from vislam.sim import open_world
-    from vislam.sim.worlds.label_images import write_labels
+    from vislam.sim.worlds.simulation import write_labels
 
     choices = {name: value for name, value in asdict(options).items() if name not in ("world", "out", "labels")}
     world = open_world(options.world, **choices)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated
 
 import cv2
@@ -17,11 +18,12 @@ from pydantic import Field
 
 from vislam.config import validated
 from vislam.core.errors import UsageError
+from vislam.core.files import replacing, write_text
 from vislam.core.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
 from vislam.imu import ImuNoise
 from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import Renderer, Scene, bake
+from vislam.sim.scene import NAMES, Renderer, Scene, bake
 from vislam.sim.sensing import DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
 from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, make_rig
 from vislam.trajectory import Trajectory
@@ -280,3 +282,18 @@ def _stamp(event: Event) -> int:
 
 def _ns(t_s: Array) -> NDArray[np.int64]:
     return np.round(t_s * 1e9).astype(np.int64) + _START_NS
+
+
+def write_labels(world: Simulation, folder: Path, on_frame: Callable[[int], None] | None = None) -> None:
+    """Write a PNG of labels for every frame of a world, named by its stamp, and `labels.toml`: for `map.labels.folder`.
+
+    `on_frame` gets how many are written. Raises StorageError when one cannot be.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "labels.toml", "".join(f'{i} = "{name}"\n' for i, name in enumerate(NAMES, start=1)))
+    for index in range(world.frame_count):
+        t_ns, labels = world.labels(index)
+        with replacing(folder / f"{t_ns}.png") as file:
+            file.write(bytes(cv2.imencode(".png", labels)[1]))
+        if on_frame is not None:
+            on_frame(index + 1)
