@@ -42,10 +42,7 @@ class Timeline(Generic[S, M]):
     """
 
     def __init__(self, core: Core[S, M], state: S, config: EkfConfig, history_s: float, max_gap_s: float) -> None:
-        """Set up an uninitialised filter of which `state` is a placeholder.
-
-        A hole in the samples longer than `max_gap_s` is bridged with the filter's gap sigmas, and counted.
-        """
+        """Set up an uninitialised filter, `state` a placeholder; holes beyond `max_gap_s` get the gap's sigmas."""
         self._core = core
         self._state = state
         self._checkpoint_ns = round(config.checkpoint_s * _NS)
