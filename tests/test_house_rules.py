@@ -20,6 +20,7 @@ LONGEST_FILE, SHORTEST_FILE = 400, 30  # a shorter one that one file alone uses 
 BUDGET_PRODUCT_LINES = 111_500  # to 97,000
 BUDGET_TEST_LINES = 58_200  # to 49,000
 BUDGET_LONG_FILES = 17  # to 0
+BUDGET_WORDS = 38_000  # of README and docs/, as `wc -w` counts
 BUDGET_WIDE_FUNCTIONS = 18  # of more than eight arguments; to 0
 
 # classes beyond the limit and how long they may be, by tens: one state machine each, whose parts share most attributes
@@ -171,6 +172,13 @@ def test_files_are_one_noun_and_not_less_than_one():
 def test_lines_stay_within_their_budgets():
     assert sum(lines_of(VISLAM).values()) <= BUDGET_PRODUCT_LINES
     assert sum(lines_of(VISLAM.parent / "tests").values()) <= BUDGET_TEST_LINES
+
+
+def test_words_of_the_docs_stay_within_their_budget():
+    root = VISLAM.parent
+    words = {p: len(p.read_text(encoding="utf-8").split()) for p in [root / "README.md", *(root / "docs").rglob("*.md")]}
+    assert sum(words.values()) <= BUDGET_WORDS, sorted(words.items(), key=lambda item: -item[1])[:10]
+
 
 
 @pytest.mark.parametrize(
