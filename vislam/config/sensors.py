@@ -23,7 +23,7 @@ class SensorCalibration:
     """
 
     gyro_axes: Axes = ("x", "y", "z")  # axes of the chip that point along x, y, z of the body
-    accel_axes: Axes = ("x", "y", "z")  # the three chips of a GY-85 are placed alike; check yours: docs/cart.md
+    accel_axes: Axes = ("x", "y", "z")  # the three chips of a GY-85 are placed alike; check yours: docs/sensors.md
     mag_axes: Axes = ("x", "y", "z")  # clones are placed otherwise
     gyro_bias_rad_s: Vector3 = (0.0, 0.0, 0.0)
     gyro_matrix: Matrix3 = _IDENTITY
@@ -47,7 +47,7 @@ class Gy85Config:
     mag: bool = True  # look for a magnetometer
     mag_rate_hz: Positive = 50.0  # how often it is asked; it measures at 75 (clones: 100)
     mag_range_ga: Positive = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
-    self_test: bool = True  # at the start, 1 s, standing still; docs/cart.md says what is tested
+    self_test: bool = True  # at the start, 1 s, standing still; docs/sensors.md
     supply_v: Positive = 3.3  # of the accelerometer: its self-test limits grow with it
     reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away; one costs up to 0.1 s
     nacks_to_reopen: Count = 5  # in a row until a chip counts as gone: single ones are noise on the wire
@@ -96,7 +96,7 @@ class BridgeClockConfig:
 
 @dataclass(frozen=True, slots=True)
 class SerialConfig:
-    """The serial bridge: a microcontroller that reads the inertial chips, docs/cart.md."""
+    """The serial bridge: a microcontroller that reads the inertial chips, docs/sensors.md."""
 
     port: str = "/dev/ttyUSB0"  # the path in /dev/serial/by-id stays the same when other devices come and go
     baud: Count = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
@@ -116,7 +116,7 @@ class SerialConfig:
 
 @dataclass(frozen=True, slots=True)
 class WebcamConfig:
-    """A webcam on V4L2; docs/cart.md. What a camera does not do as asked is reported, not hidden."""
+    """A webcam on V4L2; docs/sensors.md. What a camera does not do as asked is reported, not hidden."""
 
     device: str = "0"  # index, or a path below /dev/v4l/by-id, which stays the same when other cameras come and go
     width_px: Count = 640  # enough for 400 tracks; 1280 costs four times the work of the front end

@@ -54,10 +54,10 @@ def check_board(
                 "check its supply (3.3 V); replace the board",
             )
     for name, count in sorted(board.counters().items()):
-        add("warning", f"{name}: {count}", _EXPLAINED.get(name, "docs/cart.md says what it means"))
+        add("warning", f"{name}: {count}", _EXPLAINED.get(name, "see docs/sensors.md"))
     word = board.health() & ~Health.MAG_FAULT
     if word:
-        add("warning", f"health: {word.name}", "docs/cart.md says what each bit means")
+        add("warning", f"health: {word.name}", "see docs/sensors.md")
     max_rate_deg_s = board.imu.max_zero_deg_s if isinstance(board, FifoBoard) and board.imu else MAX_RATE_DEG_S
     findings += check_rest(inertial, where, max_rate_deg_s)
     if board.temperature_c is not None:
@@ -126,12 +126,12 @@ def _check_field(board: Gy85 | FifoBoard, magnetic: list[MagSample], add: Add) -
         add("warning", "there is no magnetometer", "nothing to do: it is optional")
         return
     if not magnetic:
-        add("warning", f"the {name} gives no samples", "keep magnets away; docs/cart.md")
+        add("warning", f"the {name} gives no samples", "keep magnets away; docs/sensors.md")
         return
     if isinstance(board, FifoBoard):
         add("ok", f"the magnetometer is a {name}: check its axes, docs/sensors.md")
     elif name != "HMC5883L":
-        add("ok", f"the magnetometer is a {name}, sold as HMC5883L: check its axes, docs/cart.md")
+        add("ok", f"the magnetometer is a {name}, sold as HMC5883L: check its axes, docs/sensors.md")
     norm = float(np.linalg.norm(np.mean([sample.field_ut for sample in magnetic], axis=0)))
     low, high = _FIELD_UT
     if low <= norm <= high:

@@ -337,7 +337,7 @@ def _examine_ports(
             notes.timings.append(_timing(f"{wanted}: magnetic", [sample.t_ns for sample in magnetic]))
         word = bridge.health()
         if word:
-            notes.add("warning", f"health: {word.name}; {_counted(bridge.counters())}", wanted, "see docs/cart.md")
+            notes.add("warning", f"health: {word.name}; {_counted(bridge.counters())}", wanted, "see docs/sensors.md")
 
 
 def _port_name(path: str) -> str:

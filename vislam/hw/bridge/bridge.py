@@ -213,7 +213,7 @@ class SerialBridge:
         if self._other_version is not None:
             return "other_version", (
                 f"{port} speaks version {self._other_version} of the protocol, this vislam speaks {PROTOCOL_VERSION}; "
-                "put the sketch of this vislam on the board, docs/cart.md says how"
+                "put the sketch of this vislam on the board, see docs/sensors.md"
             )
         if self._behind.hello is not None:
             return "no_sample", f"{port}: {self._behind.why_silent(self._faults)}"
@@ -222,7 +222,7 @@ class SerialBridge:
                 f"{port} sends bytes that are no frames: another device, or another rate than {self._config.baud} "
                 "baud; set serial.baud to what is in the sketch"
             )
-        return "silent", f"{port} is silent; is the board powered and the sketch on it? docs/cart.md says how"
+        return "silent", f"{port} is silent; is the board powered and the sketch on it? see docs/sensors.md"
 
     def _received(self, port: serial.Serial, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return the samples in what the port has, waiting for the first byte; an unplugged port is closed."""
