@@ -2,12 +2,14 @@
 
     .venv/bin/python benchmarks/results.py compare
     .venv/bin/python benchmarks/results.py compare window pose_graph --factor 1.3
+    .venv/bin/python benchmarks/results.py table
 
 Benchmarks that are given `--record` write `benchmarks/results/NAME/REVISION.json`: metrics in CPU milliseconds by name,
 with machine, versions and date. `compare` prints for each metric of the newest file its change against the newest
 earlier one of the same machine that has it, tells when one takes more than `factor` times as long as that (SLOWER) or
 as the least so far (CREEPS), and exits with 1 when one does so by more than `--limit`. Where both files have the time
 of a reference measured beside them (see cost.py), times are compared as multiples of it, whatever the machine.
+`table` writes the newest file of each benchmark into the table of RESULTS.md.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ from vislam.core.errors import DataError, VislamError  # noqa: E402
 from vislam.core.files import write_text  # noqa: E402
 
 FOLDER = ROOT / "benchmarks" / "results"
+PAGE = ROOT / "benchmarks" / "RESULTS.md"
+BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"
 FACTOR = 1.3  # CPU times of one machine repeat within a fifth
 _PACKAGES = ("numpy", "scipy", "numba", "gtsam", "opencv-python-headless")
 _REVISION_DIGITS = 12
@@ -182,6 +186,27 @@ def told(name: str, results: Sequence[Result], factor: float, limit: float | Non
     return all(row.creep <= (factor if limit is None else limit) for row in rows)
 
 
+def table(folder: Path = FOLDER) -> str:
+    """Return a table of the newest result of each benchmark; raises DataError when a file is damaged."""
+    lines = ["| benchmark | metric | CPU [ms] | revision | machine |", "|---|---|---:|---|---|"]
+    for path in sorted(folder.glob("*/")):
+        newest = history(path.name, folder)[-1]
+        lines += [
+            f"| {path.name} | {metric} | {value:.4g} | {newest.revision} | {newest.machine} |"
+            for metric, value in newest.cpu_ms.items()
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def with_table(page: str, rows: str) -> str:
+    """Return a page whose block between the markers is a table."""
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise DataError(f"{PAGE} has no lines {BEGIN} and {END}")
+    return f"{before}{BEGIN}\n{rows}{END}{after}"
+
+
 def revision() -> str:
     """Return the git revision of the code, "-changed" behind it when the library differs from it."""
 
@@ -201,14 +226,17 @@ def machine() -> str:
 
 
 def main() -> int:
-    """Compare what the command line names; return the exit code."""
+    """Do what the command line asks for; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["compare"])
+    parser.add_argument("what", choices=["compare", "table"])
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks; all that have results by default")
     parser.add_argument("--factor", type=float, default=FACTOR, help="of CPU time that is still no change")
     parser.add_argument("--limit", type=float, help="beyond which the exit code is 1; --factor by default")
     args = parser.parse_args()
     try:
+        if args.what == "table":
+            write_text(PAGE, with_table(PAGE.read_text(encoding="utf-8"), table()))
+            return 0
         return 0 if compare(args.names, args.factor, limit=args.limit) else 1
     except VislamError as error:
         print(error, file=sys.stderr)

@@ -128,3 +128,13 @@ def test_the_command_line_ends_with_a_code(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == DataError.exit_code
     assert "--record" in done.stderr
+
+
+def test_the_table_of_the_page_is_that_of_the_newest_files():
+    page = results.PAGE.read_text(encoding="utf-8")
+    assert results.with_table(page, results.table()) == page, "run benchmarks/results.py table"
+
+
+def test_a_page_without_its_markers_is_named():
+    with pytest.raises(DataError, match="table:begin"):
+        results.with_table("# Results\n", "")
