@@ -15,8 +15,7 @@ INSTEAD = {
     r"so many": "a number, as many",
     r"whoever": "users who, readers that",
     r"what ails": "faults of",
-    r"(?:it|which|file|page|run|report|doctor|column|line) says": "states, reports, has",
-    r"as (?:it was )?before told": "as stated",
+    r"says": "states, reports, has",
 }
 WORDS = re.compile("|".join(rf"(?P<w{i}>\b(?:{words})\b)" for i, words in enumerate(INSTEAD)), re.IGNORECASE)
 CODE = re.compile(r"``.*?``|`[^`\n]*`")  # names and output of the program are not prose
