@@ -59,28 +59,28 @@ def correct(connection, seconds: float, ready, go, epoch) -> None:
         connection.send(Correction(t_ns, vo, no_observations(), False, False, k // 10 if k % 10 == 0 else None))
 
 
-def close_loops(connection, stop, grown, closed) -> None:
-    """Build a graph of 1,000 keyframes, then add more and close a loop over 1,000 with every tenth."""
+def close_loops(connection, stop, grown, closed, keyframes) -> None:
+    """Build a graph of so many keyframes, then add more and close a loop over all of them with every tenth."""
     from vislam.config import GraphConfig, MachineConfig, WindowConfig
     from vislam.graph import PoseGraph
     from vislam.live.notices import MapMoved
     from worlds.lap import RIG, World
 
-    world = World(duration_s=2.0 * KEYFRAMES / 5.0)
+    world = World(duration_s=2.0 * keyframes / 5.0)
     graph = PoseGraph(GraphConfig(coupling="loose"), world.noise, MachineConfig(), RIG, WindowConfig())
     graph.initialise(world.initial_state(), world.truth[0])
     T_odom_body = world.truth[0]
-    for k in range(2 * KEYFRAMES):
-        if k == KEYFRAMES:
+    for k in range(2 * keyframes):
+        if k == keyframes:
             grown.set()
         if stop.is_set():
             return
-        is_closed = k >= KEYFRAMES and k % 10 == 0
-        packet, edges = world.packet(k), [world.loop(k, k - KEYFRAMES, k)] if is_closed else []
+        is_closed = k >= keyframes and k % 10 == 0
+        packet, edges = world.packet(k), [world.loop(k, k - keyframes, k)] if is_closed else []
         T_odom_body = T_odom_body @ packet.vo.T_keyframe_body
         began = time.monotonic()
         update = graph.add(packet, edges, T_odom_body)
-        if k >= KEYFRAMES:  # before, nobody reads yet, and the pipe would fill
+        if k >= keyframes:  # before, nobody reads yet, and the pipe would fill
             connection.send(MapMoved(update.revision, update.T_map_odom))
         if is_closed:
             closed.append(time.monotonic() - began)
@@ -91,10 +91,11 @@ def listen(address: str, results, ready) -> None:
     from vislam.live.wire.publisher import PoseListener
 
     listener = PoseListener(address)
+    patience = time.monotonic() + 60.0  # for the first
     gc.disable()  # a collection would keep it from reading for a hundred milliseconds
     ready.wait()
     ages, sequences, quiet = [], [], 0
-    while quiet < 5 or not ages:
+    while quiet < 5 or (not ages and time.monotonic() < patience):
         pose = listener.next(1.0)
         quiet = 0 if pose is not None else quiet + 1
         if pose is not None:
@@ -113,23 +114,34 @@ def fast(signals, samples, inbox, settings, epoch, table, report) -> None:
     from vislam.live.processes import fast as fast_process
     from vislam.live.processes.child import guarded
     from vislam.live.replayed_imu import ReplayedImu
+    from vislam.sensors import Suite
 
     config = load(None, settings)
     noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, RATE_HZ)
     body = partial(
         fast_process.run, config=config, noise=noise, T_body_camera=np.eye(4),
         open_source=partial(ReplayedImu, table, epoch), samples=samples, inbox=inbox,
-        memory=BiasMemory(limit=1), is_mag_calibrated=False,
+        memory=BiasMemory(limit=1), is_mag_calibrated=False, suite=Suite(),
     )  # fmt: skip
     guarded("fast", report, signals, body)
 
 
-def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
+def heard(connection) -> dict | None:
+    """Wait for a message of the fast process; return its values, None when it is ready. Raises SystemExit if it failed."""
+    from vislam.live.processes.child import Failure, Ready
+
+    said = connection.recv()
+    if isinstance(said, Failure):
+        raise SystemExit(said.traceback)
+    return None if isinstance(said, Ready) else getattr(said, "values", {})
+
+
+def processes(seconds: float, priority: int, keyframes: int) -> None:  # noqa: PLR0915
     """Measure."""
     import socket
 
     from vislam.live.epoch import Epoch
-    from vislam.live.processes.child import Failure, Flag, Ready, Signals
+    from vislam.live.processes.child import Flag, Signals
     from vislam.live.replayed_imu import InertialTable
 
     context = get_context("spawn")
@@ -137,8 +149,8 @@ def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
     signals, epoch, results = Signals(go, stop), Epoch(), context.Queue()
     count = int(seconds * RATE_HZ)
     rng = np.random.default_rng(0)
-    values = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) + rng.normal(size=(count, 6)) * np.repeat([0.02, 0.2], 3)
-    table = InertialTable((np.arange(count) * (1e9 / RATE_HZ)).astype(np.int64), values, RATE_HZ)
+    samples = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) + rng.normal(size=(count, 6)) * np.repeat([0.02, 0.2], 3)
+    table = InertialTable((np.arange(count) * (1e9 / RATE_HZ)).astype(np.int64), samples, RATE_HZ)
     to_front, at_front = socket.socketpair()
     hears_front, front_says = context.Pipe(duplex=False)
     hears_back, back_says = context.Pipe(duplex=False)
@@ -155,16 +167,14 @@ def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
             target=fast, args=(signals, to_front, [hears_front, hears_back], settings, epoch, table, says)
         )
         front = context.Process(target=correct, args=(front_says, seconds - 1.0, ready, go, epoch))
-        back = context.Process(target=close_loops, args=(back_says, stop, grown, closed))
+        back = context.Process(target=close_loops, args=(back_says, stop, grown, closed, keyframes))
         for process in (listener, publisher, front, back):
             process.daemon = True  # none stays behind when another fails
             process.start()
         ready.wait()
         last = {}
-        while not isinstance(said := hears.recv(), Ready):
-            if isinstance(said, Failure):
-                raise SystemExit(said.traceback)
-            last = {**last, **said.values}
+        while (values := heard(hears)) is not None:
+            last |= values
         grown.wait()
         go.set()
         taken = 0
@@ -175,12 +185,12 @@ def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
             except TimeoutError:
                 break
             while hears.poll():
-                last = {**last, **getattr(hears.recv(), "values", {})}
+                last |= heard(hears) or {}
         stop.set()
         ages, poses = results.get()
         publisher.join()
         while hears.poll():
-            last = {**last, **getattr(hears.recv(), "values", {})}
+            last |= heard(hears) or {}
         front.join()
         back.join()
         listener.join()
@@ -188,7 +198,7 @@ def processes(seconds: float, priority: int) -> None:  # noqa: PLR0915
     fresh = np.diff(poses[:, 1], prepend=poses[0, 1]) > 0  # the others are heartbeats, as is the first
     print(f"SCHED_FIFO {priority}" if priority and "warning" not in last else "no real-time priority")
     print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, {count} samples in {seconds:g} s")
-    print(f"loops closed over {KEYFRAMES} keyframes: {len(loops)}, at most {max(loops, default=0.0):.2f} s each")
+    print(f"loops closed over {keyframes} keyframes: {len(loops)}, at most {max(loops, default=0.0):.2f} s each")
     inside = (poses[fresh, 2] - poses[fresh, 1]) / 1e6
     for title, values_ms in (("sample to publication", inside), ("sample to reader", ages[fresh] / 1e6)):
         p50, p99, p999 = np.percentile(values_ms, [50, 99, 99.9])
@@ -266,12 +276,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["processes", "filter"])
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--keyframes", type=int, default=KEYFRAMES, help="of the graph, before the first loop")
     parser.add_argument("--priority", type=int, default=0, help="live.realtime_priority of the fast process")
     arguments = parser.parse_args()
     if arguments.what == "filter":
         filter_cost()
     else:
-        processes(arguments.seconds, arguments.priority)
+        processes(arguments.seconds, arguments.priority, arguments.keyframes)
 
 
 if __name__ == "__main__":

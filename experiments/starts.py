@@ -5,7 +5,8 @@
 
 The first form takes N starts of `experiments/starts.toml` by lot (0: all) and runs them in this process, so that what
 is compiled or read once is paid for once; map, loops and viewer are off. The second holds what `vislam compare
-experiments/starts.toml` found against the same bars. VISLAM_DATA names the folder of the recordings.
+experiments/starts.toml` found against the same bars. Recordings are looked for in VISLAM_DATA, by default
+../shared/data.
 
 The scale error is that of the best similarity to the truth over the whole piece. Two sigmas are stated of it: that of
 the start, and that of the graph in the end. A start is warned of where the run doubts itself (not of the noise of the
@@ -46,6 +47,7 @@ from vislam.slam import Slam
 from vislam.trajectory import Trajectory, evaluate
 from vislam.trajectory.consistency import stated_scale_sigma
 
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 PLAN = Path(__file__).with_name("starts.toml")
 SOON_S = 3.0  # a controller waits no longer
 SIGMAS = 3.0
@@ -146,7 +148,7 @@ def judged(
     errors: dict[str, float | None] = {}
     with suppress(DataError):  # without a trajectory there is nothing to compare
         errors = evaluate(final, truth, front.alignment) if truth is not None else {}
-    evidence = whole_evidence(front_evidence(front, config.machine), log, final, [], {}, 0, {})
+    evidence = whole_evidence(front_evidence(front, config.machine), log, final, len(log), [], {}, 0, {})
     told = list(verdict_of(evidence, config.verdict).reasons)
     is_lost = bool(lost) or log.newest_tracking is Tracking.LOST
     begins = begun["status"] in BEGUN
@@ -232,6 +234,7 @@ def main() -> None:
         print("\n".join([*(start.line() for start in starts), *summary(starts)]))
         return
     cv2.setNumThreads(1)
+    os.environ.setdefault("VISLAM_DATA", str(DATA))
     jobs = list(unique(expand(load_plan(PLAN))))
     if arguments.only:
         jobs = [job for job in jobs if any(job.label.startswith(name) for name in arguments.only)]
