@@ -22,7 +22,7 @@ class Progress:
         can_finish: whether it is worth trying to calibrate with what there is.
         advice: what to do next, one sentence.
         facts: numbers to show, by name.
-        cells: how much of each cell [rows][columns] of the image was covered, 0 to 1.
+        cells: how much of each cell of the image was covered, row by row, 0 to 1.
         ways: directions x, y, z on the sphere that are wanted, and whether each was seen.
         jpeg: the newest picture with what was found in it; empty: there is none.
     """

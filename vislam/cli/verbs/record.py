@@ -25,8 +25,8 @@ class RecordOptions:
     a path as the settings say), realsense or oak (the one inside the camera of that name), or none"""
     camera: str = "webcam"
     """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), picam[:0] (the Raspberry Pi's own),
-    realsense[:SERIAL][,depth] (stereo, or colour and depth), oak[:ID][,depth], a video file in place of a camera, or
-    none"""
+    realsense or oak with :SERIAL, then ,depth behind it as wanted (stereo, or colour and depth), a video file in place
+    of a camera, or none"""
     seconds: Positive | None = None
     """How long; None: until Ctrl-C"""
     settings: Annotated[RecordConfig, tyro.conf.arg(name="")] = field(default_factory=RecordConfig)
