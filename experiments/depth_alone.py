@@ -104,7 +104,7 @@ def outcome(recording: Recording, alone: bool, begin_s: float, dark_s: float, le
     left = transform_points(align_points(found, there), found) - there
     return Outcome(
         float(np.mean([t.vo.tracking is not Tracking.LOST for t in dark])),
-        slam.front.counters["submaps"],
+        slam.front.watch.counters["submaps"],
         float(np.linalg.norm(drift[3:])),
         float(np.rad2deg(np.linalg.norm(drift[:3]))),
         float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),

@@ -27,7 +27,6 @@ BUDGET_WIDE_FUNCTIONS = 18  # of more than eight arguments; to 0
 LONG_CLASSES = {
     "Estimator": 470,  # ladder of solvers around one iSAM2
     "FastPath": 260,
-    "Front": 470,  # odometry and keyframes of one run
     "Gy85": 260,  # one board's clock, queue and faults
     "Initialiser": 430,
     "LiveRun": 270,

@@ -19,9 +19,9 @@ from vislam.core.messages import Frame, GraphUpdate, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.mapping.semantic.images import Labeller
 from vislam.pipeline.back import Back, KeyframeIntake
+from vislam.pipeline.dark import SilentCamera
 from vislam.pipeline.front import Front
 from vislam.pipeline.in_map import InMap
-from vislam.pipeline.silence import SilentCamera
 from vislam.pipeline.steps import Finish, Step
 from vislam.sensors import Suite
 
@@ -102,7 +102,7 @@ class Slam:
         return Finish(steps, keyframes, *self._intake.finish())
 
     def _go_on_without_images(self, value: ImuSample | MagSample | Reading) -> None:
-        if self._silence is None or not isinstance(value, ImuSample) or self.front.initialisation is None:
+        if self._silence is None or not isinstance(value, ImuSample) or self.front.begun.settled is None:
             return
         stand_in = self._silence.stand_in(value.t_ns)
         if stand_in is not None:

@@ -311,7 +311,7 @@ def test_real_recording_with_one_camera(data_root) -> None:  # type: ignore[no-u
                 poses.append(step.T_odom_body)
         if len(stamps) >= 160:
             break
-    assert len(stamps) >= 160, front.last_refusal
+    assert len(stamps) >= 160, front.begun.refusal
     truth = recording.truth()
     assert truth is not None
     pairs = associate(Trajectory(np.array(stamps), np.array(poses)), truth)

@@ -64,7 +64,7 @@ def test_two_cameras_have_a_pose_from_the_first_frame_with_an_honest_tilt(start_
     ratios = begun.tilts_in_sigmas()
     print(f"tilt error in sigmas: {ratios.mean():.2f} in the mean, {ratios.max():.2f} at most")
     assert ratios.max() < 3.5
-    assert begun.front.initialisation is not None and begun.front.initialisation.status in ("static", "moving")
+    assert begun.front.begun.settled is not None and begun.front.begun.settled.status in ("static", "moving")
     facts = begun.front.start
     assert facts is not None and facts.begun_t_ns == begun.steps[0].frame.t_ns < facts.last.t_ns
 
@@ -82,7 +82,7 @@ def test_the_graph_hears_nothing_of_a_start_that_is_not_settled() -> None:
 def test_one_camera_has_a_pose_in_motion_soon_and_it_does_not_jump_when_the_start_is_settled() -> None:
     begun = Begun.of("mono", 6.0, 6.0)
     front = begun.front
-    assert front.initialisation is not None and front.initialisation.status == "moving", front.last_refusal
+    assert front.begun.settled is not None and front.begun.settled.status == "moving", front.begun.refusal
     facts = front.start
     assert facts is not None
     first_ns = begun.steps[0].frame.t_ns
@@ -108,7 +108,7 @@ def test_one_camera_has_a_pose_in_motion_soon_and_it_does_not_jump_when_the_star
 def test_one_camera_whose_recording_ends_during_the_test_is_placed_and_says_that_nothing_confirmed_it() -> None:
     begun = Begun.of("mono", 6.0, 1.9)
     front = begun.front
-    assert front.initialisation is None and front.newest_start is not None, front.last_refusal
+    assert front.begun.settled is None and front.begun.newest is not None, front.begun.refusal
     released = front.give_up_waiting()
     assert released and front.start is not None
     assert "not confirmed" in front.start.reason

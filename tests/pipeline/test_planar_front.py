@@ -103,7 +103,7 @@ def driven(**_: object) -> tuple[Cart, Front, list[FrontStep]]:
 
 def test_it_starts_at_rest_and_the_filter_is_metric() -> None:
     made, front, steps = driven()
-    assert front.initialisation is not None and front.ekf_coupling == "loose"
+    assert front.begun.settled is not None and front.config.ekf.coupling == "loose"
     true, seen = made.T_world_body[len(steps) - 1], steps[-1].T_odom_body
     first = next(i for i, s in enumerate(steps) if s.T_odom_body is not None)
     way = np.linalg.norm(np.diff(made.T_world_body[:, :3, 3], axis=0), axis=1).sum()
@@ -112,7 +112,7 @@ def test_it_starts_at_rest_and_the_filter_is_metric() -> None:
     b = invert(steps[first].T_odom_body) @ seen
     print(f"off by {np.linalg.norm((a - b)[:2, 3]) / way:.2%} of {way:.1f} m")
     assert np.linalg.norm((a - b)[:2, 3]) < 0.012 * way
-    assert front.all_counters["ekf"]["vo_gated"] <= 2
+    assert front.report().counters["ekf"]["vo_gated"] <= 2
 
 
 def test_the_filter_knows_its_error() -> None:
@@ -120,7 +120,7 @@ def test_the_filter_knows_its_error() -> None:
     made, front, steps = driven()
     stamps = np.array([s.frame.t_ns for s in steps])
     found = anees([s.state for s in steps if s.state is not None], Trajectory(stamps, made.T_world_body[: len(steps)]))
-    nis = {name: total / degrees for name, (_, total, degrees) in front.nis_statistics.items()}
+    nis = {name: total / degrees for name, (_, total, degrees) in front.report().nis.items()}
     print({name: round(value.mean, 2) for name, value in found.items()}, nis)
     assert all(value.mean < 2.5 for value in found.values())  # 3.1 over 3: one draw of 3 in 95 of 100
     assert 0.1 < nis["vo"] < 1.5  # 0.31: this floor is drawn sharper than a webcam sees one
@@ -133,7 +133,7 @@ def test_a_ride_that_shakes_widens_what_the_filter_says() -> None:
     stamps = np.array([s.frame.t_ns for s in steps])
     states = [s.state for s in steps if s.state is not None]
     found = anees(states, Trajectory(stamps, made.T_world_body[: len(steps)]))
-    ekf, (_, total, degrees) = front.all_counters["ekf"], front.nis_statistics["vo"]
+    ekf, (_, total, degrees) = front.report().counters["ekf"], front.report().nis["vo"]
     print({name: round(value.mean, 2) for name, value in found.items()}, total / degrees, ekf["noise_changes"])
     assert 1 <= ekf["noise_changes"] <= 6 and ekf["soft_resets"] == 0 and ekf["vo_gated"] <= 6
     assert all(value.mean < 2.5 for value in found.values()) and total / degrees < 1.5
@@ -165,7 +165,7 @@ def test_it_stays_where_it_stands() -> None:
     off = np.array([se3_log(invert(poses[0]) @ T) for T in poses])
     print(f"{np.abs(off[:, 3:]).max() * 1e3:.2f} mm, {np.rad2deg(np.abs(off[:, :3]).max()):.3f} deg")
     assert np.abs(off[:, 3:]).max() < 0.005 and np.rad2deg(np.abs(off[:, :3]).max()) < 0.2
-    assert front.counters["frames_at_rest"] > 0.5 * len(steps)
+    assert front.watch.counters["frames_at_rest"] > 0.5 * len(steps)
 
 
 def test_wheels_carry_it_over_a_floor_without_texture() -> None:
@@ -173,7 +173,7 @@ def test_wheels_carry_it_over_a_floor_without_texture() -> None:
     ends = {}
     for name, chosen in (("alone", config()), ("wheels", config(slip_sigma_m_s=0.02, floor_sigma_m=0.01))):
         front, steps = run(made, chosen)
-        assert front.counters["frames_lost"] >= 18
+        assert front.watch.counters["frames_lost"] >= 18
         lost = steps[60].state
         assert lost is not None and not steps[60].track.keyframe
         a = invert(made.T_world_body[44]) @ made.T_world_body[64]

@@ -13,7 +13,7 @@ from vislam.config import load
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, Frame, ImuSample, Observations
-from vislam.pipeline.silence import SilentCamera, dark
+from vislam.pipeline.dark import SilentCamera, dark
 from vislam.runs.further_sensors import FurtherReadings
 from vislam.runs.run_input import RunInput
 from vislam.runs.sources import open_source
@@ -91,9 +91,9 @@ def test_filter_and_graph_go_on_by_wheels_while_the_camera_is_silent(silent_s: f
     filter_m, graph_m = run.error_m(run.filter), run.error_m(by_graph)
     said = graph.sensed("wheels")
     print(f"{silent_s:g} s: filter {filter_m:.3f} m, graph {graph_m:.3f} m, its sigma {sigma_m:.3f} m; {said}")
-    assert run.slam.front.counters["submaps"] == 1
-    assert run.slam.front.counters["waypoints"] >= silent_s - 10.0
-    assert run.slam.front.all_counters["sensor wheels"]["unplaced"] == 0
+    assert run.slam.front.watch.counters["submaps"] == 1
+    assert run.slam.front.watch.counters["waypoints"] >= silent_s - 10.0
+    assert run.slam.front.report().counters["sensor wheels"]["unplaced"] == 0
     assert np.diff([t_ns for t_ns, _ in by_graph]).max() < 7 * SECOND_NS
     assert said["in_window"] + said["used"] > 8.0 * silent_s
     assert filter_m < 0.01 * silent_s

@@ -23,7 +23,7 @@ from vislam.core.messages import (
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import Ekf, make_ekf
 from vislam.ekf.correction import Correction, ToldReading
-from vislam.ekf.tight import CameraCalibration, MsckfEkf
+from vislam.ekf.tight import MsckfEkf
 from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise, SeenNoise
 from vislam.sensors import Suite
@@ -70,21 +70,12 @@ class Filtering:
     def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""
         self._start_ns = state.t_ns
-        if isinstance(self.ekf, MsckfEkf) and camera is not None:
-            found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
-            self.ekf.initialise(state, None, found)
-        else:
-            self.ekf.initialise(state, vo)
+        self.ekf.resume(state, vo, camera)
 
     @property
     def camera(self) -> Array | None:
         """What a tight filter learned of the camera [8]: time offset, its sigma, rotation, its sigmas (s, rad)."""
-        if not isinstance(self.ekf, MsckfEkf):
-            return None
-        found = self.ekf.calibration
-        return np.array([
-            found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
-        ])  # fmt: skip
+        return self.ekf.camera
 
     def see(
         self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError, VislamError
+from vislam.frontend import knows_scale
 from vislam.trajectory import (
     Alignment,
     Trajectory,
@@ -70,7 +71,8 @@ def output_measures(
         try:
             if truth is None:
                 raise DataError("the recording has no truth to compare with")
-            measures[name] = _output(path, truth, gauge_alignment(metrics["has_imu"], metrics["mode"]), span_ns)
+            alignment = gauge_alignment(metrics["has_imu"], knows_scale(metrics["mode"]))
+            measures[name] = _output(path, truth, alignment, span_ns)
         except VislamError as error:
             measures[name] = {"failure": str(error).replace(f"{run}/", "")}
             continue

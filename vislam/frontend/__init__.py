@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from vislam.config import FrontEndConfig
 from vislam.config.frontend import Mode
 from vislam.core.camera import Rig
-from vislam.core.errors import UsageError
-from vislam.frontend.metric import MetricFrontEnd
+from vislam.frontend.metric import RgbdFrontEnd, StereoFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import FrontEnd, TrackResult
-from vislam.frontend.rgbd import ImageDepth
-from vislam.frontend.view import View, stereo_views
 from vislam.imu import ImuNoise
 
-__all__ = ["FrontEnd", "TrackResult", "lasting_scale_sigma", "make_frontend", "mode_for"]
+__all__ = ["FRONT_ENDS", "FrontEnd", "TrackResult", "knows_scale", "lasting_scale_sigma", "make_frontend", "mode_for"]
 
 
-def _rgbd(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
-    if not rig.has_depth:
-        raise UsageError("front end 'rgbd' needs depth images, this recording has none; use --frontend.mode auto")
-    return MetricFrontEnd("rgbd", config, rig, (View(rig.cameras[0], rig.T_body_cams[0], ImageDepth(config)),), seed)
-
-
-def _stereo(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
-    if not rig.is_stereo:
-        raise UsageError("front end 'stereo' needs two cameras, this recording has one; use --frontend.mode auto")
-    return MetricFrontEnd("stereo", config, rig, stereo_views(rig, config), seed)
-
-
-FRONT_ENDS: dict[str, Callable[[FrontEndConfig, Rig, int], FrontEnd]] = {
-    "rgbd": _rgbd,
-    "stereo": _stereo,
+FRONT_ENDS: dict[str, type[FrontEnd]] = {
+    "rgbd": RgbdFrontEnd,
+    "stereo": StereoFrontEnd,
     "mono": MonoFrontEnd,
     "planar": PlanarFrontEnd,
 }
+
+
+def knows_scale(mode: str) -> bool:
+    """Return whether motions of a front end are in metres; of one that is not known here they are taken to be."""
+    return mode not in FRONT_ENDS or FRONT_ENDS[mode].knows_scale
 
 
 def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
@@ -51,16 +39,8 @@ def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
 
 
 def lasting_scale_sigma(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> float:
-    """Return the relative sigma of all metres together that motions do not tell of.
-
-    Over a floor it is that of the camera's height; for one camera with an IMU that of the accelerometer's scale.
-    """
-    mode, planar = mode_for(config, rig), config.planar
-    if mode == "mono":
-        return 0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0
-    if mode != "planar" or planar.height_m is None:
-        return 0.0
-    return planar.height_sigma_m / planar.height_m
+    """Return the relative sigma of all metres together that motions leave out, see `FrontEnd`."""
+    return FRONT_ENDS[mode_for(config, rig)].lasting_scale_sigma(config, noise)
 
 
 def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:

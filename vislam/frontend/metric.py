@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
+from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontNews
 from vislam.core.messages import (
     Array,
@@ -33,8 +35,9 @@ from vislam.frontend.local_surfaces import LocalSurfaces
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.result import TrackResult, metric_motion, too_few
+from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.tracker import Tracker, given_rows
-from vislam.frontend.view import View, sees, spread
+from vislam.frontend.view import View, sees, spread, stereo_views
 from vislam.vision.landmarks import Landmarks, metric_points, move
 from vislam.vision.locate import pnp_ransac, recognise
 from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose
@@ -54,9 +57,11 @@ _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a
 class MetricFrontEnd:
     """Frame-to-keyframe odometry on inverse-depth landmarks that are carried and improved from keyframe to keyframe."""
 
-    def __init__(self, mode: str, config: FrontEndConfig, rig: Rig, views: tuple[View, ...], seed: int) -> None:
-        """Take the cameras to look through, the usual one first; `mode` is only the name."""
-        self.mode = mode
+    mode: str
+    knows_scale = True
+
+    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int, views: tuple[View, ...]) -> None:
+        """Take the cameras to look through, the usual one first."""
         self.keyframe_spacing = 1.0
         self._config = config
         self._views = views
@@ -76,7 +81,7 @@ class MetricFrontEnd:
         self._now_sees = True  # and in this frame; only asked while another camera is looked through
         self._lost = False
         self._lacks_depth = False  # hardly a track of the keyframe was given depth when it began
-        has_surfaces = rig.has_depth and mode == "rgbd"
+        has_surfaces = rig.has_depth and self._depth.every_frame
         self._surfaces = LocalSurfaces(config, self._camera, self._T_body_cam) if has_surfaces else None
         self._by_depth = ByDepth(config, self._surfaces) if self._surfaces is not None and config.depth_alone else None
         self._blind: BlindKeyframe | None = None  # the keyframe is the first and has no depth
@@ -128,6 +133,16 @@ class MetricFrontEnd:
         self._learn_noise(attempt, keyframe)
         return self._report(frame, keyframe, attempt, has_imu=imu is not None)
 
+    @classmethod
+    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
+        """Return 0: motions tell how well their metres are known."""
+        return 0.0
+
+    @classmethod
+    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
+        """See FrontEnd.vo_inflation."""
+        return None
+
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
@@ -140,6 +155,11 @@ class MetricFrontEnd:
         readout_s = self._shutter.readout_s if self._shutter.learns else None
         lag = (self._lag.delay_estimate_s, self._lag.rows_estimate_s) if self._depth.every_frame else (None, None)
         return FrontNews(self._tracker.next_id, readout_s=readout_s, depth_delay_s=lag[0], depth_rows_s=lag[1])
+
+    @property
+    def calibration(self) -> dict[str, float]:
+        """See FrontEnd.calibration."""
+        return {}
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
@@ -519,3 +539,28 @@ class MetricFrontEnd:
         self._key_sees = self._now_sees
         self._T_key_cam = np.eye(4)
         return keyframe
+
+
+class StereoFrontEnd(MetricFrontEnd):
+    """Metric by a second camera; goes on with that one while the first is covered."""
+
+    mode = "stereo"
+
+    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
+        """Take the rig's first two cameras; raises UsageError where it has one."""
+        if not rig.is_stereo:
+            raise UsageError("front end 'stereo' needs two cameras, this recording has one; use --frontend.mode auto")
+        super().__init__(config, rig, seed, stereo_views(rig, config))
+
+
+class RgbdFrontEnd(MetricFrontEnd):
+    """Metric by depth images; goes on with these alone while the camera is covered."""
+
+    mode = "rgbd"
+
+    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
+        """Take the rig's first camera; raises UsageError where it has no depth."""
+        if not rig.has_depth:
+            raise UsageError("front end 'rgbd' needs depth images, this recording has none; use --frontend.mode auto")
+        view = View(rig.cameras[0], rig.T_body_cams[0], ImageDepth(config))
+        super().__init__(config, rig, seed, (view,))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, transform
+from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations
 from vislam.core.quantiles import median
@@ -72,6 +73,7 @@ class MonoFrontEnd:
     """
 
     mode = "mono"
+    knows_scale = False
 
     def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
         """Take the rig's first camera."""
@@ -139,6 +141,16 @@ class MonoFrontEnd:
         self._learn_noise(motion, given**2)
         return self._report(frame, motion)
 
+    @classmethod
+    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
+        """Return the relative sigma of the accelerometer's scale, by which all metres come."""
+        return 0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0
+
+    @classmethod
+    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
+        """See FrontEnd.vo_inflation."""
+        return None
+
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
@@ -148,6 +160,11 @@ class MonoFrontEnd:
     def news(self) -> FrontNews:
         """See FrontEnd.news."""
         return FrontNews(self._tracker.next_id)
+
+    @property
+    def calibration(self) -> dict[str, float]:
+        """See FrontEnd.calibration."""
+        return {}
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 

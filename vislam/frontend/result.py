@@ -7,7 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
+from vislam.config import FrontEndConfig
+from vislam.core.camera import Rig
 from vislam.core.geometry import se3_adjoint, transform
+from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 from vislam.frontend.prediction import body_motion
@@ -36,8 +39,23 @@ class TrackResult:
 class FrontEnd(Protocol):
     """Visual odometry that is fed frame by frame."""
 
-    mode: str
+    mode: str  # its name in `frontend.mode`
+    knows_scale: bool  # whether its motions are in metres
     keyframe_spacing: float  # widens the distances between keyframes; 1, unless a live back end does not keep up
+
+    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
+        """Take the cameras to look through; raises UsageError when the rig lacks what the front end needs."""
+        ...
+
+    @classmethod
+    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
+        """Return the relative sigma of all metres together that the covariances of motions leave out."""
+        ...
+
+    @classmethod
+    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
+        """Return the factor on sigmas of motions that a loose filter takes in place of `ekf.vo_inflation`, if any."""
+        ...
 
     def track(
         self,
@@ -66,6 +84,11 @@ class FrontEnd(Protocol):
     @property
     def news(self) -> FrontNews:
         """Return what was learned so far, as `begin_at` takes it; what others learn is left out."""
+        ...
+
+    @property
+    def calibration(self) -> dict[str, float]:
+        """Return what was learned of the camera's mount, for the report, with standard deviations."""
         ...
 
 

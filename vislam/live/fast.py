@@ -281,7 +281,7 @@ class FastPath:
         self._at_rest = hint.at_rest
         if not hint.at_rest and self._config.machine.slip_sigma_m_s is None:
             return None
-        hint.apply(self._ekf)
+        self._ekf.hold(hint)
         self.counters["rests_without_vision" if hint.at_rest else "wheels_without_vision"] += 1
         return hint
 

@@ -22,7 +22,7 @@ from vislam.core.messages import (
     NavState,
     Tracking,
 )
-from vislam.frontend import mode_for
+from vislam.frontend import knows_scale, mode_for
 from vislam.graph import PoseGraph
 from vislam.loop.detector import LoopDetector
 from vislam.loop.injection import FalseLoops, as_candidate
@@ -227,12 +227,16 @@ class KeyframeIntake:
     def _enters(self, odometry: OdometryKeyframe) -> bool:
         """Return whether a keyframe can be added; into a map that knows gravity only if the recording does."""
         if self._begins_recording and self.stages is not None:
-            self._begins_recording = not self.stages.begin_recording(self._front.first_state, odometry.T_odom_body)
+            self._begins_recording = not self.stages.begin_recording(
+                self._front.begun.first_state, odometry.T_odom_body
+            )
         return not self._begins_recording
 
     def _add_new(self, odometry: OdometryKeyframe) -> KeyframeStep:
         if self.stages is None:
-            self.stages = self._make(self._front.noise, self._clock, self._front.first_state, odometry.T_odom_body)
+            self.stages = self._make(
+                self._front.noise, self._clock, self._front.begun.first_state, odometry.T_odom_body
+            )
         seen = list(self._seen)
         self._seen.clear()
         step = self.stages.add(odometry, seen)
@@ -247,7 +251,7 @@ def map_stage(config: Config, rig: Rig, clock: StageClock, labeller: Labeller | 
 
 def makes_depth(config: Config, rig: Rig) -> bool:
     """Whether the map takes depth from one moving camera."""
-    return config.map.enabled and config.map.mono_depth.enabled and mode_for(config.frontend, rig) == "mono"
+    return config.map.enabled and config.map.mono_depth.enabled and not knows_scale(mode_for(config.frontend, rig))
 
 
 def seen_between(front: FrontStep) -> list[SeenFrame]:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vislam.config import EkfConfig
+from vislam.config import EkfConfig, InitConfig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import StartFacts
-from vislam.core.messages import Array
-from vislam.frontend import FrontEnd
+from vislam.core.messages import Array, Frame, ImuSpan, NavState, Tracking
+from vislam.frontend import TrackResult, knows_scale
 from vislam.frontend.camera_clock import CameraClock
-from vislam.frontend.planar import PlanarFrontEnd
+from vislam.frontend.feed import CameraFeed
+from vislam.frontend.pixel_noise import NoiseUsed
 from vislam.frontend.time_offset import TURN_SIGMA
+from vislam.frontend.uniform_motion import UniformMotion
 from vislam.imu import InertialCondition, NoiseRatios
+from vislam.pipeline.gravity import Phase
 from vislam.trajectory import Alignment, gauge_alignment
+
+if TYPE_CHECKING:
+    from vislam.pipeline.front import Front
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,25 +49,130 @@ class FrontReport:
     @property
     def alignment(self) -> Alignment:
         """How the run may be moved onto a truth."""
-        return gauge_alignment(self.start is not None, self.mode)
+        return gauge_alignment(self.start is not None, knows_scale(self.mode))
 
 
-def learned_of_camera(
-    frontend: FrontEnd, clock: CameraClock, filter_camera: Array | None, config: EkfConfig, has_imu: bool
-) -> dict[str, float]:
-    """Return what was learned of the camera, with standard deviations: its clock and turn, and over a floor its mount.
+class RunWatch:
+    """Watches the frames of a run go by, for its report.
 
-    `filter_camera` [8] is what the filter learned, see `Filtering.camera`.
+    Attributes:
+        counters: what became of frames.
+        feed: what the camera delivered.
+        tracks: what was seen of their noise.
+        uniform: how long one camera has moved without showing scale.
     """
-    told = {"camera_offset_s": clock.applied_s, "camera_offset_sigma_s": clock.sigma_s}
+
+    def __init__(self, config: InitConfig, knows_scale: bool) -> None:
+        """Start before the first frame; `knows_scale` is whether vision measures metres."""
+        self.counters = {
+            "frames_lost": 0, "frames_degraded": 0, "longest_loss_ms": 0, "imu_outages": 0, "frames_at_rest": 0,
+            "submaps": 1,
+        }  # fmt: skip
+        self.feed, self.tracks, self.uniform = CameraFeed(), NoiseUsed(), UniformMotion(config)
+        self._knows_scale = knows_scale
+        self._lost_since_ns: int | None = None
+
+    def add(self, frame: Frame) -> None:
+        """Take a frame as the camera gave it; `note` has to follow."""
+        self.feed.add(frame)
+
+    def note(self, track: TrackResult, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
+        """Take what became of the frame.
+
+        Args:
+            track: what vision made of it.
+            span: inertial data since the frame before; None: no IMU, or a hole.
+            state: the filter's before the frame.
+            at_rest: whether the body rested over it.
+        """
+        self.feed.moved(at_rest)
+        self.tracks.add(track.sigma_px, track.observations)
+        if not self._knows_scale:
+            self.uniform.add(span, state, at_rest)
+        counters, is_lost = self.counters, track.vo.tracking is Tracking.LOST
+        counters["frames_lost"] += is_lost
+        self._lost_since_ns = (self._lost_since_ns or track.vo.t_ns) if is_lost else None
+        if self._lost_since_ns is not None:
+            lasted_ms = (track.vo.t_ns - self._lost_since_ns) // 1_000_000
+            counters["longest_loss_ms"] = max(counters["longest_loss_ms"], lasted_ms)
+        counters["frames_degraded"] += track.vo.tracking is Tracking.DEGRADED
+        counters["frames_at_rest"] += at_rest
+        if track.by_depth:
+            counters["frames_by_depth"] = counters.get("frames_by_depth", 0) + 1
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]:
+        """All that was counted, by what it is about."""
+        front, feed = dict(self.counters), self.feed
+        if not self._knows_scale:
+            front["frames_without_excitation"] = self.uniform.frames
+        return {
+            "front": front,
+            "camera feed": {"frames": feed.frames, "missing": feed.missing, "repeated": feed.repeated},
+        }
+
+
+def report_of(front: Front) -> FrontReport:
+    """Return what there is to say of a run so far."""
+    imu, begun = front.inertial, front.begun
+    report = FrontReport(
+        front.frontend.mode, None, front.start, begun.refusal, _counters(front), {}, [], {},
+        front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, told_noise=front.noise,
+        track_noise=front.watch.tracks.summary(_given_px(front)),
+        sensors={} if front.readings is None else front.readings.report(),
+    )  # fmt: skip
+    if imu is None:
+        return report
+    report = replace(report, coupling=imu.filtering.coupling, condition=imu.condition.condition())
+    floor = imu.buffer.noise_floor
+    if begun.phase is Phase.VISION_ALONE or floor is None:
+        return report
+    return replace(
+        report, nis=imu.filtering.ekf.nis_statistics, noise_warnings=floor.warnings(front.config.imu.noise_tolerance),
+        imu_noise=floor.summary(), noise_ratios=floor.ratios,
+    )  # fmt: skip
+
+
+def _counters(front: Front) -> dict[str, dict[str, int]]:
+    """Return the counters of the front half and of those inside."""
+    counters, imu, gravity = front.watch.counts, front.inertial, front.gravity
+    if imu is not None and gravity is not None:
+        counters["front"] |= {"imu_outages": imu.buffer.outages, **gravity.counters}
+        if front.begun.phase is not Phase.VISION_ALONE:
+            counters["imu"] = dict(imu.buffer.counters)
+            counters |= gravity.search_counters
+            counters["camera clock"] = {"changes": front.camera_clock.changes}
+            counters["ekf"] = dict(imu.filtering.ekf.counters)
+    if front.readings is not None:
+        counters |= {f"sensor {name}": dict(counts) for name, counts in front.readings.counters.items()}
+    return counters
+
+
+def _given_px(front: Front) -> dict[str, float]:
+    """Return the noise of pixels that estimators which see the tracks themselves are given."""
+    config = front.config
+    graph = {"graph": config.window.sigma_px} if config.graph.coupling == "tight" else {}
+    is_tight = front.begun.phase is not Phase.VISION_ALONE and config.ekf.coupling == "tight"
+    return graph | ({"filter": config.ekf.tight_pixel_sigma_px} if is_tight else {})
+
+
+def _learned_of_camera(front: Front) -> dict[str, float]:
+    """Return what was learned of the camera, with standard deviations: clock and turn, and over a floor its mount."""
+    mount = front.frontend.calibration
+    if front.begun.phase is Phase.VISION_ALONE:
+        return mount
+    clock = front.camera_clock
+    found = {"camera_offset_s": clock.applied_s, "camera_offset_sigma_s": clock.sigma_s}
     if clock.drift_sigma > 0.0:
-        told |= {"camera_drift": clock.drift, "camera_drift_sigma": clock.drift_sigma}
-    mount = frontend.calibration if isinstance(frontend, PlanarFrontEnd) else {}
-    return {**({**told, **_turned(clock, filter_camera, config)} if has_imu else {}), **mount}
+        found |= {"camera_drift": clock.drift, "camera_drift_sigma": clock.drift_sigma}
+    return found | _turned(clock, front.news.filter_camera, front.config.ekf) | mount
 
 
 def _turned(clock: CameraClock, filter_camera: Array | None, config: EkfConfig) -> dict[str, float]:
-    """Return by how much the camera stands turned on the body against what was told, in degrees, by rotations."""
+    """Return by how much the camera is turned on the body against its calibration, in degrees, by rotations.
+
+    `filter_camera` [8] is what the filter learned, see `Filtering.camera`.
+    """
     found = clock.estimate
     turn, sigmas, prior_deg = found.R_correction, found.R_correction_sigma, float(np.rad2deg(TURN_SIGMA))
     if filter_camera is not None and filter_camera[5:8].all():

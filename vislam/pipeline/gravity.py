@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from enum import StrEnum
 
 import numpy as np
 
@@ -10,30 +11,103 @@ from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.errors import TrackingLostError
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.memory import StartFacts
-from vislam.core.messages import Array, ImuSpan, NavState, Observations, VoMeasurement
-from vislam.ekf.filtering import Filtering
+from vislam.core.memory import FrontMemory, StartFacts
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, VoMeasurement
 from vislam.ekf.tight import EarlyFrames, known_from
 from vislam.frontend import TrackResult
+from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.start import Initialisation, Initialiser, level_at_once, moved_to
-from vislam.imu import ImuBuffer
+from vislam.pipeline.chain import KeyframeChain
+from vislam.pipeline.inertial import Inertial
 from vislam.trajectory import Trajectory
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state
 
 _OTHER_WAYS = "a start from rest, a second camera or depth needs less"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Released:
-    """The keyframes that waited, in `odom`."""
+class Phase(StrEnum):
+    """How far a run has come to a state that it may believe; `Start` has the ways from one to the next."""
 
-    keyframes: list[OdometryKeyframe]
-    T_odom_vo: Array  # [4, 4]
-    solved: dict[int, Array] | None  # poses by time, with one camera, whose visual chain has no positions
+    SEEKING = "seeking gravity"  # no state: keyframes wait in the frame of visual odometry
+    PROVISIONAL = "provisional"  # the filter runs from a start that is still tested: keyframes wait
+    SETTLED = "settled"  # the filter's frame is `odom`: keyframes leave at once
+    RESUMED = "resumed"  # before the first frame, which is the newest keyframe of an earlier run
+    VISION_ALONE = "vision alone"  # no IMU, or one whose gravity was given up: keyframes leave at once
 
-    def place(self, t_ns: int, T_vo_body: Array) -> Array | None:
-        """Return where the body was at a keyframe; None where one camera cannot tell."""
-        return self.T_odom_vo @ T_vo_body if self.solved is None else self.solved.get(t_ns)
+
+class Start:
+    """The phase of a run and the states that led to it.
+
+    Attributes:
+        phase: now.
+        settled: the start that survived its test, or had to do without; None before.
+        newest: the start that the filter runs from, provisional or settled; None before.
+        first_state: of keyframe 0, once gravity is known.
+        refusal: why there was no state when it was last looked for.
+        scaled_from_ns: before, poses of one camera have no scale; None: all have.
+    """
+
+    def __init__(self, has_imu: bool) -> None:
+        """Begin to seek gravity, or without an IMU with vision alone."""
+        self.phase = Phase.SEEKING if has_imu else Phase.VISION_ALONE
+        self.settled: Initialisation | None = None
+        self.newest: Initialisation | None = None
+        self.first_state: NavState | None = None
+        self.refusal = "no frame yet"
+        self.scaled_from_ns: int | None = None
+        self._begun_t_ns = 0  # when the first pose was given that was not taken back; 0: none was
+        self._memory: FrontMemory | None = None  # of the earlier run, while RESUMED
+
+    @property
+    def holds_keyframes(self) -> bool:
+        """Whether keyframes wait: they are not yet where they will be in `odom`."""
+        return self.phase in (Phase.SEEKING, Phase.PROVISIONAL)
+
+    def facts(self, noise: ImuNoise | None) -> StartFacts | None:
+        """Return how gravity was found; None until then, or without an IMU."""
+        found = self.settled
+        if noise is None or found is None or found.last is None or self.first_state is None:
+            return None
+        return StartFacts(
+            found.status, found.reason, found.last, found.scale_sigma, found.excitation_m_s2, noise,
+            self.first_state, self._begun_t_ns,
+        )  # fmt: skip
+
+    def resume(self, memory: FrontMemory) -> None:
+        """Wait for the frame at which an earlier run ended; with the start of that run, if it had one."""
+        self._memory, self.phase = memory, Phase.RESUMED
+        start = memory.start
+        if start is None or memory.state is None:
+            return
+        self.first_state, self.refusal = start.first_state, start.reason
+        self.settled = self.newest = Initialisation(
+            start.status, start.reason, start.first_state, start.last, scale_sigma=start.scale_sigma,
+            excitation_m_s2=start.excitation_m_s2,
+        )  # fmt: skip
+        self._begun_t_ns = start.begun_t_ns
+
+    def see_again(self, has_imu: bool) -> FrontMemory | None:
+        """Go on from RESUMED with the first frame; return what the earlier run left. None in any other phase."""
+        memory, self._memory = self._memory, None
+        if memory is not None:
+            without = Phase.SEEKING if has_imu else Phase.VISION_ALONE
+            self.phase = without if self.settled is None else Phase.SETTLED
+        return memory
+
+    def try_out(self, found: Initialisation) -> None:
+        """Run the filter from a start; a settled one has to be settled as well."""
+        assert found.last is not None
+        if self.phase is Phase.SEEKING or found.takes_back:
+            self._begun_t_ns = found.last.t_ns
+        self.newest, self.phase = found, Phase.PROVISIONAL
+
+    def settle(self, found: Initialisation) -> None:
+        """Believe a start."""
+        self.settled, self.phase = found, Phase.SETTLED
+
+    def give_up(self) -> None:
+        """Go on without gravity, by vision that is metric."""
+        self.phase = Phase.VISION_ALONE
 
 
 class GravityWait:
@@ -47,43 +121,27 @@ class GravityWait:
         config: Config,
         rig: Rig,
         noise: ImuNoise,
-        filtering: Filtering,
-        buffer: ImuBuffer,
-        early: EarlyFrames | None,
+        start: Start,
+        chain: KeyframeChain,
+        inertial: Inertial,
+        knows_scale: bool,
     ) -> None:
-        """Begin without a state; `filtering` is started with the first one, `buffer` has the inertial samples.
+        """Bring `start` forward from the samples of `inertial`, and start its filter.
 
-        `early` keeps what one camera sees before its scale is known; None where vision is metric.
+        `chain` is that of the keyframes. `knows_scale` is whether vision measures metres: where it does not, what is
+        seen before scale is known is kept.
         """
-        self.initialisation: Initialisation | None = None  # settled
-        self.newest_start: Initialisation | None = None  # that the filter goes by; provisional ones come before
-        self.first_state: NavState | None = None  # of keyframe 0, once gravity is known
-        self.last_refusal = "no frame yet"  # why there is no first state
-        self.scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
-        self.holds_keyframes = True  # until the start is settled, or gravity given up
         self.counters: dict[str, int] = {}
+        self._start, self._chain = start, chain
         self._config = config
         self._noise = noise
-        self._filtering = filtering
-        self._buffer = buffer
+        self._filtering, self._buffer = inertial.filtering, inertial.buffer
         self._refused: Initialisation | None = None  # the newest answer without a state
-        self._begun_t_ns = 0  # when the first pose was given that was not taken back; 0: none was
         self._waiting = WaitingKeyframes()
-        self._early = early
+        self._early = None if knows_scale else EarlyFrames(config.ekf, rig, config.machine)
         self._initialiser = Initialiser(
             config.init, noise, config.machine.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
             config.frontend.track_sigma_px, config.window,
-        )  # fmt: skip
-
-    @property
-    def start(self) -> StartFacts | None:
-        """How gravity was found; None until then."""
-        found = self.initialisation
-        if found is None or found.last is None or self.first_state is None:
-            return None
-        return StartFacts(
-            found.status, found.reason, found.last, found.scale_sigma, found.excitation_m_s2, self._noise,
-            self.first_state, self._begun_t_ns,
         )  # fmt: skip
 
     @property
@@ -94,97 +152,110 @@ class GravityWait:
             "initialisation": {"taken_back": self._initialiser.taken_back},
         }
 
-    def resume(self, start: StartFacts) -> None:
-        """Take over the settled start of an earlier run."""
-        self.first_state, self.last_refusal = start.first_state, start.reason
-        self.initialisation = Initialisation(
-            start.status, start.reason, start.first_state, start.last, scale_sigma=start.scale_sigma,
-            excitation_m_s2=start.excitation_m_s2,
-        )  # fmt: skip
-        self.newest_start, self.holds_keyframes = self.initialisation, False
-        self._begun_t_ns = start.begun_t_ns
-
-    def see(self, t_ns: int, observations: Observations, at_rest: bool) -> None:
-        """Keep what one camera saw before its scale is known."""
-        if self.initialisation is None and self._early is not None:
-            self._early.see(t_ns, observations, at_rest)
-
     def seek(
-        self, span: ImuSpan | None, track: TrackResult, still_image: bool, T_vo_body: Array, time_offset_sigma_s: float
-    ) -> Released | None:
+        self, span: ImuSpan | None, track: TrackResult, still_image: bool, at_rest: bool, time_offset_sigma_s: float
+    ) -> list[OdometryKeyframe]:
         """Look for the first gravity-aligned state with another frame; return what waited once it is settled.
 
-        `span` is the inertial data since the last frame, None where they have a hole, `T_vo_body` [4, 4] where visual
-        odometry has the body, and `time_offset_sigma_s` how well the camera's clock is known.
+        Args:
+            span: inertial data since the last frame; None where they have a hole.
+            track: of the frame.
+            still_image: whether the image stood still up to it.
+            at_rest: whether the body rests, by image and samples.
+            time_offset_sigma_s: how well the camera's clock is known.
         """
-        if self.initialisation is not None:
-            return None
+        start = self._start
+        if not start.holds_keyframes:
+            return []
+        if self._early is not None:
+            self._early.see(track.vo.t_ns, track.observations, at_rest)
         self._initialiser.time_offset_sigma_s = time_offset_sigma_s
         found = self._initialiser.add(span, track.vo, still_image, track.observations)
-        self.last_refusal = found.reason
+        start.refusal = found.reason
         self._refused = found if found.first is None else None
-        if found.first is None and self.newest_start is None:
-            found = self._level(span, track.vo, T_vo_body) or found
+        if found.first is None and start.phase is Phase.SEEKING:
+            found = self._level(span, track.vo) or found
         if found.last is None or found.first is None or found.T_odom_vo is None:
-            return None
-        before = self._filtering.ekf.pose_at(found.last.t_ns) if self.newest_start is not None else None
+            return []
+        before = self._filtering.ekf.pose_at(found.last.t_ns) if start.phase is Phase.PROVISIONAL else None
         return self._start_from(found if before is None else moved_to(found, before), track.vo)
 
-    def take_refused(self) -> Initialisation | None:
-        """Return the newest answer without a state, once."""
+    def follow_clock(self, clock: CameraClock, vo: VoMeasurement) -> int:
+        """Let a frame, or the search, correct the camera's clock; return by how many ns that moves what waits.
+
+        What has left stays as it was.
+        """
+        if self._start.phase is Phase.VISION_ALONE:
+            return 0
         refused, self._refused = self._refused, None
-        return refused
-
-    def hold(self, keyframe: OdometryKeyframe, T_odom_body: Array | None) -> None:
-        """Let a keyframe in `vo` wait; `T_odom_body` [4, 4] is where a provisional start has it, if there is one."""
-        self._waiting.add(keyframe, T_odom_body)
-
-    def restamp(self, shift_ns: int) -> None:
-        """Bring all that waits `shift_ns` later, as a change of the camera's time offset asks for."""
+        is_settled = self._start.settled is not None
+        if refused is not None and np.isfinite(refused.time_offset_sigma_s):
+            shift_ns = clock.tell(refused.time_offset_s, refused.time_offset_sigma_s)
+        else:
+            shift_ns = clock.follow(vo, self._buffer, is_settled)
+        if shift_ns == 0 or is_settled:
+            return 0
         self._initialiser.restamp(shift_ns, self._buffer.span)
         self._waiting.restamp(shift_ns, self._buffer.span)
         if self._early is not None:
             self._early.restamp(shift_ns)
+        self._chain.t_ns += shift_ns
+        clock.took_keyframe()
+        return shift_ns
 
-    def is_late(self, now_t_ns: int) -> bool:
-        """Return whether keyframes have waited too long; they must not wait for ever."""
-        return self._waiting.waited_s(now_t_ns) >= self._config.init.give_up_s
+    def hold(self, packet: KeyframePacket, T_odom_body: Array | None, T_upright: Array) -> list[OdometryKeyframe]:
+        """Let the newest keyframe wait; where others have waited too long, give up and return all.
 
-    def give_up(self, T_upright: Array) -> Released | None:
-        """Return the keyframes that still wait, up being where `T_upright` [4, 4] has it: vision alone does.
+        One camera then has to do with a provisional start, and raises TrackingLostError without one; metric vision goes
+        on without the IMU.
+
+        Args:
+            packet: of the keyframe.
+            T_odom_body: [4, 4] where a provisional start has it, if there is one.
+            T_upright: [4, 4] where up is without gravity.
+        """
+        self._waiting.add(OdometryKeyframe(packet, self._chain.T_vo_body.copy()), T_odom_body)
+        waited_s = self._waiting.waited_s(packet.keyframe.t_ns)
+        if waited_s < self._config.init.give_up_s:
+            return []
+        if self._early is not None:
+            if self._start.newest is None:
+                raise TrackingLostError(f"no scale after {waited_s:.0f} s: {self._start.refusal}; {_OTHER_WAYS}")
+            return self._release_untested()
+        self.counters["imu_given_up"] = 1
+        self._start.give_up()
+        released = self._release(T_upright)
+        self._chain.stand_up(T_upright)
+        return released
+
+    def finish(self, T_upright: Array) -> list[OdometryKeyframe]:
+        """Return the keyframes that still wait when a recording ends, up being where `T_upright` [4, 4] has it.
 
         With one camera a provisional start has to do, and without any there is nothing to return.
         """
+        if not self._start.holds_keyframes:
+            return []
         return self._release(T_upright) if self._early is None else self._release_untested()
 
-    def give_up_scale(self, now_t_ns: int) -> Released | None:
-        """Return the keyframes of one camera by its provisional start; raises TrackingLostError without one."""
-        if self.newest_start is None:
-            waited_s = self._waiting.waited_s(now_t_ns)
-            raise TrackingLostError(f"no scale after {waited_s:.0f} s: {self.last_refusal}; {_OTHER_WAYS}")
-        return self._release_untested()
-
-    def _release_untested(self) -> Released | None:
-        """Return the waiting keyframes by the newest provisional start of one camera; None without one."""
-        found = self.newest_start
+    def _release_untested(self) -> list[OdometryKeyframe]:
+        """Return the waiting keyframes by the newest provisional start of one camera; without one, none."""
+        found = self._start.newest
         if found is None or found.T_odom_vo is None:
-            return None
-        self.initialisation = replace(found, reason=f"{found.reason}; not confirmed: {self.last_refusal}")
+            return []
+        self._start.settle(replace(found, reason=f"{found.reason}; not confirmed: {self._start.refusal}"))
         return self._release(found.T_odom_vo)
 
-    def _start_from(self, found: Initialisation, vo: VoMeasurement) -> Released | None:
+    def _start_from(self, found: Initialisation, vo: VoMeasurement) -> list[OdometryKeyframe]:
         """Start the filter, again if it runs; return what waited once the start is settled."""
         assert found.last is not None and found.T_odom_vo is not None
-        if self.newest_start is None or found.takes_back:
-            self._begun_t_ns = found.last.t_ns
-        self.newest_start = found
+        self._start.try_out(found)
         self._filtering.start(found.last, vo)
         if not found.is_settled:
-            return None
-        self.initialisation = found
+            return []
+        self._start.settle(found)
         return self._release(found.T_odom_vo)
 
-    def _level(self, span: ImuSpan | None, vo: VoMeasurement, T_vo_body: Array) -> Initialisation | None:
+    def _level(self, span: ImuSpan | None, vo: VoMeasurement) -> Initialisation | None:
         """Return a provisional state from the newest samples alone, where vision is metric and goes on from there.
 
         The tight filter has tracks, not metres: it does not find the velocity at once.
@@ -196,16 +267,15 @@ class GravityWait:
             span = self._buffer.unbroken(max(oldest_ns, self._buffer.oldest_t_ns), vo.t_ns)
         if span is None:
             return None
-        return level_at_once(span, vo.t_ns, T_vo_body, self._config.machine.gravity_m_s2, self._config.init)
+        return level_at_once(span, vo.t_ns, self._chain.T_vo_body, self._config.machine.gravity_m_s2, self._config.init)
 
-    def _release(self, T_odom_vo: Array) -> Released:
-        """Return the waiting keyframes in `odom`, and settle the state of the first.
+    def _release(self, T_odom_vo: Array) -> list[OdometryKeyframe]:
+        """Return the waiting keyframes in `odom`, with the newest placed there and the state of the first settled.
 
         Without scale the visual chain has no positions; those that the initialisation solved for take their place.
         """
-        found = self.initialisation
+        found = self._start.settled
         first = None if found is None else found.first
-        self.holds_keyframes = False
         solved: dict[int, Array] = {}
         states: dict[int, NavState] = {}
         if self._early is not None and found is not None and first is not None and found.T_odom_body is not None:
@@ -217,13 +287,15 @@ class GravityWait:
         keyframes = self._waiting.release(T_odom_vo, solved)
         if keyframes and first is not None:
             t_ns = keyframes[0].packet.keyframe.t_ns
-            self.first_state = first_keyframe_state(states.get(t_ns, first), keyframes[0])
+            self._start.first_state = first_keyframe_state(states.get(t_ns, first), keyframes[0])
             if self._early is not None:
                 self._leave_out(first, states, keyframes)
         if self._early is None:
-            return Released(keyframes, T_odom_vo, None)
-        self._early.forget()
-        return Released(keyframes, T_odom_vo, solved)
+            self._chain.place(T_odom_vo @ self._chain.T_vo_keyframe)
+        else:
+            self._early.forget()
+            self._chain.place(solved.get(self._chain.t_ns))
+        return keyframes
 
     def _leave_out(self, first: NavState, states: dict[int, NavState], released: list[OdometryKeyframe]) -> None:
         """Note from when on scale is known, where that is later than the first keyframe."""
@@ -231,4 +303,4 @@ class GravityWait:
         early = [keyframe for keyframe in released if keyframe.packet.keyframe.t_ns < known_ns]
         self.counters["keyframes_without_scale"] = len(early)
         if early:
-            self.scaled_from_ns = known_ns
+            self._start.scaled_from_ns = known_ns

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState
-from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
+from vislam.config import Config
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState, Tracking
+from vislam.core.readings import MotionReadings, OwnNow, OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
-from vislam.imu import ImuBuffer, preintegrate
-from vislam.pipeline.blind_motion import with_motions
+from vislam.imu import ImuBuffer, ImuNoise, preintegrate
+from vislam.pipeline.inertial import Inertial
 from vislam.pipeline.slip_watch import SlipWatch
 from vislam.sensors import BodyState, Suite
 from vislam.sensors.body import between_keyframes
@@ -81,6 +82,15 @@ class ReadingIntake:
         self._slips = {name: SlipWatch() for name in suite.names if suite[name].slips}
         self._left_out: set[str] = set()  # sensors whose code failed
         self._path: deque[tuple[int, Array]] = deque(maxlen=2)  # times and poses of frames, where there is no filter
+
+    @classmethod
+    def of_run(cls, config: Config, suite: Suite, noise: ImuNoise | None, inertial: Inertial | None) -> ReadingIntake:
+        """Return the intake of a run's further sensors; `noise` and `inertial` are of its IMU, None without one."""
+        gravity_m_s2, has_window = config.machine.gravity_m_s2, config.graph.coupling == "tight"
+        if noise is None or inertial is None:
+            return cls(suite, None, None, gravity_m_s2, 0.0, has_window)
+        filtering, buffer = inertial.filtering, inertial.buffer
+        return cls(suite, filtering, buffer, gravity_m_s2, noise.accelerometer_noise_density, has_window)
 
     def report(self) -> dict[str, dict[str, Any]]:
         """Return, by sensor, what the filter found its own variables to be, and what was wrong with its readings."""
@@ -172,7 +182,7 @@ class ReadingIntake:
         if not self._has_window or self._filter is None:
             return packet
         begun = [name for name in self._suite.names if name not in self._beginning]
-        return with_motions(packet, self._suite, begun, state, self._filter.ekf.own)
+        return _with_motions(packet, self._suite, begun, state, self._filter.ekf.own)
 
     def _tell_filter(self, reading: Reading) -> bool:
         """Give the filter a reading unless its wheels slip; return whether the graph shall have it as well."""
@@ -308,6 +318,31 @@ class _InertialPath:
             since_s, length_s, dR, dv, dp, whole.dR, whole.dp_m, self._gravity, rate - gyro_bias, gyro_bias, accel_bias,
             self._sigma,
         )  # fmt: skip
+
+
+def _with_motions(
+    packet: KeyframePacket,
+    suite: Suite,
+    begun: Iterable[str],
+    state: NavState | None,
+    own: Callable[[str], tuple[Array, Array]],
+) -> KeyframePacket:
+    """Return a keyframe's packet, its readings of motion set apart where vision does not tie it to the one before.
+
+    By inertial data alone a window is soon lost. With any sensor of motion among those that have `begun`, the filter's
+    `state` goes along. `own` gives values and sigmas [V] of a sensor's own variables, as the filter has them.
+    """
+    if any(suite[name].sees_motion_only for name in begun):
+        packet = replace(packet, filter_state=state)
+    if packet.begins_submap or packet.vo.tracking is not Tracking.LOST:
+        return packet
+    by_sensor: dict[str, list[PlacedReading]] = {}
+    rest: list[PlacedReading] = []
+    for one in packet.readings:
+        name = one.reading.sensor
+        (by_sensor.setdefault(name, []) if suite[name].sees_motion_only else rest).append(one)
+    motions = (MotionReadings(name, tuple(placed), OwnNow(*own(name))) for name, placed in by_sensor.items())
+    return replace(packet, readings=tuple(rest), motions=tuple(motions))
 
 
 def _told(error: Exception) -> str:

@@ -9,7 +9,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.up import told_up
-from vislam.frontend import lasting_scale_sigma, mode_for
+from vislam.frontend import FRONT_ENDS, knows_scale, lasting_scale_sigma, mode_for
 
 
 def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
@@ -47,9 +47,9 @@ def refuse_up(noise: ImuNoise | None) -> None:
         raise UsageError("--up is for runs without an IMU, which knows it better; leave it away, or --imu.no-enabled")
 
 
-def refuse_without_scale(ekf: EkfConfig, mode: str, has_imu: bool) -> None:
+def refuse_without_scale(ekf: EkfConfig, has_scale: bool, has_imu: bool) -> None:
     """Raise UsageError where one camera would have to tell metres."""
-    if mode != "mono":
+    if has_scale:
         return
     if not has_imu:
         raise UsageError(
@@ -75,14 +75,14 @@ def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
 def _filter(config: Config, mode: str, lasting_scale_sigma: float) -> EkfConfig:
     coupling = config.ekf.coupling
     if coupling == "auto":
-        coupling = "tight" if mode == "mono" else "loose"
+        coupling = "loose" if knows_scale(mode) else "tight"
     if config.machine.slip_sigma_m_s is not None and coupling == "tight":
         raise UsageError("--machine.slip-sigma-m-s needs --ekf.coupling loose, which has no use for tracks")
-    readout_s = config.ekf.tight_readout_s
+    readout_s, own_inflation = config.ekf.tight_readout_s, FRONT_ENDS[mode].vo_inflation(config.frontend)
     return replace(
         config.ekf,
         coupling=coupling,
         tight_readout_s=config.frontend.readout_s if readout_s is None else readout_s,
         scale_sigma=max(config.ekf.scale_sigma, lasting_scale_sigma),
-        vo_inflation=config.frontend.planar.vo_inflation if mode == "planar" else config.ekf.vo_inflation,
+        vo_inflation=config.ekf.vo_inflation if own_inflation is None else own_inflation,
     )

@@ -17,6 +17,7 @@ from vislam.core.messages import (
 )
 from vislam.ekf import Correction
 from vislam.frontend import TrackResult
+from vislam.trajectory.continuity import Continuity
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
 
@@ -27,6 +28,10 @@ class Estimate:
     T_odom_before: Array  # [4, 4] by inertial data alone, from where it was at the last frame
     T_odom_body: Array  # [4, 4] with all that is known
     rate_sigma_rad_s: float  # of the gyroscope's bias; infinite without an IMU
+
+    def shown(self, t_ns: int, published: Continuity) -> Array:
+        """Return the pose in `odom` [4, 4] as it is published at a time: continuous where that is wanted."""
+        return published.follow(t_ns, self.T_odom_before, self.T_odom_body, self.rate_sigma_rad_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from vislam.core.memory import FrontMemory
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.core.recording import Recording
-from vislam.pipeline.silence import dark
+from vislam.pipeline.dark import dark
 from vislam.runs.further_sensors import FurtherReadings
 from vislam.sensors import Suite
 

@@ -187,15 +187,15 @@ def coverage(
     return float(steps[held].sum() / (last - first))
 
 
-def gauge_alignment(has_gravity: bool, mode: str) -> Alignment:
+def gauge_alignment(has_gravity: bool, knows_scale: bool) -> Alignment:
     """Return how a run's trajectories may be moved onto the truth: by what no sensor of it can know.
 
-    With an IMU that found gravity: yaw and position. One camera alone (`mode` "mono") knows no scale either (Sim3).
+    With an IMU that found gravity: yaw and position. One camera alone knows no scale either (Sim3).
     Cameras with depth but no IMU do not know which way is up (SE3).
     """
     if has_gravity:
         return "yaw"
-    return "sim3" if mode == "mono" else "se3"
+    return "se3" if knows_scale else "sim3"
 
 
 def evaluate(

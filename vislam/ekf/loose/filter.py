@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from vislam.config import EkfConfig, MachineConfig
 from vislam.core.messages import Array, NavState, Observations, Tracking, VoMeasurement
+from vislam.ekf.correction import Correction, Hint
 from vislam.ekf.history import AtRest, Event
 from vislam.ekf.loose.core import LooseCore, LooseMeasurement
 from vislam.ekf.loose.measurements import NewKeyframe, OnWheels
@@ -71,6 +72,15 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
         usable = vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo)
         self._begin(state.t_ns, self._loose.begin(state, vo if usable else None, self._state.ledger.noise))
 
+    def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
+        """Start where an earlier run was; see `initialise`. What that learned of the camera is of no use here."""
+        self.initialise(state, vo)
+
+    @property
+    def camera(self) -> Array | None:
+        """What was learned of the camera: nothing."""
+        return None
+
     def add_keyframe(self, keyframe_id: int, t_ns: int) -> UpdateResult:
         """Clone the pose at `t_ns`: visual motions at later times may refer to this keyframe."""
         return self._insert(Event(t_ns, NewKeyframe(keyframe_id)))
@@ -91,6 +101,22 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
     def update_vision(self, vo: VoMeasurement, observations: Observations) -> UpdateResult:
         """Take what vision made of a frame; loosely coupled, its motion counts and its tracks do not."""
         return self.update_vo(vo)
+
+    def correct(self, seen: Correction) -> UpdateResult:
+        """Take all of a frame at once; return the answer to its motion."""
+        with self.replayed_once():
+            answer = self.update_vo(seen.vo)
+            if seen.at_rest:
+                self.update_zero_velocity(seen.t_ns)
+            elif seen.on_wheels:
+                self.update_nonholonomic(seen.t_ns)
+            if seen.keyframe_id is not None:
+                self.add_keyframe(seen.keyframe_id, seen.t_ns)
+            return answer
+
+    def hold(self, hint: Hint) -> None:
+        """Take what holds the body while the camera sees nothing."""
+        (self.update_zero_velocity if hint.at_rest else self.update_nonholonomic)(hint.t_ns)
 
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:
         """Tell the filter that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""

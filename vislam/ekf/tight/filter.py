@@ -16,7 +16,7 @@ import numpy as np
 
 from vislam.config import EkfConfig, MachineConfig
 from vislam.core.geometry import so3_log
-from vislam.core.messages import NavState, Observations, Tracking, VoMeasurement
+from vislam.core.messages import Array, NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf.history import AtRest, Event
 from vislam.ekf.sensed_timeline import SensedTimeline
 from vislam.ekf.tight.core import CameraCalibration, TightCore, TightState
@@ -28,6 +28,7 @@ from vislam.sensors import Suite
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
+    from vislam.ekf.correction import Correction, Hint
 
 
 class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
@@ -73,6 +74,22 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         """
         self._begin(state.t_ns, self._tight.begin(state, camera, self._state.window.noise))
 
+    def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
+        """Start where an earlier run was, with what its filter had learned of the camera, see `camera`."""
+        if camera is None:
+            self.initialise(state, vo)
+            return
+        found = CameraCalibration(float(camera[0]), float(camera[1]), camera[2:5].copy(), camera[5:8].copy())
+        self.initialise(state, None, found)
+
+    @property
+    def camera(self) -> Array | None:
+        """What was learned of the camera [8]: time offset, its sigma, rotation, its sigmas (s, rad)."""
+        found = self.calibration
+        return np.array([
+            found.time_offset_s, found.time_offset_sigma_s, *found.rotation_rad, *found.rotation_sigma_rad
+        ])  # fmt: skip
+
     def add_keyframe(self, keyframe_id: int, t_ns: int) -> UpdateResult:
         """Count a keyframe; every frame is cloned anyway."""
         self._counts["keyframes"] += 1
@@ -93,6 +110,18 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         if not len(frame.ids):
             return self._refuse("vision_invalid", "no track with finite pixels inside the camera model")
         return self._insert(Event(vo.t_ns, frame))
+
+    def correct(self, seen: Correction) -> UpdateResult:
+        """Take all of a frame; return the answer to its tracks."""
+        answer = self.update_vision(seen.vo, seen.observations, seen.shows_scale)
+        if seen.at_rest:
+            self.update_zero_velocity(seen.t_ns)
+        if seen.keyframe_id is not None:
+            self.add_keyframe(seen.keyframe_id, seen.t_ns)
+        return answer
+
+    def hold(self, hint: Hint) -> None:
+        """Leave out what holds the body while the camera sees nothing: rest is an event of frames here."""
 
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:
         """Tell the filter that the body is at rest at a frame: no velocity, and the pose where rest began."""

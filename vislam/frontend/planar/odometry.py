@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
+from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
 from vislam.frontend.intake import Intake
@@ -38,6 +39,7 @@ class PlanarFrontEnd:
     """Frame-to-keyframe odometry on a plane, metric by the height of the camera above it."""
 
     mode = "planar"
+    knows_scale = True
 
     def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
         """Take the rig's first camera; raises UsageError where its height above the floor is not known."""
@@ -58,6 +60,17 @@ class PlanarFrontEnd:
         self._life = KeyframeLife(config, has_scale=True)  # its tracks are points on the floor
         self._frames_since_keyframe = 0
         self._R_key: Array = np.eye(3)  # level frame from cam0, in the keyframe
+
+    @classmethod
+    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
+        """Return the relative sigma of the camera's height, by which all metres come."""
+        height_m = config.planar.height_m
+        return 0.0 if height_m is None else config.planar.height_sigma_m / height_m
+
+    @classmethod
+    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
+        """See FrontEnd.vo_inflation."""
+        return config.planar.vo_inflation
 
     @property
     def mount(self) -> Mount:

@@ -205,11 +205,11 @@ class FrontProcess:
 
     def _correct(self, step: FrontStep) -> None:
         """Tell the fast process's filter what this one was told."""
-        found = self.front.newest_start
+        found = self.front.begun.newest
         if found is not self._told_start and found is not None and found.last is not None:
             self._told_start = found
             self._send(Start(found.last, step.track.vo))
-        if self.front.ekf_coupling == "tight":
+        if self.front.config.ekf.coupling == "tight":
             if step.state is not None:
                 is_tracking = step.track.vo.tracking is not Tracking.LOST
                 at_rest = any(correction.at_rest for correction in step.corrections)
@@ -221,7 +221,7 @@ class FrontProcess:
     def _tell_readings(self) -> None:
         """Tell the fast process's filter what this one was told by further sensors; `Rebase` has it in its state."""
         for told in self.front.take_told_readings():
-            if self.front.ekf_coupling != "tight":
+            if self.front.config.ekf.coupling != "tight":
                 self._send(told)
 
     def _follow_sensors(self, readings: ReadingSource) -> None:
@@ -234,7 +234,7 @@ class FrontProcess:
 
     def _judge(self, t_ns: int) -> None:
         """Tell the pose whether the run so far is to be doubted, and people why; nothing while it begins."""
-        if self.front.initialisation is None or t_ns - self._judged_t_ns < _JUDGE_NS:
+        if self.front.begun.settled is None or t_ns - self._judged_t_ns < _JUDGE_NS:
             return
         self._judged_t_ns = t_ns
         verdict = judge(front_evidence(self._report(), self._config.machine), self._config.verdict)
@@ -270,7 +270,7 @@ class FrontProcess:
         if not self._begins_back:
             return None, None
         self._begins_back = False
-        return self.front.noise, self.front.first_state
+        return self.front.noise, self.front.begun.first_state
 
     def _put_keyframe(self, keyframe: KeyframeOut) -> None:
         """Hand a keyframe to the back end; where it has too many, vision waits and the pose is dead reckoning."""

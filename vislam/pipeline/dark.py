@@ -1,0 +1,109 @@
+"""A camera that sees nothing, or is silent: keyframes have to go on, for readings of further sensors hang on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import StrEnum
+
+import numpy as np
+
+from vislam.core.messages import Frame, Keyframe, KeyframePacket, NavState, Tracking, VoMeasurement
+
+_PATIENCE_S = 5.0  # without sight; until then the camera may find the last keyframe again
+_EVERY_S = 1.0  # from then on
+_SLACK_S = 0.05  # frames do not come to the millisecond
+
+
+class Sight(StrEnum):
+    """What a camera sees, in the order in which a dark place is entered; any frame that is placed leads to SEEING."""
+
+    SEEING = "seeing"
+    LOST = "lost"  # for so short that the last keyframe may be found again
+    DARK = "dark"  # keyframes come by time alone
+
+
+class Waypoints:
+    """Decides when a frame without sight is to be a keyframe: often enough for the path between two by inertial data.
+
+    Often enough also for the memory of these data, which is `imu.buffer_s`. Only as long as the filter knows where the
+    body is: what its sensors leave in doubt is for loops to join, as after any loss of sight.
+
+    Attributes:
+        sight: now.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first frame."""
+        self.sight = Sight.SEEING
+        self._since_ns: int | None = None  # the last frame that was placed, or waypoint; None: no frame yet
+        self._ends = False  # whether sight is back since `marked`
+
+    def wants(self, vo: VoMeasurement, is_keyframe: bool) -> bool:
+        """Take note of a frame; return whether it is time for a keyframe, though vision gives none."""
+        if vo.tracking is not Tracking.LOST or is_keyframe or self._since_ns is None:
+            self._ends = self._ends or self.sight is Sight.DARK
+            self.sight, self._since_ns = Sight.SEEING, vo.t_ns
+            return False
+        wait_s = _EVERY_S if self.sight is Sight.DARK else _PATIENCE_S
+        if (vo.t_ns - self._since_ns) * 1e-9 < wait_s - _SLACK_S:
+            self.sight = Sight.LOST if self.sight is Sight.SEEING else self.sight
+            return False
+        self.sight, self._since_ns = Sight.DARK, vo.t_ns
+        return True
+
+    def marked(self, packet: KeyframePacket, state: NavState | None) -> KeyframePacket:
+        """Return a keyframe's packet, with the filter's `state` there if it is the first with sight after waypoints."""
+        ends, self._ends = self._ends, False
+        return replace(packet, state_at_sight=state) if ends else packet
+
+
+class SilentCamera:
+    """Stands in for a camera that is silent: frames in which it is dark, so that all goes on as for a covered one.
+
+    Attributes:
+        frames: that were put in.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first frame."""
+        self.frames = 0
+        self._last: Frame | None = None  # of the camera
+        self._newest_ns = 0  # dark ones included
+
+    def see(self, frame: Frame) -> None:
+        """Take a frame of the camera."""
+        self._last, self._newest_ns = frame, frame.t_ns
+
+    def stand_in(self, t_ns: int) -> Frame | None:
+        """Return the dark frame that is due at a time, a nanosecond before it; None: there is none.
+
+        The camera's own next frame has that time, or a later one.
+        """
+        last = self._last
+        if last is None or t_ns - last.t_ns < _PATIENCE_S * 1e9 or t_ns - self._newest_ns < _EVERY_S * 1e9:
+            return None
+        self._newest_ns = t_ns - 1
+        self.frames += 1
+        return dark(last, self._newest_ns)
+
+
+def unseen_keyframe(keyframe_id: int, frame: Frame) -> Keyframe:
+    """Return a keyframe in which nothing is to be recognised."""
+    return Keyframe(keyframe_id, frame.t_ns, frame, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
+
+
+def dark(frame: Frame, t_ns: int) -> Frame:
+    """Return a frame like another in which nothing is seen."""
+    tracks = frame.tracks
+    if tracks is not None:
+        tracks = replace(
+            tracks, track_ids=tracks.track_ids[:0], pixels_px=tracks.pixels_px[:0],
+            right_px=None if tracks.right_px is None else tracks.right_px[:0],
+            depth_m=None if tracks.depth_m is None else tracks.depth_m[:0],
+            descriptors=None if tracks.descriptors is None else tracks.descriptors[:0],
+        )  # fmt: skip
+    return Frame(
+        t_ns, frame.index, tuple(np.zeros_like(image) for image in frame.images),
+        None if frame.color is None else np.zeros_like(frame.color),
+        None if frame.depth_m is None else np.zeros_like(frame.depth_m), tracks,
+    )  # fmt: skip

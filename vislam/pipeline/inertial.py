@@ -1,0 +1,152 @@
+"""What an IMU gives the front half: its samples, the filter that runs on them, and rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vislam.config import Config
+from vislam.core.camera import Rig
+from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, ImuSample, ImuSpan, NavState, NoiseScale
+from vislam.ekf.filtering import Filtering
+from vislam.frontend import TrackResult
+from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.stillness import Stillness
+from vislam.imu import ConditionWatch, ImuBuffer, ImuNoise, RestDetector, pose_after, subtract_bias
+from vislam.pipeline.steps import Estimate
+from vislam.sensors import Suite
+
+_KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
+_SWAY_M_S = 0.03  # that a filter at rest may take for speed; a body that sets off is soon faster
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Since:
+    """What is known of the motion since the last frame before the next one is looked at."""
+
+    span: ImuSpan | None = None  # None: no IMU, or a hole
+    state: NavState | None = None  # the filter's newest
+    unbiased: ImuSpan | None = None  # the span, with the biases of the state taken off
+    gyro_sigma_rad_s: float = np.inf  # how well the rate of turn is known
+    T_last_now: Array | None = None  # [4, 4] where the filter knows it to centimetres
+
+
+class Inertial:
+    """Owns the buffer of samples, the filter and the two watches for rest.
+
+    Attributes:
+        buffer: the last seconds of samples, and what they show of their noise.
+        condition: whether the IMU is used within its limits.
+        filtering: the filter, and what is on its way to it.
+    """
+
+    def __init__(self, config: Config, rig: Rig, noise: ImuNoise, suite: Suite | None) -> None:
+        """Set up for an IMU; `config` is as `settings.derived` gives it, `suite` are further sensors, if any."""
+        self.buffer = ImuBuffer(config.imu, config.machine, noise)
+        self.condition = ConditionWatch()
+        self.filtering = Filtering(config.ekf, noise, config.machine, rig, suite)
+        self._rest = RestDetector(config.init, noise)
+        self._stillness = Stillness(config.init)
+        self._is_corrected = config.ekf.vision != "none"
+        self._gravity_m_s2, self._bias_walk = config.machine.gravity_m_s2, noise.gyroscope_random_walk
+        self._at_frame: NavState | None = None  # the filter's state at the last frame
+        self._of_graph: NavState | None = None  # the graph's at its newest keyframe
+
+    @property
+    def noise_scale(self) -> NoiseScale:
+        """White noise of the IMU over that of its model, as the newest samples show it."""
+        floor = self.buffer.noise_floor
+        return AS_MODELLED if floor is None else floor.now.scale
+
+    def add(self, sample: ImuSample) -> bool:
+        """Take a sample, with which the filter predicts; False where the buffer refuses it."""
+        if not self.buffer.add(sample):
+            return False
+        self.filtering.ekf.predict(sample)
+        self.condition.add(sample)
+        return True
+
+    def since(self, last_t_ns: int | None, t_ns: int, clock: CameraClock) -> Since:
+        """Return what is known of the motion since the last frame, None: there was none, with `clock` the camera's."""
+        span = None if last_t_ns is None else self.buffer.unbroken(last_t_ns, t_ns)
+        state = self.filtering.state
+        if state is None or last_t_ns is None:
+            return Since(span, state, span)
+        dt_s, sigmas = (t_ns - last_t_ns) * 1e-9, state.covariance
+        is_known = np.sqrt(np.trace(sigmas[6:9, 6:9])) * dt_s <= _KNOWN_MOTION_M
+        motion = self.filtering.motion(last_t_ns, t_ns) if is_known else None
+        if span is None:
+            return Since(span, state, span, T_last_now=motion)
+        sigma_rad_s = float(np.sqrt(np.diag(sigmas)[9:12].max())) + clock.gyro_sigma_rad_s(span)
+        unbiased = subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
+        return Since(span, state, unbiased, sigma_rad_s, motion)
+
+    def rests(self, track: TrackResult, span: ImuSpan | None) -> tuple[bool, bool]:
+        """Return whether the image stood still up to a frame, and whether the body rests by image and samples."""
+        still_image = self._stillness.add(track.vo.t_ns, track.observations)
+        return still_image, self._rest.add(span) and self._stillness.resting
+
+    def correct(
+        self, track: TrackResult, at_rest: bool, shows_scale: bool, span: ImuSpan | None, T_by_vision: Array | None
+    ) -> tuple[Estimate | None, NavState | None]:
+        """Give the filter a frame; return the pose in `odom` and the filter's state there, None where it has none.
+
+        Args:
+            track: what was seen in the frame.
+            at_rest: whether the body rests.
+            shows_scale: whether the motion lets one camera see scale.
+            span: inertial data since the last frame; None: there is a hole.
+            T_by_vision: [4, 4] the pose where samples do not reach the frame.
+        """
+        t_ns = track.vo.t_ns
+        ekf, floor = self.filtering.ekf, self.buffer.noise_floor
+        if not ekf.initialised:
+            return None, None
+        assert floor is not None
+        keyframe_id = None if track.keyframe is None else track.keyframe.id
+        self.filtering.see(t_ns, track.vo, track.observations, at_rest, keyframe_id, shows_scale, floor.now)
+        after, state = ekf.pose_at(t_ns), ekf.state_at(t_ns)
+        if after is None:
+            after = T_by_vision
+        if after is None:
+            return None, state
+        last, self._at_frame = self._at_frame, state
+        # uncorrected, the filter is not to be turned by the graph's bias either
+        if not self._is_corrected or state is None or last is None or span is None or span.t_ns[0] != last.t_ns:
+            return Estimate(after, after, 0.0), state
+        gyro_bias, sigma_rad_s = _surer_gyro_bias(last, self._of_graph, self._bias_walk)
+        before = _uncorrected(replace(last, gyro_bias_rad_s=gyro_bias), span, self._gravity_m_s2, at_rest)
+        return Estimate(before, after, sigma_rad_s), state
+
+    def feed_back(self, update: GraphUpdate) -> None:
+        """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
+        self._of_graph = update.newest
+        self.filtering.feed_back(update)
+
+
+def _uncorrected(last: NavState, span: ImuSpan, gravity_m_s2: float, at_rest: bool) -> Array:
+    """Return the pose [4, 4] after a span by inertial data alone.
+
+    A correction may enter with a later sample only, so the filter's own prediction is no measure of it.
+    """
+    after = pose_after(last, span, gravity_m_s2)
+    way_m = float(np.linalg.norm(after[:3, 3] - last.T_world_body[:3, 3]))
+    sways = way_m < _SWAY_M_S * (int(span.t_ns[-1]) - int(span.t_ns[0])) * 1e-9
+    return last.T_world_body if at_rest and sways else after
+
+
+def _surer_gyro_bias(state: NavState, graph: NavState | None, walk: float) -> tuple[Array, float]:
+    """Return the gyroscope's bias [3] and its largest sigma, of the filter or of the graph: whichever is surer.
+
+    For what is published only: the graph has seen the same images longer, and the filter stays what it is alone.
+    `walk` is that of the bias, in rad/s^2/sqrt(Hz).
+    """
+    sigma_rad_s = float(np.sqrt(np.diag(state.covariance)[9:12].max()))
+    if graph is None:
+        return state.gyro_bias_rad_s, sigma_rad_s
+    walked = walk**2 * max(state.t_ns - graph.t_ns, 0) * 1e-9
+    graph_rad_s = float(np.sqrt(np.diag(graph.covariance)[9:12].max() + walked))
+    if graph_rad_s < sigma_rad_s:
+        return graph.gyro_bias_rad_s, graph_rad_s
+    return state.gyro_bias_rad_s, sigma_rad_s
