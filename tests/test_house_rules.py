@@ -32,7 +32,6 @@ LONG_CLASSES = {
     "LiveRun": 270,
     "LoopSet": 410,  # decides about all loops of a run
     "Mapper": 280,  # every product of a map
-    "MetricFrontEnd": 470,  # keyframe life of stereo and RGB-D
     "PoseGraph": 340,
     "Run": 320,
     "RunViewer": 290,
@@ -46,11 +45,8 @@ LONG_CLASSES = {
 # attributes of classes beyond the limit, which may only fall
 MANY_ATTRIBUTES = {
     "FastPath": 29,
-    "Front": 36,
     "FrontProcess": 21,
     "Gy85": 23,
-    "MetricFrontEnd": 26,
-    "MonoFrontEnd": 21,
     "Run": 21,
     "SerialBridge": 23,
     "SlidingWindow": 22,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vislam.config import FrontEndConfig
 from vislam.core.messages import Array
-from vislam.frontend.agreement import confirmed, failure, weakness
+from vislam.frontend.attempt import confirmed, failure, weakness
 
 CONFIG = FrontEndConfig()
 PIXELS = np.column_stack([np.arange(100.0), np.zeros(100)])

@@ -10,7 +10,7 @@ from vislam.core.errors import UsageError
 from vislam.core.messages import Frame
 from vislam.ekf.filtering import Filtering
 from vislam.graph import PoseGraph
-from vislam.pipeline import back, front, inertial
+from vislam.pipeline import back, front, inertial_stages
 from vislam.pipeline.settings import derived
 from vislam.runs import execute
 from vislam.runs.folder import prepare
@@ -43,7 +43,7 @@ def test_the_stages_get_what_config_json_says(tmp_path, monkeypatch, rig, coupli
         return make_frontend(config, rig, seed)
 
     make_frontend = front.make_frontend
-    monkeypatch.setattr(inertial, "Filtering", SpiedFilter)
+    monkeypatch.setattr(inertial_stages, "Filtering", SpiedFilter)
     monkeypatch.setattr(back, "PoseGraph", SpiedGraph)
     monkeypatch.setattr(front, "make_frontend", spied_frontend)
     out = tmp_path / "run"

@@ -8,10 +8,10 @@ from vislam.core.camera import Rig
 from vislam.frontend.metric import RgbdFrontEnd, StereoFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
-from vislam.frontend.result import FrontEnd, TrackResult
+from vislam.frontend.result import CommonErrors, FrontEnd, TrackResult
 from vislam.imu import ImuNoise
 
-__all__ = ["FRONT_ENDS", "FrontEnd", "TrackResult", "knows_scale", "lasting_scale_sigma", "make_frontend", "mode_for"]
+__all__ = ["FRONT_ENDS", "FrontEnd", "TrackResult", "common_errors", "knows_scale", "make_frontend", "mode_for"]
 
 
 FRONT_ENDS: dict[str, type[FrontEnd]] = {
@@ -38,9 +38,9 @@ def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
     return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
 
 
-def lasting_scale_sigma(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> float:
-    """Return the relative sigma of all metres together that motions leave out, see `FrontEnd`."""
-    return FRONT_ENDS[mode_for(config, rig)].lasting_scale_sigma(config, noise)
+def common_errors(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
+    """Return what motions of the front end of `mode_for` have in common; `noise` is the IMU's, None without one."""
+    return FRONT_ENDS[mode_for(config, rig)].errors(config, noise)
 
 
 def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:

@@ -42,6 +42,17 @@ class Exposures:
             self.shutter.start_at(news.readout_s)
         self.lag.start_at(news.depth_delay_s, news.depth_rows_s)
 
+    def learned(self, next_track_id: int, knows_lag: bool) -> FrontNews:
+        """Return what was learned, as `start_at` takes it; `knows_lag` is whether every frame measures depth."""
+        readout_s = self.shutter.readout_s if self.shutter.learns else None
+        delay_s, rows_s = (self.lag.delay_estimate_s, self.lag.rows_estimate_s) if knows_lag else (None, None)
+        return FrontNews(next_track_id, readout_s=readout_s, depth_delay_s=delay_s, depth_rows_s=rows_s)
+
+    def look_through(self, camera: Camera, back: Array) -> None:
+        """Go on with another camera of the rig; `back` [6, 6] brings velocities to its axes."""
+        self.key_twist_per_s = back @ self.key_twist_per_s
+        self.shutter.look_through(camera)
+
     def learn(
         self, frame: Frame, attempt: Attempt, landmarks: Landmarks, key_pixels: Array, sigma_xy: float, dt_s: float
     ) -> None:

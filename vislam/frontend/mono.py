@@ -14,12 +14,12 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontNews
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations
 from vislam.core.quantiles import median
-from vislam.frontend.agreement import confirmed, failure, weakness
+from vislam.frontend.attempt import confirmed, failure, weakness
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.prediction import MotionPredictor
-from vislam.frontend.result import TrackResult, too_few, unscaled_motion
+from vislam.frontend.result import CommonErrors, TrackResult, too_few, unscaled_motion
 from vislam.frontend.tracker import Tracker
 from vislam.vision.refine import refine_pose
 from vislam.vision.two_view import (
@@ -65,6 +65,22 @@ class _Motion:
         return int(self.view.inliers.sum())
 
 
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """What is asked of tracks, which depends on who followed them."""
+
+    min_inliers: int
+    sigma_xy: float  # of a pixel relative to the keyframe's
+    min_parallax_px: float
+
+    @classmethod
+    def of(cls, config: FrontEndConfig, fx: float, is_given: bool) -> _Limits:
+        """Return those of a camera; given tracks are as noisy in the keyframe as here, where a corner is its patch."""
+        ends = _BOTH_ENDS if is_given else 1.0
+        least = config.min_given if is_given else config.min_inliers
+        return cls(least, ends * config.track_sigma_px / fx, ends * config.mono_min_parallax_px)
+
+
 class MonoFrontEnd:
     """Frame-to-keyframe odometry from epipolar geometry; below a few pixels of parallax only the rotation is told.
 
@@ -78,6 +94,7 @@ class MonoFrontEnd:
     def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
         """Take the rig's first camera."""
         self.keyframe_spacing = 1.0
+        self.calibration: dict[str, float] = {}
         self._config = config
         self._camera = rig.cameras[0]
         self._T_body_cam = rig.T_body_cams[0]
@@ -86,9 +103,7 @@ class MonoFrontEnd:
         self._tracker = Tracker(config)
         self._noise = PixelNoise(config.track_sigma_px)
         self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
-        self._min_inliers = config.min_inliers
-        self._sigma_xy = config.track_sigma_px / self._camera.fx  # of a pixel relative to the keyframe's
-        self._min_parallax_px = config.mono_min_parallax_px
+        self._limits = _Limits.of(config, self._camera.fx, is_given=False)
         self._life = KeyframeLife(config, has_scale=False)
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
         self._R_key_cam: Array = np.eye(3)  # of the last frame, predicted while lost
@@ -110,11 +125,8 @@ class MonoFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float, T_last_now: Array | None
     ) -> TrackResult:
         frame, dt_s = self._intake.accept(frame)
-        # a corner is its patch in the keyframe; a point that was followed elsewhere is as noisy there as here
         given = _BOTH_ENDS if frame.tracks is not None else 1.0
-        self._min_inliers = self._config.min_inliers if frame.tracks is None else self._config.min_given
-        self._sigma_xy = given * self._config.track_sigma_px / self._camera.fx
-        self._min_parallax_px = given * self._config.mono_min_parallax_px
+        self._limits = _Limits.of(self._config, self._camera.fx, frame.tracks is not None)
         if self._life.keyframe is None:
             return self._start(frame, "")
         R_now_next = np.ascontiguousarray(self._predictor.predict(dt_s, imu)[:3, :3])
@@ -142,14 +154,9 @@ class MonoFrontEnd:
         return self._report(frame, motion)
 
     @classmethod
-    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
-        """Return the relative sigma of the accelerometer's scale, by which all metres come."""
-        return 0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0
-
-    @classmethod
-    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
-        """See FrontEnd.vo_inflation."""
-        return None
+    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
+        """Return that of the accelerometer's scale, by which all metres come."""
+        return CommonErrors(0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0)
 
     def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
@@ -160,11 +167,6 @@ class MonoFrontEnd:
     def news(self) -> FrontNews:
         """See FrontEnd.news."""
         return FrontNews(self._tracker.next_id)
-
-    @property
-    def calibration(self) -> dict[str, float]:
-        """See FrontEnd.calibration."""
-        return {}
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
@@ -192,17 +194,17 @@ class MonoFrontEnd:
     def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
         key_xy, xy = self._key_xy, self._camera.normalise(pixels)
         still = self._turn(R_guess, key_xy, xy) if prior is None else self._turn_by(prior, key_xy, xy)
-        parallax_px = self._parallax_px(still.R_key_cam if still.converged else R_guess, key_xy, xy)
+        parallax_px = self._camera.fx * _parallax(still.R_key_cam if still.converged else R_guess, key_xy, xy)
         view = still
         followed = int(np.isfinite(xy[:, 0]).sum())
         explained = still.converged and still.inliers.sum() >= _TURN_EXPLAINS * followed
-        if not explained or parallax_px > self._min_parallax_px:
+        if not explained or parallax_px > self._limits.min_parallax_px:
             both = self._two_view(R_guess, prior, key_xy, xy)
             # a direction that does not settle is no reason to give up a rotation that does
             if both.converged or not still.converged:
                 view = _without_vague_direction(both)
-                parallax_px = self._parallax_px(view.R_key_cam, key_xy, xy)
-        agree, least = int(view.inliers.sum()), self._min_inliers
+                parallax_px = self._camera.fx * _parallax(view.R_key_cam, key_xy, xy)
+        agree, least = int(view.inliers.sum()), self._limits.min_inliers
         why = failure(len(self._tracker), followed, agree, view.converged, least, self._config)
         return _Motion(view, pixels, xy, parallax_px, why)
 
@@ -211,7 +213,7 @@ class MonoFrontEnd:
         points = np.column_stack([key_xy, np.zeros(len(key_xy))])
         no_noise: Array = np.zeros((len(points), 3, 3))
         start = transform(np.ascontiguousarray(R_guess), np.zeros(3))
-        pose = refine_pose(start, points, no_noise, xy, self._sigma_xy, self._config.cauchy, rotation_only=True)
+        pose = refine_pose(start, points, no_noise, xy, self._limits.sigma_xy, self._config.cauchy, rotation_only=True)
         R = np.ascontiguousarray(pose.T_key_cam[:3, :3])
         return turn_only(TwoViewEstimate(R, np.zeros(3), pose.covariance, pose.inliers, pose.converged))
 
@@ -219,7 +221,7 @@ class MonoFrontEnd:
         """Take the gyroscope's rotation: what vision finds alone swallows small translations before a flat scene."""
         moved_px = moved_xy(prior.R_key_cam, key_xy, xy) * self._camera.fx
         with np.errstate(invalid="ignore"):
-            inliers = np.asarray(moved_px < self._min_parallax_px, dtype=np.bool_)
+            inliers = np.asarray(moved_px < self._limits.min_parallax_px, dtype=np.bool_)
         covariance = np.eye(6) * (_GYRO_KNOWN_ALREADY * prior.sigma_rad) ** 2
         return turn_only(TwoViewEstimate(prior.R_key_cam, np.zeros(3), covariance, inliers, True))
 
@@ -230,11 +232,11 @@ class MonoFrontEnd:
         config = self._config
         best: TwoViewEstimate | None = None
         if self._direction_key.any():
-            best = refine_two_view(R_guess, self._direction_key, key_xy, xy, self._sigma_xy, config.cauchy)
+            best = refine_two_view(R_guess, self._direction_key, key_xy, xy, self._limits.sigma_xy, config.cauchy)
         if best is None or not best.converged or best.inliers.sum() < _RANSAC_BELOW * np.isfinite(xy[:, 0]).sum():
-            start = essential_ransac(R_guess, key_xy, xy, _RANSAC_PX / self._camera.fx, self._min_inliers)
+            start = essential_ransac(R_guess, key_xy, xy, _RANSAC_PX / self._camera.fx, self._limits.min_inliers)
             if start is not None:
-                other = refine_two_view(*start[:2], key_xy, xy, self._sigma_xy, config.cauchy)
+                other = refine_two_view(*start[:2], key_xy, xy, self._limits.sigma_xy, config.cauchy)
                 if best is None or other.inliers.sum() > best.inliers.sum():
                     best = other
         if best is None:
@@ -250,7 +252,7 @@ class MonoFrontEnd:
         starts = [self._direction_key] if self._direction_key.any() else []
         fitting = direction_given_rotation(prior.R_key_cam, key_xy, xy)
         for start in [*starts, *([] if fitting is None else [fitting])]:
-            found = refine_two_view(prior.R_key_cam, start, key_xy, xy, self._sigma_xy, config.cauchy, prior)
+            found = refine_two_view(prior.R_key_cam, start, key_xy, xy, self._limits.sigma_xy, config.cauchy, prior)
             if found.converged >= best.converged and found.inliers.sum() > best.inliers.sum():
                 best = found
         return best
@@ -260,11 +262,6 @@ class MonoFrontEnd:
         T_key_cam = np.asarray(transform(motion.view.R_key_cam, motion.view.direction_key))
         distances = epipolar_distances(T_key_cam, self._key_xy, motion.xy)
         self._noise.learn(distances, self._camera, motion.xy, ends)
-
-    def _parallax_px(self, R_key_cam: Array, key_xy: Array, xy: Array) -> float:
-        moved = moved_xy(R_key_cam, key_xy, xy)
-        seen = np.isfinite(moved)
-        return median(moved[seen]) * self._camera.fx if seen.any() else 0.0
 
     # -- what comes of it --------------------------------------------------------------------------------------------
 
@@ -289,7 +286,7 @@ class MonoFrontEnd:
 
     def _weakness(self, motion: _Motion) -> str:
         # of tracks that somebody chose, as many times the least as of our own
-        enough = self._config.degraded_inliers * self._min_inliers // self._config.min_inliers
+        enough = self._config.degraded_inliers * self._limits.min_inliers // self._config.min_inliers
         return weakness(motion.followed, motion.inliers, enough, self._config)
 
     def _lose(self, frame: Frame, motion: _Motion) -> TrackResult:
@@ -333,3 +330,10 @@ def _without_vague_direction(view: TwoViewEstimate) -> TwoViewEstimate:
     """Return the estimate without its direction if that is hardly known."""
     vague = view.converged and float(np.trace(view.covariance[3:, 3:])) > _VAGUE_RAD**2
     return turn_only(view) if vague else view
+
+
+def _parallax(R_key_cam: Array, key_xy: Array, xy: Array) -> float:
+    """Return the median way on z = 1 that a turn leaves; 0 where nothing was followed."""
+    moved = moved_xy(R_key_cam, key_xy, xy)
+    seen = np.isfinite(moved)
+    return median(moved[seen]) if seen.any() else 0.0

@@ -36,6 +36,14 @@ class TrackResult:
         return replace(self, sigma_px=sigma_px, observations=replace(self.observations, noise=noise))
 
 
+@dataclass(frozen=True, slots=True)
+class CommonErrors:
+    """How motions err together, which their covariances leave out."""
+
+    scale_sigma: float = 0.0  # relative, of all metres
+    vo_inflation: float | None = None  # on sigmas, in a loose filter; None: `ekf.vo_inflation`
+
+
 class FrontEnd(Protocol):
     """Visual odometry that is fed frame by frame."""
 
@@ -48,13 +56,8 @@ class FrontEnd(Protocol):
         ...
 
     @classmethod
-    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
-        """Return the relative sigma of all metres together that the covariances of motions leave out."""
-        ...
-
-    @classmethod
-    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
-        """Return the factor on sigmas of motions that a loose filter takes in place of `ekf.vo_inflation`, if any."""
+    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
+        """Return what motions have in common; `noise` is the IMU's, None without one."""
         ...
 
     def track(

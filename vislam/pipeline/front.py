@@ -33,7 +33,7 @@ from vislam.pipeline.chain import KeyframeChain
 from vislam.pipeline.dark import Waypoints, unseen_keyframe
 from vislam.pipeline.front_report import FrontReport, RunWatch, report_of
 from vislam.pipeline.gravity import GravityWait, Phase, Start
-from vislam.pipeline.inertial import Inertial, Since
+from vislam.pipeline.inertial_stages import Inertial, Since
 from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.pipeline.settings import derived, refuse_without_scale
 from vislam.pipeline.steps import Estimate, FrontStep

@@ -18,7 +18,7 @@ from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.start import Initialisation, Initialiser, level_at_once, moved_to
 from vislam.pipeline.chain import KeyframeChain
-from vislam.pipeline.inertial import Inertial
+from vislam.pipeline.inertial_stages import Inertial
 from vislam.trajectory import Trajectory
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state
 

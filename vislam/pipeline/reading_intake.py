@@ -14,9 +14,9 @@ from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavS
 from vislam.core.readings import MotionReadings, OwnNow, OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, ImuNoise, preintegrate
-from vislam.pipeline.inertial import Inertial
+from vislam.pipeline.inertial_stages import Inertial
 from vislam.pipeline.slip_watch import SlipWatch
-from vislam.sensors import BodyState, Suite
+from vislam.sensors import BodyState, Sensor, Suite
 from vislam.sensors.body import between_keyframes
 
 _MAX_WAITING = 4096  # readings that wait for the filter to begin; older ones go
@@ -252,24 +252,14 @@ class ReadingIntake:
 
     def _begun(self, name: str, beginning: _Beginning) -> OwnStart | None:
         """Return first values of a sensor's own variables; None: too early, or the sensor is left out from here on."""
-        sensor = self._suite[name]
         try:
-            begun = sensor.begin(beginning.readings, beginning.bodies)
-            if begun is None:
-                return None
-            start = OwnStart(name, np.asarray(begun.values, float), np.asarray(begun.sigmas, float))
-            asked = (len(sensor.variables),)
-            if start.values.shape != asked or start.sigmas.shape != asked:
-                raise ValueError(f"{start.values.shape} values and {start.sigmas.shape} sigmas, {asked} asked")
-            if not (np.isfinite(start.values).all() and np.isfinite(start.sigmas).all() and (start.sigmas >= 0).all()):
-                raise ValueError("values that are not finite, or sigmas that are not finite and at least 0")
+            return _first_values(name, self._suite[name], beginning)
         except Exception as error:
             self.notes[name] = f"left out, it cannot begin: {_told(error)}"
             self._left_out.add(name)
             beginning.readings.clear()
             beginning.bodies.clear()
             return None
-        return start
 
     def _body_at(self, t_ns: int) -> BodyState | None:
         if self._filter is not None:
@@ -318,6 +308,20 @@ class _InertialPath:
             since_s, length_s, dR, dv, dp, whole.dR, whole.dp_m, self._gravity, rate - gyro_bias, gyro_bias, accel_bias,
             self._sigma,
         )  # fmt: skip
+
+
+def _first_values(name: str, sensor: Sensor, beginning: _Beginning) -> OwnStart | None:
+    """Return what a sensor begins with; None: too early. Raises ValueError where that cannot be used."""
+    begun = sensor.begin(beginning.readings, beginning.bodies)
+    if begun is None:
+        return None
+    start = OwnStart(name, np.asarray(begun.values, float), np.asarray(begun.sigmas, float))
+    wanted = (len(sensor.variables),)
+    if start.values.shape != wanted or start.sigmas.shape != wanted:
+        raise ValueError(f"{start.values.shape} values and {start.sigmas.shape} sigmas, {wanted} asked")
+    if not (np.isfinite(start.values).all() and np.isfinite(start.sigmas).all() and (start.sigmas >= 0).all()):
+        raise ValueError("values that are not finite, or sigmas that are not finite and at least 0")
+    return start
 
 
 def _with_motions(

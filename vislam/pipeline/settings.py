@@ -9,7 +9,8 @@ from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.up import told_up
-from vislam.frontend import FRONT_ENDS, knows_scale, lasting_scale_sigma, mode_for
+from vislam.frontend import common_errors, knows_scale, mode_for
+from vislam.frontend.result import CommonErrors
 
 
 def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
@@ -25,9 +26,10 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
         refuse_up(noise)
     mode = mode_for(config.frontend, rig)
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
-    lasting = lasting_scale_sigma(config.frontend, rig, noise)
+    errors = common_errors(config.frontend, rig, noise)
     by_imu = noise is not None and not rig.is_stereo and not rig.has_depth
-    graph = replace(config.graph, scale_sigma=max(config.graph.scale_sigma, lasting), edges_share_scale=by_imu)
+    scale_sigma = max(config.graph.scale_sigma, errors.scale_sigma)
+    graph = replace(config.graph, scale_sigma=scale_sigma, edges_share_scale=by_imu)
     machine = config.machine
     if noise is not None:  # the time between any two samples of a slow IMU is no outage
         machine = replace(machine, max_gap_s=noise.gap_s(machine.max_gap_s))
@@ -35,7 +37,7 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
         config,
         machine=machine,
         frontend=replace(config.frontend, mode=mode),
-        ekf=config.ekf if noise is None else _filter(config, mode, lasting),
+        ekf=config.ekf if noise is None else _filter(config, mode, errors),
         window=replace(config.window, readout_s=readout_s),
         graph=graph if noise is not None else without_gravity(graph, rig),
     )
@@ -72,17 +74,17 @@ def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
     return replace(graph, coupling=coupling, edges_share_scale=False)
 
 
-def _filter(config: Config, mode: str, lasting_scale_sigma: float) -> EkfConfig:
+def _filter(config: Config, mode: str, errors: CommonErrors) -> EkfConfig:
     coupling = config.ekf.coupling
     if coupling == "auto":
         coupling = "loose" if knows_scale(mode) else "tight"
     if config.machine.slip_sigma_m_s is not None and coupling == "tight":
         raise UsageError("--machine.slip-sigma-m-s needs --ekf.coupling loose, which has no use for tracks")
-    readout_s, own_inflation = config.ekf.tight_readout_s, FRONT_ENDS[mode].vo_inflation(config.frontend)
+    readout_s = config.ekf.tight_readout_s
     return replace(
         config.ekf,
         coupling=coupling,
         tight_readout_s=config.frontend.readout_s if readout_s is None else readout_s,
-        scale_sigma=max(config.ekf.scale_sigma, lasting_scale_sigma),
-        vo_inflation=config.ekf.vo_inflation if own_inflation is None else own_inflation,
+        scale_sigma=max(config.ekf.scale_sigma, errors.scale_sigma),
+        vo_inflation=config.ekf.vo_inflation if errors.vo_inflation is None else errors.vo_inflation,
     )

@@ -27,7 +27,7 @@ from vislam.frontend.planar.fit import Fit, FloorPair, camera_motion, joint_fit,
 from vislam.frontend.planar.floor import Mount, Regions, Tilt, make_mount
 from vislam.frontend.planar.floor_tracks import FloorTracks, Steps
 from vislam.frontend.planar.place import Place, by_jitter, by_tilt, failure, weakness, yaw_prior
-from vislam.frontend.result import TrackResult, metric_motion, too_few
+from vislam.frontend.result import CommonErrors, TrackResult, metric_motion, too_few
 from vislam.vision.landmarks import move
 from vislam.vision.two_view import from_epipolar_segment
 
@@ -62,15 +62,12 @@ class PlanarFrontEnd:
         self._R_key: Array = np.eye(3)  # level frame from cam0, in the keyframe
 
     @classmethod
-    def lasting_scale_sigma(cls, config: FrontEndConfig, noise: ImuNoise | None) -> float:
-        """Return the relative sigma of the camera's height, by which all metres come."""
-        height_m = config.planar.height_m
-        return 0.0 if height_m is None else config.planar.height_sigma_m / height_m
-
-    @classmethod
-    def vo_inflation(cls, config: FrontEndConfig) -> float | None:
-        """See FrontEnd.vo_inflation."""
-        return config.planar.vo_inflation
+    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
+        """Return that of the camera's height, by which all metres come, and the inflation over a floor."""
+        floor = config.planar
+        return CommonErrors(
+            0.0 if floor.height_m is None else floor.height_sigma_m / floor.height_m, floor.vo_inflation
+        )
 
     @property
     def mount(self) -> Mount:

@@ -1,0 +1,154 @@
+"""Frames placed by the landmarks of their keyframe."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vislam.config import FrontEndConfig
+from vislam.core.geometry import invert, se3_log
+from vislam.core.messages import Array, Frame, Keyframe
+from vislam.frontend.attempt import Attempt, confirmed, failure
+from vislam.frontend.blind_keyframe import BlindKeyframe
+from vislam.frontend.depth import DepthReading
+from vislam.frontend.keyframe_tracks import KeyframeTracks
+from vislam.vision.landmarks import metric_points, move
+from vislam.vision.locate import pnp_ransac, recognise
+from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose
+
+# times what tracks scatter by: the noise of independent tracks that would move a pose as much. What neighbours have in
+# common (patch, lens, registered depth) leaves no residual, since a pose can follow it; it is as if 16 of them were one
+_ALIKE = 4.0
+_USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is assumed: what blurs or bends images spoils both
+_RANSAC_PX = 3.0
+_RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
+_BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
+
+
+class Placer:
+    """Places frames by the landmarks of the keyframe: a guess, tracks around it, refinement, RANSAC where they differ.
+
+    Poses are T_key_cam [4, 4] of the camera that is looked through.
+    """
+
+    def __init__(self, config: FrontEndConfig, tracks: KeyframeTracks) -> None:
+        """Take the tracks of the keyframe, which change with each new one."""
+        self._config, self._tracks = config, tracks
+
+    def attempt(self, frame: Frame, T_guess: Array, dt_s: float) -> Attempt:
+        """Follow the tracks from where a guess puts them, and place the frame `dt_s` after the one before."""
+        return self._place(frame, T_guess, dt_s, self._tracks.follow(frame, T_guess, dt_s))
+
+    def confirmed(self, attempt: Attempt, frame: Frame, T_expected: Array, dt_s: float) -> Attempt:
+        """Return the attempt, or another without the tracks that are not where the filter's motion puts them."""
+        tracks = self._tracks
+        expected, covariance = move(tracks.landmarks.mean, tracks.landmarks.covariance, T_expected)
+        gate_xy = self._config.astray_px / tracks.camera.fx
+        gate_xy = gate_xy + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+        astray = np.linalg.norm(attempt.xy - expected[:, :2], axis=1) > gate_xy
+        return confirmed(
+            attempt, astray, lambda pixels: self._place(frame, T_expected, dt_s, pixels), self._config
+        )  # fmt: skip
+
+    def recognised(self, attempt: Attempt, frame: Frame, keyframe: Keyframe, dt_s: float) -> Attempt:
+        """Return a failed attempt, or another from where the keyframe's features are recognised in the frame."""
+        view, config = self._tracks.view, self._config
+        if not frame.images:
+            return attempt
+        T_found = recognise(
+            keyframe, frame.images[0], view.camera, view.T_body_cam, config.described_features, config.min_inliers
+        )
+        return attempt if T_found is None else self.attempt(frame, T_found, dt_s)
+
+    def from_blindness(self, blind: BlindKeyframe, frame: Frame, pixels: Array, twist_per_s: Array) -> Attempt | None:
+        """Place the first frame with depth against a keyframe without, whose landmarks get theirs from it.
+
+        None where the keyframe is out of sight. `pixels` [N, 2] are the tracks in the frame.
+        """
+        tracks = self._tracks
+        xy = tracks.camera.normalise(pixels)
+        reading = tracks.measure(frame, pixels, xy, np.full(len(xy), np.nan), twist_per_s, to_learn=False)
+        placed = blind.placed(np.column_stack([xy, reading.rho]), self._ransac)
+        if placed is None:
+            return None
+        T_key_cam, rho = placed
+        tracks.landmarks.mean[:, 2] = rho
+        tracks.landmarks.covariance[:, 2, 2] = (_BLIND_SIGMA * rho) ** 2
+        estimate = self._search(T_key_cam, xy, None)
+        estimate = self._polish(estimate, xy, None) if estimate.converged else estimate
+        return Attempt(pixels, xy, xy, None, reading.rho, twist_per_s, estimate, self._failure(estimate, xy))
+
+    def covariance(self, attempt: Attempt, measured_px: float, given: bool) -> Array:
+        """Return the covariance [6, 6] of the camera's motion, by the noise that was measured instead of assumed.
+
+        `given` is whether the tracks came with the frame: followed elsewhere, they are independent, and the noise of
+        their depth is that of the settings.
+        """
+        tracks, config = self._tracks, self._config
+        pixel_px, scale = (measured_px, 1.0) if given else (_ALIKE * _USUAL_PX, measured_px / _USUAL_PX)
+        ratio = pixel_px / config.track_sigma_px
+        by_pixel = np.array([ratio, ratio, 1.0])
+        mean, covariance = tracks.landmarks.mean, tracks.landmarks.covariance * by_pixel[:, None] * by_pixel
+        xy = np.where(attempt.estimate.inliers[:, None], attempt.xy, np.nan)
+        exposures = tracks.exposures
+        shear = exposures.shear(attempt, tracks.landmarks, tracks.tracker.pixels, xy)
+        found = pose_covariance(
+            attempt.estimate.T_key_cam, mean, covariance, xy, ratio * tracks.sigma_xy, config.cauchy,
+            *self._weighed(attempt.depth_now), scale, shear, exposures.shutter.sigma_s,
+        )  # fmt: skip
+        return attempt.estimate.covariance if found is None else found
+
+    def _place(self, frame: Frame, T_guess: Array, dt_s: float, pixels: Array) -> Attempt:
+        """Place the frame by tracks found at `pixels` [N, 2], from a guess."""
+        tracks, T_before = self._tracks, self._tracks.T_key_cam
+        shutter = tracks.exposures.shutter
+        twist = se3_log(invert(T_before) @ T_guess) / dt_s
+        predicted, _ = move(tracks.landmarks.mean, tracks.landmarks.covariance, T_guess)
+        rho = predicted[:, 2]
+        seen = tracks.camera.normalise(pixels)
+        xy = shutter.to_instant(pixels, seen, rho, twist)
+        depth_now = None
+        if tracks.view.depth.every_frame and tracks.view.depth.available(frame):
+            depth_now = tracks.measure(frame, pixels, seen, rho, twist, to_learn=False)
+        estimate = self._search(T_guess, xy, depth_now)
+        if estimate.converged:
+            # once more with the velocity that was found instead of the predicted one, and without the outliers
+            twist = se3_log(invert(T_before) @ estimate.T_key_cam) / dt_s
+            xy = shutter.to_instant(pixels, seen, rho, twist)
+            if depth_now is not None:
+                depth_now = tracks.measure(frame, pixels, seen, rho, twist, to_learn=True)
+            estimate = self._polish(estimate, xy, depth_now)
+        return Attempt(pixels, seen, xy, depth_now, rho, twist, estimate, self._failure(estimate, xy))
+
+    def _failure(self, estimate: PoseEstimate, xy: Array) -> str:
+        followed, agree, least = int(np.isfinite(xy[:, 0]).sum()), int(estimate.inliers.sum()), self._config.min_inliers
+        return failure(len(self._tracks), followed, agree, estimate.converged, least, self._config)
+
+    def _search(self, T_guess: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
+        """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
+        estimate = self._refine(T_guess, xy, depth_now)
+        followed = int(np.isfinite(xy[:, 0]).sum())
+        if estimate.inliers.sum() < _RANSAC_BELOW * followed:
+            landmarks = self._tracks.landmarks
+            known = landmarks.known & (landmarks.mean[:, 2] > 0.0)
+            T_ransac = self._ransac(metric_points(landmarks.mean[known]), xy[known])
+            if T_ransac is not None:
+                other = self._refine(T_ransac, xy, depth_now)
+                if other.inliers.sum() > estimate.inliers.sum():
+                    estimate = other
+        return estimate
+
+    def _polish(self, estimate: PoseEstimate, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
+        return self._refine(estimate.T_key_cam, np.where(estimate.inliers[:, None], xy, np.nan), depth_now)
+
+    def _refine(self, T: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
+        tracks = self._tracks
+        mean, covariance = tracks.landmarks.mean, tracks.landmarks.covariance
+        return refine_pose(T, mean, covariance, xy, tracks.sigma_xy, self._config.cauchy, *self._weighed(depth_now))
+
+    def _weighed(self, depth_now: DepthReading | None) -> tuple[Array | None, Array | None]:
+        if depth_now is None:
+            return None, None
+        return depth_now.rho, self._config.depth_now_factor * depth_now.sigma_rho
+
+    def _ransac(self, points_m: Array, xy: Array) -> Array | None:
+        return pnp_ransac(points_m, xy, _RANSAC_PX / self._tracks.camera.fx, self._config.min_inliers)
