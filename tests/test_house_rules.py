@@ -28,7 +28,6 @@ LONG_CLASSES = {
     "Estimator": 470,  # ladder of solvers around one iSAM2
     "FastPath": 260,
     "Gy85": 260,  # one board's clock, queue and faults
-    "Initialiser": 430,
     "LiveRun": 270,
     "LoopSet": 410,  # decides about all loops of a run
     "Mapper": 280,  # every product of a map

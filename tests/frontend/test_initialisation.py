@@ -10,7 +10,7 @@ import pytest
 from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.geometry import invert, level_rotation, so3_exp, so3_log, transform
 from vislam.core.messages import Array, ImuSample, NavState, Tracking, VoMeasurement
-from vislam.frontend.start.initialisation import Initialisation, Initialiser
+from vislam.frontend.start import Initialisation, Initialiser
 from vislam.imu import ImuBuffer, ImuNoise
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, RealMotion, SimulatedVision, state_error
 from worlds.parts import GRAVITY_M_S2

@@ -9,7 +9,7 @@ import pytest
 
 from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.messages import ImuSample
-from vislam.frontend.start.initialisation import Initialisation, Phase
+from vislam.frontend.start import Initialisation, Phase
 from vislam.imu import ImuBuffer
 from worlds.parts import GRAVITY_M_S2
 from worlds.start import KINDS, Start, initialiser

@@ -10,7 +10,7 @@ import numpy as np
 from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.geometry import invert, so3_exp, transform, transform_points
 from vislam.core.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
-from vislam.frontend.start.initialisation import Initialisation, Initialiser
+from vislam.frontend.start import Initialisation, Initialiser
 from vislam.imu import ImuBuffer, ImuNoise
 from worlds.motion import NS, T0_NS, Motion
 from worlds.parts import EUROC_CAMERA, GRAVITY_M_S2, R_BODY_CAM
