@@ -127,7 +127,7 @@ def fast(signals, samples, inbox, settings, epoch, table, report) -> None:
 
 
 def heard(connection) -> dict | None:
-    """Wait for a message of the fast process; return its values, None when it is ready. Raises SystemExit if it failed."""
+    """Return the next message of the fast process, None when it is ready. Raises SystemExit if it failed."""
     from vislam.live.processes.child import Failure, Ready
 
     said = connection.recv()
