@@ -2,7 +2,10 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -43,12 +46,20 @@ def test_a_job_that_failed_leaves_no_stamp_and_no_error(kernels: Path, monkeypat
 def test_a_stamp_holds_for_one_source_only(kernels: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = tmp_path / "package" / "kernel.py"
     source.parent.mkdir()
-    source.write_text("a = 1\n")
     monkeypatch.setattr(precompile, "_PACKAGE", source.parent)
-    precompile._set_done("cart", precompile._stamp())
-    assert precompile._is_done("cart", precompile._stamp())
-    source.write_text("a = 2\n")
-    assert not precompile._is_done("cart", precompile._stamp())
+    monkeypatch.setattr(precompile, "JOBS", {"cart": JOBS["cart"]})
+    compiled: list[str] = []
+
+    @contextmanager
+    def child(command: list[str], **_: object) -> Iterator[SimpleNamespace]:
+        compiled.append(command[-1])
+        yield SimpleNamespace(stdout=["a kernel\n"], returncode=0)
+
+    monkeypatch.setattr(subprocess, "Popen", child)
+    for text, count in (("a = 1\n", 1), ("a = 1\n", 1), ("a = 2\n", 2)):
+        source.write_text(text)
+        assert precompile.main([]) == 0
+        assert compiled == ["cart"] * count
 
 
 def test_a_child_says_nothing_but_names_of_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

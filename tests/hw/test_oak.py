@@ -24,7 +24,7 @@ from vislam.hw.sensors import check_devices
 from vislam.live.sources import open_live
 from vislam.runs.record import record
 
-LONG_S = 30.0
+LONG_S = 600.0
 CAMERA = OakConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0, position_m=(0.1, 0.0, 0.2))
 SENSORS = replace(SensorsConfig(), oak=CAMERA)
 

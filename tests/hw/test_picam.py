@@ -21,7 +21,7 @@ from vislam.hw.library_cameras import is_library_camera
 from vislam.hw.sensors import check_devices, is_video, open_camera
 from vislam.runs.record import record
 
-LONG_S = 30.0
+LONG_S = 600.0
 CONFIG = PicamConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0)
 
 

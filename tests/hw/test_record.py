@@ -26,7 +26,7 @@ from vislam.hw.emulator import emulated_bus, emulated_gy85
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.runs.record import Recorded, record
 
-LONG_S = 60.0  # how long a test waits for what must come; never how long it takes
+LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 WIDTH, HEIGHT = 320, 240
 CONFIG = RecordConfig(min_free_gb=0.0)
 

@@ -19,7 +19,7 @@ from vislam.hw.cameras.webcam import Webcam, _Stamper
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
 
-LONG_S = 30.0  # how long a test waits for what must come; never how long it takes
+LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 AGE_NS = 20_000_000
 
 
@@ -54,7 +54,7 @@ class FakeCapture:
         return self.values.get(prop, -1.0)
 
     def grab(self) -> bool:
-        self.hang.wait(LONG_S)
+        self.hang.wait(60.0)  # what a test leaves hanging ends some time
         time.sleep(0.005)
         self.grabbed += 1
         self.stamp_ms = (self.clock() - AGE_NS) / 1e6

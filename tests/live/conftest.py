@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from live_runs import PATIENCE_S, begin, has_map, interrupt, left_behind, until
 
 from vislam.live import run_live
+from worlds.shared import shared
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True, scope="session")
 def patient_end() -> Iterator[None]:
-    """Let a run write down what there is after a signal, on however slow a machine; tests that hurry say so."""
+    """Let a run write down what there is after a signal, on however slow a machine; tests that hurry state it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_live, "_BRIEF_S", 60.0)
+        patch.setattr(run_live, "_BRIEF_S", 600.0)
         yield
+
+
+@pytest.fixture(scope="session")
+def interrupted(patient_end: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """A run that was ended by Ctrl-C when it had a map, and its metrics; of all workers: who resumes it copies it."""
+
+    def make(folder: Path) -> None:
+        live = begin(folder / "run")
+        live.execute(until(has_map, interrupt), PATIENCE_S)
+        assert live.is_brief
+        assert left_behind() == []
+
+    out = shared(tmp_path_factory, "interrupted-live", make) / "run"
+    return out, json.loads((out / "metrics.json").read_text())

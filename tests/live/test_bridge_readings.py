@@ -30,7 +30,7 @@ from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.ticks import TicksSettings
 from vislam.sensors.toml import SensorPort, load_sensor_setup
 
-LONG_S = 30.0  # how long a test waits for what must come; never how long it takes
+LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 TICKS = TicksSettings(ticks_per_turn=1000, radius_m=0.05)
 M_PER_TICK = 2.0 * np.pi * 0.05 / 1000
 PORTS = {

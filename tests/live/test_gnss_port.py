@@ -25,7 +25,7 @@ from vislam.live.port_readings import PortReadings
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.toml import SensorPort
 
-LONG_S = 30.0  # how long a test waits for what must come; never how long it takes
+LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 METRES_PER_MINUTE = 1852.2  # of latitude, at 48 degrees, to a metre
 
 

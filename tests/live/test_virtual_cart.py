@@ -49,10 +49,11 @@ def test_its_further_sensors_are_drawn_on_its_motion(tmp_path: Path) -> None:
         wheels = [reading for reading in found if reading.sensor == "wheels"]
         assert len(wheels) >= 70
         assert len(found) - len(wheels) >= 17
-        scales = np.array([one.values for one in wheels[60:]]) * readings._own["wheels"][:2]
+        own = setup.suite.drawn_own("wheels", np.random.default_rng([0, 0]))  # of the seed, as the first sensor
+        scales = np.array([one.values for one in wheels[60:]]) * own[:2]
         for told, reading in zip(scales, wheels[60:], strict=True):
             here = drive.at((reading.t_ns - begin_ns) * 1e-9)
-            half = 0.5 * readings._own["wheels"][2] * here.rate_rad_s
+            half = 0.5 * own[2] * here.rate_rad_s
             np.testing.assert_allclose(told, [here.speed_m_s - half, here.speed_m_s + half], atol=1e-6)
         assert readings.status() == {"wheels": "well", "baro": "well"}
         begin_ns -= 60 * 10**9  # nobody asked for a minute

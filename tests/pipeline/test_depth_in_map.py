@@ -86,7 +86,7 @@ def old(tmp_path_factory):
 
 def other_noise(seed=7):
     world = World("rgbd", seed=seed)
-    world._rng = np.random.default_rng(99)
+    world.rng = np.random.default_rng(99)
     return world
 
 

@@ -33,23 +33,21 @@ def run(tmp_path, uri, **settings):
     return metrics, {n: evaluate(t, truth, "yaw") for n, t in found.items()}, found
 
 
-@pytest.mark.parametrize("coupling", ["loose", "tight"])
-@pytest.mark.parametrize("rig", ["mono", "stereo"])
-def test_half_a_minute_of_rest(tmp_path, rig, coupling):
-    metrics, _, found = run(tmp_path, f"points:still,rig={rig},duration_s=30,{CAMERA}", ekf__coupling=coupling)
+@pytest.mark.parametrize(("rig", "coupling"), [("mono", "tight"), ("stereo", "loose")])
+def test_long_rest(tmp_path, rig, coupling):
+    metrics, _, found = run(tmp_path, f"points:still,rig={rig},duration_s=15,{CAMERA}", ekf__coupling=coupling)
     assert metrics["initialisation"]["status"] == "static"
-    assert metrics["counters"]["front"]["frames_at_rest"] > 285
-    # a frame's own noise is no drift: five seconds are averaged; what the first frame did not know has come in by then
+    assert metrics["counters"]["front"]["frames_at_rest"] > 140
+    # a frame's own noise is no drift: four seconds are averaged; what the first frame did not know has come in by then
     for name, trajectory in found.items():
-        first, last = trajectory.T_world_body[100:150], trajectory.T_world_body[-50:]
+        first, last = trajectory.T_world_body[40:80], trajectory.T_world_body[-40:]
         drift_m = np.linalg.norm(last[:, :3, 3].mean(axis=0) - first[:, :3, 3].mean(axis=0))
         turned = Rotation.from_matrix(first[:, :3, :3]).mean().inv() * Rotation.from_matrix(last[:, :3, :3]).mean()
         drift_deg = np.rad2deg(turned.magnitude())
         print(f"{name}: {1e3 * drift_m:.1f} mm, {drift_deg:.3f} deg")
         assert drift_m < 0.0025, name
-        assert drift_deg < 0.35, (
-            name
-        )  # tilt that rest cannot tell from the accelerometer's bias wanders within its sigma
+        # tilt that rest cannot tell from the accelerometer's bias wanders within its sigma
+        assert drift_deg < 0.35, name
 
 
 @pytest.mark.parametrize("coupling", ["loose", "tight"])
@@ -106,29 +104,28 @@ def test_a_lost_filter_is_told(tmp_path):
     assert any("visual measurements as impossible" in reason for reason in metrics["verdict"]["reasons"])
 
 
-@pytest.mark.parametrize(("world", "uniform"), [("straight", True), ("laps", False)])
-def test_uniform_motion_of_one_camera_is_told(tmp_path, world, uniform):
+def test_uniform_motion_of_one_camera_is_stated_and_its_sigmas_grow(tmp_path):
     """Without a change of acceleration nothing shows scale any more, and noise must not pass for it in the filter."""
-    metrics, errors, _ = run(tmp_path, f"points:{world},rig=mono,duration_s=28,{CAMERA}", graph__coupling="loose")
-    assert any("uniform motion for" in reason for reason in metrics["verdict"]["reasons"]) == uniform
-    assert (metrics["counters"]["front"]["frames_without_excitation"] > 150) == uniform
-    assert errors["ekf"]["ate_max_m"] < (2.0 if uniform else 0.2)
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_in_uniform_motion_sigmas_say_that_scale_is_forgotten(tmp_path, seed):
-    uri = f"points:straight,rig=mono,duration_s=28,{CAMERA}"
-    prepare(tmp_path / "run", False)
-    execute(open_source(uri, seed), load(None, QUICK | {"seed": seed}), tmp_path / "run", uri, [])
+    metrics, errors, _ = run(tmp_path, f"points:straight,rig=mono,duration_s=28,{CAMERA}")
+    assert any("uniform motion for" in reason for reason in metrics["verdict"]["reasons"])
+    assert metrics["counters"]["front"]["frames_without_excitation"] > 150
+    assert errors["ekf"]["ate_max_m"] < 2.0
     truth = read_trajectory(tmp_path / "run" / "trajectory_truth.tum")
     for name in ("ekf", "graph"):
         states = read_states_csv(tmp_path / "run" / f"states_{name}.csv")[1]
         sigmas_m = [np.sqrt(np.trace(s.covariance[3:6, 3:6])) for s in states]
         found = anees(states, truth)
-        print(f"seed {seed}, {name}: {found['position'].mean:.2f}, sigma at the end {sigmas_m[-1]:.2f} m")
+        print(f"{name}: {found['position'].mean:.2f}, sigma at the end {sigmas_m[-1]:.2f} m")
         assert 0.05 < found["position"].mean < 4.0, name  # one run of 28 s is little: its errors are one draw
         assert 0.3 < sigmas_m[-1] < 3.0, name
         assert sigmas_m[len(states) // 3] < 0.5 * sigmas_m[-1], name
+
+
+def test_laps_of_one_camera_are_no_uniform_motion(tmp_path):
+    metrics, errors, _ = run(tmp_path, f"points:laps,rig=mono,duration_s=16,{CAMERA}", graph__coupling="loose")
+    assert not any("uniform motion for" in reason for reason in metrics["verdict"]["reasons"])
+    assert metrics["counters"]["front"]["frames_without_excitation"] < 75
+    assert errors["ekf"]["ate_max_m"] < 0.2
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,14 @@ from vislam.cli import run_verb
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import se3_exp
+from vislam.core.messages import NavState
 from vislam.mapping.drive.grid import Grid, read_grid, write_grid
 from vislam.mapping.formats.ply import write_ply
 from vislam.runs.loaded import load_run
 from vislam.runs.offline import export_mcap as exporting
 from vislam.runs.offline.export_mcap import export_mcap
 from vislam.runs.session import SessionWriter
-from vislam.trajectory import Trajectory, write_tum
+from vislam.trajectory import Trajectory, write_states_csv, write_tum
 
 CAMERA = Camera(640, 480, 458.0, 457.0, 320.0, 240.0)
 RIG = Rig((CAMERA, CAMERA), (se3_exp(np.array([0.1, -0.2, 1.5, 0.01, 0.02, 0.03])), np.eye(4)))
@@ -145,24 +146,22 @@ def test_odometry_has_the_covariance_of_its_keyframe_in_the_axes_of_odom(run, fo
     assert np.diag(between.pose.covariance.reshape(6, 6)).tolist() == [1e9] * 6
 
 
-def test_the_covariances_of_a_turned_and_moving_body_are_those_of_samples():
+def test_the_covariances_of_a_turned_and_moving_body_are_those_of_samples(tmp_path):
     rng = np.random.default_rng(7)
     A = rng.normal(size=(15, 15))
     covariance, R = 1e-6 * (A @ A.T), Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix()
     velocity_world = np.array([1.2, -0.4, 0.3])
-    T = np.eye(4)[None].copy()
-    T[0, :3, :3] = R
-    states = exporting.KeyframeStates(
-        np.zeros(1, int),
-        np.zeros(1, int),
-        T,
-        velocity_world[None],
-        np.zeros((1, 3)),
-        np.zeros((1, 3)),
-        covariance[None],
-    )
-    velocity, of_pose, of_velocity = exporting._as_ros(R, states, 0)
-    np.testing.assert_allclose(velocity, R.T @ velocity_world)
+    T = np.eye(4)
+    T[:3, :3] = R
+    for name in ("ekf", "graph"):
+        write_tum(Trajectory(np.array([START_NS]), T[None]), tmp_path / f"trajectory_{name}.tum")
+    state = NavState(START_NS, T, velocity_world, np.zeros(3), np.zeros(3), covariance)
+    write_states_csv(tmp_path / "states_ekf.csv", [0], [state])
+    export_mcap(tmp_path, tmp_path / "a.mcap")
+    [(_, message, _)] = read(tmp_path / "a.mcap")["/odom"]
+    linear, of_pose = message.twist.twist.linear, message.pose.covariance.reshape(6, 6)
+    of_velocity = message.twist.covariance.reshape(6, 6)[:3, :3]
+    np.testing.assert_allclose([linear.x, linear.y, linear.z], R.T @ velocity_world, atol=1e-8)
     errors = rng.multivariate_normal(np.zeros(15), covariance, 200_000)
     turned = errors[:, :3] @ R.T  # exp(R d) R is R exp(d)
     np.testing.assert_allclose(of_pose, np.cov(np.hstack([errors[:, 3:6], turned]).T), atol=2e-7)

@@ -82,15 +82,14 @@ def test_pairs_are_written_with_their_matches(tmp_path):
     assert again[0][1].read_bytes() == path.read_bytes()
 
 
-def test_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(loop_gallery, "_MAX_THUMBNAIL_BYTES", 60_000)
+def test_memory_is_bounded_and_the_oldest_are_forgotten(monkeypatch, tmp_path):
+    monkeypatch.setattr(loop_gallery, "_MAX_THUMBNAIL_BYTES", 150_000)
     gallery = LoopGallery()
-    for k in range(20):
-        gallery.add(step(k))
-    kept = gallery._thumbnails
-    assert sum(jpeg.nbytes for jpeg, _ in kept.values()) == gallery._bytes <= 60_000
-    assert 0 < len(kept) < 20
-    assert list(kept) == list(range(20 - len(kept), 20))
+    for k in range(12):
+        gallery.add(step(k, [candidate(k - 1, k)] if k else []))
+    shown = sorted(pair.to_id for pair, _ in gallery.write(tmp_path, [row(k - 1, k, "accepted") for k in range(1, 12)]))
+    assert 0 < len(shown) < 11
+    assert shown == list(range(12 - len(shown), 12))
 
 
 def test_a_caption_says_what_is_known_and_leaves_out_the_rest():

@@ -78,6 +78,13 @@ class Opened:
             assert [url for url in self.requests[1:] if not url.startswith(("data:", "blob:"))] == []
 
 
+@pytest.fixture(scope="module")
+def page(browser, report):
+    """The report on a desk's screen, for tests that do one thing after another on one page."""
+    with Opened(browser, report) as opened:
+        yield opened
+
+
 def move_to(page, share):
     """Point at the first plot, at a share of its width."""
     over = page.locator(".plot .u-over").first
@@ -100,51 +107,47 @@ def test_nothing_fails_or_is_cut_and_the_map_is_drawn(browser, report, tmp_path,
             page.screenshot(path=f"{folder}/report_{width}_{scheme}.png")
 
 
-def test_pointing_at_a_plot_moves_the_camera_and_the_facts(browser, report):
-    with Opened(browser, report) as page:
-        place = "() => Array.from(window.vislamReport.view.marker.matrix.elements)"
-        before = page.evaluate(place)
-        move_to(page, (LOST[0] + 20) * PERIOD_NS * 1e-9 / 60.0)
-        page.wait_for_function("() => Number(document.documentElement.dataset.time) > 30")
-        assert page.evaluate(place) != before
-        details = page.locator("#view-details").inner_text()
-        assert "lost, 7 inliers" in details
-        assert "7 inliers of 30, image too dark" in details
-        t = float(page.evaluate("document.documentElement.dataset.time"))
-        assert f"{t:.2f} s" in details
+def test_pointing_at_a_plot_moves_the_camera_and_the_facts(page):
+    place = "() => Array.from(window.vislamReport.view.marker.matrix.elements)"
+    before = page.evaluate(place)
+    move_to(page, (LOST[0] + 20) * PERIOD_NS * 1e-9 / 60.0)
+    page.wait_for_function("() => Number(document.documentElement.dataset.time) > 30")
+    assert page.evaluate(place) != before
+    details = page.locator("#view-details").inner_text()
+    assert "lost, 7 inliers" in details
+    assert "7 inliers of 30, image too dark" in details
+    t = float(page.evaluate("document.documentElement.dataset.time"))
+    assert f"{t:.2f} s" in details
 
 
-def test_layers_can_be_turned_off(browser, report):
-    with Opened(browser, report) as page:
-        whole = page.evaluate(COLORS)
-        page.locator("#view-layers input[name=map]").uncheck()
-        assert page.evaluate(COLORS) < 0.5 * whole
-        page.locator("#view-layers input[name=map]").check()
-        assert page.evaluate(COLORS) == whole
+def test_layers_can_be_turned_off(page):
+    whole = page.evaluate(COLORS)
+    page.locator("#view-layers input[name=map]").uncheck()
+    assert page.evaluate(COLORS) < 0.5 * whole
+    page.locator("#view-layers input[name=map]").check()
+    assert page.evaluate(COLORS) == whole
 
 
-def test_the_map_turns_under_the_mouse(browser, report):
-    with Opened(browser, report) as page:
-        stands = "() => window.vislamReport.view.camera.position.toArray()"
-        before, box = page.evaluate(stands), page.locator("#view-canvas").bounding_box()
-        page.mouse.move(box["x"] + 300, box["y"] + 200)
-        page.mouse.down()
-        page.mouse.move(box["x"] + 420, box["y"] + 240, steps=4)
-        page.mouse.up()
-        page.wait_for_function(f"(before) => ({stands})().join() !== before.join()", arg=before)
+def test_the_map_turns_under_the_mouse(page):
+    stands = "() => window.vislamReport.view.camera.position.toArray()"
+    before, box = page.evaluate(stands), page.locator("#view-canvas").bounding_box()
+    page.mouse.move(box["x"] + 300, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 420, box["y"] + 240, steps=4)
+    page.mouse.up()
+    page.wait_for_function(f"(before) => ({stands})().join() !== before.join()", arg=before)
 
 
-def test_a_loop_that_is_clicked_tells_its_reason(browser, report):
-    with Opened(browser, report) as page:
-        page.evaluate("window.vislamReport.view.fromAbove()")
-        at = page.evaluate(
-            "() => { const v = window.vislamReport.view, e = v.data.loops.ends;"
-            "const a = v.project(e[0], e[1], e[2]), b = v.project(e[3], e[4], e[5]);"
-            "return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]; }"
-        )
-        page.locator("#view-canvas").click(position={"x": at[0], "y": at[1]})
-        page.wait_for_selector("#view-details .loop:not([hidden])")
-        assert "verified, 3 neighbours agree" in page.locator("#view-details .loop").inner_text()
+def test_a_loop_that_is_clicked_tells_its_reason(page):
+    page.evaluate("window.vislamReport.view.fromAbove()")
+    at = page.evaluate(
+        "() => { const v = window.vislamReport.view, e = v.data.loops.ends;"
+        "const a = v.project(e[0], e[1], e[2]), b = v.project(e[3], e[4], e[5]);"
+        "return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]; }"
+    )
+    page.locator("#view-canvas").click(position={"x": at[0], "y": at[1]})
+    page.wait_for_selector("#view-details .loop:not([hidden])")
+    assert "verified, 3 neighbours agree" in page.locator("#view-details .loop").inner_text()
 
 
 class Fingers:
@@ -207,18 +210,17 @@ def test_the_map_turns_and_nears_under_fingers_and_a_tap_tells_of_a_loop(browser
         assert page.evaluate("window.vislamReport.view.chosen.visible")
 
 
-def test_plots_zoom_together(browser, report):
-    with Opened(browser, report) as page:
-        spans = "() => window.vislamReport.plots.plots.map((p) => p.scales.x.max - p.scales.x.min)"
-        whole = page.evaluate(spans)
-        move_to(page, 0.3)
-        page.mouse.down()
-        box = page.locator(".plot .u-over").first.bounding_box()
-        page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 20, steps=4)
-        page.mouse.up()
-        page.wait_for_function(f"(span) => ({spans})().every((s) => s < 0.5 * span)", arg=whole[0])
-        page.locator("#plots-whole").click()
-        page.wait_for_function(f"(span) => ({spans})().every((s) => Math.abs(s - span) < 1e-6)", arg=whole[0])
+def test_plots_zoom_together(page):
+    spans = "() => window.vislamReport.plots.plots.map((p) => p.scales.x.max - p.scales.x.min)"
+    whole = page.evaluate(spans)
+    move_to(page, 0.3)
+    page.mouse.down()
+    box = page.locator(".plot .u-over").first.bounding_box()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 20, steps=4)
+    page.mouse.up()
+    page.wait_for_function(f"(span) => ({spans})().every((s) => s < 0.5 * span)", arg=whole[0])
+    page.locator("#plots-whole").click()
+    page.wait_for_function(f"(span) => ({spans})().every((s) => Math.abs(s - span) < 1e-6)", arg=whole[0])
 
 
 def test_without_javascript_the_pictures_stand(browser, report):

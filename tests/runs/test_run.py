@@ -18,8 +18,10 @@ from vislam.datasets.recorder import record
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.report.run_files import read_run
+from vislam.runs.sources import open_source
 from vislam.sim import open_world
 from vislam.trajectory import read_tum
+from worlds.shared import shared
 
 REPLAYED = ("trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum", "loops.csv", "states_graph.csv")
 FAST = {"view.enabled": False}
@@ -45,26 +47,28 @@ def run(recording, out, **settings):
 
 
 def room(duration_s=8.0, **options):
-    return open_world("handheld-room", duration_s=duration_s, image_width_px=320, **options)
+    return open_world("handheld-room", duration_s=duration_s, image_width_px=320, camera_hz=10.0, **options)
 
 
-def cached(recording):
-    """Render once, replay often."""
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A simulated recording on disk, drawn once for all workers."""
+    return shared(tmp_path_factory, "small-room", lambda folder: record(room(), folder / "room")) / "room"
+
+
+@pytest.fixture(scope="module")
+def small_room(recorded):
+    """The same, read once and replayed often."""
+    recording = open_source(str(recorded))
     values = list(recording.events())
     return Edited(recording, lambda _: iter(values))
 
 
 @pytest.fixture(scope="module")
-def small_room():
-    return cached(room())
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    """A simulated recording on disk."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    record(room(6.0), folder)
-    return folder
+def finished(recorded, tmp_path_factory):
+    """A run with everything that a run can leave."""
+    make = lambda folder: run(open_source(str(recorded)), folder / "run", view__enabled=True)  # noqa: E731
+    return shared(tmp_path_factory, "small-room-run", make) / "run"
 
 
 @pytest.fixture
@@ -74,45 +78,35 @@ def damaged(recorded, tmp_path):
     return tmp_path / "damaged"
 
 
-def test_a_run_leaves_the_documented_folder(small_room, tmp_path):
-    metrics = run(small_room, tmp_path / "run", view__enabled=True)
-    names = {str(p.relative_to(tmp_path / "run")) for p in (tmp_path / "run").rglob("*") if p.is_file()}
+def test_a_run_leaves_the_documented_folder(small_room, finished):
+    metrics = json.loads((finished / "metrics.json").read_text())
+    names = {str(p.relative_to(finished)) for p in finished.rglob("*") if p.is_file()}
     assert names >= {
         "manifest.json", "config.json", "metrics.json", "trajectory_ekf.tum", "trajectory_live.tum",
         "trajectory_graph.tum", "trajectory_truth.tum", "states_ekf.csv", "states_graph.csv", "loops.csv",
         "tracking.csv", "session.db", "run.rrd", "map/cloud.ply", "map/octomap.bt", "map/grid.pgm", "map/grid.yaml",
     }  # fmt: skip
     assert metrics["frames"] == small_room.frame_count
-    assert len(read_tum(tmp_path / "run" / "trajectory_graph.tum")) == small_room.frame_count
+    assert len(read_tum(finished / "trajectory_graph.tum")) == small_room.frame_count
     assert metrics["initialisation"]["status"] == "static"
     cost, stages_ms = metrics["cost"], metrics["cost"]["stages_cpu_ms_per_frame"]
     assert sum(stages_ms.values()) == pytest.approx(cost["cpu_ms_per_frame"])
-    assert {
-        "read",
-        "track",
-        "ekf",
-        "ekf predict",
-        "loop",
-        "graph",
-        "map",
-        "view",
-        "pictures",
-        "other",
-    } <= stages_ms.keys()
+    stages = {"read", "track", "ekf", "ekf predict", "loop", "graph", "map", "view", "pictures", "other"}
+    assert stages <= stages_ms.keys()
     assert cost["first_pose_s"] == pytest.approx(metrics["initialisation"]["t_s"], abs=1.0)
     assert 0.0 < cost["first_pose_cpu_s"] < cost["cpu_s"]
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
     assert metrics["accuracy"]["ekf"]["ate_rmse_m"] < 0.03
-    assert json.loads((tmp_path / "run" / "config.json").read_text())["view"]["enabled"] is True
-    assert read_run(tmp_path / "run").unread == {}
+    assert json.loads((finished / "config.json").read_text())["view"]["enabled"] is True
+    assert read_run(finished).unread == {}
 
 
-def test_replay_in_fresh_processes_gives_identical_bytes(recorded, tmp_path):
+def test_replay_in_a_fresh_process_gives_identical_bytes(recorded, finished, tmp_path):
+    """As in one that has run other things before, and shows the run."""
+    command = [sys.executable, "-m", "vislam", "run", str(recorded), "--out", str(tmp_path / "again")]
+    subprocess.run([*command, "--view.no-enabled"], check=True, capture_output=True, timeout=600)
     digests = []
-    for name in ("first", "second"):
-        out = tmp_path / name
-        command = [sys.executable, "-m", "vislam", "run", str(recorded), "--out", str(out), "--view.no-enabled"]
-        subprocess.run(command, check=True, capture_output=True, timeout=300)
+    for out in (finished, tmp_path / "again"):
         files = [*(out / f for f in REPLAYED), *sorted((out / "map").iterdir())]
         digests.append({f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in files})
     assert digests[0] == digests[1]
@@ -202,7 +196,7 @@ def test_a_recording_cut_short_plays_to_its_end(damaged, tmp_path):
     out = tmp_path / "run"
     assert run_verb(["run", str(damaged), "--out", str(out), "--view.no-enabled"]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
-    assert 60 < metrics["frames"] < 100
+    assert 50 < metrics["frames"] < 60
     assert metrics["problems"]
 
 
@@ -257,9 +251,8 @@ def test_a_run_is_never_overwritten_by_accident(tmp_path, capsys):
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "five years"
 
 
-def test_overwriting_leaves_nothing_of_the_old_run(tmp_path):
-    out = tmp_path / "run"
-    run(room(2.0), out)
+def test_overwriting_leaves_nothing_of_the_old_run(finished, tmp_path):
+    out = shutil.copytree(finished, tmp_path / "run")
     assert (out / "map" / "cloud.ply").is_file()
     prepare(out, overwrite=True)
     assert [p for p in out.rglob("*") if p.is_file()] == []
@@ -272,7 +265,7 @@ def test_a_full_disk_ends_with_a_storage_error_and_keeps_what_was_written(record
         f"from vislam.cli import run_verb; sys.exit(run_verb(['run', {str(recorded)!r}, '--out', {str(out)!r},"
         " '--view.no-enabled']))"
     )
-    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=600)
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
     assert "free disk space" in done.stderr
@@ -289,14 +282,14 @@ def test_an_interrupt_keeps_what_was_computed(small_room, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(Edited(small_room, interrupted), tmp_path / "run", map__enabled=False)
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["frames"] > 50
+    assert metrics["frames"] > 40
     assert "stopped early" in metrics["warnings"][0]
 
 
-def test_evaluation_fails_on_too_little_coverage(small_room, tmp_path, capsys):
-    run(small_room, tmp_path / "run", map__enabled=False)
-    assert run_verb(["eval", str(tmp_path / "run"), "--min-coverage", "0.5"]) == 0
-    assert run_verb(["eval", str(tmp_path / "run"), "--min-coverage", "0.999"]) == 4
+def test_evaluation_fails_on_too_little_coverage(finished, tmp_path, capsys):
+    out = shutil.copytree(finished, tmp_path / "run")
+    assert run_verb(["eval", str(out), "--min-coverage", "0.5"]) == 0
+    assert run_verb(["eval", str(out), "--min-coverage", "0.999"]) == 4
     assert "covers" in capsys.readouterr().err
 
 

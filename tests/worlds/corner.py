@@ -54,8 +54,8 @@ class World:
 
     def __post_init__(self) -> None:
         self.rig = rig(self.kind)
-        self._rng = np.random.default_rng(self.seed)
-        self._textures = [texture(self._rng, _TEXTURE_PX, 128, 55) for _ in _PLANES]
+        self.rng = np.random.default_rng(self.seed)
+        self._textures = [texture(self.rng, _TEXTURE_PX, 128, 55) for _ in _PLANES]
         self._rays = []
         for cam in self.rig.cameras:
             u, v = np.meshgrid(np.arange(cam.width, dtype=float), np.arange(cam.height, dtype=float))
@@ -77,7 +77,7 @@ class World:
             maps = uv.astype(np.float32).reshape(cam.height, cam.width, 2)
             sampled = cv2.remap(painted, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).ravel()
             grey[hit], nearest[hit] = sampled[hit], z[hit]
-        grey += self._rng.normal(0.0, self.noise_grey, len(grey)).astype(np.float32)
+        grey += self.rng.normal(0.0, self.noise_grey, len(grey)).astype(np.float32)
         image = np.clip(np.round(grey), 0, 255).astype(np.uint8).reshape(cam.height, cam.width)
         return image, nearest.reshape(cam.height, cam.width)
 
@@ -89,7 +89,7 @@ class World:
         ]
         depth = None
         if self.rig.has_depth:
-            rho = 1.0 / drawn[0][1] + self._rng.normal(0.0, self.depth_sigma_rho, drawn[0][1].shape)
+            rho = 1.0 / drawn[0][1] + self.rng.normal(0.0, self.depth_sigma_rho, drawn[0][1].shape)
             depth = np.where(drawn[0][1] < 8.0, 1.0 / rho, 0.0).astype(np.float32)
         stamp = index * FRAME_NS + 1_000_000_000 if t_ns is None else t_ns
         return Frame(stamp, index, tuple(image for image, _ in drawn), None, depth)

@@ -1,0 +1,93 @@
+"""Live runs of a replayed recording, what watches over them and ends them, and what they must not leave behind.
+
+The recording is played again from its start each time, as a cart does that was put back to where it began. A run is
+ended when it has been found, or has seen enough, however long that takes.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import psutil
+
+from vislam.config import Config, SensorsConfig, load
+from vislam.core.files import write_json
+from vislam.hw.health import Health
+from vislam.live.beginning import in_map, resumed
+from vislam.live.replay import Outages, ReplaySource
+from vislam.live.run_live import LiveRun
+from vislam.runs.folder import MapChoice, prepare
+
+WORLD = "points:corridor-loop,camera_hz=10,tracks=150"
+PATIENCE_S = 60.0  # the recording is 63 s long; a quiet machine needs a few of them
+FILES = {
+    "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "session.db",
+    "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum",
+    "trajectory_truth.tum",
+}  # fmt: skip
+
+
+def settings(name: str = "going-on", **others: object) -> Config:
+    live = {f"live.{key}": value for key, value in {"send_to": (), **others}.items()}
+    return load(None, {"view.enabled": False, "live.name": f"vislam-test-{name}-{os.getpid()}", **live})
+
+
+def begin(out: Path, base: MapChoice | None = None, outages: Outages | None = None) -> LiveRun:
+    """Return a run that goes on with what is in a folder, or begins in a map, or begins."""
+    source, config = ReplaySource(WORLD, outages=outages), settings()
+    if (out / "session.db").exists():
+        beginning = resumed(out, source, config)
+        assert beginning is not None
+    else:
+        prepare(out, overwrite=False)
+        beginning = None if base is None else in_map(base, source, config)
+    write_json(out / "sensors.json", asdict(SensorsConfig()))
+    return LiveRun(source, config, out, f"replay:{WORLD}", ["vislam", "live"], base, beginning)
+
+
+def until(enough: Callable[[LiveRun], bool], act: Callable[[LiveRun], None]) -> Callable[[LiveRun], None]:
+    """Return what watches a run and acts once, when it has enough."""
+    done: list[bool] = []
+
+    def watch(run: LiveRun) -> None:
+        if not done and enough(run):
+            done.append(True)
+            act(run)
+
+    return watch
+
+
+def status(run: LiveRun) -> dict:
+    """Return the newest status of the fast process."""
+    return run.notes.get("fast", {}).get("status", {})
+
+
+class Notes(dict):
+    """Notes of a run that keep each health that the fast process reported, however late this one looks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.health: list[Health] = []
+
+    def __setitem__(self, role: str, values: dict) -> None:
+        if role == "fast" and "status" in values:
+            self.health.append(Health(values["status"]["health"]))
+        super().__setitem__(role, values)
+
+
+def has_map(run: LiveRun) -> bool:
+    return status(run).get("map_revision", 0) >= 8
+
+
+def interrupt(run: LiveRun) -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def left_behind(name: str = "going-on") -> list[str]:
+    """Return processes and shared memory of a run that should have ended."""
+    children = [p.name() for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    return children + [p.name for p in Path("/dev/shm").glob(f"*vislam-test-{name}-{os.getpid()}*")]
