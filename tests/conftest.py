@@ -1,10 +1,13 @@
 """Fixtures every test may use."""
 
+import ctypes
 import os
 import signal
+from contextlib import suppress
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -13,7 +16,11 @@ from hypothesis import settings
 
 from needs import missing
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+TESTS = Path(__file__).resolve().parent
+REPOSITORY = TESTS.parent
+QUICK = {line for line in (TESTS / "quick.txt").read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+_LIBC = ctypes.CDLL(None)
+_M_MMAP_THRESHOLD, _MAPPED_BYTES = -3, 1 << 20
 
 # Compilation makes first examples slow, and a build must not fail by chance: fixed examples, no deadline.
 settings.register_profile("vislam", deadline=None, derandomize=True)
@@ -21,9 +28,34 @@ settings.load_profile("vislam")
 
 cv2.setNumThreads(1)  # as in deterministic replay
 
+with suppress(AttributeError):  # of another libc; glibc would keep freed arrays of up to 32 MB for a next one
+    _LIBC.mallopt(_M_MMAP_THRESHOLD, _MAPPED_BYTES)
+
 for interrupt in (signal.SIGINT, signal.SIGHUP):  # in the background of a script they are ignored, and tests send them
     if signal.getsignal(interrupt) is signal.SIG_IGN:
         signal.signal(interrupt, signal.default_int_handler if interrupt == signal.SIGINT else signal.SIG_DFL)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out slow files before they are imported, where only quick tests are asked for."""
+    if config.option.markexpr != "not slow" or collection_path.suffix != ".py":
+        return None
+    return collection_path.resolve().relative_to(TESTS).as_posix() not in QUICK or None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as slow what does not stand in `quick.txt`."""
+    for item in items:
+        if item.path.resolve().relative_to(TESTS).as_posix() not in QUICK:
+            item.add_marker("slow")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def trimmed() -> Iterator[None]:
+    """Give back to the system what the tests of a module have freed."""
+    yield
+    with suppress(AttributeError):
+        _LIBC.malloc_trim(0)
 
 
 @pytest.fixture(scope="session")
