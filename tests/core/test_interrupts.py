@@ -95,13 +95,13 @@ def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: P
     rng = random.Random(SEED)
     print("seed", SEED)
     out = tmp_path / "corridor"
-    arguments = ["simulate", "corridor-loop", "--duration-s", "3", "--image-width-px", "320", "--out"]
+    arguments = ["simulate", "corridor-loop", "--duration-s", "2", "--image-width-px", "320", "--out"]
     whole_s, process = 0.0, started([*arguments, str(tmp_path / "whole")])
     while process.poll() is None:
         whole_s = max(whole_s, cpu_s(psutil.Process(process.pid)))
         time.sleep(0.005)
     assert process.returncode == 0 and (tmp_path / "whole" / "mav0").exists()
-    for k in range(7):
+    for k in range(6):
         number, share = SIGNALS[k % 3], rng.uniform(0.1, 0.9)
         reached = lambda process, spent_s=share * whole_s: cpu_s(process) >= spent_s  # noqa: E731
         ended = interrupted([*arguments, str(out)], reached, number, to_group=k % 2 == 0)

@@ -22,8 +22,8 @@ from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
 from vislam.runs.folder import MapChoice, prepare
 
-WORLD = "points:corridor-loop,camera_hz=10,tracks=150"
-PATIENCE_S = 60.0  # the recording is 63 s long; a quiet machine needs a few of them
+PATIENCE_S = 600.0  # a quiet machine needs a few of them; the recording goes on as long
+WORLD = f"points:laps,rig=rgbd,camera_hz=10,tracks=150,duration_s={PATIENCE_S:g}"
 FILES = {
     "manifest.json", "config.json", "metrics.json", "tracking.csv", "loops.csv", "retrieved.csv", "session.db",
     "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum",

@@ -103,7 +103,7 @@ def test_a_run_begins_in_the_map_of_another(interrupted, tmp_path: Path) -> None
 def test_what_cannot_go_on_is_refused_before_anything_starts(interrupted, tmp_path: Path, monkeypatch) -> None:
     out, _ = interrupted
     with pytest.raises(UsageError, match="other cameras"):
-        in_map(MapChoice(out, False), ReplaySource(WORLD + ",rig=mono"), settings())
+        in_map(MapChoice(out, False), ReplaySource(WORLD.replace("rgbd", "mono")), settings())
     with pytest.raises(DataError, match="no session at"):
         in_map(MapChoice(tmp_path, False), ReplaySource(WORLD), settings())
     monkeypatch.setattr("vislam.live.beginning.time.monotonic_ns", lambda: 1)

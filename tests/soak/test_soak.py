@@ -53,12 +53,11 @@ def test_edges_that_cannot_be_used_are_refused_before_anything_is_touched() -> N
     np.testing.assert_allclose(graph.poses[1], step, atol=1e-6)
 
 
-@pytest.mark.parametrize("step_m", [1.0, 0.25])
-def test_open_loop_chain_as_far_as_gtsam_throws(step_m: float) -> None:
-    """Healthy chains on which iSAM2 with Cholesky throws, after about 370 m."""
+def test_open_loop_chain_as_far_as_gtsam_throws() -> None:
+    """A healthy chain on which iSAM2 with Cholesky throws, after about 370 m."""
     rng = np.random.default_rng(3)
     sigmas = np.repeat([0.001, 0.002], 3)
-    count = {1.0: 700, 0.25: 1500}[step_m]
+    step_m, count = 1.0, 450
     covariance = np.diag(sigmas**2)
     step = transform(np.eye(3), np.array([step_m, 0.0, 0.0]))
     config = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
