@@ -174,7 +174,7 @@ def test_a_reader_never_sees_half_of_two_values() -> None:
         end = time.monotonic() + 600.0  # only ends a hang
         assert ready.wait(600.0)
         slot, last, seen = SlotReader(name), 0, 0
-        while seen < 5000 and time.monotonic() < end:
+        while seen < 1000 and time.monotonic() < end:
             read = slot.read()
             if read is None:  # the writer was in the way every time
                 continue
@@ -182,7 +182,7 @@ def test_a_reader_never_sees_half_of_two_values() -> None:
             assert value == bytes([sequence % 256]) * 4096
             assert sequence >= last
             seen, last = seen + (sequence > last), sequence
-        assert seen == 5000
+        assert seen == 1000
     finally:
         stop.set()
         writer.join(600.0)
