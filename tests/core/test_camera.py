@@ -188,3 +188,12 @@ def test_rectified_points_share_a_row_and_disparity_gives_depth():
         rectify(Rig((EUROC,), (np.eye(4),)))
     with pytest.raises(DataError, match="swap the cameras"):
         rectify(Rig((EUROC, SKEWED), (left_pose @ offset, left_pose)))
+
+
+@pytest.mark.parametrize("margin_px", [0.0, 5.0])
+def test_an_image_ends_at_the_middle_of_its_last_pixels(margin_px):
+    low, high = np.full(2, margin_px), np.array([IDEAL.width, IDEAL.height]) - 1.0 - margin_px
+    for axis in (0, 1):
+        out = 0.01 * np.eye(2)[axis]
+        asked = np.array([low, high, low - out, high + out, np.full(2, np.nan)])
+        assert IDEAL.contains(asked, margin_px).tolist() == [True, True, False, False, False]
