@@ -31,7 +31,7 @@ import results  # noqa: E402
 from vislam.config import LoopConfig, LoopTruthConfig  # noqa: E402
 from vislam.core.geometry import invert, so3_log  # noqa: E402
 from vislam.core.messages import Frame, Keyframe, LoopCandidate, LoopDecision, LoopEdge  # noqa: E402
-from vislam.loop.detector import LoopDetector  # noqa: E402
+from vislam.loop.closer import LoopCloser  # noqa: E402
 from vislam.runs.session.reader import Session, StoredKeyframe  # noqa: E402
 
 RULE = LoopTruthConfig()
@@ -42,7 +42,7 @@ class Pass:
 
     def __init__(self, session: Session, stored: list[StoredKeyframe], is_lost: bool) -> None:
         log = session.factor_log()
-        detector = LoopDetector(LoopConfig(), log.rig, 0, log.first_state is not None)
+        detector = LoopCloser(LoopConfig(), log.rig, 0, log.first_state is not None)
         middle = len(stored) // 2
         self.times_ms: list[float] = []
         self.verified, self.edges, self.gross = 0, 0, 0

@@ -89,7 +89,7 @@ def main() -> None:
         scratch = Mapper(config, rig)
         scratch.restore(scans, T)
         scratch.finish()
-        same = encode_ot(scratch.occupancy.octree()) == encode_ot(mapper.occupancy.octree())
+        same = encode_ot(scratch.occupancy.leaves()) == encode_ot(mapper.occupancy.leaves())
         print(f"  the same as from scratch: {same}")
 
 

@@ -33,7 +33,7 @@ from vislam.core.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.loop.words.vocabulary import train
 from vislam.runs.session import Session, SessionWriter, recall
 from vislam.slam import Slam
@@ -110,7 +110,7 @@ def load(path: Path, query: Keyframe) -> dict[str, float]:
     slam = Slam(Config(), RIG)
     slam.begin_in_map(memory)
     step("graph and index")
-    assert slam.back is not None and isinstance(slam.back.loops, LoopDetector)
+    assert slam.back is not None and isinstance(slam.back.loops, LoopCloser)
     _, candidates = slam.back.loops.detect(query, np.eye(4), begins_submap=True)
     step("first query")
     spent["by the clock"] = time.perf_counter() - began

@@ -37,7 +37,7 @@ from vislam.config import MapConfig  # noqa: E402
 from vislam.core.messages import Array, Frame  # noqa: E402
 from vislam.core.recording import Recording  # noqa: E402
 from vislam.mapping.depth.image import filter_depth, rgbd_view, scan_points  # noqa: E402
-from vislam.mapping.octree.occupancy import OccupancyMap  # noqa: E402
+from vislam.mapping.octree.occupancy import Octree  # noqa: E402
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot  # noqa: E402
 from vislam.runs.sources import open_source  # noqa: E402
 
@@ -121,11 +121,9 @@ def scans_of(recording: Recording, frames: list[tuple[Frame, Array]]) -> list[tu
     return scans
 
 
-def ours(
-    scans: list[tuple[NDArray[np.float32], Array]], resolution: float, insertion: Any
-) -> tuple[float, OccupancyMap]:
+def ours(scans: list[tuple[NDArray[np.float32], Array]], resolution: float, insertion: Any) -> tuple[float, Octree]:
     """Return CPU seconds of all insertions, and the map."""
-    grid = OccupancyMap(resolution)
+    grid = Octree(resolution)
     seconds = 0.0
     for points, origin in scans:
         begin = time.process_time()
@@ -157,8 +155,8 @@ def compare(args: argparse.Namespace) -> list[dict[str, Any]]:
                 theirs_s.append(answer["seconds"])
                 seconds, grid = ours(scans, resolution, insertion)
                 ours_s.append(seconds)
-            same = encode_ot(grid.octree()) == (folder / "tree.ot").read_bytes()
-            same &= encode_bt(grid.max_likelihood_octree()) == (folder / "tree.bt").read_bytes()
+            same = encode_ot(grid.leaves()) == (folder / "tree.ot").read_bytes()
+            same &= encode_bt(grid.max_likelihood_leaves()) == (folder / "tree.bt").read_bytes()
             rows.append(
                 {
                     "resolution_m": resolution, "insertion": insertion, "files_equal": same,

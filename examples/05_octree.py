@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.octomap_io import encode_bt, read_octree
 from vislam.mapping.octree.query import nearest_obstacle, ray_cast, sphere_state
 
@@ -24,7 +24,7 @@ inside = 0.3**2 - (2.0 * np.sin(angle)) ** 2  # of a ray that meets the pillar
 to_pillar_m = along - np.sqrt(np.maximum(inside, 0.0))
 points = ways * np.where(inside > 0.0, to_pillar_m, to_wall_m)[:, None]
 
-grid = OccupancyMap(resolution_m=0.05)
+grid = Octree(resolution_m=0.05)
 for _ in range(3):  # one look is a hint; log-odds add up
     grid.insert(points, origin_map_m=np.zeros(3))
 
@@ -42,8 +42,8 @@ print(f"from (1, 0) the next obstacle is {near.distance_m[0]:.2f} m away")
 # .bt is OctoMap's own format: octovis shows it, and any planner reads it
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "map.bt"
-    path.write_bytes(encode_bt(grid.max_likelihood_octree()))
-    again = OccupancyMap.from_octree(read_octree(path))
+    path.write_bytes(encode_bt(grid.max_likelihood_leaves()))
+    again = Octree.from_leaves(read_octree(path))
     print(f"{path.stat().st_size} bytes on disk")
 
 assert states.tolist() == [Occupancy.FREE, Occupancy.UNKNOWN, Occupancy.FREE]

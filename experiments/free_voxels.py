@@ -40,7 +40,7 @@ from vislam.factors.factor_log import rig_from  # noqa: E402
 from vislam.mapping.cloud.store import KeyframeStore  # noqa: E402
 from vislam.mapping.depth.extract import ScanExtractor  # noqa: E402
 from vislam.mapping.depth.image import DepthView, filter_depth, scan_points, surface_points  # noqa: E402
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap  # noqa: E402
+from vislam.mapping.octree.occupancy import Occupancy, Octree  # noqa: E402
 from vislam.mapping.octree.query import nearest_obstacle  # noqa: E402
 from vislam.sim import open_world  # noqa: E402
 
@@ -70,10 +70,10 @@ def scans_of_run(run: Path) -> tuple[MapConfig, DepthView, Scans]:
     return config, view, [(depth, T) for depth, T in depths if depth is not None]
 
 
-def build(scans: Scans, view: DepthView, config: MapConfig, model: tuple[float, float, float]) -> OccupancyMap:
+def build(scans: Scans, view: DepthView, config: MapConfig, model: tuple[float, float, float]) -> Octree:
     """Return the map of scans under a sensor model."""
     miss, beside, clamp = model
-    grid = OccupancyMap(
+    grid = Octree(
         config.resolution_m, config.hit_probability, miss, config.clamp_min_probability, clamp, beside
     )  # fmt: skip
     for depth, T in scans:
@@ -82,7 +82,7 @@ def build(scans: Scans, view: DepthView, config: MapConfig, model: tuple[float, 
     return grid
 
 
-def in_free(grid: OccupancyMap, scans: Scans, view: DepthView) -> tuple[float, float]:
+def in_free(grid: Octree, scans: Scans, view: DepthView) -> tuple[float, float]:
     """Return the share of depth points in free voxels, and the part of them that touches an occupied one."""
     free: list[Array] = []
     count = 0
@@ -95,19 +95,19 @@ def in_free(grid: OccupancyMap, scans: Scans, view: DepthView) -> tuple[float, f
     return len(lost) / max(count, 1), float(touching.mean()) if len(touching) else 0.0
 
 
-def against_truth(grid: OccupancyMap, octomaps: OccupancyMap, frames: list[View]) -> tuple[float, float, float]:
+def against_truth(grid: Octree, octomaps: Octree, frames: list[View]) -> tuple[float, float, float]:
     """Return recall, excess and open, see above."""
     surface, seen = np.unique(np.vstack([f.surface for f in frames]), axis=0, return_counts=True)
     tree = cKDTree(surface)
     recall = (states_of(grid, surface[seen >= 3]) == Occupancy.OCCUPIED).mean()
-    excess = away(tree, grid.max_likelihood_octree().occupied_voxels()).mean()
-    octree = octomaps.max_likelihood_octree()
+    excess = away(tree, grid.max_likelihood_leaves().occupied_voxels()).mean()
+    octree = octomaps.max_likelihood_leaves()
     free = replace(octree, log_odds=-octree.log_odds).occupied_voxels()
     stays = states_of(grid, free[away(tree, free)]) == Occupancy.FREE
     return float(recall), float(excess), float(stays.mean())
 
 
-def states_of(grid: OccupancyMap, voxels: NDArray[np.int64]) -> NDArray[np.int8]:
+def states_of(grid: Octree, voxels: NDArray[np.int64]) -> NDArray[np.int8]:
     """Return the states [N] of voxels [N, 3]."""
     return grid.state_at((voxels + 0.5) * grid.resolution_m)
 
@@ -152,7 +152,7 @@ def main() -> None:
             grid = build(scans, view, config, model)
             cpu_ms = 1e3 * (time.process_time() - begun) / len(scans)
             lost, touching = in_free(grid, scans, view)
-            occupied = len(grid.max_likelihood_octree().occupied_voxels())
+            occupied = len(grid.max_likelihood_leaves().occupied_voxels())
             truth = [f"{share:.2%}" for share in against_truth(grid, octomaps, frames)] if frames else ["-"] * 3
             print(
                 f"| {cause} | {name} | {len(scans)} | {lost:.2%} | {touching:.1%} | {occupied} | {cpu_ms:.2f} ms | "

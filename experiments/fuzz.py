@@ -556,11 +556,11 @@ def _maps() -> list[dict[str, bytes]]:
     from vislam.mapping.formats.pcd import write_pcd
     from vislam.mapping.formats.ply import write_ply
     from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
-    from vislam.mapping.octree.tree import Octree
+    from vislam.mapping.octree.tree import OctreeLeaves
 
     starts = np.arange(32, dtype=np.int64) * 9 + (1 << 45)
     values = np.where(np.arange(32) % 2, 2.0, -2.0).astype(np.float32)
-    octree = Octree(0.05, starts, np.zeros(32, np.uint8), values)
+    octree = OctreeLeaves(0.05, starts, np.zeros(32, np.uint8), values)
     rng = np.random.default_rng(1)
     points, colors = rng.normal(size=(40, 3)).astype(np.float32), rng.integers(0, 255, (40, 3), np.uint8)
     with tempfile.TemporaryDirectory() as name:

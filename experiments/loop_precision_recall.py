@@ -31,7 +31,7 @@ from vislam.config import LoopTruthConfig
 from vislam.core.errors import VislamError
 from vislam.core.files import write_json, write_text
 from vislam.core.messages import Array, Frame, Keyframe, LoopCandidate
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.loop.table import LoopRow, loops_text, retrieved_text
 from vislam.runs.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
 from vislam.runs.report import write_loop_plot
@@ -109,7 +109,7 @@ def _drifted(run: Path, share: float, no_guess: bool) -> Path:
     log, config, stored = session.factor_log(), session.config(), list(session.keyframes())
     session.close()
     loop = replace(config.loop, max_odometry=0) if no_guess else config.loop
-    detector = LoopDetector(loop, log.rig, config.seed, log.first_state is not None)
+    detector = LoopCloser(loop, log.rig, config.seed, log.first_state is not None)
     rows, retrieved = [], []
     for k, T in zip(stored, pulled_away(np.array([k.T_odom_body for k in stored]), share), strict=True):
         keyframe = Keyframe(k.id, k.t_ns, Frame(k.t_ns, k.id, ()), k.keypoints_px, k.descriptors, k.points_body_m)

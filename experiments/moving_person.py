@@ -38,7 +38,7 @@ from vislam.core.camera import Camera  # noqa: E402
 from vislam.core.geometry import invert  # noqa: E402
 from vislam.core.messages import Array, ImageF32  # noqa: E402
 from vislam.mapping.depth.image import DepthView, filter_depth, rgbd_view, scan_points  # noqa: E402
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap  # noqa: E402
+from vislam.mapping.octree.occupancy import Occupancy, Octree  # noqa: E402
 from vislam.mapping.octree.query import nearest_obstacle  # noqa: E402
 from vislam.sim import Simulation, open_world  # noqa: E402
 from vislam.sim.scene.figure import figure_depth  # noqa: E402
@@ -152,9 +152,9 @@ def seen_through(view: View, camera: Camera, centres: Array, max_range_m: float)
     return out
 
 
-def new_map(config: MapConfig, model: Model) -> OccupancyMap:
+def new_map(config: MapConfig, model: Model) -> Octree:
     """Return an empty map that believes as the model says."""
-    return OccupancyMap(
+    return Octree(
         config.resolution_m,
         model.hit_probability,
         model.miss_probability,
@@ -164,7 +164,7 @@ def new_map(config: MapConfig, model: Model) -> OccupancyMap:
     )
 
 
-def build(frames: list[View], view: DepthView, config: MapConfig, model: Model) -> OccupancyMap:
+def build(frames: list[View], view: DepthView, config: MapConfig, model: Model) -> Octree:
     """Return the map of the frames without the person."""
     grid = new_map(config, model)
     for frame in frames:
@@ -173,7 +173,7 @@ def build(frames: list[View], view: DepthView, config: MapConfig, model: Model) 
     return grid
 
 
-def person_places(frames: list[View], static: OccupancyMap) -> tuple[Array, Array]:
+def person_places(frames: list[View], static: Octree) -> tuple[Array, Array]:
     """Return the centres [N, 3] of the voxels that the person was seen in, and of those beside static ones [M, 3]."""
     r = static.resolution_m
     voxels = np.unique(np.floor(np.vstack([f.figure_points for f in frames]) / r).astype(np.int64), axis=0)
@@ -206,7 +206,7 @@ def judge(frames: list[View], view: DepthView, camera: Camera, config: MapConfig
     times_s += [frames[-1].t_s - t for t in since_s[frames[-1].t_s - since_s > 1.0]]
     surface, seen = np.unique(np.vstack([f.surface for f in frames]), axis=0, return_counts=True)
     true = (surface[seen >= 3] + 0.5) * config.resolution_m
-    occupied = (static.max_likelihood_octree().occupied_voxels() + 0.5) * config.resolution_m
+    occupied = (static.max_likelihood_leaves().occupied_voxels() + 0.5) * config.resolution_m
     return {
         "voxels": len(times_s),
         "cleared_in_1s": float(np.mean(np.array(times_s) < 1.0 + 1e-6)) if times_s else None,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vislam.config import MapConfig
 from vislam.core.errors import DataError, VislamError
 from vislam.mapping.drive.drive import DriveGrid, DriveMap
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 from vislam.mapping.octree.octomap_io import read_octree
 from vislam.mapping.pictures.picture import Line
 from vislam.mapping.pictures.plan import render_drive
@@ -106,7 +106,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--goal", type=_place)
     parser.add_argument("--out", type=Path, default=Path("plan.png"))
     options = parser.parse_args(arguments)
-    occupancy = OccupancyMap.from_octree(read_octree(options.run / "map" / "octomap.bt"))
+    occupancy = Octree.from_leaves(read_octree(options.run / "map" / "octomap.bt"))
     grid = DriveMap(MapConfig()).update(occupancy)
     way = read_trajectory(options.run / "trajectory_graph.tum").positions_m
     start = way[-1, :2] if options.start is None else options.start

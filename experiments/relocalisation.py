@@ -52,7 +52,7 @@ from vislam.core.recording import Recording, WrappedRecording
 from vislam.datasets import open_dataset
 from vislam.frontend import make_frontend
 from vislam.graph import PoseGraph
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.loop.evaluation import true_places
 from vislam.pipeline.front import Front
 from vislam.sim import open_world
@@ -131,7 +131,7 @@ def graph_of(known: SavedMap, config: Config, recording: Simulation) -> PoseGrap
 
 def ask(known: SavedMap, recording: Simulation, first: int, config: Config) -> Answer:
     """Begin at a frame of the second recording and go on until the place is found, or the time is up."""
-    detector, graph = LoopDetector(config.loop, recording.rig, config.seed, True), graph_of(known, config, recording)
+    detector, graph = LoopCloser(config.loop, recording.rig, config.seed, True), graph_of(known, config, recording)
     detector.restore(known.places)
     front = Front(config, recording.rig, None, StageClock())
     count, T_map_odom, T_up, cpu_ms = len(known.T_map_body), np.eye(4), None, []
@@ -286,7 +286,7 @@ def _ask_frame(
     known: SavedMap, query: Keyframe, T_truth_body: Array, sees: bool, recording: Recording, config: Config
 ) -> FrameAnswer:  # fmt: skip
     """Ask the map where one frame is."""
-    detector = LoopDetector(config.loop, recording.rig, config.seed)
+    detector = LoopCloser(config.loop, recording.rig, config.seed)
     detector.restore(known.places)
     start = time.thread_time()
     candidates = detector.detect(query, np.eye(4), begins_submap=True, tags=())[1]

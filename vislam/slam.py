@@ -44,6 +44,9 @@ class Slam:
         self._frames: deque[Frame] = deque()
         self._silence = SilentCamera() if suite is not None and len(suite) and noise is not None else None
 
+    def __repr__(self) -> str:
+        return f"Slam({self.front.frontend.mode}, {0 if self.back is None else len(self.back.graph.poses())} keyframes)"
+
     @property
     def back(self) -> Back | None:
         """The stages at the rate of keyframes; None before the first."""

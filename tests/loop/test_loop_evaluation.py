@@ -25,7 +25,7 @@ from vislam.core.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.loop.evaluation import (
     DOUBTFUL,
     RIGHT,
@@ -180,7 +180,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     world: LandmarkWorld = room(1)
     rng, poses = np.random.default_rng(0), lap_poses(2.0, PER_LAP)
-    detector = LoopDetector(replace(LoopConfig(), appearance_skip_keyframes=12, appearance_skip_s=1.0), world.rig, 0)
+    detector = LoopCloser(replace(LoopConfig(), appearance_skip_keyframes=12, appearance_skip_s=1.0), world.rig, 0)
     writer = SessionWriter(folder / "session.db", {"source": "test"}, world.rig, None, 9.81)
     rows: list[LoopRow] = []
     retrieved: list[RetrievedKeyframe] = []

@@ -8,7 +8,7 @@ import pytest
 from vislam.config import LoopConfig
 from vislam.core.geometry import invert, se3_log
 from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge, Submaps
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, room
 
 PER_LAP = 40
@@ -23,15 +23,15 @@ def laps() -> tuple[LandmarkWorld, list[Array], list[Keyframe]]:
     return world, poses, [world.see(i, pose, rng) for i, pose in enumerate(poses)]
 
 
-def begin(world: LandmarkWorld, keyframes: list[Keyframe], poses: list[Array], config: LoopConfig) -> LoopDetector:
-    detector = LoopDetector(config, world.rig, 0, gravity_aligned=True)
+def begin(world: LandmarkWorld, keyframes: list[Keyframe], poses: list[Array], config: LoopConfig) -> LoopCloser:
+    detector = LoopCloser(config, world.rig, 0, gravity_aligned=True)
     for keyframe, pose in zip(keyframes[:LOST], poses, strict=False):
         detector.detect(keyframe, pose)
     return detector
 
 
 def go_on(
-    detector: LoopDetector, keyframes: list[Keyframe], estimates: list[Array]
+    detector: LoopCloser, keyframes: list[Keyframe], estimates: list[Array]
 ) -> list[tuple[list[LoopEdge], list[LoopCandidate]]]:
     return [
         detector.detect(keyframe, pose, begins_submap=n == 0)
@@ -70,7 +70,7 @@ def test_a_loss_right_at_the_start_needs_no_words_of_the_run(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
     world, poses, keyframes = laps
-    detector = LoopDetector(CONFIG, world.rig, 0)
+    detector = LoopCloser(CONFIG, world.rig, 0)
     for k in range(4):
         detector.detect(keyframes[k], poses[k])
     again = [replace(keyframes[k], id=k + 3) for k in (1, 2)]

@@ -11,12 +11,12 @@ from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.core.messages import Array, Frame, Keyframe, LoopDecision
 from vislam.datasets import open_dataset
 from vislam.frontend import make_frontend
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 
 EVERY = 6  # frames from keyframe to keyframe
 
 
-def every_nth(uri: str) -> tuple[LoopDetector, list[Keyframe], Array]:
+def every_nth(uri: str) -> tuple[LoopCloser, list[Keyframe], Array]:
     """Return a detector, every n-th frame as a keyframe (the first of its own front end), and the true poses."""
     recording = open_dataset(uri)
     truth = recording.truth()
@@ -32,7 +32,7 @@ def every_nth(uri: str) -> tuple[LoopDetector, list[Keyframe], Array]:
             Keyframe(len(keyframes), first.t_ns, frame, first.keypoints_px, first.descriptors, first.points_body_m)
         )
     poses = truth.at(np.array([keyframe.t_ns for keyframe in keyframes]))
-    return LoopDetector(LoopConfig(), recording.rig, 0), keyframes, poses
+    return LoopCloser(LoopConfig(), recording.rig, 0), keyframes, poses
 
 
 @pytest.mark.data

@@ -10,7 +10,7 @@ from vislam.core.geometry import invert, se3_log
 from vislam.core.memory import TagSighting
 from vislam.core.messages import Frame, Keyframe
 from vislam.loop import detector as detector_module
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.vision.features import find_tags
 from worlds.landmarks import body_pose, make_rig
@@ -97,7 +97,7 @@ def test_a_blank_wall_with_tags_closes_the_loop():
     """Nothing but two tags ties the second visit to the first."""
     rng = np.random.default_rng(SEED)
     tags = {7: hung(1.5, 0.35, 0.1, 225.0), 9: hung(1.5, -0.35, 0.0, 135.0)}
-    detector = LoopDetector(load(None, WITH_SIZE).loop, RIG, SEED)
+    detector = LoopCloser(load(None, WITH_SIZE).loop, RIG, SEED)
     first = [body_pose((0.1 * k, 0.0, 0.0), 2.0 * k) for k in range(3)]
     second = [body_pose((0.05 + 0.1 * k, 0.1, 0.0), 2.0 - k) for k in range(3)]
     poses = [*first, *[body_pose((0.0, 0.0, 0.0), 180.0)] * 8, *second]
@@ -128,7 +128,7 @@ def searched(monkeypatch, settings, tagged=()):
         return (TagSighting(7, 40.0, None, None),) if frame.index in tagged else ()
 
     monkeypatch.setattr(detector_module, "sight_tags", sight)
-    detector = LoopDetector(load(None, settings).loop, RIG, SEED)
+    detector = LoopCloser(load(None, settings).loop, RIG, SEED)
     nothing = np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3))
     for k in range(14):
         seen = Frame(k * 300_000_000, k, (np.zeros((480, 640), np.uint8),))

@@ -6,7 +6,7 @@ import pytest
 from vislam.config import DriveConfig, MapConfig
 from vislam.core.errors import DataError
 from vislam.mapping.drive.drive import Drive, DriveMap
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 
 CELL = 0.1
 DRIVE = DriveConfig(body_length_m=0.6, body_width_m=0.4, max_step_m=0.1, max_slope_deg=15.0, slope_window_m=1.0)
@@ -21,7 +21,7 @@ class Yard:
         self.things = []  # rows, columns, lowest and highest voxel
 
     def occupancy(self, parts=1):
-        grid = OccupancyMap(CELL)
+        grid = Octree(CELL)
         scans = [[] for _ in range(parts)]
         for (row, column), top in np.ndenumerate(self.ground):
             if np.isnan(top):
@@ -223,7 +223,7 @@ def test_reflections_below_the_floor_do_not_open_it():
 
 
 def test_the_floor_is_told_or_found_and_an_empty_map_is_unknown():
-    empty = DriveMap(CONFIG).update(OccupancyMap(CELL))
+    empty = DriveMap(CONFIG).update(Octree(CELL))
     assert empty.states.tolist() == [[Drive.UNKNOWN]]
     assert not empty.is_traversable(np.zeros((1, 2))).any()
     yard = Yard(20, 20)

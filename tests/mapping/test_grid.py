@@ -6,12 +6,12 @@ import pytest
 import yaml
 
 from vislam.mapping.drive.grid import floor_height_m, navigation_grid, write_grid
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 
 
 def room():
     """A floor 3 m by 2 m with a box at its far right corner, seen from above the middle; x from 1, y from -1."""
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     x, y = np.meshgrid(np.arange(1.05, 4.0, 0.05), np.arange(-0.95, 1.0, 0.05))
     floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.25)])
     bx, by, bz = np.meshgrid(np.arange(3.55, 3.8, 0.1), np.arange(0.55, 0.8, 0.1), np.arange(0.35, 0.8, 0.1))
@@ -25,7 +25,7 @@ def room():
 
 
 def test_bands_above_the_floor():
-    octree = room().octree()
+    octree = room().leaves()
     floor = floor_height_m(octree)
     assert floor == pytest.approx(0.2)
     grid = navigation_grid(octree, floor, 0.1, 1.5)
@@ -49,7 +49,7 @@ def cell_reader(grid):
 
 
 def test_map_server_reads_back_what_was_meant(tmp_path):
-    octree = room().octree()
+    octree = room().leaves()
     grid = navigation_grid(octree, floor_height_m(octree), 0.1, 1.5)
     image_path, yaml_path = write_grid(tmp_path, grid)
     meta = yaml.safe_load(yaml_path.read_text())
@@ -65,7 +65,7 @@ def test_map_server_reads_back_what_was_meant(tmp_path):
 
 
 def test_large_leaves_fill_all_their_cells():
-    octree = room().octree()
+    octree = room().leaves()
     assert octree.levels.max() >= 1  # pruned
     grid = navigation_grid(octree, 0.2, 0.1, 1.5)
     free = replace(octree, log_odds=-octree.log_odds).occupied_voxels()
@@ -77,7 +77,7 @@ def test_large_leaves_fill_all_their_cells():
 
 
 def test_an_empty_map_gives_one_unknown_cell(tmp_path):
-    octree = OccupancyMap(0.05).octree()
+    octree = Octree(0.05).leaves()
     assert floor_height_m(octree) == 0.0
     grid = navigation_grid(octree, 0.0, 0.1, 1.5)
     assert grid.cells.tolist() == [[-1]]

@@ -38,7 +38,7 @@ def digest(mapper):
 
 
 def digest_of(occupancy):
-    return hashlib.sha256(encode_ot(occupancy.octree())).hexdigest()
+    return hashlib.sha256(encode_ot(occupancy.leaves())).hexdigest()
 
 
 SEEN = [keyframe(k) for k in range(10)]
@@ -48,7 +48,7 @@ DRIFTED = [T @ se3_exp(np.array([0.0, 0.0, 0.01 * k, 0.03 * k, -0.02 * k, 0.0]))
 
 def test_the_room_is_found_and_the_rest_is_unknown():
     mapper = mapper_at(TRUE)
-    occupied = mapper.occupancy.octree()
+    occupied = mapper.occupancy.leaves()
     centres = occupied.centres_m()[0][occupied.log_odds >= 0]
     to_wall = np.minimum(np.abs(centres - ROOM_LOW), np.abs(centres - ROOM_HIGH)).min(axis=1)
     assert np.percentile(to_wall, 99) < 0.05
@@ -221,10 +221,10 @@ def test_any_sequence_of_keyframes_and_corrections_ends_in_the_map_from_scratch(
 def test_a_reader_keeps_the_map_it_holds():
     mapper = mapper_at(DRIFTED)
     held = mapper.occupancy
-    before = encode_ot(held.octree())
+    before = encode_ot(held.leaves())
     mapper.move(update(range(10), TRUE))
     mapper.finish()
-    assert encode_ot(held.octree()) == before
+    assert encode_ot(held.leaves()) == before
     assert mapper.occupancy is not held
 
 

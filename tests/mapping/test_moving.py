@@ -50,7 +50,7 @@ def ghosts_and_kept(config, rate_hz):
         empty.add(keyframe(k, pose(0), BACKGROUND), pose(0))
         places = np.vstack(seen)
         at_most = max(at_most, int((mapper.occupancy.state_at(places) == Occupancy.OCCUPIED).sum()))
-    walls = (empty.occupancy.max_likelihood_octree().occupied_voxels() + 0.5) * config.resolution_m
+    walls = (empty.occupancy.max_likelihood_leaves().occupied_voxels() + 0.5) * config.resolution_m
     left = int((mapper.occupancy.state_at(in_view(places, config)) == Occupancy.OCCUPIED).sum())
     return left, at_most, (mapper.occupancy.state_at(walls) == Occupancy.OCCUPIED).mean()
 

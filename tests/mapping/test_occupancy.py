@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vislam.core.errors import DataError
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
 
 
@@ -92,13 +92,13 @@ def random_scan(rng, count, reach):
 )
 def test_equals_a_slow_octomap_voxel_by_voxel(seed, resolution, max_range, insertion, miss_beside):
     rng = np.random.default_rng(seed)
-    fast = OccupancyMap(resolution, miss_beside_probability=miss_beside)
+    fast = Octree(resolution, miss_beside_probability=miss_beside)
     slow = SlowOctoMap(resolution, miss_beside)
     for _ in range(3):
         points, origin = random_scan(rng, 15, 1.0)
         fast.insert(points, origin, max_range, insertion)
         slow.insert(points, origin, max_range, insertion == "discretised")
-    octree = fast.octree()
+    octree = fast.leaves()
     assert int((np.int64(1) << (3 * octree.levels.astype(np.int64))).sum()) == len(slow.cells)
     centres = np.array([slow.centre(k) for k in slow.cells], dtype=np.float64)
     np.testing.assert_array_equal(fast.log_odds_at(centres), np.array(list(slow.cells.values()), dtype=np.float32))
@@ -109,7 +109,7 @@ def test_equals_a_slow_octomap_voxel_by_voxel(seed, resolution, max_range, inser
 @pytest.mark.parametrize("insertion", ["discretised", "full"])
 def test_files_equal_those_of_octomap_byte_for_byte(tmp_path, resolution, insertion):
     rng = np.random.default_rng(7)
-    ours, theirs = OccupancyMap(resolution), pyoctomap.OcTree(resolution)
+    ours, theirs = Octree(resolution), pyoctomap.OcTree(resolution)
     for _ in range(3):
         points, origin = random_scan(rng, 1500, 1.5)
         ours.insert(points, origin, 2.0, insertion)
@@ -117,19 +117,19 @@ def test_files_equal_those_of_octomap_byte_for_byte(tmp_path, resolution, insert
             points.astype(np.float64), origin.astype(np.float64), max_range=2.0, discretize=insertion == "discretised"
         )
     theirs.write(str(tmp_path / "a.ot"))
-    assert encode_ot(ours.octree()) == (tmp_path / "a.ot").read_bytes()
+    assert encode_ot(ours.leaves()) == (tmp_path / "a.ot").read_bytes()
     theirs.writeBinary(str(tmp_path / "a.bt"))
-    assert encode_bt(ours.max_likelihood_octree()) == (tmp_path / "a.bt").read_bytes()
+    assert encode_bt(ours.max_likelihood_leaves()) == (tmp_path / "a.bt").read_bytes()
 
 
 def test_where_a_miss_beside_a_hit_counts_as_any_files_are_still_octomaps():
     rng = np.random.default_rng(8)
-    octomaps, equal, spared = (OccupancyMap(0.05, miss_beside_probability=p) for p in (None, 0.4, 0.46))
+    octomaps, equal, spared = (Octree(0.05, miss_beside_probability=p) for p in (None, 0.4, 0.46))
     for _ in range(3):
         points, origin = random_scan(rng, 1500, 1.5)
         for grid in (octomaps, equal, spared):
             grid.insert(points, origin, 2.0)
-    assert encode_ot(equal.octree()) == encode_ot(octomaps.octree()) != encode_ot(spared.octree())
+    assert encode_ot(equal.leaves()) == encode_ot(octomaps.leaves()) != encode_ot(spared.leaves())
 
 
 def grazing_scans(grid, count):
@@ -145,14 +145,14 @@ def grazing_scans(grid, count):
 
 
 def test_a_floor_that_rays_graze_stays_where_a_miss_beside_a_hit_counts_less():
-    before = grazing_scans(OccupancyMap(0.05, 0.7, 0.32, 0.1192, 0.9), 12)
-    now = grazing_scans(OccupancyMap(0.05, 0.7, 0.32, 0.1192, 0.9, 0.46), 12)
+    before = grazing_scans(Octree(0.05, 0.7, 0.32, 0.1192, 0.9), 12)
+    now = grazing_scans(Octree(0.05, 0.7, 0.32, 0.1192, 0.9, 0.46), 12)
     assert before > 0.1
     assert now < 0.5 * before
 
 
 def test_what_lay_on_a_floor_and_is_gone_is_cleared_in_the_end():
-    grid = OccupancyMap(0.05, 0.7, 0.32, 0.1192, 0.9, 0.46)
+    grid = Octree(0.05, 0.7, 0.32, 0.1192, 0.9, 0.46)
     x, y = np.meshgrid(np.arange(1.0, 2.0, 0.02), np.arange(-0.5, 0.5, 0.02))
     floor, origin = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.02)]), np.array([0.0, 0.0, 1.0])
     lying = (abs(floor[:, 0] - 1.5) < 0.2) & (abs(floor[:, 1]) < 0.2)
@@ -168,7 +168,7 @@ def test_what_lay_on_a_floor_and_is_gone_is_cleared_in_the_end():
 
 
 def test_a_ray_frees_its_way_and_nothing_else():
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     grid.insert(np.array([[1.05, 0.05, 0.05]]), np.array([0.05, 0.05, 0.05]))
     along = np.array([[x, 0.05, 0.05] for x in (0.05, 0.55, 0.95)])
     assert (grid.state_at(along) == Occupancy.FREE).all()
@@ -179,15 +179,15 @@ def test_a_ray_frees_its_way_and_nothing_else():
 
 @pytest.mark.parametrize("insertion", ["discretised", "full"])
 def test_a_point_beyond_the_range_only_clears_the_way(insertion):
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     grid.insert(np.array([[3.05, 0.05, 0.05]]), np.array([0.05, 0.05, 0.05]), 2.0, insertion)
-    assert len(grid.octree().occupied_voxels()) == 0
+    assert len(grid.leaves().occupied_voxels()) == 0
     states = grid.state_at(np.array([[1.95, 0.05, 0.05], [2.25, 0.05, 0.05], [3.05, 0.05, 0.05]]))
     assert states.tolist() == [Occupancy.FREE, Occupancy.UNKNOWN, Occupancy.UNKNOWN]
 
 
 def test_clamping_lets_a_voxel_change_its_mind():
-    grid, wall, behind = OccupancyMap(0.1), np.array([[1.05, 0.05, 0.05]]), np.array([[2.05, 0.05, 0.05]])
+    grid, wall, behind = Octree(0.1), np.array([[1.05, 0.05, 0.05]]), np.array([[2.05, 0.05, 0.05]])
     origin = np.full(3, 0.05)
     for _ in range(1000):
         grid.insert(wall, origin)
@@ -201,20 +201,20 @@ def test_clamping_lets_a_voxel_change_its_mind():
 
 def test_points_that_are_not_finite_are_left_out():
     points = np.array([[1.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])
-    dirty, clean = OccupancyMap(0.1), OccupancyMap(0.1)
+    dirty, clean = Octree(0.1), Octree(0.1)
     assert dirty.insert(points, np.zeros(3)) == 1
     clean.insert(points[:1], np.zeros(3))
-    assert encode_ot(dirty.octree()) == encode_ot(clean.octree())
+    assert encode_ot(dirty.leaves()) == encode_ot(clean.leaves())
     assert dirty.insert(np.full((3, 3), np.nan), np.zeros(3)) == 0
     assert dirty.insert(np.zeros((0, 3)), np.zeros(3)) == 0
 
 
 def test_queries_beyond_the_world_are_unknown():
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     grid.insert(np.ones((1, 3)), np.zeros(3))
     places = np.array([[1e9, 0.0, 0.0], [-1e30, 0.0, 0.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]])
     assert (grid.state_at(places) == Occupancy.UNKNOWN).all()
-    assert np.isnan(grid.octree().log_odds_at(places)).all()
+    assert np.isnan(grid.leaves().log_odds_at(places)).all()
 
 
 @pytest.mark.parametrize(
@@ -226,23 +226,23 @@ def test_queries_beyond_the_world_are_unknown():
     ],
 )
 def test_impossible_scans_are_refused_and_leave_the_map_alone(points, origin, words):
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     grid.insert(np.ones((1, 3)), np.zeros(3))
-    before = encode_ot(grid.octree())
+    before = encode_ot(grid.leaves())
     with pytest.raises(DataError, match=words):
         grid.insert(np.array(points), np.array(origin))
-    assert encode_ot(grid.octree()) == before
+    assert encode_ot(grid.leaves()) == before
 
 
 @pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_resolutions_are_refused(resolution):
     with pytest.raises(DataError, match="resolution"):
-        OccupancyMap(resolution)
+        Octree(resolution)
 
 
 def test_many_blocks_survive_the_growth_of_the_table():
     rng = np.random.default_rng(3)
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     places = rng.uniform(-30, 30, (3000, 3))
     for place in places:
         grid.insert(place[None], place)

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from needs import missing
 from vislam.cli import run_verb
 from vislam.core.errors import DataError
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot, read_octree
 
 
 def sample_map(seed=11, scans=3):
     rng = np.random.default_rng(seed)
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     for _ in range(scans):
         origin = rng.uniform(-0.5, 0.5, 3)
         grid.insert(origin + rng.uniform(-2, 2, (300, 3)), origin)
@@ -30,11 +30,11 @@ def sample_map(seed=11, scans=3):
 
 @pytest.fixture
 def bt_bytes():
-    return encode_bt(sample_map().max_likelihood_octree())
+    return encode_bt(sample_map().max_likelihood_leaves())
 
 
 def test_round_trip(tmp_path, bt_bytes):
-    octree = sample_map().max_likelihood_octree()
+    octree = sample_map().max_likelihood_leaves()
     path = tmp_path / "a.bt"
     path.write_bytes(bt_bytes)
     back = read_octree(path)
@@ -77,8 +77,8 @@ def test_octomaps_own_tools_draw_the_same_boxes(tmp_path, bt_bytes):
 
 def test_octomaps_own_tools_find_no_difference(tmp_path, bt_bytes):
     (tmp_path / "a.bt").write_bytes(bt_bytes)
-    (tmp_path / "ours.ot").write_bytes(encode_ot(sample_map().max_likelihood_octree()))
-    (tmp_path / "other.ot").write_bytes(encode_ot(sample_map().octree()))  # the same voxels, less sure
+    (tmp_path / "ours.ot").write_bytes(encode_ot(sample_map().max_likelihood_leaves()))
+    (tmp_path / "other.ot").write_bytes(encode_ot(sample_map().leaves()))  # the same voxels, less sure
     run_tool("convert_octree", tmp_path / "a.bt", tmp_path / "converted.ot")
     same = run_tool("compare_octrees", tmp_path / "ours.ot", tmp_path / "converted.ot")
     different = run_tool("compare_octrees", tmp_path / "ours.ot", tmp_path / "other.ot")
@@ -89,7 +89,7 @@ def test_octomaps_own_tools_find_no_difference(tmp_path, bt_bytes):
 
 def test_an_empty_map_is_a_valid_file(tmp_path):
     path = tmp_path / "empty.bt"
-    path.write_bytes(encode_bt(OccupancyMap(0.05).max_likelihood_octree()))
+    path.write_bytes(encode_bt(Octree(0.05).max_likelihood_leaves()))
     assert b"size 0\n" in path.read_bytes()
     octree = read_octree(path)
     assert len(octree) == 0
@@ -98,7 +98,7 @@ def test_an_empty_map_is_a_valid_file(tmp_path):
 
 @pytest.mark.parametrize("kind", ["bt", "ot"])
 def test_every_truncation_is_an_error(tmp_path, kind):
-    octree = sample_map().max_likelihood_octree()
+    octree = sample_map().max_likelihood_leaves()
     content = encode_bt(octree) if kind == "bt" else encode_ot(octree)
     path = tmp_path / f"cut.{kind}"
     data = content.index(b"data\n") + 5
@@ -147,7 +147,7 @@ def test_the_binary_file_of_a_tree_for_colours_is_read(tmp_path):
 
 
 def test_octomap_reads_our_colours(tmp_path):
-    octree = sample_map().octree()
+    octree = sample_map().leaves()
     centres = octree.centres_m()[0]
     rng = np.random.default_rng(8)
     places, colors = np.repeat(centres[::2], 3, axis=0), rng.integers(0, 255, (3 * len(centres[::2]), 3), np.uint8)
@@ -167,7 +167,7 @@ def test_octomap_reads_our_colours(tmp_path):
 def test_a_coloured_map_is_that_of_octomap_byte_for_byte(tmp_path, insertion):
     """Each occupied leaf of OctoMap's own tree of the same points gets the mean colour of the points in it."""
     rng = np.random.default_rng(9)
-    ours, theirs = OccupancyMap(0.1), pyoctomap.ColorOcTree(0.1)
+    ours, theirs = Octree(0.1), pyoctomap.ColorOcTree(0.1)
     points = np.round(rng.uniform(-0.45, 0.45, (4000, 3)), 2).astype(np.float32) + np.float32(0.004)
     colors = rng.integers(0, 256, points.shape).astype(np.uint8)
     for scan in [points[:300], *[points] * 6]:  # often enough for most to be clamped, and pruned
@@ -175,7 +175,7 @@ def test_a_coloured_map_is_that_of_octomap_byte_for_byte(tmp_path, insertion):
         theirs.insertPointCloud(
             scan.astype(np.float64), np.zeros(3), max_range=2.0, discretize=insertion == "discretised"
         )
-    coloured = ours.octree()
+    coloured = ours.leaves()
     assert ((coloured.log_odds >= 0.0) & (coloured.levels > 0)).any()
     is_occupied = coloured.log_odds_at(points) >= 0.0
     coloured = coloured.with_colors(points[is_occupied], colors[is_occupied])
@@ -193,9 +193,9 @@ def test_a_coloured_map_is_that_of_octomap_byte_for_byte(tmp_path, insertion):
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.booleans())
 def test_any_octree_survives_writing_and_reading(seed, count, is_coloured):
     rng = np.random.default_rng(seed)
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     grid.insert(rng.uniform(-1, 1, (count, 3)) ** 3 * 1000, np.array([500.0, 0.0, 0.0]), 3.0, "full")
-    octree = grid.octree()
+    octree = grid.leaves()
     if is_coloured:
         octree = octree.with_colors(octree.centres_m()[0], rng.integers(0, 256, (len(octree), 3)).astype(np.uint8))
     with TemporaryDirectory() as folder:
@@ -229,7 +229,7 @@ def test_whatever_follows_a_header_is_read_or_refused(data, kind, tree):
 @settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(0, 255), st.booleans())
 def test_a_changed_byte_never_does_worse_than_an_error(place, value, is_binary):
-    octree = sample_map(scans=1).octree()
+    octree = sample_map(scans=1).leaves()
     content = bytearray(encode_bt(octree) if is_binary else encode_ot(octree))
     content[place % len(content)] = value
     with TemporaryDirectory() as folder:

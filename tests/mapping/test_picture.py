@@ -2,7 +2,7 @@ import numpy as np
 
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 from vislam.mapping.pictures.picture import Line, render_cloud, render_mesh, render_octree
 
 SIZE = (320, 180)
@@ -61,10 +61,10 @@ def test_lines_are_drawn_and_shine_through_where_hidden():
 
 
 def test_voxels_show_height_by_colour():
-    grid = OccupancyMap(0.1)
+    grid = Octree(0.1)
     for _ in range(2):
         grid.insert(joined(plate(0.0, RED), plate(1.0, RED, 0.4)).points_m + 0.01, np.array([0.0, 0.0, 5.0]))
-    image = render_octree(grid.octree(), size=SIZE)
+    image = render_octree(grid.leaves(), size=SIZE)
     drawn = (image < 250).any(axis=2)
     assert drawn.mean() > 0.2
     warm = (image[..., 0].astype(int) > image[..., 2].astype(int) + 60) & drawn
@@ -91,7 +91,7 @@ def test_empty_maps_and_broken_lines_still_give_a_picture():
     for image in (
         render_cloud(nothing, lines, SIZE),
         render_cloud(nothing, [], SIZE),
-        render_octree(OccupancyMap(0.1).octree(), lines, SIZE),
+        render_octree(Octree(0.1).leaves(), lines, SIZE),
         render_cloud(Cloud(np.ones((1, 3), np.float32), np.full((1, 3), 9, np.uint8)), [], SIZE),
     ):
         assert image.shape == (180, 320, 3)

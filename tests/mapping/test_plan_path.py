@@ -83,15 +83,15 @@ def test_the_picture_shows_the_grid_with_north_up():
 
 
 def test_the_experiment_needs_only_a_run_folder(tmp_path, capsys):
-    from vislam.mapping.octree.occupancy import OccupancyMap
+    from vislam.mapping.octree.occupancy import Octree
     from vislam.mapping.octree.octomap_io import encode_bt
 
-    occupancy = OccupancyMap(CELL)
+    occupancy = Octree(CELL)
     x, y = np.meshgrid(np.arange(0.05, 4.0, CELL), np.arange(0.05, 3.0, CELL))
     floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -0.05)])
     occupancy.insert(floor, np.array([2.0, 1.5, 2.0]))
     (tmp_path / "map").mkdir()
-    (tmp_path / "map" / "octomap.bt").write_bytes(encode_bt(occupancy.max_likelihood_octree()))
+    (tmp_path / "map" / "octomap.bt").write_bytes(encode_bt(occupancy.max_likelihood_leaves()))
     poses = [f"{k}.0 {1 + 0.2 * k} 1.5 0.0 0 0 0 1\n" for k in range(8)]
     (tmp_path / "trajectory_graph.tum").write_text("".join(poses))
     plan_path.main([str(tmp_path), "--goal", "0.8,2.2", "--out", str(tmp_path / "plan.png")])

@@ -7,7 +7,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.octomap_io import encode_ot, read_octree
 from vislam.mapping.octree.query import (
     box_state,
@@ -25,7 +25,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 def random_map(seed, rays=120):
     rng = np.random.default_rng(seed)
-    grid = OccupancyMap(RESOLUTION)
+    grid = Octree(RESOLUTION)
     for _ in range(3):
         origin = rng.uniform(-0.3, 0.3, 3)
         grid.insert(origin + rng.uniform(-1.1, 1.1, (rays, 3)), origin, 1.0)
@@ -54,7 +54,7 @@ def distances_to(corners, point):
 def test_levels_are_those_of_octomaps_search(seed):
     grid, rng = random_map(seed)
     theirs = pyoctomap.OcTree(RESOLUTION)
-    octree = grid.octree()
+    octree = grid.leaves()
     for centre, size, value in zip(*octree.centres_m(), octree.log_odds, strict=True):
         for offset in np.ndindex(*[round(size / RESOLUTION)] * 3):
             theirs.updateNode(centre + (np.array(offset) + 0.5) * RESOLUTION - 0.5 * size, float(value))
@@ -68,19 +68,19 @@ def test_levels_are_those_of_octomaps_search(seed):
 
 def test_a_map_from_an_octree_is_the_map(tmp_path):
     grid, rng = random_map(3, rays=4000)
-    octree = grid.octree()
+    octree = grid.leaves()
     assert (octree.levels > 0).any()
-    back = OccupancyMap.from_octree(octree)
-    assert encode_ot(back.octree()) == encode_ot(octree)
+    back = Octree.from_leaves(octree)
+    assert encode_ot(back.leaves()) == encode_ot(octree)
     more = rng.uniform(-1, 1, (50, 3))
     grid.insert(more, np.zeros(3))
     back.insert(more, np.zeros(3))
-    assert encode_ot(back.octree()) == encode_ot(grid.octree())
+    assert encode_ot(back.leaves()) == encode_ot(grid.leaves())
 
 
 def test_a_map_of_octomap_itself_can_be_asked(data_root):
     octree = read_octree(data_root / "octomap" / "geb079.bt")
-    grid = OccupancyMap.from_octree(octree)
+    grid = Octree.from_leaves(octree)
     centres, size = octree.centres_m()
     np.testing.assert_array_equal(grid.log_odds_at(centres[::53]), octree.log_odds[::53])
     large = np.flatnonzero(size > octree.resolution_m)[:20]
@@ -92,7 +92,7 @@ def test_an_octree_too_large_to_take_apart_is_refused(tmp_path):
     path = tmp_path / "huge.bt"
     path.write_bytes(b"# Octomap OcTree binary file\nid OcTree\nsize 9\nres 0.1\ndata\n\xaa\xaa")
     with pytest.raises(DataError, match="blocks"):
-        OccupancyMap.from_octree(read_octree(path))
+        Octree.from_leaves(read_octree(path))
 
 
 @settings(max_examples=12)
@@ -127,7 +127,7 @@ def test_rays_end_where_a_slow_search_of_all_voxels_says(seed, unknown):
 @given(SEEDS)
 def test_rays_end_where_octomaps_do(seed):
     rng = np.random.default_rng(seed)
-    ours, theirs = OccupancyMap(RESOLUTION), pyoctomap.OcTree(RESOLUTION)
+    ours, theirs = Octree(RESOLUTION), pyoctomap.OcTree(RESOLUTION)
     points = rng.uniform(-1.0, 1.0, (400, 3)).astype(np.float32)
     ours.insert(points, np.zeros(3))
     theirs.insertPointCloud(points.astype(np.float64), np.zeros(3), discretize=True)
@@ -247,7 +247,7 @@ def test_far_places_are_unknown_and_rays_to_nowhere_end():
     assert (hits.outcome == Occupancy.FREE).all()
     back = ray_cast(grid, [3000.0, 0.0, 0.0], [-1.0, 0.0, 0.0], 4000.0)
     assert back.outcome[0] == ray_cast(grid, [5.0, 0.0, 0.0], [-1.0, 0.0, 0.0], 10.0).outcome[0]
-    empty = OccupancyMap(0.1)
+    empty = Octree(0.1)
     assert nearest_frontier(empty, np.zeros((1, 3)), 5.0).distance_m[0] == np.inf
     assert np.isnan(empty.log_odds_at(np.zeros((1, 3)), 9)).all()
     assert len(sphere_state(grid, np.zeros((0, 3)), 0.1)) == 0

@@ -10,12 +10,14 @@ if TYPE_CHECKING:
     from vislam.batch.bundle.bundle_adjustment import BatchResult, optimize_run
     from vislam.batch.bundle.loops import LoopVerdict
     from vislam.batch.posegraph.files import read_pose_graph, write_pose_graph
+    from vislam.batch.posegraph.graph_file import PoseGraphFile
     from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
     from vislam.batch.posegraph.problem import PoseGraphProblem
 
 __all__ = [
     "BatchResult",
     "LoopVerdict",
+    "PoseGraphFile",
     "PoseGraphProblem",
     "PoseGraphSolution",
     "optimize_pose_graph",
@@ -30,6 +32,7 @@ __getattr__ = late(
         "BatchResult": "vislam.batch.bundle.bundle_adjustment",
         "optimize_run": "vislam.batch.bundle.bundle_adjustment",
         "LoopVerdict": "vislam.batch.bundle.loops",
+        "PoseGraphFile": "vislam.batch.posegraph.graph_file",
         "read_pose_graph": "vislam.batch.posegraph.files",
         "write_pose_graph": "vislam.batch.posegraph.files",
         "PoseGraphSolution": "vislam.batch.posegraph.optimize",

@@ -136,20 +136,24 @@ def dump(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def load(path: Path | None = None, overrides: dict[str, Any] | None = None, profile_name: str | None = None) -> Config:
-    """Build a configuration from defaults, a profile, a TOML file and dotted overrides as `{"map.enabled": False}`.
+def load(
+    base: Path | Config | None = None, overrides: Mapping[str, Any] | None = None, profile_name: str | None = None
+) -> Config:
+    """Build a configuration from defaults, a profile, a TOML file or configuration, and overrides.
 
-    Each goes before those named before it. Raises UsageError naming the field, what was asked and what is allowed.
+    Overrides are dotted names, `{"map.enabled": False}`, or sections, `{"map": {"enabled": False}}`. Each goes before
+    those named before it. Raises UsageError naming the field, what was asked and what is allowed.
     """
-    below = {} if profile_name is None else profile(profile_name)
-    data = merged(below, {} if path is None else _read_toml(path))
+    data = {} if profile_name is None else profile(profile_name)
+    if base is not None:
+        data = merged(data, dump(base) if isinstance(base, Config) else _read_toml(base))
     for dotted, value in (overrides or {}).items():
-        *sections, name = dotted.split(".")
-        node = data
-        for section in sections:
-            node = node.setdefault(section, {})
-        node[name] = value
-    return from_data(data, source=str(path) if path else "overrides")
+        section, *rest = reversed(dotted.split("."))
+        nested = {section: value}
+        for name in rest:
+            nested = {name: nested}
+        data = merged(data, nested)
+    return from_data(data, source=str(base) if isinstance(base, Path) else "overrides")
 
 
 def load_sensors(path: Path | None = None) -> SensorsConfig:

@@ -317,6 +317,10 @@ class Rig:
             if T.shape != (4, 4) or not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
                 raise DataError(f"extrinsics of cam{index} are not a rigid transform: {np.asarray(T).tolist()}")
 
+    def __repr__(self) -> str:
+        cameras = ", ".join(f"{c.width} x {c.height} px, {c.distortion}" for c in self.cameras)
+        return f"Rig({len(self.cameras)} cameras: {cameras}{', depth' if self.has_depth else ''})"
+
     @property
     def is_stereo(self) -> bool:
         """Whether there is a second camera."""

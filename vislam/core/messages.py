@@ -10,7 +10,7 @@ Tangents and 6x6 covariances are ordered rotation, then translation, with the pe
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -87,6 +87,10 @@ class ImuSpan:
     accel_m_s2: Array  # [N, 3]
     noise: NoiseScale = AS_MODELLED  # what the samples around it show
 
+    def __repr__(self) -> str:
+        length_s = float(self.t_ns[-1] - self.t_ns[0]) * 1e-9 if len(self.t_ns) else 0.0
+        return f"ImuSpan({len(self.t_ns)} samples over {length_s:.3f} s)"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
@@ -99,6 +103,11 @@ class Observations:
     instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
     noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are told
+
+    def __repr__(self) -> str:
+        right = "" if self.right_px is None else f", {int(np.isfinite(self.right_px[:, 0]).sum())} in cam1"
+        depth = "" if self.depth_m is None else f", {int(np.isfinite(self.depth_m).sum())} with depth"
+        return f"Observations({len(self.track_ids)} tracks{right}{depth})"
 
 
 def no_observations() -> Observations:
@@ -117,6 +126,12 @@ class Frame:
     depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
     tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
     depth_lag_s: float = 0.0  # how much later than the images depth was taken, as its own stamp says
+
+    def __repr__(self) -> str:
+        has = [f"{image.shape[1]} x {image.shape[0]} px" for image in self.images]
+        has += [name for name, image in (("colour", self.color), ("depth", self.depth_m)) if image is not None]
+        has += [] if self.tracks is None else [f"{len(self.tracks.track_ids)} tracks"]
+        return f"Frame({self.index} at {self.t_ns * 1e-9:.3f} s: {', '.join(has) or 'no images'})"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,6 +161,9 @@ class Keyframe:
     T_image_depth: Array | None = None  # [4, 4] where cam0 was when depth was taken, as the image sees it; None: there
     depth_sweep: Array | None = None  # [6] twist of cam0 from the first to the last row of depth; None: taken at once
     image_sweep: Array | None = None  # [6] the same of its image
+
+    def __repr__(self) -> str:
+        return f"Keyframe({self.id} at {self.t_ns * 1e-9:.3f} s: {len(self.keypoints_px)} features)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,6 +238,28 @@ class NavState:
     gyro_bias_rad_s: Array  # [3]
     accel_bias_m_s2: Array  # [3]
     covariance: Array  # [15, 15]; rotation perturbed on the body side, position and velocity in world axes
+
+    @classmethod
+    def with_sigmas(
+        cls, t_ns: int, T_world_body: Array, *, sigma_rad: float, sigma_m: float,
+        velocity_world_m_s: Sequence[float] | Array = (0.0, 0.0, 0.0), sigma_m_s: float = 0.1,
+        gyro_bias_rad_s: Sequence[float] | Array = (0.0, 0.0, 0.0), gyro_bias_sigma_rad_s: float = 0.01,
+        accel_bias_m_s2: Sequence[float] | Array = (0.0, 0.0, 0.0), accel_bias_sigma_m_s2: float = 0.2,
+    ) -> NavState:  # fmt: skip
+        """Return a state [4, 4], [3], [3], [3] whose errors are independent, with these sigmas per axis."""
+        sigmas = (sigma_rad, sigma_m, sigma_m_s, gyro_bias_sigma_rad_s, accel_bias_sigma_m_s2)
+        T, velocity, gyro_bias, accel_bias = (
+            np.array(v, dtype=np.float64) for v in (T_world_body, velocity_world_m_s, gyro_bias_rad_s, accel_bias_m_s2)
+        )
+        return cls(t_ns, T, velocity, gyro_bias, accel_bias, np.diag(np.repeat(np.square(sigmas), 3)))
+
+    def __repr__(self) -> str:
+        x, y, z = self.T_world_body[:3, 3]
+        turn, place = (float(np.sqrt(np.trace(self.covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
+        return (
+            f"NavState(t {self.t_ns * 1e-9:.3f} s: at ({x:.3f}, {y:.3f}, {z:.3f}) m, sigma {place:.2g} m and "
+            f"{np.rad2deg(turn):.2g} deg, speed {float(np.linalg.norm(self.velocity_world_m_s)):.3g} m/s)"
+        )
 
 
 @dataclass(frozen=True, slots=True)

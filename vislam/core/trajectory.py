@@ -44,6 +44,9 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self)} poses, {self.duration_s:.1f} s, {self.path_m:.1f} m)"
+
     @property
     def positions_m(self) -> Array:
         """Positions [N, 3] of the body in the world frame."""

@@ -14,6 +14,7 @@ from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
 from vislam.imu.power_up import PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, pose_after, preintegrate
 from vislam.imu.rest import RestDetector
+from vislam.imu.resting import state_at_rest
 from vislam.imu.series import ImuSeries, join, shifted, subtract_bias
 
 __all__ = [
@@ -38,5 +39,6 @@ __all__ = [
     "power_up",
     "preintegrate",
     "shifted",
+    "state_at_rest",
     "subtract_bias",
 ]

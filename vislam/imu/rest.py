@@ -8,7 +8,7 @@ import numpy as np
 
 from vislam.config import InitConfig
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.messages import Array, ImuSpan
+from vislam.core.messages import AS_MODELLED, Array, ImuSpan, NoiseScale
 from vislam.imu.series import join
 
 _NS = 1_000_000_000
@@ -21,6 +21,14 @@ def is_still(gyro_rad_s: Array, accel_m_s2: Array, most: tuple[float, float, flo
     """Return whether samples [N, 3] look like rest: spread of rate and of force, and mean rate, below the `most`."""
     found = gyro_rad_s.std(axis=0), accel_m_s2.std(axis=0), gyro_rad_s.mean(axis=0)
     return all(float(np.linalg.norm(value)) < limit for value, limit in zip(found, most, strict=True))
+
+
+def still_limits(config: InitConfig, noise: ImuNoise, scale: NoiseScale = AS_MODELLED) -> tuple[float, float, float]:
+    """Return the `most` of `is_still`, widened where the sensor's own white noise needs it."""
+    per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
+    gyro = max(config.rest_gyro_std_rad_s, per_sample * noise.gyroscope_noise_density * scale.gyro)
+    accel = max(config.rest_accel_std_m_s2, per_sample * noise.accelerometer_noise_density * scale.accel)
+    return gyro, accel, config.rest_gyro_max_rad_s
 
 
 class RestDetector:
@@ -40,9 +48,7 @@ class RestDetector:
         self._force_s = 0.0  # ... and over how long
         self._set_off = False  # the last rest ended by speed gained, so the next one has to show that force is steady
         self._accel_density = noise.accelerometer_noise_density
-        per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
-        self._gyro_white_std = per_sample * noise.gyroscope_noise_density
-        self._accel_white_std = per_sample * noise.accelerometer_noise_density
+        self._noise = noise
 
     def clear(self) -> None:
         """Forget what was seen, as after a hole in the data."""
@@ -91,6 +97,4 @@ class RestDetector:
 
     def _is_still(self, span: ImuSpan) -> bool:
         """Return whether one span looks like rest, whatever its length."""
-        gyro_limit = max(self._config.rest_gyro_std_rad_s, self._gyro_white_std * span.noise.gyro)
-        accel_limit = max(self._config.rest_accel_std_m_s2, self._accel_white_std * span.noise.accel)
-        return is_still(span.gyro_rad_s, span.accel_m_s2, (gyro_limit, accel_limit, self._config.rest_gyro_max_rad_s))
+        return is_still(span.gyro_rad_s, span.accel_m_s2, still_limits(self._config, self._noise, span.noise))

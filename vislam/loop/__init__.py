@@ -1,1 +1,25 @@
 """Loop closing: recognise places seen before and measure the relative pose, precision first."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vislam.core.late import late
+
+if TYPE_CHECKING:
+    from vislam.loop.closer import LoopCloser
+    from vislam.loop.detector import Loop, LoopDetector
+    from vislam.loop.table import LoopRow, read_loops
+
+__all__ = ["Loop", "LoopCloser", "LoopDetector", "LoopRow", "read_loops"]
+
+__getattr__ = late(
+    __name__,
+    {
+        "Loop": "vislam.loop.detector",
+        "LoopCloser": "vislam.loop.closer",
+        "LoopDetector": "vislam.loop.detector",
+        "LoopRow": "vislam.loop.table",
+        "read_loops": "vislam.loop.table",
+    },
+)

@@ -27,7 +27,7 @@ from vislam.mapping.drive.drive import DriveGrid, DriveMap
 from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh.posed import PosedView, posed_views
 from vislam.mapping.mesh.volume import Volume
-from vislam.mapping.octree import CorrectedOccupancy, Occupancy, OccupancyMap, Octree
+from vislam.mapping.octree import CorrectedOccupancy, Occupancy, Octree, OctreeLeaves
 from vislam.mapping.products import LEVEL, SURFACES, NotLevel, remove_products, write_products
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.fusion import LabelFusion
@@ -70,14 +70,14 @@ class Mapper:
         return {**self._extractor.counters, **self._occupancy.counters, "store_bytes": self._store.nbytes}
 
     @property
-    def occupancy(self) -> OccupancyMap:
+    def occupancy(self) -> Octree:
         """The occupancy map as it is now, for the thread that feeds the mapper.
 
         A new keyframe goes into it; a correction leaves it alone, and puts another in its place when complete.
         """
         return self._occupancy.occupancy
 
-    def snapshot(self) -> OccupancyMap:
+    def snapshot(self) -> Octree:
         """Return a copy of the occupancy map for other threads, which nothing changes and for which nobody waits.
 
         The thread that feeds the mapper calls this and hands the copy on.
@@ -170,9 +170,9 @@ class Mapper:
         kept = without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
         return smoothed(kept, config.cloud_smooth_m)
 
-    def coloured_octree(self) -> Octree:
+    def coloured_octree(self) -> OctreeLeaves:
         """Return the octree of log-odds; occupied leaves have the mean colour of what keyframes saw in them."""
-        octree = self.occupancy.octree()
+        octree = self.occupancy.leaves()
         view, config = self._extractor.view, self._config
         average, _ = _averaged(self._scans(), view, config.min_range_m, config.resolution_m, _MAX_COLOURED_VOXELS)
         points = average.cloud()
@@ -181,7 +181,7 @@ class Mapper:
 
     def grid(self) -> Grid:
         """Return the navigation grid of the occupancy map."""
-        octree = self.occupancy.max_likelihood_octree()
+        octree = self.occupancy.max_likelihood_leaves()
         floor_m = self._config.grid_floor_m
         floor_m = floor_height_m(octree) if floor_m is None else floor_m
         return navigation_grid(octree, floor_m, self._config.grid_low_m, self._config.grid_high_m)

@@ -24,7 +24,7 @@ from vislam.mapping.formats.pcd import write_pcd
 from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mesh.atlas import textured
 from vislam.mapping.mesh.posed import PosedView
-from vislam.mapping.octree import OccupancyMap, Octree, encode_bt, encode_ot
+from vislam.mapping.octree import Octree, OctreeLeaves, encode_bt, encode_ot
 from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.layer_files import CLASSES_NAME, VOXELS_NAME, write_layer
 
@@ -54,10 +54,10 @@ class MapSource(Protocol):
     """What a map can be asked for."""
 
     @property
-    def occupancy(self) -> OccupancyMap:
+    def occupancy(self) -> Octree:
         """The occupancy map."""
 
-    def coloured_octree(self) -> Octree:
+    def coloured_octree(self) -> OctreeLeaves:
         """Return the octree with colours."""
 
     def cloud(self) -> Cloud:
@@ -105,7 +105,7 @@ def write_products(
     writers: dict[str, Callable[[Path], object]] = {  # a text is the reason why nothing was written
         "cloud": lambda path: _write_cloud(path, cloud(), labels, in_colors),
         "pcd": lambda path: write_pcd(path, cloud().points_m, cloud().colors),
-        "octomap": lambda path: _write_octree(path, encode_bt(source.occupancy.max_likelihood_octree())),
+        "octomap": lambda path: _write_octree(path, encode_bt(source.occupancy.max_likelihood_leaves())),
         "ot": lambda path: _write_octree(path, encode_ot(source.coloured_octree())),
         "grid": lambda _: write_grid(folder, source.grid()),
         "drive": lambda _: write_grid(folder, source.drive().navigation_grid(), "drive"),

@@ -24,7 +24,7 @@ from vislam.core.messages import (
 )
 from vislam.frontend import knows_scale, mode_for
 from vislam.graph import PoseGraph
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.loop.injection import FalseLoops, as_candidate
 from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
@@ -63,7 +63,7 @@ class Back:
         graph = config.graph if has_gravity else without_gravity(config.graph, rig)
         self.graph = PoseGraph(graph, noise if has_gravity else None, config.machine, rig, config.window, suite)
         self.graph.initialise(first_state, T_map_body)
-        self.loops = LoopDetector(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
+        self.loops = LoopCloser(config.loop, rig, config.seed, has_gravity) if config.loop.enabled else None
         self._false = None
         if config.loop.inject_share > 0.0:
             self._false = FalseLoops(config.loop.inject_share, config.loop.inject_group, config.seed)

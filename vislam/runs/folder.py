@@ -243,6 +243,17 @@ class MapChoice:
         return self.path / "session.db" if self.path.is_dir() else self.path
 
 
+def map_choice(path: Path | None, localize_only: bool, settings: Config) -> MapChoice | None:
+    """Return the map that a run begins in; raises UsageError where an option needs one that is not given."""
+    if path is not None:
+        return MapChoice(path, localize_only)
+    if localize_only:
+        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
+    if settings.loop.start_in_map is not None:
+        raise UsageError("--loop.start-in-map is a place in a map; give --map OLD/session.db")
+    return None
+
+
 class RunLog:
     """Remembers of every frame what the trajectories and tables need, and writes them."""
 

@@ -48,7 +48,7 @@ def show_map(viewer: Viewer, t_ns: int, mapper: Mapper, is_level: bool, is_last:
     if not viewer.wants_map(t_ns, is_last):
         return
     with suppress(DataError):  # too many voxels, or too large a grid: said where they are exported
-        octree = mapper.occupancy.max_likelihood_octree()
+        octree = mapper.occupancy.max_likelihood_leaves()
         viewer.log_octree(t_ns, octree.occupied_voxels(), octree.resolution_m)
         if is_level:
             grid = mapper.grid()

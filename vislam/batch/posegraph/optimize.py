@@ -40,6 +40,14 @@ class PoseGraphSolution:
     robust_reason: str = ""  # why these edges were kept
     undecided: tuple[int, ...] = ()  # edges left out because nothing tells whether they are true
 
+    def __repr__(self) -> str:
+        end = "converged" if self.converged else "not converged"
+        costs = f"chi2 {self.costs[0]:.6g} to {self.costs[-1]:.6g}" if self.costs else "no cost"
+        left_out = f", {len(self.rejected)} of {len(self.weights)} edges rejected" if len(self.rejected) else ""
+        return (
+            f"PoseGraphSolution({len(self.poses)} poses, {costs} in {len(self.costs) - 1} iterations, {end}{left_out})"
+        )
+
     @property
     def rejected(self) -> NDArray[np.int64]:
         """Indices of the edges that were found false."""

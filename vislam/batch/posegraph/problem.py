@@ -60,6 +60,9 @@ class PoseGraphProblem:
         if m and (self.edges.min() < 0 or self.edges.max() >= n or np.any(self.edges[:, 0] == self.edges[:, 1])):
             raise DataError(f"an edge must join two different poses of the {n} that there are")
 
+    def __repr__(self) -> str:
+        return f"PoseGraphProblem({len(self.ids)} poses of dimension {self.dimension}, {len(self.edges)} edges)"
+
     def with_edges(self, edges: Ids | Mask) -> PoseGraphProblem:
         """Return the problem with some of its edges, by index or by a mask [E]."""
         return replace(

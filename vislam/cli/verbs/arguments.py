@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from vislam.cli.verbs import VERBS
 from vislam.cli.verbs.brief import Brief, brief_help
-from vislam.config import Config
 from vislam.config.moved import refuse_moved
 from vislam.config.ranges import check_ranges
 from vislam.core.collector import while_importing
@@ -17,7 +16,7 @@ from vislam.core.compiling import tell_of_compilation
 from vislam.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from vislam.runs.folder import MapChoice
+    pass
 
 Options = TypeVar("Options")
 
@@ -83,16 +82,3 @@ def take_path(arguments: list[str], name: str) -> Path | None:
     """Remove an option as `take_option` and return its value as a path."""
     value = take_option(arguments, name)
     return Path(value) if value else None
-
-
-def map_choice(path: Path | None, localize_only: bool, settings: Config) -> MapChoice | None:
-    """Return the map that a run begins in; raises UsageError where an option needs one that is not given."""
-    from vislam.runs.folder import MapChoice
-
-    if path is not None:
-        return MapChoice(path, localize_only)
-    if localize_only:
-        raise UsageError("--localize-only needs a map; give --map OLD/session.db")
-    if settings.loop.start_in_map is not None:
-        raise UsageError("--loop.start-in-map is a place in a map; give --map OLD/session.db")
-    return None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.results import print_metrics
-from vislam.cli.verbs.run import RunOptions, run_source
+from vislam.cli.verbs.run import RunOptions, run_options
 from vislam.config import Config
 from vislam.config.ranges import Whole
 
@@ -38,5 +38,5 @@ def main(arguments: list[str]) -> int:
     )
     source = f"sim:{options.world},camera_hz={_CAMERA_HZ}"
     run = RunOptions(source, options.out, Config(seed=options.seed), overwrite=True)
-    print_metrics(run_source(run, ["vislam", "demo", *arguments]), run.out, as_json=False)
+    print_metrics(run_options(run, ["vislam", "demo", *arguments]), run.out, as_json=False)
     return 0

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vislam.cli.verbs.arguments import map_choice, parse, take_option, take_path
+from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
-from vislam.cli.verbs.results import print_metrics, written_up
+from vislam.cli.verbs.results import print_metrics
 from vislam.cli.verbs.terminal import rewritten_line
 from vislam.cli.verbs.web_page import WebChoice, begun_by_page, opened, take_web
 from vislam.config import Config, SensorsConfig, load, load_cart
@@ -99,9 +99,9 @@ def main(arguments: list[str]) -> int:
     settings = settings if further.file is None else replace(settings, sensors=further)
     defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
-    base = map_choice(options.map, options.localize_only, options.settings)
-    from vislam.runs.folder import prepare
+    from vislam.runs.folder import map_choice, prepare
 
+    base = map_choice(options.map, options.localize_only, options.settings)
     with opened(web, options.settings.live.name, options.out) as station:
         make = partial(_made, command=command, base=base, station=station)
         if station is not None and web is not None and web.waits:
@@ -160,6 +160,7 @@ def _execute(
 ) -> int:  # fmt: skip
     from vislam.core.files import write_json
     from vislam.live.status import status_line
+    from vislam.runs.run import written_up
 
     with written_up(out, command, lambda: live.is_brief), rewritten_line() as show:
         write_json(out / "sensors.json", asdict(sensors))

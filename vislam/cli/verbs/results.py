@@ -1,40 +1,15 @@
-"""What a run leaves, shown: its report in the folder, its metrics on the terminal."""
+"""The metrics of a run on the terminal."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from vislam.cli.verbs.terminal import number, print_table
-from vislam.core.errors import VislamError, printable
-from vislam.core.log import log_to
-
-
-@contextmanager
-def written_up(out: Path, command: Sequence[str], is_hurried: Callable[[], bool] = lambda: False) -> Iterator[None]:
-    """Keep the log of a run and write its report afterwards, whatever happened on the way but an interrupt.
-
-    An interrupt that was answered with an end in order is told by `is_hurried`.
-    """
-    from vislam.runs import report  # what draws is loaded by the first use, when the run has given its memory back
-
-    with log_to(out, command):
-        try:
-            yield
-        except KeyboardInterrupt:
-            raise  # whoever interrupts does not wait for a report
-        except BaseException:
-            with suppress(VislamError):  # what went wrong first is what is told
-                if (out / "metrics.json").is_file():
-                    report.write_report(out)
-            raise
-        if not is_hurried():
-            report.write_report(out)
+from vislam.core.errors import printable
 
 
 def print_metrics(metrics: dict[str, Any], out: Path, as_json: bool) -> None:

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional
 
-from vislam.cli.verbs.arguments import map_choice, parse, take_option, take_path
+from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
-from vislam.cli.verbs.results import print_metrics, written_up
+from vislam.cli.verbs.results import print_metrics
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import Config, dump, load
 from vislam.core.errors import UsageError
@@ -81,10 +81,7 @@ def main(arguments: list[str]) -> int:
     if options.dry_run:
         print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
         return 0
-    from vislam.core.up import told_up
-
-    told_up(options.settings.up)
-    print_metrics(run_source(options, command), options.out, options.json)
+    print_metrics(run_options(options, command), options.out, options.json)
     return 0
 
 
@@ -92,6 +89,7 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     """Go on with the run in a folder, whatever ended it."""
     from vislam.runs import resume
     from vislam.runs.folder import read_setup
+    from vislam.runs.run import written_up
     from vislam.runs.sources import open_source
 
     options = parse(ResumeOptions, arguments, "run")
@@ -105,16 +103,11 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     return 0
 
 
-def run_source(options: RunOptions, command: list[str]) -> dict[str, Any]:
-    """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
-    from vislam.datasets.calibrated import with_clock
-    from vislam.runs import execute
-    from vislam.runs.folder import prepare
-    from vislam.runs.sources import open_source
+def run_options(options: RunOptions, command: list[str]) -> dict[str, Any]:
+    """Run what the options ask for, with progress on the terminal; return the metrics."""
+    from vislam.runs.run import run_source
 
-    settings = with_clock(options.settings)
-    base = map_choice(options.map, options.localize_only, settings)
-    recording = open_source(options.source, settings.seed, settings.calibration)
-    prepare(options.out, options.overwrite, base)
-    with written_up(options.out, command), progress_bar(recording.name) as progress:
-        return execute(recording, settings, options.out, options.source, command, progress, base)
+    return run_source(
+        options.source, options.settings, options.out, command,
+        overwrite=options.overwrite, base=options.map, localize_only=options.localize_only, show=progress_bar,
+    )  # fmt: skip

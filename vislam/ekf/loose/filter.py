@@ -15,8 +15,10 @@ depends only on the set of measurements, not on when they came.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from vislam.config import EkfConfig, MachineConfig
-from vislam.core.messages import Array, NavState, Observations, Tracking, VoMeasurement
+from vislam.core.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf.correction import Correction, Hint
 from vislam.ekf.history import AtRest, Event
 from vislam.ekf.loose.core import LooseCore, LooseMeasurement
@@ -25,7 +27,7 @@ from vislam.ekf.loose.state import LooseState
 from vislam.ekf.loose.visual_motion import why_unusable
 from vislam.ekf.sensed_timeline import SensedTimeline
 from vislam.ekf.timeline import UpdateResult
-from vislam.imu import ImuNoise
+from vislam.imu import ImuNoise, state_at_rest
 from vislam.sensors import Suite
 
 
@@ -52,6 +54,31 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
         """
         self._loose = LooseCore(config, noise, machine, T_body_camera, suite)
         super().__init__(self._loose, self._loose.blank(), config, config.history_s, machine.max_gap_s)
+
+    @classmethod
+    def at_rest(
+        cls, samples: Sequence[ImuSample], noise: ImuNoise, gravity_m_s2: float = 9.81, config: EkfConfig | None = None
+    ) -> Ekf:
+        """Return a filter that begins at the last of the samples of a body at rest, level and with heading zero.
+
+        Raises DataError where they do not show rest; see `vislam.imu.state_at_rest`.
+        """
+        ekf = cls.from_state(state_at_rest(samples, noise, gravity_m_s2), noise, gravity_m_s2, config)
+        ekf.predict(samples[-1])
+        return ekf
+
+    @classmethod
+    def from_state(
+        cls, state: NavState, noise: ImuNoise, gravity_m_s2: float = 9.81, config: EkfConfig | None = None
+    ) -> Ekf:
+        """Return a filter that begins in a state; `NavState.with_sigmas` makes one of a pose and sigmas."""
+        ekf = cls(config or EkfConfig(), noise, MachineConfig(gravity_m_s2=gravity_m_s2))
+        ekf.initialise(state)
+        return ekf
+
+    def __repr__(self) -> str:
+        inside = self.state() if self.initialised else "not initialised"
+        return f"Ekf({self.counters['imu_samples']} inertial samples; {inside})"
 
     @property
     def position_variance_m2(self) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 from vislam.config import InitConfig
 from vislam.core.geometry import level_rotation, so3_exp, transform
 from vislam.core.messages import Array, ImuSpan, NavState
-from vislam.frontend.start.rest import level_covariance
 from vislam.frontend.start.solution import Solution
+from vislam.imu.resting import level_covariance
 
 _NS = 1_000_000_000
 

@@ -19,10 +19,10 @@ from vislam.frontend.start.answer import Initialisation, moving
 from vislam.frontend.start.from_tracks import Sighted, StartFromTracks
 from vislam.frontend.start.inertial_alignment import VisualMotion, Window, excitation, refine, solve_linear
 from vislam.frontend.start.refusals import Refusals
-from vislam.frontend.start.rest import rest_accel_bias, rest_covariance
 from vislam.frontend.start.solution import from_alignment
 from vislam.frontend.start.views import Entry, FrameWindow, metric_motions
 from vislam.imu import ImuNoise, RestDetector, join
+from vislam.imu.resting import rest_accel_bias, rest_covariance
 
 _NS = 1_000_000_000
 

@@ -19,7 +19,7 @@ from vislam.config import MapConfig
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.mapping.drive.grid import Grid
-from vislam.mapping.octree import NEVER, Columns, ColumnStore, OccupancyMap
+from vislam.mapping.octree import NEVER, Columns, ColumnStore, Octree
 
 F32 = NDArray[np.float32]
 _I16 = NDArray[np.int16]
@@ -120,7 +120,7 @@ class DriveMap:
         self._store = ColumnStore()
         self._slopes = _Slopes()
 
-    def update(self, occupancy: OccupancyMap) -> DriveGrid:
+    def update(self, occupancy: Octree) -> DriveGrid:
         """Return the grid of the map as it is now; only columns that changed since the last call are read again.
 
         Raises DataError when the map's extent is larger than any to drive by.

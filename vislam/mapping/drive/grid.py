@@ -13,7 +13,7 @@ from vislam.core.errors import DataError
 from vislam.core.files import replacing
 from vislam.core.jit import njit
 from vislam.core.reading import read_bytes, read_text
-from vislam.mapping.octree import Octree
+from vislam.mapping.octree import OctreeLeaves
 
 _OCCUPIED_SHADE, _FREE_SHADE, _UNKNOWN_SHADE = 0, 254, 205  # map_saver's
 _MAX_CELLS = 1 << 28
@@ -31,7 +31,7 @@ class Grid:
     floor_m: float  # height of the floor, in the map frame
 
 
-def floor_height_m(octree: Octree) -> float:
+def floor_height_m(octree: OctreeLeaves) -> float:
     """Return the height of the lowest large horizontal surface: its voxels' lower side; 0 when nothing is occupied."""
     voxels = octree.occupied_voxels()
     if len(voxels) == 0:
@@ -42,7 +42,7 @@ def floor_height_m(octree: Octree) -> float:
     return level * octree.resolution_m
 
 
-def navigation_grid(octree: Octree, floor_m: float, low_m: float, high_m: float) -> Grid:
+def navigation_grid(octree: OctreeLeaves, floor_m: float, low_m: float, high_m: float) -> Grid:
     """Return the grid of what lies between `low_m` and `high_m` above the floor.
 
     A column is occupied when any voxel of the band is, else free when any is free, else unknown. Raises DataError

@@ -9,22 +9,40 @@ from vislam.mapping.octree.blocks import find_slot
 from vislam.mapping.octree.columns import NEVER, Columns, ColumnStore
 from vislam.mapping.octree.correct import CorrectedOccupancy
 from vislam.mapping.octree.describe import describe_octree, describe_place
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot, read_octree
-from vislam.mapping.octree.tree import Octree
+from vislam.mapping.octree.query import (
+    Nearest,
+    RayHits,
+    box_state,
+    footprint_state,
+    nearest_frontier,
+    nearest_obstacle,
+    ray_cast,
+    sphere_state,
+)
+from vislam.mapping.octree.tree import OctreeLeaves
 
 __all__ = [
     "NEVER",
     "ColumnStore",
     "Columns",
     "CorrectedOccupancy",
+    "Nearest",
     "Occupancy",
-    "OccupancyMap",
     "Octree",
+    "OctreeLeaves",
+    "RayHits",
+    "box_state",
     "describe_octree",
     "describe_place",
     "encode_bt",
     "encode_ot",
     "find_slot",
+    "footprint_state",
+    "nearest_frontier",
+    "nearest_obstacle",
+    "ray_cast",
     "read_octree",
+    "sphere_state",
 ]

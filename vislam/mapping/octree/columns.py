@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.jit import njit
 from vislam.mapping.octree.blocks import KEY_ORIGIN
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 
 MAX_RUNS = 6  # floor, seat, table, shelf, lamp, ceiling; what is higher is taken for one with the highest
 NEVER = np.int16(32767)  # the lowest free voxel of a column without any
@@ -50,7 +50,7 @@ class ColumnStore:
         self._counts = np.zeros((0, _EDGE, _EDGE), np.int16)
         self._lowest_free = np.zeros((0, _EDGE, _EDGE), np.int16)
 
-    def update(self, occupancy: OccupancyMap) -> int:
+    def update(self, occupancy: Octree) -> int:
         """Follow the map; return how many columns of blocks were looked at again."""
         pool = occupancy.pool
         keys = pool.keys[: pool.count]

@@ -22,7 +22,7 @@ from vislam.core.messages import Array
 from vislam.mapping.cloud.store import KeyframeStore, Scan
 from vislam.mapping.depth.image import DepthView, scan_points
 from vislam.mapping.octree.blocks import BLOCK_VOXELS, BlockPool
-from vislam.mapping.octree.occupancy import NO_MARKS, OccupancyMap, ScanMarks
+from vislam.mapping.octree.occupancy import NO_MARKS, Octree, ScanMarks
 
 _REPLAYS = 24  # keyframes whose marks are applied again in about the time in which one casts its rays
 
@@ -56,7 +56,7 @@ class _Patch:
     waiting: list[int]  # keyframes that have yet to cast their rays
     gone: list[int]  # keyframes that are in the map and are not to be
     moved: dict[int, _Said] = field(default_factory=dict)
-    blocks: OccupancyMap | None = None  # those that are made anew
+    blocks: Octree | None = None  # those that are made anew
     replayed: int = 0  # keyframes of which they hold what was said
 
 
@@ -75,7 +75,7 @@ class CorrectedOccupancy:
         self.counters = {"rebuilds": 0, "keyframes_integrated_again": 0, "marks_bytes": 0}
 
     @property
-    def occupancy(self) -> OccupancyMap:
+    def occupancy(self) -> Octree:
         """The map to ask; a correction replaces the object, and leaves the one that a reader still holds alone."""
         return self._occupancy
 
@@ -181,7 +181,7 @@ class CorrectedOccupancy:
             self._patch = None
             self.counters["rebuilds"] += 1
 
-    def _dirty_blocks(self, patch: _Patch) -> OccupancyMap:
+    def _dirty_blocks(self, patch: _Patch) -> Octree:
         """Return a map that knows nothing of the blocks that moved or gone keyframes touched, before or now."""
         touched = [said.blocks for said in patch.moved.values()]
         touched += [self._said[i].blocks for i in (*patch.moved, *patch.gone) if i in self._said]
@@ -217,8 +217,8 @@ class CorrectedOccupancy:
         return NO_MARKS
 
 
-def _new_map(config: MapConfig) -> OccupancyMap:
-    return OccupancyMap(
+def _new_map(config: MapConfig) -> Octree:
+    return Octree(
         config.resolution_m,
         config.hit_probability,
         config.miss_probability,

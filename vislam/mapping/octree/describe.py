@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from vislam.core.errors import DataError
-from vislam.mapping.octree.occupancy import Occupancy, OccupancyMap
+from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.query import nearest_frontier, nearest_obstacle
-from vislam.mapping.octree.tree import Octree
+from vislam.mapping.octree.tree import OctreeLeaves
 
 
-def describe_octree(octree: Octree) -> dict[str, Any]:
+def describe_octree(octree: OctreeLeaves) -> dict[str, Any]:
     """Return resolution, extent [m], number of leaves, and volumes [m^3] of what is occupied and free."""
     centres, size = octree.centres_m()
     occupied = octree.log_odds >= 0.0
@@ -26,7 +26,9 @@ def describe_octree(octree: Octree) -> dict[str, Any]:
     return answer
 
 
-def describe_place(octree: Octree, place_m: tuple[float, float, float], level: int, window_m: float) -> dict[str, Any]:
+def describe_place(
+    octree: OctreeLeaves, place_m: tuple[float, float, float], level: int, window_m: float
+) -> dict[str, Any]:
     """Return state and probability at a place, and distance and centre of the nearest obstacle and frontier.
 
     Raises DataError on a place that is not finite, a level that does not exist or an octree too large to take apart.
@@ -34,7 +36,7 @@ def describe_place(octree: Octree, place_m: tuple[float, float, float], level: i
     point = np.array([place_m])
     if not np.isfinite(point).all():
         raise DataError(f"a place must be three finite numbers of metres, got {list(place_m)}")
-    grid = OccupancyMap.from_octree(octree)
+    grid = Octree.from_leaves(octree)
     value = float(grid.log_odds_at(point, level)[0])
     answer: dict[str, Any] = {"place_m": list(place_m), "level": level}
     answer["state"] = Occupancy(int(grid.state_at(point, level)[0])).name.lower()

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vislam.core.jit import njit
 from vislam.mapping.octree.blocks import KEY_ORIGIN, BlockPool, find_slot, pack_block
-from vislam.mapping.octree.tree import Octree, morton_decode, morton_encode
+from vislam.mapping.octree.tree import OctreeLeaves, morton_decode, morton_encode
 
 _BLOCK_LEVEL = 3  # a block is one cube of this level
 _F32 = NDArray[np.float32]
@@ -57,7 +57,7 @@ def _within_blocks(keys: _I64, level: int, table: _I64, rows: NDArray[np.int32],
     return out
 
 
-def fill_from_octree(pool: BlockPool, octree: Octree) -> None:
+def fill_from_octree(pool: BlockPool, octree: OctreeLeaves) -> None:
     """Put the leaves of an octree into an empty pool, large ones taken apart; DataError when they are too many."""
     large = octree.levels >= _BLOCK_LEVEL
     whole = float(np.sum(8.0 ** (octree.levels[large].astype(np.float64) - _BLOCK_LEVEL)))

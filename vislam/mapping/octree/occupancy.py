@@ -6,15 +6,18 @@ import copy
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.core.errors import DataError
+from vislam.core.errors import DataError, UsageError
+from vislam.core.files import replacing
 from vislam.core.messages import Array
 from vislam.mapping.octree.blocks import KEY_ORIGIN, BlockPool
 from vislam.mapping.octree.levels import fill_from_octree, largest_log_odds
+from vislam.mapping.octree.octomap_io import encode_bt, encode_ot, read_octree
 from vislam.mapping.octree.scan import (
     LogOdds,
     Voxels,
@@ -25,7 +28,7 @@ from vislam.mapping.octree.scan import (
     marked_blocks,
     pack_marks,
 )
-from vislam.mapping.octree.tree import TREE_LEVELS, Octree, log_odds, octree_from_blocks
+from vislam.mapping.octree.tree import TREE_LEVELS, OctreeLeaves, log_odds, octree_from_blocks
 
 Insertion = Literal["discretised", "full"]
 
@@ -53,7 +56,7 @@ class ScanMarks:
 NO_MARKS = ScanMarks(0, np.zeros(0, np.int64), np.zeros((0, 2, 64), np.uint8))
 
 
-class OccupancyMap:
+class Octree:
     """Voxels of equal size with a clamped log-odds of being occupied; a voxel is occupied from probability 0.5 on.
 
     Each scan changes a voxel once: by `hit_probability` if a point lies in it, else by `miss_probability` if a ray
@@ -83,6 +86,11 @@ class OccupancyMap:
         self._hit, self._miss, self._low, self._high, self._beside = (log_odds(p) for p in probabilities)
         self.pool = BlockPool()  # of log-odds
         self._words = np.zeros(1 << 12, np.uint64)  # the scan's grid, kept between scans, all zero
+
+    def __repr__(self) -> str:
+        known = self.pool.values[: self.pool.count]
+        occupied, free = int(np.count_nonzero(known >= 0.0)), int(np.count_nonzero(known < 0.0))
+        return f"Octree(voxels of {self.resolution_m:g} m: {occupied} occupied, {free} free)"
 
     @property
     def nbytes(self) -> int:
@@ -154,7 +162,7 @@ class OccupancyMap:
             LogOdds(self._hit, self._miss, self._beside, self._low, self._high),
         )  # fmt: skip
 
-    def with_pool(self, pool: BlockPool) -> OccupancyMap:
+    def with_pool(self, pool: BlockPool) -> Octree:
         """Return a map of the same sensor model with other voxels."""
         out = copy.copy(self)
         out.pool = pool
@@ -182,7 +190,7 @@ class OccupancyMap:
         return base, blocks
 
     @classmethod
-    def from_octree(cls, octree: Octree) -> OccupancyMap:
+    def from_leaves(cls, octree: OctreeLeaves) -> Octree:
         """Return the map that an octree describes, to ask or to go on with, with OctoMap's sensor model.
 
         Raises DataError when its leaves are more voxels than fit in memory.
@@ -191,7 +199,24 @@ class OccupancyMap:
         fill_from_octree(grid.pool, octree)
         return grid
 
-    def copy(self) -> OccupancyMap:
+    @classmethod
+    def load(cls, path: Path | str) -> Octree:
+        """Read OctoMap's file, `.bt` or `.ot`; raises DataError when it is damaged or no such file."""
+        return cls.from_leaves(read_octree(Path(path)))
+
+    def save(self, path: Path | str) -> None:
+        """Write OctoMap's file: free and occupied for a name in `.bt`, log-odds for one in `.ot`.
+
+        Raises UsageError for another name.
+        """
+        ending = Path(path).suffix
+        if ending not in (".bt", ".ot"):
+            raise UsageError(f"{path}: an octree is written as .bt or .ot, got '{ending}'; change the name")
+        content = encode_ot(self.leaves()) if ending == ".ot" else encode_bt(self.max_likelihood_leaves())
+        with replacing(Path(path)) as file:
+            file.write(content)
+
+    def copy(self) -> Octree:
         """Return a map of the same voxels that goes its own way from here on."""
         return self.with_pool(self.pool.copy())
 
@@ -213,12 +238,12 @@ class OccupancyMap:
         """Return the `Occupancy` [N] at points [N, 3], of voxels or of the cubes of a level: see `log_odds_at`."""
         return states(self.log_odds_at(points_map_m, level))
 
-    def octree(self) -> Octree:
+    def leaves(self) -> OctreeLeaves:
         """Return the map as a pruned octree: a copy that later scans do not change."""
         pool = self.pool
         return octree_from_blocks(self.resolution_m, pool.block_coordinates(), pool.values[: pool.count])
 
-    def max_likelihood_octree(self) -> Octree:
+    def max_likelihood_leaves(self) -> OctreeLeaves:
         """Return the octree whose leaves are at the clamping thresholds, occupied or free: what a .bt file holds."""
         pool = self.pool
         values = pool.values[: pool.count]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.jit import njit
 from vislam.core.reading import read_bytes
-from vislam.mapping.octree.tree import TREE_LEVELS, Octree, log_odds
+from vislam.mapping.octree.tree import TREE_LEVELS, OctreeLeaves, log_odds
 
 _BINARY_TITLE = b"# Octomap OcTree binary file"
 _FULL_TITLE = b"# Octomap OcTree file"
@@ -33,13 +33,13 @@ _REASONS = {
 _Bytes = NDArray[np.uint8]
 
 
-def encode_bt(octree: Octree) -> bytes:
+def encode_bt(octree: OctreeLeaves) -> bytes:
     """Return the `.bt` file of an octree whose leaves are pruned by occupied or free; colours are left out."""
     data, inner = _encode_bt(octree.starts, octree.levels, octree.log_odds)
     return _header(_BINARY_TITLE, _PLAIN, len(octree) + inner, octree.resolution_m) + data.tobytes()
 
 
-def encode_ot(octree: Octree) -> bytes:
+def encode_ot(octree: OctreeLeaves) -> bytes:
     """Return the `.ot` file of an octree with its log-odds: a ColorOcTree when it has colours, else an OcTree.
 
     An inner node has the largest log-odds of its children, and the average of their colours.
@@ -62,7 +62,7 @@ def _header(title: bytes, kind: str, nodes: int, resolution_m: float) -> bytes:
     return title + f"\n{_COMMENT}id {kind}\nsize {nodes}\nres {resolution_m:g}\ndata\n".encode()
 
 
-def read_octree(path: Path, occupied_probability: float = 0.971, free_probability: float = 0.1192) -> Octree:
+def read_octree(path: Path, occupied_probability: float = 0.971, free_probability: float = 0.1192) -> OctreeLeaves:
     """Return the octree of a `.bt` or `.ot` file, of which an inner node's own values are not kept.
 
     Leaves of a `.bt` get OctoMap's clamping thresholds unless told otherwise. Raises DataError when the file is not a
@@ -78,7 +78,7 @@ def read_octree(path: Path, occupied_probability: float = 0.971, free_probabilit
         return _decode_full(content[offset:], kind, resolution_m, size, path)
     starts, levels, is_occupied = _decode_leaves(content[offset:], size, path)
     values = np.where(is_occupied, log_odds(occupied_probability), log_odds(free_probability))
-    return Octree(resolution_m, starts, levels, values)
+    return OctreeLeaves(resolution_m, starts, levels, values)
 
 
 def _parse_header(content: bytes, path: Path) -> tuple[bool, dict[str, str], int]:
@@ -118,7 +118,7 @@ def _checked_header(fields: dict[str, str], path: Path) -> tuple[str, float, int
     return kind, resolution_m, size
 
 
-def _decode_full(data: bytes, kind: str, resolution_m: float, size: int, path: Path) -> Octree:
+def _decode_full(data: bytes, kind: str, resolution_m: float, size: int, path: Path) -> OctreeLeaves:
     node_type = _node_type(kind)
     if len(data) != size * node_type.itemsize:
         raise DataError(
@@ -136,7 +136,7 @@ def _decode_full(data: bytes, kind: str, resolution_m: float, size: int, path: P
     if not np.isfinite(values).all():
         raise DataError(f"{path} is damaged: a leaf's log-odds is not a finite number")
     colors = np.ascontiguousarray(nodes["color"][leaves]) if kind == _COLOURED else None
-    return Octree(resolution_m, starts, levels, values, colors)
+    return OctreeLeaves(resolution_m, starts, levels, values, colors)
 
 
 def _decode_leaves(

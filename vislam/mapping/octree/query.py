@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.mapping.octree import query_kernels as kernels
-from vislam.mapping.octree.occupancy import OccupancyMap
+from vislam.mapping.octree.occupancy import Octree
 
 Numbers = NDArray[np.floating] | list[float] | list[list[float]] | tuple[float, ...]
 _MAX_SHAPE_VOXELS = 1 << 26  # a shape of 20 x 20 x 20 m at 5 cm
@@ -40,7 +40,7 @@ class Nearest:
 
 
 def ray_cast(
-    grid: OccupancyMap,
+    grid: Octree,
     origins_m: Numbers,
     directions: Numbers,
     max_range_m: float,
@@ -65,7 +65,7 @@ def ray_cast(
     return RayHits(outcome, range_m, voxel)
 
 
-def sphere_state(grid: OccupancyMap, centres_m: Numbers, radius_m: float) -> NDArray[np.int8]:
+def sphere_state(grid: Octree, centres_m: Numbers, radius_m: float) -> NDArray[np.int8]:
     """Return the `Occupancy` [N] of the voxels that spheres around centres [N, 3] reach into.
 
     OCCUPIED when any of them is, else UNKNOWN when any is, else FREE. Raises DataError on input that is not finite or
@@ -77,9 +77,7 @@ def sphere_state(grid: OccupancyMap, centres_m: Numbers, radius_m: float) -> NDA
     return np.asarray(kernels.spheres(centres, radius_m, grid.resolution_m, *grid.pool.arrays))
 
 
-def box_state(
-    grid: OccupancyMap, centres_m: Numbers, size_m: Numbers, R_map_box: Numbers | None = None
-) -> NDArray[np.int8]:
+def box_state(grid: Octree, centres_m: Numbers, size_m: Numbers, R_map_box: Numbers | None = None) -> NDArray[np.int8]:
     """Return the `Occupancy` [N], as of `sphere_state`, of boxes of size [3] around centres [N, 3].
 
     `R_map_box` [N, 3, 3] or [3, 3] turns them; without it they stand along the map's axes. The test is exact
@@ -100,9 +98,7 @@ def box_state(
     return np.asarray(kernels.boxes(centres, 0.5 * size, R, grid.resolution_m, *grid.pool.arrays))
 
 
-def footprint_state(
-    grid: OccupancyMap, poses: Numbers, polygon_m: Numbers, low_m: float, high_m: float
-) -> NDArray[np.int8]:
+def footprint_state(grid: Octree, poses: Numbers, polygon_m: Numbers, low_m: float, high_m: float) -> NDArray[np.int8]:
     """Return the `Occupancy` [N], as of `sphere_state`, of a robot's body at planar poses [N, 3]: x, y (m), yaw (rad).
 
     The body is the convex polygon [K, 2] in the robot's frame between two heights of the map; begin it a voxel above
@@ -123,7 +119,7 @@ def footprint_state(
     return np.asarray(kernels.footprints(places, polygon, low_m, high_m, grid.resolution_m, *grid.pool.arrays))
 
 
-def nearest_obstacle(grid: OccupancyMap, points_m: Numbers, window_m: float) -> Nearest:
+def nearest_obstacle(grid: Octree, points_m: Numbers, window_m: float) -> Nearest:
     """Return the nearest occupied voxel within `window_m` of each point [N, 3].
 
     Raises DataError on points that are not finite or a window that is not positive.
@@ -131,7 +127,7 @@ def nearest_obstacle(grid: OccupancyMap, points_m: Numbers, window_m: float) -> 
     return _nearest(grid, points_m, window_m, False)
 
 
-def nearest_frontier(grid: OccupancyMap, points_m: Numbers, window_m: float) -> Nearest:
+def nearest_frontier(grid: Octree, points_m: Numbers, window_m: float) -> Nearest:
     """Return the nearest free voxel with an unknown voxel beside it (Yamauchi 1997), as the crow flies.
 
     Raises DataError like `nearest_obstacle`.
@@ -139,7 +135,7 @@ def nearest_frontier(grid: OccupancyMap, points_m: Numbers, window_m: float) -> 
     return _nearest(grid, points_m, window_m, True)
 
 
-def _nearest(grid: OccupancyMap, points_m: Numbers, window_m: float, frontier: bool) -> Nearest:
+def _nearest(grid: Octree, points_m: Numbers, window_m: float, frontier: bool) -> Nearest:
     points = _rows(points_m, 3, "points")
     _check_positive(window_m, "the window")
     distance, voxel = kernels.nearest(points, window_m, frontier, grid.resolution_m, *grid.pool.arrays)
@@ -162,7 +158,7 @@ def _check_positive(value_m: float, what: str) -> None:
         raise DataError(f"{what} must be a positive number of metres, got {value_m}")
 
 
-def _check_size(grid: OccupancyMap, extent_m: Array) -> None:
+def _check_size(grid: Octree, extent_m: Array) -> None:
     voxels = float((extent_m / grid.resolution_m + 2.0).prod())
     if voxels > _MAX_SHAPE_VOXELS:
         raise DataError(

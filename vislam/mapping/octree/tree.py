@@ -27,7 +27,7 @@ def log_odds(probability: float) -> np.float32:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Octree:
+class OctreeLeaves:
     """Leaves of a pruned octree, in Morton order; where no leaf is, nothing is known."""
 
     resolution_m: float
@@ -60,7 +60,7 @@ class Octree:
         out[inside] = np.where((leaf >= 0) & (codes < ends), leaf, -1)
         return out
 
-    def with_colors(self, points_map_m: NDArray[np.floating], colors: NDArray[np.uint8]) -> Octree:
+    def with_colors(self, points_map_m: NDArray[np.floating], colors: NDArray[np.uint8]) -> OctreeLeaves:
         """Return the octree whose leaves have the mean RGB colour [N, 3] of the points [N, 3] in them, else white."""
         leaf = self.leaves_at(points_map_m)
         counts = np.bincount(leaf[leaf >= 0], minlength=len(self))
@@ -96,7 +96,7 @@ class Octree:
 
 def octree_from_blocks(
     resolution_m: float, block_coordinates: NDArray[np.int64], values: NDArray[np.float32]
-) -> Octree:
+) -> OctreeLeaves:
     """Return the pruned octree of 8x8x8 blocks: coordinates [B, 3], values [B, 512] x fastest, NaN unknown."""
     codes = morton_encode(block_coordinates)
     order = np.argsort(codes, kind="stable")
@@ -109,7 +109,7 @@ def octree_from_blocks(
         if count == len(starts):
             break
         starts, levels, leaves = starts[:count], levels[:count], leaves[:count]
-    return Octree(resolution_m, starts.copy(), levels.copy(), leaves.copy())
+    return OctreeLeaves(resolution_m, starts.copy(), levels.copy(), leaves.copy())
 
 
 def _morton_within_block() -> NDArray[np.int64]:

@@ -31,7 +31,7 @@ def write_pictures(source: MapSource, folder: Path, path_m: NDArray[np.float64],
     Raises StorageError when one cannot be written.
     """
     path = [Line(path_m, _PATH_COLOR)]
-    octree = source.occupancy.max_likelihood_octree()
+    octree = source.occupancy.max_likelihood_leaves()
     pictures = {}
     if (folder / FILES["cloud"]).is_file():
         points, colors = read_ply(folder / FILES["cloud"])

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from vislam.core.messages import Array, ImageU8
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh
-from vislam.mapping.octree import Octree
+from vislam.mapping.octree import OctreeLeaves
 
 SIZE = (1600, 900)  # width, height
 _ELEVATION_RAD = np.deg2rad(50.0)
@@ -67,7 +67,7 @@ def render_mesh(mesh: Mesh, lines: Sequence[Line] = (), size: tuple[int, int] = 
     return render_cloud(Cloud(mesh.points_m, mesh.colors), lines, size)
 
 
-def render_octree(octree: Octree, lines: Sequence[Line] = (), size: tuple[int, int] = SIZE) -> ImageU8:
+def render_octree(octree: OctreeLeaves, lines: Sequence[Line] = (), size: tuple[int, int] = SIZE) -> ImageU8:
     """Return the picture [H, W, 3] RGB of an octree's occupied voxels, coloured by height."""
     centres = (octree.occupied_voxels() + 0.5) * octree.resolution_m
     return _render(centres, None, octree.resolution_m, lines, size)

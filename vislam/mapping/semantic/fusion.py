@@ -15,7 +15,7 @@ from vislam.config import LabelConfig
 from vislam.core.messages import Array
 from vislam.mapping.cloud.store import KeyframeStore
 from vislam.mapping.depth.image import DepthView, surface_points
-from vislam.mapping.octree import Occupancy, OccupancyMap
+from vislam.mapping.octree import Occupancy, Octree
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.votes import VoxelVotes, voxel_centres
@@ -52,7 +52,7 @@ class LabelFusion:
         return self._waiting.pop(keyframe_id, None)
 
     def layer(
-        self, T_map_body: Mapping[int, Array], store: KeyframeStore, view: DepthView, occupancy: OccupancyMap
+        self, T_map_body: Mapping[int, Array], store: KeyframeStore, view: DepthView, occupancy: Octree
     ) -> LabelLayer:
         """Return the labels of the occupied voxels, as keyframes at their poses [4, 4] saw them, in this order."""
         done = self._poses

@@ -23,7 +23,7 @@ from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.joining import RelativeCovariance, Waiting
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from vislam.runs.folder import storage
 from vislam.runs.offline.session_graph import (
     Edges,
@@ -182,11 +182,11 @@ class _Search:
             ]
         self.submaps = self.submaps.joined_by(self._joining)
 
-    def _detector(self) -> LoopDetector:
+    def _detector(self) -> LoopCloser:
         """Return a detector that knows the first session and which submaps there will be."""
         part = self.parts[0]
         config = replace(part.config.loop, enabled=True)
-        detector = LoopDetector(config, part.rig, part.config.seed, part.has_gravity)
+        detector = LoopCloser(config, part.rig, part.config.seed, part.has_gravity)
         detector.restore(part.memory.places)
         detector.move(self._update())
         return detector

@@ -10,7 +10,7 @@ import pytest
 from vislam.config import LoopConfig
 from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
-from vislam.loop.detector import LoopDetector
+from vislam.loop.closer import LoopCloser
 from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, make_rig, room
 
 PER_LAP = 40
@@ -27,7 +27,7 @@ def drifting(poses: list[Array], seed: int, sigma_m: float, sigma_deg: float) ->
 
 
 def run(
-    detector: LoopDetector, keyframes: list[Keyframe], estimates: list[Array]
+    detector: LoopCloser, keyframes: list[Keyframe], estimates: list[Array]
 ) -> tuple[list[LoopEdge], list[LoopCandidate]]:
     edges: list[LoopEdge] = []
     candidates: list[LoopCandidate] = []
@@ -54,7 +54,7 @@ def laps() -> tuple[LandmarkWorld, list[Array], list[Keyframe]]:
 def test_the_second_lap_closes_on_the_first(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
     world, poses, keyframes = laps
     edges, candidates = run(
-        LoopDetector(CONFIG, world.rig, 0, gravity_aligned=True), keyframes, drifting(poses, 1, 0.01, 0.2)
+        LoopCloser(CONFIG, world.rig, 0, gravity_aligned=True), keyframes, drifting(poses, 1, 0.01, 0.2)
     )
     closing = [edge for edge in edges if edge.to_id - edge.from_id > PER_LAP // 2]
     assert len({edge.to_id for edge in closing}) >= 0.9 * PER_LAP
@@ -75,7 +75,7 @@ def test_appearance_closes_loops_where_odometry_is_lost(
     away = np.eye(4)
     away[:3, 3] = [40.0, 0.0, 0.0]
     estimates = poses[:PER_LAP] + [away @ pose for pose in poses[PER_LAP:]]
-    edges, candidates = run(LoopDetector(CONFIG, world.rig, 0), keyframes, estimates)
+    edges, candidates = run(LoopCloser(CONFIG, world.rig, 0), keyframes, estimates)
     # not the last two of the first lap, which are neighbours of what odometry finds at the end of the second
     closing = [edge for edge in edges if edge.from_id < PER_LAP - 2 and edge.to_id >= PER_LAP]
     sources = {(c.from_id, c.to_id): c.source for c in candidates}
@@ -90,7 +90,7 @@ def test_every_candidate_has_a_decision_and_a_reason(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
     world, poses, keyframes = laps
-    detector = LoopDetector(replace(CONFIG, min_rigid=0), world.rig, 0)  # what is not alike is verified, too
+    detector = LoopCloser(replace(CONFIG, min_rigid=0), world.rig, 0)  # what is not alike is verified, too
     _, candidates = run(detector, keyframes, poses)
     assert all(c.reason and c.source in ("appearance", "odometry") and c.from_id < c.to_id for c in candidates)
     rejected = [c for c in candidates if c.decision is LoopDecision.REJECTED]
@@ -106,7 +106,7 @@ def test_two_runs_give_the_same_bytes(laps: tuple[LandmarkWorld, list[Array], li
     world, poses, keyframes = laps
     runs = []
     for _ in range(2):
-        detector = LoopDetector(CONFIG, world.rig, 3)
+        detector = LoopCloser(CONFIG, world.rig, 3)
         edges, candidates = run(detector, keyframes[: PER_LAP + 15], poses[: PER_LAP + 15])
         runs.append((
             detector.vocabulary.hash,
@@ -121,7 +121,7 @@ def test_the_vocabulary_is_trained_again_as_the_run_grows(
     laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
 ) -> None:
     world, poses, keyframes = laps
-    detector, changes, last = LoopDetector(CONFIG, world.rig, 0), [], None
+    detector, changes, last = LoopCloser(CONFIG, world.rig, 0), [], None
     for keyframe, pose in zip(keyframes, poses, strict=True):
         detector.detect(keyframe, pose)
         now = detector.vocabulary.hash
@@ -135,7 +135,7 @@ def test_another_place_gives_no_edge() -> None:
     """The second lap is in a room of the same shape with other landmarks, where the map says it is the same room."""
     first, second, poses, rng = room(1), room(2), lap_poses(2.0, PER_LAP), np.random.default_rng(0)
     keyframes = [(first if i < PER_LAP else second).see(i, pose, rng) for i, pose in enumerate(poses)]
-    edges, candidates = run(LoopDetector(CONFIG, first.rig, 0), keyframes, poses)
+    edges, candidates = run(LoopCloser(CONFIG, first.rig, 0), keyframes, poses)
     across = [c for c in candidates if c.from_id < PER_LAP <= c.to_id]
     assert len(across) > PER_LAP
     assert all(c.decision is LoopDecision.REJECTED for c in across)
@@ -151,9 +151,9 @@ def test_a_tilted_copy_of_a_place_contradicts_gravity() -> None:
     away[:3, 3] = [30.0, 0.0, 0.0]
     seen = [(world if i < PER_LAP else copy).see(i, pose, rng) for i, pose in enumerate(poses)]
     estimates = [pose if i < PER_LAP else away @ pose for i, pose in enumerate(poses)]
-    blind, _ = run(LoopDetector(CONFIG, world.rig, 0), seen, estimates)
+    blind, _ = run(LoopCloser(CONFIG, world.rig, 0), seen, estimates)
     assert [e for e in blind if e.from_id < PER_LAP <= e.to_id]  # it does fool everything else
-    edges, candidates = run(LoopDetector(CONFIG, world.rig, 0, gravity_aligned=True), seen, estimates)
+    edges, candidates = run(LoopCloser(CONFIG, world.rig, 0, gravity_aligned=True), seen, estimates)
     assert not [e for e in edges if e.from_id < PER_LAP <= e.to_id]
     assert [c for c in candidates if "off gravity" in c.reason]
 
@@ -165,7 +165,7 @@ def test_what_nothing_speaks_against_is_offered_at_once(
     world, poses, keyframes = laps
     away = np.eye(4)
     away[:3, 3] = [40.0, 0.0, 0.0]
-    detector = LoopDetector(replace(CONFIG, max_odometry=0), world.rig, 0)
+    detector = LoopCloser(replace(CONFIG, max_odometry=0), world.rig, 0)
     run(detector, keyframes[:PER_LAP], poses[:PER_LAP])
     edges, candidates = detector.detect(keyframes[PER_LAP], away @ poses[PER_LAP])
     sound = [c for c in candidates if c.decision is not LoopDecision.REJECTED]
@@ -181,7 +181,7 @@ def test_a_map_that_moves_is_followed(laps: tuple[LandmarkWorld, list[Array], li
     away[:3, 3] = [40.0, 0.0, 0.0]
     still = replace(CONFIG, max_appearance=0)
     for moves in (False, True):
-        detector = LoopDetector(still, world.rig, 0)
+        detector = LoopCloser(still, world.rig, 0)
         run(detector, keyframes[:PER_LAP], [away @ pose for pose in poses[:PER_LAP]])
         if moves:
             ids = np.arange(PER_LAP + 3)  # some that the detector has not met yet
@@ -196,7 +196,7 @@ def test_without_depth_edges_have_no_scale() -> None:
     inner = lap_poses(1.5, PER_LAP, 2.0)
     mixed = poses[:PER_LAP] + inner[PER_LAP:]
     keyframes = [world.see(i, pose, rng, depth=False) for i, pose in enumerate(mixed)]
-    edges, candidates = run(LoopDetector(CONFIG, world.rig, 0), keyframes, drifting(mixed, 2, 0.005, 0.1))
+    edges, candidates = run(LoopCloser(CONFIG, world.rig, 0), keyframes, drifting(mixed, 2, 0.005, 0.1))
     assert [e for e in edges if e.from_id < PER_LAP <= e.to_id]
     assert not any(edge.has_scale for edge in edges)
     for edge in edges:
@@ -217,7 +217,7 @@ def test_poor_keyframes_do_no_harm(laps: tuple[LandmarkWorld, list[Array], list[
     blind = replace(bad, keypoints_px=np.full_like(bad.keypoints_px, np.nan))
     assert bad.points_body_m is not None
     pointless = replace(bad, points_body_m=np.full_like(bad.points_body_m, np.nan))
-    detector = LoopDetector(replace(CONFIG, first_training=3), world.rig, 0)
+    detector = LoopCloser(replace(CONFIG, first_training=3), world.rig, 0)
     sequence = [nothing, blind, nothing, pointless, nothing, blind, *keyframes[:8], nothing, blind, pointless]
     edges, _ = run(detector, [replace(k, id=i) for i, k in enumerate(sequence)], [poses[0]] * len(sequence))
     assert all(np.all(np.isfinite(edge.T_from_to)) for edge in edges)
@@ -225,14 +225,14 @@ def test_poor_keyframes_do_no_harm(laps: tuple[LandmarkWorld, list[Array], list[
 
 def test_switched_off_it_does_nothing(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
     world, poses, keyframes = laps
-    edges, candidates = run(LoopDetector(replace(CONFIG, enabled=False), world.rig, 0), keyframes[:12], poses[:12])
+    edges, candidates = run(LoopCloser(replace(CONFIG, enabled=False), world.rig, 0), keyframes[:12], poses[:12])
     assert edges == []
     assert candidates == []
 
 
 def test_it_keeps_no_images() -> None:
     rig, world, rng = make_rig(), room(1), np.random.default_rng(0)
-    detector = LoopDetector(CONFIG, rig, 0)
+    detector = LoopCloser(CONFIG, rig, 0)
     keyframe = world.see(0, body_pose((0.0, 0.0, 0.0), 0.0), rng)
     detector.detect(keyframe, np.eye(4))
     view = detector._views[0]

@@ -1,18 +1,60 @@
-"""The first state from rest: gravity and gyro bias are the means of what the IMU says."""
+"""The first state from rest: gravity and gyro bias are the means of what the IMU measures."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from vislam.config import InitConfig
-from vislam.core.geometry import skew
-from vislam.core.messages import Array, ImuSpan
-from vislam.imu import ImuNoise
+from vislam.core.errors import DataError
+from vislam.core.geometry import level_rotation, skew, transform
+from vislam.core.imu_noise import ImuNoise
+from vislam.core.messages import Array, ImuSample, ImuSpan, NavState
+from vislam.imu.rest import is_still, still_limits
 
 _NS = 1_000_000_000
 _CHOSEN = 1e-3  # sigma, rad and m, of heading and position where odom is defined to be zero
 _REST_SIGMA_M_S = 0.02  # a body at rest still sways
 _CORRELATED_S = 0.05  # vibration at rest averages out over samples this far apart
+
+
+def state_at_rest(
+    samples: Sequence[ImuSample], noise: ImuNoise, gravity_m_s2: float = 9.81, config: InitConfig | None = None
+) -> NavState:
+    """Return the state at the last of the samples of a body at rest: level, heading and position zero.
+
+    Raises DataError for samples that are too few or too short, that are not of rest, or whose force is not gravity.
+    """
+    config = config or InitConfig()
+    length_s = (samples[-1].t_ns - samples[0].t_ns) / _NS if samples else 0.0
+    if length_s < config.rest_s:
+        raise DataError(
+            f"a state from rest needs {config.rest_s:g} s of samples (init.rest_s), got {len(samples)} over "
+            f"{length_s:.2f} s; give more, or a state by NavState.with_sigmas"
+        )
+    span = ImuSpan(
+        np.array([sample.t_ns for sample in samples]),
+        np.array([sample.gyro_rad_s for sample in samples]),
+        np.array([sample.accel_m_s2 for sample in samples]),
+    )
+    gyro, force = span.gyro_rad_s.mean(axis=0), span.accel_m_s2.mean(axis=0)
+    if not is_still(span.gyro_rad_s, span.accel_m_s2, still_limits(config, noise)):
+        raise DataError(
+            f"the {length_s:.2f} s of samples are not of rest: rate {np.linalg.norm(gyro):.2g} rad/s, its spread "
+            f"{np.linalg.norm(span.gyro_rad_s.std(axis=0)):.2g} rad/s, that of the force "
+            f"{np.linalg.norm(span.accel_m_s2.std(axis=0)):.2g} m/s^2; give a state by NavState.with_sigmas"
+        )
+    norm = float(np.linalg.norm(force))
+    if abs(norm - gravity_m_s2) > config.gravity_tolerance_m_s2:
+        raise DataError(
+            f"the force at rest is {norm:.2f} m/s^2, gravity {gravity_m_s2:.2f}, allowed difference "
+            f"{config.gravity_tolerance_m_s2:g} (init.gravity_tolerance_m_s2); calibrate the accelerometer"
+        )
+    R = level_rotation(force)
+    covariance = rest_covariance(span, R, gravity_m_s2, config, noise)
+    accel_bias = rest_accel_bias(span, gravity_m_s2, config)
+    return NavState(samples[-1].t_ns, transform(R, np.zeros(3)), np.zeros(3), gyro, accel_bias, covariance)
 
 
 def rest_variance(values: Array, rested_s: float) -> float:
