@@ -51,7 +51,7 @@ def filter_alone() -> None:
         ekf.predict(sample)
     print(ekf)
     assert np.linalg.norm(ekf.state().T_world_body[:3, 3]) < 1e-3
-    start = vislam.NavState.with_sigmas(0, np.eye(4), sigma_rad=0.01, sigma_m=0.1)
+    start = vislam.NavState.with_sigmas(0, np.eye(4), (0.01, 0.1))
     assert vislam.Ekf.from_state(start, noise).state().t_ns == 0
 
 

@@ -241,17 +241,28 @@ class NavState:
 
     @classmethod
     def with_sigmas(
-        cls, t_ns: int, T_world_body: Array, *, sigma_rad: float, sigma_m: float,
+        cls, t_ns: int, T_world_body: Array, pose_sigmas: tuple[float, float], *,
         velocity_world_m_s: Sequence[float] | Array = (0.0, 0.0, 0.0), sigma_m_s: float = 0.1,
-        gyro_bias_rad_s: Sequence[float] | Array = (0.0, 0.0, 0.0), gyro_bias_sigma_rad_s: float = 0.01,
-        accel_bias_m_s2: Sequence[float] | Array = (0.0, 0.0, 0.0), accel_bias_sigma_m_s2: float = 0.2,
+        gyro_bias_rad_s: Sequence[float] | Array = (0.0, 0.0, 0.0),
+        accel_bias_m_s2: Sequence[float] | Array = (0.0, 0.0, 0.0), bias_sigmas: tuple[float, float] = (0.01, 0.2),
     ) -> NavState:  # fmt: skip
-        """Return a state [4, 4], [3], [3], [3] whose errors are independent, with these sigmas per axis."""
-        sigmas = (sigma_rad, sigma_m, sigma_m_s, gyro_bias_sigma_rad_s, accel_bias_sigma_m_s2)
+        """Return a state whose errors are independent, all axes of a part alike.
+
+        Args:
+            t_ns: its time.
+            T_world_body: [4, 4].
+            pose_sigmas: of rotation (rad) and position (m).
+            velocity_world_m_s: [3].
+            sigma_m_s: of the velocity.
+            gyro_bias_rad_s: [3].
+            accel_bias_m_s2: [3].
+            bias_sigmas: of the gyroscope (rad/s) and of the accelerometer (m/s^2).
+        """
         T, velocity, gyro_bias, accel_bias = (
             np.array(v, dtype=np.float64) for v in (T_world_body, velocity_world_m_s, gyro_bias_rad_s, accel_bias_m_s2)
         )
-        return cls(t_ns, T, velocity, gyro_bias, accel_bias, np.diag(np.repeat(np.square(sigmas), 3)))
+        variances = np.square([*pose_sigmas, sigma_m_s, *bias_sigmas])
+        return cls(t_ns, T, velocity, gyro_bias, accel_bias, np.diag(np.repeat(variances, 3)))
 
     def __repr__(self) -> str:
         x, y, z = self.T_world_body[:3, 3]
