@@ -126,12 +126,19 @@ def test_closing_ends_the_thread_and_raises_what_failed(monkeypatch: pytest.Monk
         return [thread.name for thread in threading.enumerate() if thread.name.startswith("vislam-words")]
 
     views = make_views(20)
-    for work, error in ((slowed(train, 0.3), None), (slowed(failing, 0.3), MemoryError)):
-        monkeypatch.setattr(database_module, "train", work)
+    for work, error in ((train, None), (failing, MemoryError)):
+        released = threading.Event()
+
+        def held(*arguments: Any, work: Callable[..., Any] = work, released: threading.Event = released) -> Any:
+            assert released.wait(600.0)
+            return work(*arguments)
+
+        monkeypatch.setattr(database_module, "train", held)
         database = PlaceDatabase(CONFIG, 0)
         for view in views:
             database.add(view)
         assert workers()
+        released.set()
         if error is None:
             database.close()
         else:
