@@ -41,7 +41,7 @@ CORRECTIONS = {
 
 
 def update(ids: list[int], T: list[np.ndarray]) -> GraphUpdate:
-    """Return the news that keyframes are at other poses."""
+    """Return an update by which keyframes are at other poses."""
     return GraphUpdate(1, np.array(ids, np.int64), np.array(T).reshape(-1, 4, 4), np.eye(4), None)
 
 
@@ -49,12 +49,12 @@ def correct(mapper: Mapper, T: dict[int, np.ndarray], ids: list[int]) -> str:
     """Move keyframes, advance until the map has followed, and return what that took."""
     for i in ids:
         T[i] = T[i] @ MOVED
-    before, news, calls_ms = mapper.counters["rebuilds"], update(ids, [T[i] for i in ids]), []
+    before, moved, calls_ms = mapper.counters["rebuilds"], update(ids, [T[i] for i in ids]), []
     while mapper.counters["rebuilds"] == before:
         start = time.process_time()
-        mapper.move(news)
+        mapper.move(moved)
         calls_ms.append(1e3 * (time.process_time() - start))
-        news = update([], [])
+        moved = update([], [])
     return f"{sum(calls_ms):.0f} ms in {len(calls_ms)} calls, the longest {max(calls_ms):.0f} ms"
 
 

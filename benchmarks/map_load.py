@@ -21,7 +21,7 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert, se3_exp, so3_exp, transform
-from vislam.core.memory import EdgeRecord, GraphNews, KeyframeEntry, LoopPlace, LoopState, WindowRecord, WordsMemory
+from vislam.core.memory import EdgeRecord, GraphRecord, KeyframeEntry, LoopPlace, LoopState, WindowRecord, WordsMemory
 from vislam.core.messages import (
     Frame,
     GraphUpdate,
@@ -89,8 +89,8 @@ def write(path: Path, keyframes: int, features: int) -> Keyframe:
             tree = train(seen, config.vocabulary_branching, config.vocabulary_depth, 0, config.training_descriptors)
             words = WordsMemory(tree.to_bytes(), k, 3)
         change = GraphUpdate(k + 1, np.array([k]), pose(k)[None], np.eye(4), None)
-        news = GraphNews(window=said, loops=tuple(states))
-        writer.add(KeyframeEntry(packet, pose(k), change, news, edges, words=words))
+        record = GraphRecord(window=said, loops=tuple(states))
+        writer.add(KeyframeEntry(packet, pose(k), change, record, edges, words=words))
     writer.close(finished=True)
     return keyframe_of(keyframes, features, rng, places)
 

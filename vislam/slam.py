@@ -75,7 +75,7 @@ class Slam:
         memory contradicts itself.
         """
         first_id = memory.front.keyframe_id + 1
-        self.front.begin_in_map(first_id, memory.front.news.next_track_id)
+        self.front.begin_in_map(first_id, memory.front.learned.next_track_id)
         update = self._intake.begin_in_map(memory)
         self._in_map.begin(update.submaps.begun(first_id))
         return update

@@ -19,7 +19,7 @@ from vislam.datasets.camera_files import CameraCalibration, camchain_text, read_
 from vislam.datasets.imu_files import imu_calibration_text, mag_calibration_text
 from vislam.hw.sensors import calibration_of
 from vislam.imu import ImuCalibration, MagCalibration
-from vislam.live.web.news import Asked
+from vislam.live.web.updates import Asked
 
 LENS = Camera(640, 480, 512.0, 511.0, 320.5, 239.5, distortion="radtan", coefficients=(-0.2, 0.05, 0.0, 0.0))
 OLD_LENS = replace(LENS, fx=600.0, fy=600.0, distortion="none", coefficients=())

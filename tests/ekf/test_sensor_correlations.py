@@ -217,9 +217,9 @@ def test_the_filter_of_a_run_remembers_what_it_told_of_sensors(coupling: str) ->
         assert filtering.begin_sensor(run.start.t_ns, start).accepted
     for reading in run.readings:
         assert filtering.add_reading(reading).accepted
-    for told in pickle.loads(pickle.dumps(filtering.take_told_readings())):  # noqa: S301
+    for told in pickle.loads(pickle.dumps(filtering.take_applied_readings())):  # noqa: S301
         assert told.apply(twin.ekf).accepted
-    assert filtering.take_told_readings() == []
+    assert filtering.take_applied_readings() == []
     assert filtering.ekf.state().T_world_body.tobytes() == twin.ekf.state().T_world_body.tobytes()
     assert filtering.ekf.state().covariance.tobytes() == twin.ekf.state().covariance.tobytes()
     assert filtering.ekf.own("beacon")[0].tobytes() == twin.ekf.own("beacon")[0].tobytes()

@@ -128,7 +128,7 @@ def test_rolling_shutter_is_found_from_given_tracks() -> None:
     for event in recording.events():
         if isinstance(event, Frame):
             frontend.track(event, None)
-    found_s = frontend.news.readout_s
+    found_s = frontend.learned.readout_s
     print(f"seed 1: {found_s} of 0.02 s")
     assert found_s == pytest.approx(0.02, abs=0.003)
 

@@ -198,13 +198,13 @@ def test_two_runs_give_identical_bytes() -> None:
 
 def test_it_goes_on_where_it_was() -> None:
     driven, frames = usual(), drawn()[1]
-    news = driven.frontend.news
+    learned = driven.frontend.learned
     again = PlanarFrontEnd(CONFIG, rig(), 3)
-    again.begin_at(17, news)
+    again.begin_at(17, learned)
     first = again.track(frames[0], None)
     assert first.keyframe is not None and first.keyframe.id == 17
     assert again.calibration == pytest.approx(driven.frontend.calibration, rel=1e-3)
-    assert first.observations.track_ids.min() >= news.next_track_id
+    assert first.observations.track_ids.min() >= learned.next_track_id
 
 
 def test_a_known_height_chooses_it() -> None:

@@ -564,7 +564,7 @@ def test_a_restored_graph_has_no_more_in_its_solver(make, tmp_path, monkeypatch:
         edges = [world.loop(k, k - 100, k)] if k >= 100 else []
         start = start_facts(world.initial_state(), world.noise) if k == 0 else None
         update = old.add(world.packet(k), edges, world.truth[k])
-        entry = KeyframeEntry(world.packet(k), world.truth[k], update, old.take_news(), edges, start=start)
+        entry = KeyframeEntry(world.packet(k), world.truth[k], update, old.take_record(), edges, start=start)
         writer.add(entry)
     writer.close()
     memory = recall(Session(tmp_path / "session.db"))

@@ -16,7 +16,7 @@ from vislam.live.web import feed as feed_module
 from vislam.live.web.feed import MOST_POINTS, Feed
 from vislam.live.web.frame_share import FrameShare, picture
 from vislam.live.web.map_share import SAVED, MapShare, quantised
-from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Save, Saved, Status, StepPicture
+from vislam.live.web.updates import FrameUpdate, KeyframeCloud, LoopUpdate, MapUpdate, Save, Saved, Status, StepPicture
 from vislam.live.wire.mail import Inbox
 from vislam.live.wire.published_pose import NO_VISION_MS, PublishedPose
 from vislam.mapping.formats.ply import read_ply
@@ -28,9 +28,9 @@ def cloud(count: int) -> KeyframeCloud:
     return KeyframeCloud(0.001, np.full((count, 3), 7, np.int16), np.zeros(count, np.uint16))
 
 
-def news(ids: range, points: int = 10, revision: int = 1) -> MapNews:
+def update(ids: range, points: int = 10, revision: int = 1) -> MapUpdate:
     poses = {i: np.eye(4) for i in ids}
-    return MapNews(revision, poses, dict.fromkeys(ids, 0), {i: cloud(points) for i in ids}, [])
+    return MapUpdate(revision, poses, dict.fromkeys(ids, 0), {i: cloud(points) for i in ids}, [])
 
 
 def whole(feed: Feed) -> tuple[dict, int]:
@@ -61,10 +61,10 @@ def pose_at(position: Array, health: Health = Health.LEVELLED, sigma: float = 0.
 
 def test_what_changed_is_sent_and_nothing_else() -> None:
     feed = Feed()
-    feed.take(news(range(3)))
+    feed.take(update(range(3)))
     first = feed.map({})
     assert len(first["clouds"]) == 3
-    feed.take(MapNews(2, {1: np.eye(4) * 2}, {}, {}, []))
+    feed.take(MapUpdate(2, {1: np.eye(4) * 2}, {}, {}, []))
     second = feed.map({"epoch": str(first["epoch"]), "since": str(first["revision"])})
     assert np.frombuffer(base64.b64decode(second["ids"]), "<u4").tolist() == [1]
     assert second["clouds"] == {}
@@ -73,7 +73,7 @@ def test_what_changed_is_sent_and_nothing_else() -> None:
 def test_points_are_bounded_however_many_keyframes_there_are() -> None:
     feed = Feed()
     for begin in range(0, 1024, 32):
-        feed.take(news(range(begin, begin + 32), 2000))
+        feed.take(update(range(begin, begin + 32), 2000))
     clouds, answers = whole(feed)
     assert len(clouds) == 1024
     assert points_of(clouds) <= MOST_POINTS
@@ -84,9 +84,9 @@ def test_points_are_bounded_however_many_keyframes_there_are() -> None:
 def test_keyframes_are_thinned_when_there_are_too_many_and_the_page_begins_anew(monkeypatch) -> None:
     monkeypatch.setattr(feed_module, "_MOST_KEYFRAMES", 100)
     feed = Feed()
-    feed.take(news(range(100)))
+    feed.take(update(range(100)))
     before = feed.map({})
-    feed.take(news(range(100, 150)))
+    feed.take(update(range(100, 150)))
     told = feed.map({"epoch": str(before["epoch"]), "since": str(before["revision"])})
     assert told["epoch"] == before["epoch"] + 1
     assert len(told["clouds"]) == 75
@@ -106,7 +106,7 @@ def test_the_path_is_bounded_and_only_its_new_part_is_sent() -> None:
 @pytest.mark.parametrize("query", [{"path": "-1"}, {"path": "x"}, {"path": "9" * 15, "epoch": "0"}, {"since": "1e9"}])
 def test_numbers_that_are_none_are_taken_for_zero_or_ask_for_nothing(query: dict[str, str]) -> None:
     feed = Feed()
-    feed.take(news(range(2)))
+    feed.take(update(range(2)))
     feed.follow(pose_at(np.zeros(3)))
     json.dumps(feed.state(query), allow_nan=False)
     json.dumps(feed.map(query), allow_nan=False)
@@ -125,7 +125,7 @@ def test_the_newest_picture_is_shown_whether_of_the_run_or_of_a_step() -> None:
     assert feed.picture() == b""
     feed.take(StepPicture(b"step"))
     assert (feed.picture(), feed.state({})["picture"]) == (b"step", 1)
-    feed.take(FrameNews(5, b"frame", "lost", 3, "dark"))
+    feed.take(FrameUpdate(5, b"frame", "lost", 3, "dark"))
     state = feed.state({})
     assert (feed.picture(), state["picture"], state["frame"]["reason"]) == (b"frame", 2, "dark")
     assert base64.b64decode(feed.seen()["state"]) == b"\x02"
@@ -135,7 +135,7 @@ def test_loops_status_and_what_was_saved_are_told() -> None:
     feed = Feed()
     feed.take(Status({"phase": "running"}))
     feed.take(Saved("saved/cloud.ply"))
-    feed.take(MapNews(1, {}, {}, {}, [LoopNews(1, 9, "pending", "waits"), LoopNews(1, 9, "accepted", "agrees")]))
+    feed.take(MapUpdate(1, {}, {}, {}, [LoopUpdate(1, 9, "pending", "waits"), LoopUpdate(1, 9, "accepted", "agrees")]))
     state = feed.state({})
     assert state["phase"] == "running"
     assert feed.is_going

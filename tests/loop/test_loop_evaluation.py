@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vislam.config import LoopConfig, LoopTruthConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import interpolate, invert, se3_exp
-from vislam.core.memory import GraphNews, KeyframeEntry
+from vislam.core.memory import GraphRecord, KeyframeEntry
 from vislam.core.messages import (
     GraphUpdate,
     KeyframePacket,
@@ -191,7 +191,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         vo = VoMeasurement(keyframe.t_ns, max(0, k - 1), np.eye(4), np.eye(6), True, Tracking.OK, 100)
         seen = Observations(np.empty(0, np.int64), np.empty((0, 2)))
         update = GraphUpdate(k, np.array([k]), pose[None], np.eye(4), None)
-        writer.add(KeyframeEntry(KeyframePacket(keyframe, vo, seen, None), pose, update, GraphNews(), edges))
+        writer.add(KeyframeEntry(KeyframePacket(keyframe, vo, seen, None), pose, update, GraphRecord(), edges))
         for c in candidates:
             weight = 1.0 if c.decision is LoopDecision.ACCEPTED else math.nan
             judged = {"decision": str(c.decision), "reason": c.reason, "source": c.source, "weight": weight}

@@ -150,8 +150,8 @@ def test_the_map_process_of_a_live_run_makes_the_same_depth(recording, finished)
             for keyframe in step.keyframes:
                 late.put(keyframe)
             front = slam.front
-            seen.put(Seen(light(step.front, shows=False, feeds_depth=True), np.eye(4), front.start, front.news))
-    seen.put(FrontEnded(slam.front.report(), slam.front.start, slam.front.news, {}))
+            seen.put(Seen(light(step.front, shows=False, feeds_depth=True), np.eye(4), front.start, front.learned))
+    seen.put(FrontEnded(slam.front.report(), slam.front.start, slam.front.learned, {}))
     late.put(BackEnded(None, None, None, {}, {}))
     life, clock = Life("map", Pipe()[1], Signals(Flag(), Flag())), StageClock()
     stage = map_stage(config, source.rig, clock)

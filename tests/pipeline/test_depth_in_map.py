@@ -12,7 +12,7 @@ from vislam.core.geometry import invert, quaternion_xyzw_from_rotation, se3_exp,
 from vislam.loop.table import read_loops
 from vislam.pipeline.settings import derived
 from vislam.runs import execute, map_of, resume
-from vislam.runs.begin import told_start
+from vislam.runs.begin import parse_start
 from vislam.runs.folder import MapChoice, prepare, read_setup
 from vislam.runs.session import Session
 from vislam.slam import Slam
@@ -177,7 +177,7 @@ def test_another_room_gets_no_edge_by_depth_whatever_place_is_told(old, tmp_path
 )
 def test_a_start_that_is_no_pose_is_told(text):
     with pytest.raises(UsageError, match="QX,QY,QZ,QW"):
-        told_start(text, np.eye(4))
+        parse_start(text, np.eye(4))
 
 
 def test_a_start_without_a_map_is_told(tmp_path, capsys):

@@ -41,9 +41,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, World]:
         update = graph.add(packet, edges, world.truth[k])
         pose = graph.poses()[-1]
         writer.add_frame(FrameEntry(world.t_ns(k), k, np.eye(4), world.truth[k], pose, packet.vo.tracking, 9, k, ""))
-        writer.add(KeyframeEntry(packet, world.truth[k], update, graph.take_news(), edges))
+        writer.add(KeyframeEntry(packet, world.truth[k], update, graph.take_record(), edges))
     final = graph.finish()
-    writer.move(final, graph.take_news())
+    writer.move(final, graph.take_record())
     writer.close(finished=True)
     return run, world
 

@@ -42,7 +42,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_stopped_run_goes_on_with_tilt_and_clock(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = recall(Session(stopped / "session.db"))
-    assert before is not None and before.front.news.tilt is not None
+    assert before is not None and before.front.learned.tilt is not None
     whole = json.loads((stopped.parent / "whole" / "metrics.json").read_text())
     assert run_verb(["run", "--resume", str(stopped), "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)

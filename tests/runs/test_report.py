@@ -13,7 +13,7 @@ import pytest
 
 from run_folder import DEGRADED, LOST, make_run
 from vislam.core.errors import DataError, StorageError
-from vislam.core.memory import GraphNews, KeyframeEntry, PackedScan
+from vislam.core.memory import GraphRecord, KeyframeEntry, PackedScan
 from vislam.core.messages import GraphUpdate
 from vislam.mapping.formats.ply import write_ply
 from vislam.runs.report import write_report
@@ -145,7 +145,7 @@ def add_map_and_session(run):
         colors = cv2.imencode(".png", rng.integers(0, 255, (60, 80, 3), dtype=np.uint8))[1].tobytes()
         scan = PackedScan(k, cv2.imencode(".png", np.full((60, 80), 1000, np.uint16))[1].tobytes(), b"", colors)
         update = GraphUpdate(k + 1, np.array([k]), world.truth[k][None], np.eye(4), None)
-        writer.add(KeyframeEntry(world.packet(k), world.truth[k], update, GraphNews(), scans={k: scan}))
+        writer.add(KeyframeEntry(world.packet(k), world.truth[k], update, GraphRecord(), scans={k: scan}))
     writer.close(finished=True)
 
 

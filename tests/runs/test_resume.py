@@ -62,7 +62,7 @@ def feed(graph: PoseGraph, world: World, measured: list, writer: SessionWriter |
         update = graph.add(packet, edges, world.truth[k])
         if writer is not None:
             start = start_facts(world.initial_state(), world.noise) if measured[-1][0].imu is not None else None
-            writer.add(KeyframeEntry(packet, world.truth[k], update, graph.take_news(), edges, start=start))
+            writer.add(KeyframeEntry(packet, world.truth[k], update, graph.take_record(), edges, start=start))
 
 
 def same(a: object, b: object) -> bool:

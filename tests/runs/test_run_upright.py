@@ -12,7 +12,7 @@ from needs import missing
 from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
 from vislam.core.errors import UsageError
-from vislam.core.up import Up, angle_deg, told_up, turn_to_z
+from vislam.core.up import Up, angle_deg, parse_up, turn_to_z
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.runs import execute
@@ -121,7 +121,7 @@ def test_an_imu_knows_better(source, tmp_path):
 
 
 def test_a_vector_may_begin_with_a_minus():
-    np.testing.assert_allclose(told_up("-3,0,-4"), [-0.6, 0.0, -0.8])
+    np.testing.assert_allclose(parse_up("-3,0,-4"), [-0.6, 0.0, -0.8])
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0, -0.8)])

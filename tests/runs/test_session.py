@@ -17,7 +17,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.database import connect
 from vislam.core.errors import DataError, StorageError
 from vislam.core.geometry import se3_exp
-from vislam.core.memory import FrameEntry, GraphNews, KeyframeEntry
+from vislam.core.memory import FrameEntry, GraphRecord, KeyframeEntry
 from vislam.core.messages import (
     Frame,
     GraphUpdate,
@@ -77,8 +77,8 @@ def update(revision, ids, poses, newest=None):
     return GraphUpdate(revision, np.array(ids, np.int64), poses, np.eye(4), newest)
 
 
-def news(accepted=(), rejected=()):
-    return GraphNews(loops=tuple(decided(i, i in accepted) for i in (*accepted, *rejected)))
+def record(accepted=(), rejected=()):
+    return GraphRecord(loops=tuple(decided(i, i in accepted) for i in (*accepted, *rejected)))
 
 
 def write_three(path, count=3):
@@ -94,7 +94,7 @@ def write_three(path, count=3):
         writer.add_frame(FrameEntry(1000 * i, i, np.eye(4)))
         change = update(i + 1, [i], [poses[i]], state(1000 * i))
         start = start_facts(state(0), NOISE)
-        writer.add(KeyframeEntry(packets[i], poses[i], change, news(accepted, rejected), edges, start=start))
+        writer.add(KeyframeEntry(packets[i], poses[i], change, record(accepted, rejected), edges, start=start))
     return writer, packets, poses, edge
 
 
@@ -110,7 +110,7 @@ def test_a_session_gives_back_what_was_stored(tmp_path):
     writer, packets, poses, edge = write_three(tmp_path / "session.db")
     frames = [p.keyframe for p in packets]
     moved = se3_exp(np.full(6, 0.1))
-    writer.move(update(4, [1], [moved]), news())
+    writer.move(update(4, [1], [moved]), record())
     writer.close()
     session = Session(tmp_path / "session.db")
     stored = list(session.keyframes())
@@ -161,7 +161,7 @@ def test_the_factor_log_gives_back_every_measurement(tmp_path):
 
 def test_a_loop_decided_later_changes_its_decision(tmp_path):
     writer, *_ = write_three(tmp_path / "session.db")
-    writer.move(update(4, [], []), news(accepted=(6,), rejected=(5,)))
+    writer.move(update(4, [], []), record(accepted=(6,), rejected=(5,)))
     writer.close()
     session = Session(tmp_path / "session.db")
     assert [e.id for e in session.edges()] == [6]
@@ -171,7 +171,7 @@ def test_a_loop_decided_later_changes_its_decision(tmp_path):
 def test_a_failed_commit_leaves_no_half_keyframe(tmp_path):
     """Whatever breaks in the middle of a keyframe, packet, edges and frames of it are all absent."""
     writer, packets, poses, edge = write_three(tmp_path / "session.db", count=2)
-    bad = GraphNews(loops=(decided(("not", "an id"), True),))
+    bad = GraphRecord(loops=(decided(("not", "an id"), True),))
     writer.add_frame(FrameEntry(1500, 1, None))
     with pytest.raises(StorageError):
         writer.add(KeyframeEntry(packets[2], poses[2], update(3, [2], [poses[2]]), bad, [edge]))

@@ -57,7 +57,7 @@ def feed(graph: PoseGraph, world: World, packets: list[KeyframePacket], writer: 
         update = graph.add(packet, [], world.truth[k])
         if writer is not None:
             start = start_facts(world.initial_state(), world.noise) if packets[-1].imu is not None else None
-            writer.add(KeyframeEntry(packet, world.truth[k], update, graph.take_news(), start=start))
+            writer.add(KeyframeEntry(packet, world.truth[k], update, graph.take_record(), start=start))
 
 
 def stored(path: Path, world: World, config: GraphConfig = LOOSE, imu: bool = True, end: int = 40) -> PoseGraph:
@@ -150,7 +150,7 @@ def test_a_session_of_the_format_before_is_read_and_gone_on_with(tmp_path) -> No
     writer = SessionWriter.reopen(path)
     sensed = packets_of(World(4.0, seed=4))[10]
     update = graph.add(sensed, [], world.truth[10])
-    writer.add(KeyframeEntry(sensed, world.truth[10], update, graph.take_news()))
+    writer.add(KeyframeEntry(sensed, world.truth[10], update, graph.take_record()))
     writer.close()
     assert [len(packet.readings) for packet in Session(path).packets()] == [0] * 10 + [2]
 

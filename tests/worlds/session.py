@@ -16,7 +16,7 @@ from vislam.batch.bundle.loops import Loops
 from vislam.config import Config
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert, se3_exp, se3_log, transform, transform_points
-from vislam.core.memory import FrameEntry, GraphNews, KeyframeEntry
+from vislam.core.memory import FrameEntry, GraphRecord, KeyframeEntry
 from vislam.core.messages import Array, GraphUpdate, KeyframePacket, Observations
 from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe
 from vislam.factors.keys import X
@@ -185,7 +185,7 @@ def store(log: FactorLog, path: Path, info: dict | None = None, upto: int | None
         writer.add_frame(FrameEntry(packet.keyframe.t_ns, k, np.eye(4)))
         edges = [e for e in log.edges if e.edge.to_id == k]
         change = GraphUpdate(k + 1, np.array([k]), keyframe.T_map_body[None], np.eye(4), None)
-        news = GraphNews(loops=tuple(decided(e.edge.id, e.accepted) for e in edges))
+        record = GraphRecord(loops=tuple(decided(e.edge.id, e.accepted) for e in edges))
         start = None if log.first_state is None else start_facts(log.first_state, log.noise)
-        writer.add(KeyframeEntry(packet, keyframe.T_odom_body, change, news, [e.edge for e in edges], start=start))
+        writer.add(KeyframeEntry(packet, keyframe.T_odom_body, change, record, [e.edge for e in edges], start=start))
     return writer

@@ -87,7 +87,7 @@ class Places:
 
     def now(self) -> dict[int, LoopState]:
         """Return the state of every offered loop."""
-        self._states |= {state.id: state for state in self._graph.take_news().loops}
+        self._states |= {state.id: state for state in self._graph.take_record().loops}
         return self._states
 
     def of(self, place: LoopPlace) -> set[int]:

@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> int:
 def _do(job: Job) -> int:
     """Run the verbs of a job; a line on stdout for each kernel that is compiled, and nothing else."""
     from vislam.cli import run_verb
-    from vislam.core.compiling import tell_of_each
+    from vislam.core.compiling import on_each_kernel
 
     out = os.fdopen(os.dup(1), "w", buffering=1)
     with tempfile.TemporaryDirectory(prefix="vislam-precompile-") as folder:
@@ -108,7 +108,7 @@ def _do(job: Job) -> int:
         with open(os.devnull, "w", encoding="utf-8") as nowhere:
             os.dup2(nowhere.fileno(), 1)
             os.dup2(nowhere.fileno(), 2)
-        tell_of_each(lambda name: print(name, file=out))
+        on_each_kernel(lambda name: print(name, file=out))
         return max(run_verb(list(verb)) for verb in job.verbs)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 _WORTH_SAYING_S = 1.0  # of CPU: a kernel or two for arguments that nobody had before are no reason to speak
 
 
-def tell_of_compilation(say: Callable[[], None]) -> None:
+def on_compilation(say: Callable[[], None]) -> None:
     """Call `say` once, when numba has compiled for a second from now on; what is read from the cache does not count."""
     from numba.core import event
 
@@ -17,7 +17,7 @@ def tell_of_compilation(say: Callable[[], None]) -> None:
     event.register("numba:compile", _Listener(say))
 
 
-def tell_of_each(say: Callable[[str], None]) -> None:
+def on_each_kernel(say: Callable[[str], None]) -> None:
     """Call `say` with the name of every kernel of vislam that is compiled, when it is."""
     from numba.core import event
 

@@ -125,7 +125,7 @@ class LoopState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GraphNews:
+class GraphRecord:
     """What a graph has to remember of its last keyframe, beside what was measured and the poses."""
 
     window: WindowRecord | None = None  # None: loose coupling
@@ -222,7 +222,7 @@ class StartFacts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrontNews:
+class Learned:
     """What the front half has learned so far, beside the filter's state."""
 
     next_track_id: int = 0
@@ -244,7 +244,7 @@ class FrontMemory:
     T_odom_body: Array  # [4, 4]
     start: StartFacts | None  # None: no IMU
     state: NavState | None  # of the filter at the keyframe; None without an IMU
-    news: FrontNews
+    learned: Learned
 
     @property
     def camera_t_ns(self) -> int:
@@ -291,7 +291,7 @@ class KeyframeEntry:
     packet: KeyframePacket
     T_odom_body: Array  # [4, 4]
     update: GraphUpdate
-    news: GraphNews
+    record: GraphRecord
     edges: Sequence[LoopEdge] = ()
     candidates: Sequence[LoopCandidate] = ()
     retrieved: Sequence[RetrievedKeyframe] = ()
@@ -302,5 +302,5 @@ class KeyframeEntry:
     words: WordsMemory | None = None  # None: as before
     tags: tuple[TagSighting, ...] = ()
     start: StartFacts | None = None  # goes with the first keyframe
-    front: FrontNews | None = None
+    front: Learned | None = None
     filter_state: NavState | None = None

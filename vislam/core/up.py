@@ -72,7 +72,7 @@ class Up:
         }
 
 
-def told_up(text: str) -> Array | str:
+def parse_up(text: str) -> Array | str:
     """Return what `--up` says: one of the words of `WORDS`, or a unit vector [3] in the first camera's axes.
 
     Raises UsageError for anything else.

@@ -66,7 +66,7 @@ class Hint:
 
 
 @dataclass(frozen=True, slots=True)
-class ToldReading:
+class AppliedReading:
     """What a sensor other than IMU and camera told, or first values of its own variables, and when that was."""
 
     t_ns: int

@@ -22,7 +22,7 @@ from vislam.core.messages import (
 )
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import Ekf, make_ekf
-from vislam.ekf.correction import Correction, ToldReading
+from vislam.ekf.correction import AppliedReading, Correction
 from vislam.ekf.tight import MsckfEkf
 from vislam.ekf.timeline import UpdateResult
 from vislam.imu import ImuNoise, SeenNoise
@@ -31,7 +31,7 @@ from vislam.sensors import Suite
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
 
-_MOST_TOLD = 4096  # readings of further sensors; only a live run asks for them, many times a second
+_MOST_APPLIED = 4096  # readings of further sensors; only a live run asks for them, many times a second
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
@@ -52,10 +52,10 @@ class Filtering:
         self._has_wheels = machine.slip_sigma_m_s is not None
         self.ekf: Ekf | MsckfEkf = make_ekf(config, noise, machine, rig, suite)
         self._seen: deque[Correction] = deque()  # on its way to the filter
-        self._told: list[Correction] = []  # since somebody asked
-        self._told_readings: deque[ToldReading] = deque(maxlen=_MOST_TOLD)  # since somebody asked, if anybody does
+        self._applied: list[Correction] = []  # since they were last taken
+        self._applied_readings: deque[AppliedReading] = deque(maxlen=_MOST_APPLIED)  # since they were last taken
         self._start_ns = 0
-        self._noise_told = AS_MODELLED
+        self._noise_applied = AS_MODELLED
 
     @property
     def state(self) -> NavState | None:
@@ -86,36 +86,36 @@ class Filtering:
             vo = replace(vo, T_keyframe_body=None, tracking=Tracking.LOST)
             observations, at_rest, keyframe_id = no_observations(), False, None
         on_wheels = self._has_wheels and not at_rest
-        news = None
-        if noise.scale != self._noise_told:
-            self._noise_told, news = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))
-        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale, news))
+        changed = None
+        if noise.scale != self._noise_applied:
+            self._noise_applied, changed = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))
+        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale, changed))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
         while self._seen and self._seen[0].t_ns <= newest_ns:
             correction = self._seen.popleft()
             correction.apply(self.ekf)
-            self._told.append(correction)
+            self._applied.append(correction)
 
-    def take_told(self) -> list[Correction]:
+    def take_applied(self) -> list[Correction]:
         """Return what the filter was told since this was asked last."""
-        told, self._told = self._told, []
-        return told
+        applied, self._applied = self._applied, []
+        return applied
 
     def add_reading(self, reading: Reading) -> UpdateResult:
         """Tell the filter at once what a sensor says; stamps are by the IMU's clock, and may be late."""
-        self._told_readings.append(ToldReading(reading.t_ns, reading))
-        return self._told_readings[-1].apply(self.ekf)
+        self._applied_readings.append(AppliedReading(reading.t_ns, reading))
+        return self._applied_readings[-1].apply(self.ekf)
 
     def begin_sensor(self, t_ns: int, start: OwnStart) -> UpdateResult:
         """Tell the filter first values of a sensor's own variables, which hold from `t_ns` on."""
-        self._told_readings.append(ToldReading(t_ns, start))
-        return self._told_readings[-1].apply(self.ekf)
+        self._applied_readings.append(AppliedReading(t_ns, start))
+        return self._applied_readings[-1].apply(self.ekf)
 
-    def take_told_readings(self) -> list[ToldReading]:
+    def take_applied_readings(self) -> list[AppliedReading]:
         """Return what the filter was told of other sensors since this was asked last, in that order."""
-        told = list(self._told_readings)
-        self._told_readings.clear()
-        return told
+        applied = list(self._applied_readings)
+        self._applied_readings.clear()
+        return applied
 
     def motion(self, from_t_ns: int, to_t_ns: int) -> Array | None:
         """Return T_from_to [4, 4] between two times of the filter's memory; None outside of it."""

@@ -31,7 +31,7 @@ class Odometry(Protocol):
         `T_map_earlier` [4, 4] is the pose of the one before that; `vo_scale` multiplies the sigma of visual odometry.
         """
 
-    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+    def changed(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         """Return factors about older keyframes that came or changed with the newest one."""
 
     def reach_m(self, k: int) -> float:
@@ -82,7 +82,7 @@ class MotionOdometry:
             record, previous, before, last_motion=last_motion, has_imu=self.has_imu, vo_scale=vo_scale, floor_m=floor_m
         )
 
-    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+    def changed(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         """See Odometry; what was measured here never changes."""
         return {}
 

@@ -113,7 +113,7 @@ class WindowOdometry:
         older = [edge for edge in self._newest.edges if edge.to_id != self._newest.id]
         return [(edge.to_id, *_variances(self.covariance(edge, vo_scale))) for edge in older]
 
-    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+    def changed(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         """See Odometry."""
         assert self._newest is not None
         out: dict[Label, gtsam.NonlinearFactor] = {}

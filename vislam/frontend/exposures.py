@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera
-from vislam.core.memory import FrontNews
+from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame
 from vislam.frontend.attempt import Attempt
 from vislam.frontend.depth import DepthSensor
@@ -36,17 +36,17 @@ class Exposures:
         self.key_twist_per_s: Array = np.zeros(6)
         self._cauchy = config.cauchy
 
-    def start_at(self, news: FrontNews) -> None:
+    def start_at(self, learned: Learned) -> None:
         """Take what an earlier run had learned, to be learned further."""
-        if news.readout_s is not None:
-            self.shutter.start_at(news.readout_s)
-        self.lag.start_at(news.depth_delay_s, news.depth_rows_s)
+        if learned.readout_s is not None:
+            self.shutter.start_at(learned.readout_s)
+        self.lag.start_at(learned.depth_delay_s, learned.depth_rows_s)
 
-    def learned(self, next_track_id: int, knows_lag: bool) -> FrontNews:
+    def learned(self, next_track_id: int, knows_lag: bool) -> Learned:
         """Return what was learned, as `start_at` takes it; `knows_lag` is whether every frame measures depth."""
         readout_s = self.shutter.readout_s if self.shutter.learns else None
         delay_s, rows_s = (self.lag.delay_estimate_s, self.lag.rows_estimate_s) if knows_lag else (None, None)
-        return FrontNews(next_track_id, readout_s=readout_s, depth_delay_s=delay_s, depth_rows_s=rows_s)
+        return Learned(next_track_id, readout_s=readout_s, depth_delay_s=delay_s, depth_rows_s=rows_s)
 
     def look_through(self, camera: Camera, back: Array) -> None:
         """Go on with another camera of the rig; `back` [6, 6] brings velocities to its axes."""

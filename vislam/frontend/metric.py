@@ -11,7 +11,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, se3_log
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.memory import FrontNews
+from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
 from vislam.frontend.attempt import Attempt, weakness
 from vislam.frontend.blind_keyframe import NO_DEPTH, BlindKeyframe
@@ -249,15 +249,15 @@ class MetricFrontEnd:
 
     # -- what is known -----------------------------------------------------------------------------------------------
 
-    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
+    def begin_at(self, keyframe_id: int, learned: Learned, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
-        self._tracks.tracker.next_id = news.next_track_id
-        self._tracks.exposures.start_at(news)
+        self._tracks.tracker.next_id = learned.next_track_id
+        self._tracks.exposures.start_at(learned)
 
     @property
-    def news(self) -> FrontNews:
-        """See FrontEnd.news."""
+    def learned(self) -> Learned:
+        """See FrontEnd.learned."""
         return self._tracks.exposures.learned(self._tracks.tracker.next_id, self._usual.depth.every_frame)
 
     @classmethod

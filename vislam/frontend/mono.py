@@ -11,7 +11,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, transform
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.memory import FrontNews
+from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations
 from vislam.core.quantiles import median
 from vislam.frontend.attempt import confirmed, failure, weakness
@@ -158,15 +158,15 @@ class MonoFrontEnd:
         """Return that of the accelerometer's scale, by which all metres come."""
         return CommonErrors(0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0)
 
-    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
+    def begin_at(self, keyframe_id: int, learned: Learned, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
-        self._tracker.next_id = news.next_track_id
+        self._tracker.next_id = learned.next_track_id
 
     @property
-    def news(self) -> FrontNews:
-        """See FrontEnd.news."""
-        return FrontNews(self._tracker.next_id)
+    def learned(self) -> Learned:
+        """See FrontEnd.learned."""
+        return Learned(self._tracker.next_id)
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 

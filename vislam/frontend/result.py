@@ -11,7 +11,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
 from vislam.core.geometry import se3_adjoint, transform
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.memory import FrontNews
+from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 from vislam.frontend.prediction import body_motion
 from vislam.vision.two_view import TwoViewEstimate
@@ -77,7 +77,7 @@ class FrontEnd(Protocol):
         """
         ...
 
-    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
+    def begin_at(self, keyframe_id: int, learned: Learned, seeks_place: bool = False) -> None:
         """Number the first keyframe and new tracks as given, and know what is known; before the first frame.
 
         With `seeks_place` the first keyframes come quickly, as after a loss: chances to recognise the place.
@@ -85,7 +85,7 @@ class FrontEnd(Protocol):
         ...
 
     @property
-    def news(self) -> FrontNews:
+    def learned(self) -> Learned:
         """Return what was learned so far, as `begin_at` takes it; what others learn is left out."""
         ...
 

@@ -174,7 +174,7 @@ class Estimator(Generic[L]):
             self._buffer = np.concatenate([self._buffer, np.zeros_like(self._buffer)])
             self._reach_m = np.concatenate([self._reach_m, np.zeros_like(self._reach_m)])
         self._reach_m[k] = self._odometry.reach_m(k)
-        named = self._odometry.news(self.vo_scale) | step.named | refreshed
+        named = self._odometry.changed(self.vo_scale) | step.named | refreshed
         return step, self._extend(step.factors, named, step.guess, step.own)
 
     def distrust_odometry(self, factor: float) -> None:

@@ -12,7 +12,7 @@ from vislam.config import GraphConfig, MachineConfig, WindowConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert
-from vislam.core.memory import EdgeReport, GraphMemory, GraphNews, LoopPlace, WindowRecord
+from vislam.core.memory import EdgeReport, GraphMemory, GraphRecord, LoopPlace, WindowRecord
 from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Submaps
 from vislam.factors.builder import Step
 from vislam.factors.journal import (
@@ -159,7 +159,7 @@ class PoseGraph:
         self._revision, self._T_odom_last = memory.revision, memory.T_odom_body
         self._T_map_odom = poses[-1] @ invert(memory.T_odom_body)
         update = self._publish([], [], note, everything=True)
-        self.take_news()
+        self.take_record()
         return update
 
     def go_on(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> None:
@@ -168,12 +168,12 @@ class PoseGraph:
             raise UsageError(f"keyframe {packet.keyframe.id} is not the newest of the graph")
         self._source.go_on(packet, self._estimator.poses[-1], T_odom_body)
 
-    def take_news(self) -> GraphNews:
+    def take_record(self) -> GraphRecord:
         """Return what `restore` will need of the last keyframe, beside what was measured and the poses."""
         loops = self._loops.take_states(self._waiting.edges)
         states = self._source.take_states(self._newest)
         own = self.readings.all_own(self._estimator.values)
-        return GraphNews(self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, own)
+        return GraphRecord(self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, own)
 
     def add(
         self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None

@@ -112,7 +112,7 @@ class _Chain:
         moved = edge.T_from_to if edge.from_id == k - 1 else invert(edge.T_from_to)
         return Step([edge.factor(robust=False)], _guess(nearest_rigid(before.T_map_body @ moved)), 0.0, 0.0, "")
 
-    def news(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
+    def changed(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         return {}
 
     def reach_m(self, k: int) -> float:

@@ -77,4 +77,4 @@ def recalled(beginning: Beginning) -> SlamMemory:
 
 def _of(memory: SlamMemory, session: Path, is_own: bool) -> Beginning:
     front = memory.front
-    return Beginning(session, is_own, front.keyframe_id + 1, front.news.next_track_id, memory.held, memory.T_guess)
+    return Beginning(session, is_own, front.keyframe_id + 1, front.learned.next_track_id, memory.held, memory.T_guess)

@@ -16,7 +16,7 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.geometry import invert, transform
 from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking
-from vislam.ekf.correction import Correction, Hint, ToldReading
+from vislam.ekf.correction import AppliedReading, Correction, Hint
 from vislam.ekf.loose.filter import Ekf
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
@@ -133,13 +133,13 @@ class FastPath:
         """What is remembered of the gyro's drift [3], rad/s per deg C."""
         return self._alone.bias_per_c
 
-    def told_of_power_up(self) -> dict[str, Any]:
+    def power_up_report(self) -> dict[str, Any]:
         """Return the zero that was found, or why none was."""
         return self._alone.told()
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
-        corrects = self._started and isinstance(message, (Correction, ToldReading, Rebase))
+        corrects = self._started and isinstance(message, (Correction, AppliedReading, Rebase))
         before = self._ekf.state() if corrects else None
         self._take(message)
         if before is not None:
@@ -151,7 +151,7 @@ class FastPath:
             is_seen = message.vo.tracking is not Tracking.LOST
             self._follow_vision(is_seen, answer.accepted, is_seen and not np.isnan(answer.nis) and not answer.accepted)
             self._at_rest = message.at_rest
-        elif isinstance(message, ToldReading):
+        elif isinstance(message, AppliedReading):
             message.apply(self._ekf)
         elif isinstance(message, Rebase):
             self.counters["rebases"] += 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.core.memory import EdgeReport, FrontNews, GraphNews, StartFacts
+from vislam.core.memory import EdgeReport, GraphRecord, Learned, StartFacts
 from vislam.core.messages import Array, GraphUpdate, NavState
 from vislam.imu import ImuNoise
 from vislam.pipeline.front_report import FrontReport
@@ -40,7 +40,7 @@ class Seen:
     step: FrontStep
     T_map_odom: Array  # [4, 4]
     start: StartFacts | None
-    news: FrontNews
+    learned: Learned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class FrontEnded:
 
     report: FrontReport
     start: StartFacts | None
-    news: FrontNews
+    learned: Learned
     timings: Timings
 
 
@@ -91,6 +91,6 @@ class BackEnded:
 
     graph: EndedGraph | None  # None: not one keyframe came
     update: GraphUpdate | None
-    news: GraphNews | None
+    record: GraphRecord | None
     counters: dict[str, dict[str, int]]
     timings: Timings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vislam.core.messages import Array, NavState, NoiseScale, VoMeasurement
-from vislam.ekf.correction import Correction, ToldReading
+from vislam.ekf.correction import AppliedReading, Correction
 from vislam.hw.health import Health
 
 
@@ -49,4 +49,4 @@ class MapMoved:
     T_map_odom: Array  # [4, 4]
 
 
-ToFast = Start | Correction | ToldReading | Rebase | CameraHealth | Doubted | MapMoved
+ToFast = Start | Correction | AppliedReading | Rebase | CameraHealth | Doubted | MapMoved

@@ -31,7 +31,7 @@ from vislam.live.processes import front as front_process
 from vislam.live.processes import map as map_process
 from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded, measured
 from vislam.live.reading_source import ReadingSource, live_readings
-from vislam.live.web.news import WebEnds
+from vislam.live.web.updates import WebEnds
 from vislam.live.wire.slot import remove
 from vislam.pipeline.settings import derived
 from vislam.runs import imu_noise

@@ -13,7 +13,7 @@ from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
 from vislam.core.errors import UsageError
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.memory import GraphNews, SlamMemory, WordsMemory
+from vislam.core.memory import GraphRecord, SlamMemory, WordsMemory
 from vislam.core.messages import (
     Array,
     GraphUpdate,
@@ -130,8 +130,8 @@ class Back:
                 with self.clock.measure("depth in map"):
                     found = self._by_depth.look(odometry, self.T_map_odom, self.graph.relative_covariance, edges)
                 if found is not None:
-                    by_depth, record = self.loops.offer(found[0], keyframe.id, found[1])
-                    edges, candidates = edges + by_depth, [*candidates, record]
+                    by_depth, offered = self.loops.offer(found[0], keyframe.id, found[1])
+                    edges, candidates = edges + by_depth, [*candidates, offered]
         if self._false is not None:
             false = self._false.add(odometry.T_odom_body, edges)
             edges, candidates = edges + false, candidates + [as_candidate(edge) for edge in false]
@@ -140,8 +140,8 @@ class Back:
         self._follow(update)
         scans = {} if self.map is None else self.map.add(odometry, self.T_map_odom @ odometry.T_odom_body, seen)
         retrieved, tags = ([], ()) if self.loops is None else (self.loops.retrieved, self.loops.tags(keyframe.id))
-        news, words = self.graph.take_news(), self._new_words()
-        return KeyframeStep(odometry, update, edges, candidates, retrieved, news, scans, words, tags)
+        record, words = self.graph.take_record(), self._new_words()
+        return KeyframeStep(odometry, update, edges, candidates, retrieved, record, scans, words, tags)
 
     def finish(self) -> GraphUpdate:
         """Optimise to convergence and bring the map to the final poses."""
@@ -214,11 +214,11 @@ class KeyframeIntake:
                 steps.append(self._add_new(odometry))
         return steps
 
-    def finish(self) -> tuple[GraphUpdate | None, GraphNews | None]:
+    def finish(self) -> tuple[GraphUpdate | None, GraphRecord | None]:
         """Optimise to convergence; None where no keyframe came."""
         if self.stages is None:
             return None, None
-        return self.stages.finish(), self.stages.graph.take_news()
+        return self.stages.finish(), self.stages.graph.take_record()
 
     def _restore(self, memory: SlamMemory) -> GraphUpdate:
         self.stages = self._make(self._front.noise, self._clock, memory.first_state, memory.T_start)

@@ -10,7 +10,7 @@ from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
 from vislam.core.geometry import level_rotation, transform
-from vislam.core.memory import FrontMemory, FrontNews, StartFacts
+from vislam.core.memory import FrontMemory, Learned, StartFacts
 from vislam.core.messages import (
     AS_MODELLED,
     Array,
@@ -24,7 +24,7 @@ from vislam.core.messages import (
 )
 from vislam.core.readings import Reading
 from vislam.ekf import Hint
-from vislam.ekf.correction import ToldReading
+from vislam.ekf.correction import AppliedReading
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion, lost_motion
@@ -100,18 +100,18 @@ class Front:
         That keyframe comes out again, with its old id and pose, as it is seen now.
         """
         self.begun.resume(memory)
-        self.frontend.begin_at(memory.keyframe_id, memory.news)
+        self.frontend.begin_at(memory.keyframe_id, memory.learned)
         self._chain.begin_at(memory.T_odom_body)
         if self.begun.settled is None or memory.state is None or self.inertial is None:
             return
-        self.camera_clock.start_at(memory.time_offset_s, memory.news.time_offset_sigma_s)
+        self.camera_clock.start_at(memory.time_offset_s, memory.learned.time_offset_sigma_s)
         vo = identity_motion(memory.t_ns, memory.keyframe_id, True, 0)
-        self.inertial.filtering.resume(memory.state, vo, memory.news.filter_camera)
+        self.inertial.filtering.resume(memory.state, vo, memory.learned.filter_camera)
 
     def begin_in_map(self, keyframe_id: int, next_track_id: int) -> None:
         """Number keyframes and tracks on from those of a map, before the first frame; the first begins a new submap."""
         self._chain.first_id = keyframe_id
-        self.frontend.begin_at(keyframe_id, FrontNews(next_track_id), seeks_place=True)
+        self.frontend.begin_at(keyframe_id, Learned(next_track_id), seeks_place=True)
 
     # -- what goes in ------------------------------------------------------------------------------------------------
 
@@ -171,15 +171,15 @@ class Front:
             T_keyframe_body = np.eye(4)
         shift_ns = 0 if self.gravity is None else self.gravity.follow_clock(self.camera_clock, track.vo)
         self._last_frame_t_ns = frame.t_ns + shift_ns
-        corrections = [] if self._imu is None else self._imu.filtering.take_told()
+        corrections = [] if self._imu is None else self._imu.filtering.take_applied()
         shown = None if estimate is None else estimate.shown(frame.t_ns, self._published)
         return FrontStep(
             frame, track, shown, estimate, state, self._chain.id, T_keyframe_body, ready, corrections
         )  # fmt: skip
 
-    def take_told_readings(self) -> list[ToldReading]:
+    def take_applied_readings(self) -> list[AppliedReading]:
         """Return what the filter was given of further sensors since the last call."""
-        return [] if self._imu is None else self._imu.filtering.take_told_readings()
+        return [] if self._imu is None else self._imu.filtering.take_applied_readings()
 
     def sensor_doubts(self) -> dict[str, str]:
         """Return, of further sensors that contradict the rest now, a word on how."""
@@ -214,7 +214,7 @@ class Front:
         """Return the track, tied to the keyframes of an earlier run where it begins anew."""
         memory = self.begun.see_again(self.inertial is not None)
         if memory is not None and track.keyframe is None:  # too little to see there for a start: a lost keyframe
-            self.frontend.begin_at(memory.keyframe_id + 1, memory.news)
+            self.frontend.begin_at(memory.keyframe_id + 1, memory.learned)
             vo = identity_motion(frame.t_ns, memory.keyframe_id, track.vo.has_scale, 0)
             return replace(track, keyframe=unseen_keyframe(memory.keyframe_id, frame), vo=vo)
         is_alone = track.keyframe is not None and track.vo.keyframe_id == track.keyframe.id
@@ -234,7 +234,7 @@ class Front:
             return track
         self.watch.counters["waypoints"] = self.watch.counters.get("waypoints", 0) + 1
         keyframe = unseen_keyframe(self._chain.id + 1, frame)
-        self.frontend.begin_at(keyframe.id + 1, FrontNews(self.frontend.news.next_track_id), seeks_place=True)
+        self.frontend.begin_at(keyframe.id + 1, Learned(self.frontend.learned.next_track_id), seeks_place=True)
         return replace(track, keyframe=keyframe, vo=lost_motion(frame.t_ns, self._chain.id, track.vo.has_scale))
 
     def _estimate(self, track: TrackResult, since: Since, at_rest: bool) -> tuple[Estimate | None, NavState | None]:
@@ -277,10 +277,10 @@ class Front:
         return self.begun.facts(self.noise)
 
     @property
-    def news(self) -> FrontNews:
+    def learned(self) -> Learned:
         """What was learned so far, beside the filter's state."""
         camera = None if self._imu is None else self._imu.filtering.camera
-        return replace(self.frontend.news, time_offset_sigma_s=self.camera_clock.sigma_s, filter_camera=camera)
+        return replace(self.frontend.learned, time_offset_sigma_s=self.camera_clock.sigma_s, filter_camera=camera)
 
     @property
     def noise_scale(self) -> NoiseScale:

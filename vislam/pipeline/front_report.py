@@ -165,7 +165,7 @@ def _learned_of_camera(front: Front) -> dict[str, float]:
     found = {"camera_offset_s": clock.applied_s, "camera_offset_sigma_s": clock.sigma_s}
     if clock.drift_sigma > 0.0:
         found |= {"camera_drift": clock.drift, "camera_drift_sigma": clock.drift_sigma}
-    return found | _turned(clock, front.news.filter_camera, front.config.ekf) | mount
+    return found | _turned(clock, front.learned.filter_camera, front.config.ekf) | mount
 
 
 def _turned(clock: CameraClock, filter_camera: Array | None, config: EkfConfig) -> dict[str, float]:

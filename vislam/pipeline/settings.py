@@ -8,7 +8,7 @@ from vislam.config import Config, EkfConfig, GraphConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.up import told_up
+from vislam.core.up import parse_up
 from vislam.frontend import common_errors, knows_scale, mode_for
 from vislam.frontend.result import CommonErrors
 
@@ -22,7 +22,7 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
     itself; who writes settings down or sends them to other processes does so before there is one. Raises UsageError for
     settings that contradict each other.
     """
-    if not isinstance(told_up(config.up), str) or config.up != "auto":
+    if not isinstance(parse_up(config.up), str) or config.up != "auto":
         refuse_up(noise)
     mode = mode_for(config.frontend, rig)
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vislam.core.memory import GraphNews, PackedScan, TagSighting, WordsMemory
+from vislam.core.memory import GraphRecord, PackedScan, TagSighting, WordsMemory
 from vislam.core.messages import (
     Array,
     Frame,
@@ -58,7 +58,7 @@ class KeyframeStep:
     edges: list[LoopEdge]
     candidates: list[LoopCandidate]
     retrieved: list[RetrievedKeyframe]
-    news: GraphNews  # what the graph has to remember
+    record: GraphRecord  # what the graph has to remember
     scans: dict[int, PackedScan]  # what came into the map with it: its own scan, or depth that came late
     words: WordsMemory | None  # the vocabulary, when it is new
     tags: tuple[TagSighting, ...]  # that it saw
@@ -82,4 +82,4 @@ class Finish:
     steps: list[Step]
     keyframes: list[KeyframeStep]  # those that had waited for gravity until the end
     update: GraphUpdate | None  # None: not one keyframe reached the back end
-    news: GraphNews | None
+    record: GraphRecord | None

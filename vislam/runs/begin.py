@@ -145,7 +145,7 @@ def map_of(
     if config.loop.start_in_map is not None and not recording.rig.has_depth:
         raise UsageError(f"--loop.start-in-map is a guess for depth, which {recording.name} does not have")
     count = len(memory.graph.packets)
-    T_guess = told_start(config.loop.start_in_map, stored_level(stored.info()).T_level_map)
+    T_guess = parse_start(config.loop.start_in_map, stored_level(stored.info()).T_level_map)
     memory = replace(memory, held=count if is_held else 0, map_keyframes=count, T_guess=T_guess)
     was = recorded(stored.info().get("config") or {}, str(stored.path)).get("map") or {}
     now = json.loads(json.dumps(asdict(config.map)))
@@ -154,7 +154,7 @@ def map_of(
     return memory
 
 
-def told_start(text: str | None, T_level_map: Array) -> Array | None:
+def parse_start(text: str | None, T_level_map: Array) -> Array | None:
     """Return the pose [4, 4] that `loop.start_in_map` gives in a map's files, in the frame of its session.
 
     `T_level_map` [4, 4] turns one into the other. Raises UsageError when it is no pose.

@@ -19,7 +19,7 @@ from vislam.config import Config, ImuConfig, recorded
 from vislam.core import interrupts
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
-from vislam.core.memory import FrontMemory, GraphNews, KeyframeEntry, SlamMemory
+from vislam.core.memory import FrontMemory, GraphRecord, KeyframeEntry, SlamMemory
 from vislam.core.messages import Localisation, LoopDecision, Submaps, Tracking
 from vislam.core.recording import Recording
 from vislam.imu import ImuNoise
@@ -135,7 +135,7 @@ class Run:
         now = datetime.now(UTC).isoformat(timespec="seconds")
         self.resumed = [*info.get("resumed", []), {"keyframe": front.keyframe_id, "t_s": t_s, "utc": now}]
         self.session.tell({"resumed": self.resumed, "finished": False})
-        self.session.move(update, GraphNews())
+        self.session.move(update, GraphRecord())
         self.warnings.append(
             f"resumed {len(self.resumed)} times, last at keyframe {front.keyframe_id}: timings, counters and "
             "real-time factor are those of the part since then"
@@ -147,7 +147,7 @@ class Run:
         update = self.slam.begin_in_map(memory)
         self.log.begin_in_map(memory)
         self.base = self.session.base()
-        self.session.move(update, GraphNews())
+        self.session.move(update, GraphRecord())
 
     def execute(self, progress: Progress | None = None) -> dict[str, Any]:
         """Process the whole recording and write every file; return the metrics.
@@ -221,9 +221,9 @@ class Run:
         with self.slam.clock.measure("store"):
             packet, front = step.odometry.packet, self.slam.front
             entry = KeyframeEntry(
-                packet, step.odometry.T_odom_body, step.update, step.news, step.edges, step.candidates, step.retrieved,
-                self.log.shifts(step.update.accepted_loop_ids), step.scans, step.words, step.tags, front.start,
-                front.news, self.log.filter_state(packet.keyframe.id),
+                packet, step.odometry.T_odom_body, step.update, step.record, step.edges, step.candidates,
+                step.retrieved, self.log.shifts(step.update.accepted_loop_ids), step.scans, step.words, step.tags,
+                front.start, front.learned, self.log.filter_state(packet.keyframe.id),
             )  # fmt: skip
             self.session.add(entry)
             self.gallery.add(step)
@@ -242,8 +242,8 @@ class Run:
         for keyframe in finish.keyframes:
             self.log.add_keyframe(keyframe)
             self._store(keyframe)
-        if finish.update is not None and finish.news is not None:
-            self.session.move(finish.update, finish.news)
+        if finish.update is not None and finish.record is not None:
+            self.session.move(finish.update, finish.record)
             self.viewer.move(finish.update)
         final, rows, loops = self._write_estimates()
         self._explain([] if is_brief else rows)

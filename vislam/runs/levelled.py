@@ -20,7 +20,7 @@ from vislam.core.geometry import transform
 from vislam.core.messages import Array, NavState
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
-from vislam.core.up import Up, angle_deg, told_up
+from vislam.core.up import Up, angle_deg, parse_up
 from vislam.datasets.stream import FileRecording
 from vislam.frontend.planar import up_in_camera
 from vislam.mapping.mapper import Mapper
@@ -144,7 +144,7 @@ class Known:
 
 def find_up(recording: Recording, config: Config, known: Known) -> Levelled:
     """Return which way is up, without gravity: as told, by the map, the accelerometer, the floor, or surfaces."""
-    told = told_up(config.up)
+    told = parse_up(config.up)
     if known.front.start is not None or not len(known.path):
         return Levelled()
     if not isinstance(told, str):

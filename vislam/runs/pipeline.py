@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.clock import StageClock
-from vislam.core.memory import EdgeReport, FrontNews, SlamMemory, StartFacts
+from vislam.core.memory import EdgeReport, Learned, SlamMemory, StartFacts
 from vislam.core.messages import Array, GraphUpdate, NavState
 from vislam.mapping.mapper import Mapper
 from vislam.pipeline.front_report import FrontReport
@@ -60,7 +60,7 @@ class FrontHalf(Protocol):
         ...
 
     @property
-    def news(self) -> FrontNews:
+    def learned(self) -> Learned:
         """What was learned so far."""
         ...
 

@@ -10,7 +10,7 @@ from typing import Any
 from vislam.config import Config, load
 from vislam.core.errors import VislamError
 from vislam.core.log import log_to
-from vislam.core.up import told_up
+from vislam.core.up import parse_up
 from vislam.datasets.calibrated import with_clock
 from vislam.runs.begin import execute
 from vislam.runs.drive import Progress
@@ -57,7 +57,7 @@ def run_source(
     localize_only: bool, show: Show,
 ) -> dict[str, Any]:  # fmt: skip
     """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
-    told_up(config.up)
+    parse_up(config.up)
     config = with_clock(config)
     choice = map_choice(base, localize_only, config)
     recording = open_source(source, config.seed, config.calibration)

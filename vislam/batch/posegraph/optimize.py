@@ -13,7 +13,7 @@ from vislam.batch.posegraph.auto import decide, decide_by_kernel
 from vislam.batch.posegraph.gnc import reject_false_edges
 from vislam.batch.posegraph.growing import grown_start
 from vislam.batch.posegraph.problem import Decision, Ids, PoseGraphProblem
-from vislam.batch.posegraph.sightings import reject_false_sightings, told_undetermined, undetermined_landmarks
+from vislam.batch.posegraph.sightings import reject_false_sightings, undetermined_landmarks, undetermined_message
 from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
 from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
 from vislam.batch.posegraph.structure import Structure
@@ -121,7 +121,7 @@ def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> li
     if not problem.is_point.any():
         return []
     free = undetermined_landmarks(problem, poses, weights)
-    return [told_undetermined(free)] if len(free) else []
+    return [undetermined_message(free)] if len(free) else []
 
 
 def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, dict[str, float]]:

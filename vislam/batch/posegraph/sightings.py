@@ -105,7 +105,7 @@ def undetermined_landmarks(problem: PoseGraphProblem, poses: Array, weights: Arr
     return np.asarray(problem.ids[free])
 
 
-def told_undetermined(ids: Ids) -> str:
+def undetermined_message(ids: Ids) -> str:
     """Return a sentence on landmarks that are undetermined."""
     return (
         f"{len(ids)} landmarks are seen along one direction only, as by range or bearing alone from one place (the "

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 
 from vislam.batch.posegraph.cholesky import Factor
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
-from vislam.batch.posegraph.sightings import told_undetermined, undetermined_landmarks
+from vislam.batch.posegraph.sightings import undetermined_landmarks, undetermined_message
 from vislam.batch.posegraph.structure import NormalEquations, Structure, adjoints
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError, UsageError
@@ -38,7 +38,7 @@ class Uncertainty:
         if not equations.factorise(0.0):
             free = undetermined_landmarks(self._problem, self._poses, np.ones(len(self._problem.edges)))
             if len(free):
-                raise DataError(f"{told_undetermined(free)}; so there is no covariance")
+                raise DataError(f"{undetermined_message(free)}; so there is no covariance")
             raise DataError(
                 "the measurements leave a pose undetermined, so there is no covariance; give its edges more"
             )

@@ -12,7 +12,7 @@ from vislam.cli.verbs.brief import Brief, brief_help
 from vislam.config.moved import refuse_moved
 from vislam.config.ranges import check_ranges
 from vislam.core.collector import while_importing
-from vislam.core.compiling import tell_of_compilation
+from vislam.core.compiling import on_compilation
 from vislam.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def _announce_compilation(verb: str) -> None:
     if about_s == 0:
         return
     with while_importing():
-        tell_of_compilation(partial(_say_compiling, verb, about_s))
+        on_compilation(partial(_say_compiling, verb, about_s))
 
 
 def _say_compiling(verb: str, about_s: int | None) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.memory import FrontNews
+from vislam.core.memory import Learned
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import Exposed, KeyframeLife, keyframe_reason
@@ -105,18 +105,18 @@ class PlanarFrontEnd:
         self._life.placed(frame.t_ns)
         return self._report(frame, place)
 
-    def begin_at(self, keyframe_id: int, news: FrontNews, seeks_place: bool = False) -> None:
+    def begin_at(self, keyframe_id: int, learned: Learned, seeks_place: bool = False) -> None:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
-        self._tracks.tracker.next_id = news.next_track_id
-        if news.tilt is not None:
-            self._tilt.start_at(news.tilt[:2], news.tilt[2:].reshape(2, 2))
+        self._tracks.tracker.next_id = learned.next_track_id
+        if learned.tilt is not None:
+            self._tilt.start_at(learned.tilt[:2], learned.tilt[2:].reshape(2, 2))
 
     @property
-    def news(self) -> FrontNews:
-        """See FrontEnd.news."""
+    def learned(self) -> Learned:
+        """See FrontEnd.learned."""
         tilt = np.concatenate([self._tilt.mean, self._tilt.covariance.ravel()])
-        return FrontNews(self._tracks.tracker.next_id, tilt=None if self._is_split else tilt)
+        return Learned(self._tracks.tracker.next_id, tilt=None if self._is_split else tilt)
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 

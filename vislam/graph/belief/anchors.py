@@ -23,7 +23,7 @@ class Anchors:
         self._reach = config.anchor_reach
         self._tied: dict[int, Tied] = {}
         self._ids: list[int] = []  # keys of the above, ascending
-        self._fresh: list[Tied] = []  # since `take_news`
+        self._fresh: list[Tied] = []  # since `take_record`
 
     def near(self, k: int) -> Tied | None:
         """Return the tied keyframe nearest to k along the run; None when there is none in reach."""
@@ -43,7 +43,7 @@ class Anchors:
         self._tied = {k: Tied(k, k, np.zeros((6, 6))) for k in self._ids}
         self._fresh = list(self._tied.values())
 
-    def take_news(self) -> tuple[Tied, ...]:
+    def take_record(self) -> tuple[Tied, ...]:
         """Return what was tied since the last call."""
         fresh, self._fresh = tuple(self._fresh), []
         return fresh

@@ -78,7 +78,7 @@ class LoopSet:
 
     def take_ties(self) -> tuple[Tied, ...]:
         """Return what became known of anchors since the last call."""
-        return self._anchors.take_news()
+        return self._anchors.take_record()
 
     def restore(
         self, models: Sequence[LoopModel], by_place: dict[LoopPlace, list[LoopModel]], ties: Sequence[Tied]

@@ -38,14 +38,14 @@ class PassedReadings:
     def take(self) -> list[Reading]:
         """Return the readings that came since the last call, at once."""
         found: list[Reading] = []
-        for news in passed_on(self._source):
-            if isinstance(news, CountsAt):
-                found += [r for talk in self._counts.values() for r in talk.counted(news.t_ns, news.left, news.right)]
-            elif isinstance(news, BytesAt):
+        for item in passed_on(self._source):
+            if isinstance(item, CountsAt):
+                found += [r for talk in self._counts.values() for r in talk.counted(item.t_ns, item.left, item.right)]
+            elif isinstance(item, BytesAt):
                 self._heard_ns = time.monotonic_ns()
-                found += [r for talk in self._fixes.values() for r in talk.feed(news.data, news.t_ns)]
+                found += [r for talk in self._fixes.values() for r in talk.feed(item.data, item.t_ns)]
             else:
-                self._state = news
+                self._state = item
                 self._begin()
         if self._heard_ns is not None and time.monotonic_ns() - self._heard_ns > _GAP_NS:
             self._heard_ns = None

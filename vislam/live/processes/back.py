@@ -75,7 +75,7 @@ def run(
         graph = EndedGraph(
             back.graph.ids, back.graph.poses(), back.graph.states(), back.graph.edge_reports(), own, sensed
         )
-        ended = BackEnded(graph, update, back.graph.take_news(), back.counters, clock.summary_ms())
+        ended = BackEnded(graph, update, back.graph.take_record(), back.counters, clock.summary_ms())
     _put(life, outbox, ended)
     outbox.close()
 

@@ -111,7 +111,7 @@ def _loop(
         if now_ns - noted_ns > _NOTE_S * _NS:
             noted_ns = now_ns
             power_up(fast, source)
-            life.note(status=fast.status(), latency_ms=latency.summary_ms(), power_up=fast.told_of_power_up())
+            life.note(status=fast.status(), latency_ms=latency.summary_ms(), power_up=fast.power_up_report())
 
 
 class Messages:

@@ -158,7 +158,7 @@ class FrontProcess:
         datums = {name: {"datum": asdict(datum)} for name, datum in readings.datums().items()}
         sensors = {name: entry | datums.get(name, {}) for name, entry in report.sensors.items()}
         report = replace(report, counters=counters, sensors=sensors)
-        ended = FrontEnded(report, self.front.start, self.front.news, self.clock.summary_ms())
+        ended = FrontEnded(report, self.front.start, self.front.learned, self.clock.summary_ms())
         self._put(self._to_map, ended)
         self._to_map.close()
 
@@ -197,7 +197,7 @@ class FrontProcess:
         shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
         shows = shows and self._to_map.age_s < live.map_age_s
         self._frames_taken += 1
-        seen = Seen(light(step, shows, self._feeds_depth), self._T_map_odom(), self.front.start, self.front.news)
+        seen = Seen(light(step, shows, self._feeds_depth), self._T_map_odom(), self.front.start, self.front.learned)
         if not self._to_map.put(seen):
             raise HardwareError(
                 "the map process does not take frames any more; is the disk of --out stuck, or the machine too slow?"
@@ -220,7 +220,7 @@ class FrontProcess:
 
     def _tell_readings(self) -> None:
         """Tell the fast process's filter what this one was told by further sensors; `Rebase` has it in its state."""
-        for told in self.front.take_told_readings():
+        for told in self.front.take_applied_readings():
             if self.front.config.ekf.coupling != "tight":
                 self._send(told)
 

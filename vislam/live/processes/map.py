@@ -16,7 +16,7 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.clock import StageClock
 from vislam.core.errors import HardwareError
-from vislam.core.memory import FrontNews, SlamMemory, StartFacts
+from vislam.core.memory import Learned, SlamMemory, StartFacts
 from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.core.recording import Recording
 from vislam.live.beginning import Beginning
@@ -140,7 +140,7 @@ class _Front:
 
     def __init__(self) -> None:
         self.start: StartFacts | None = None
-        self.news = FrontNews()
+        self.learned = Learned()
         self.ended: FrontEnded | None = None
 
     def report(self) -> FrontReport:
@@ -244,7 +244,7 @@ class FollowedPipeline:
                     raise HardwareError("the front process died; what it had not told yet is lost")
                 continue
             if isinstance(message, FrontEnded):
-                self.front.ended, self.front.start, self.front.news = message, message.start, message.news
+                self.front.ended, self.front.start, self.front.learned = message, message.start, message.learned
             else:
                 yield self._step(message)
 
@@ -265,11 +265,11 @@ class FollowedPipeline:
         if ended.update is not None and self._map.stage is not None and not self.life.is_brief:
             self._map.stage.move(ended.update)
             self._map.stage.finish()
-        return Finish([], keyframes, ended.update, ended.news)
+        return Finish([], keyframes, ended.update, ended.record)
 
     def _step(self, seen: Seen) -> Step:
         front = seen.step
-        self.front.start, self.front.news = seen.start, seen.news
+        self.front.start, self.front.learned = seen.start, seen.learned
         self._newest_id = max(self._newest_id, front.keyframe_id)
         if self._map.stage is not None and self._map.stage.wants_frames:
             self._seen += seen_between(front)

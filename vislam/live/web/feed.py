@@ -12,7 +12,7 @@ import numpy as np
 from vislam.core.files import plain
 from vislam.core.messages import Array
 from vislam.hw.health import Health
-from vislam.live.web.news import FrameNews, KeyframeCloud, LoopNews, MapNews, Saved, Status, StepPicture
+from vislam.live.web.updates import FrameUpdate, KeyframeCloud, LoopUpdate, MapUpdate, Saved, Status, StepPicture
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.runs.report.page_assets import floats, packed
 
@@ -39,27 +39,27 @@ class Feed:
         self._pose: PublishedPose | None = None
         self._path = _Path()
         self._map = _Keyframes()
-        self._frame: FrameNews | None = None
+        self._frame: FrameUpdate | None = None
         self._jpeg, self._pictures = b"", 0
         self._seen: deque[tuple[int, int, int]] = deque(maxlen=_MOST_FRAMES)  # time, inliers, state
         self._saved: deque[Saved] = deque(maxlen=4)
 
-    def take(self, news: object) -> None:
+    def take(self, update: object) -> None:
         """Take what a process told."""
         with self._lock:
-            if isinstance(news, Status):
-                self._status = news.values
-            elif isinstance(news, FrameNews):
-                self._frame = news
-                self._jpeg, self._pictures = news.jpeg, self._pictures + 1
-                self._seen.append((news.t_ns, news.inliers, _STATES.index(news.tracking)))
-                self._begin(news.t_ns)
-            elif isinstance(news, StepPicture):
-                self._jpeg, self._pictures = news.jpeg, self._pictures + 1
-            elif isinstance(news, MapNews):
-                self._map.take(news)
-            elif isinstance(news, Saved):
-                self._saved.append(news)
+            if isinstance(update, Status):
+                self._status = update.values
+            elif isinstance(update, FrameUpdate):
+                self._frame = update
+                self._jpeg, self._pictures = update.jpeg, self._pictures + 1
+                self._seen.append((update.t_ns, update.inliers, _STATES.index(update.tracking)))
+                self._begin(update.t_ns)
+            elif isinstance(update, StepPicture):
+                self._jpeg, self._pictures = update.jpeg, self._pictures + 1
+            elif isinstance(update, MapUpdate):
+                self._map.take(update)
+            elif isinstance(update, Saved):
+                self._saved.append(update)
 
     def follow(self, pose: PublishedPose) -> None:
         """Take the newest pose."""
@@ -124,7 +124,7 @@ class Feed:
             "health": [(flag.name or "").lower() for flag in pose.health],
         })  # fmt: skip
 
-    def _told_frame(self, frame: FrameNews) -> dict[str, Any]:
+    def _told_frame(self, frame: FrameUpdate) -> dict[str, Any]:
         return {
             "t_s": (frame.t_ns - (self._zero_ns or 0)) * _NS,
             "has_picture": bool(frame.jpeg),
@@ -164,16 +164,16 @@ class _Keyframes:
         self._epoch, self._revision = 0, 0
         self._poses: dict[int, tuple[int, Array]] = {}
         self._clouds: dict[int, tuple[int, KeyframeCloud]] = {}
-        self._loops: dict[tuple[int, int], LoopNews] = {}
+        self._loops: dict[tuple[int, int], LoopUpdate] = {}
         self._graph_revision = self._left_out = 0
 
-    def take(self, news: MapNews) -> None:
+    def take(self, update: MapUpdate) -> None:
         self._revision += 1
-        self._graph_revision, self._left_out = news.revision, news.left_out
-        for i, T in news.T_map_body.items():
+        self._graph_revision, self._left_out = update.revision, update.left_out
+        for i, T in update.T_map_body.items():
             self._poses[i] = (self._revision, T[:3].astype(np.float32))
-        self._clouds |= {i: (self._revision, cloud) for i, cloud in news.clouds.items()}
-        self._loops |= {(loop.from_id, loop.to_id): loop for loop in news.loops}
+        self._clouds |= {i: (self._revision, cloud) for i, cloud in update.clouds.items()}
+        self._loops |= {(loop.from_id, loop.to_id): loop for loop in update.loops}
         for pair in [*self._loops][: max(len(self._loops) - _MOST_LOOPS, 0)]:
             del self._loops[pair]
         if len(self._poses) > _MOST_KEYFRAMES:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from vislam.core.messages import Array, Frame
-from vislam.live.web.news import FrameNews
+from vislam.live.web.updates import FrameUpdate
 from vislam.live.wire.mail import Outbox
 from vislam.pipeline.steps import FrontStep
 
@@ -36,7 +36,7 @@ class FrameShare:
         track = step.track
         jpeg = picture(step.frame, track.observations.pixels_px)
         self._box.put(
-            FrameNews(step.frame.t_ns, jpeg, str(track.vo.tracking), track.vo.inliers, track.reason[:_MAX_REASON])
+            FrameUpdate(step.frame.t_ns, jpeg, str(track.vo.tracking), track.vo.inliers, track.reason[:_MAX_REASON])
         )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import VislamError, storage_failure
 from vislam.core.messages import Array, GraphUpdate, ImageU8, Keyframe
-from vislam.live.web.news import KeyframeCloud, LoopNews, MapNews, Save, Saved
+from vislam.live.web.updates import KeyframeCloud, LoopUpdate, MapUpdate, Save, Saved
 from vislam.live.wire.mail import Outbox
 from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mapper import Mapper
@@ -42,7 +42,7 @@ class MapShare:
         self._poses: dict[int, Array] = {}
         self._times: dict[int, int] = {}
         self._clouds: dict[int, KeyframeCloud] = {}
-        self._loops: list[LoopNews] = []
+        self._loops: list[LoopUpdate] = []
         self._revision = self._left_out = 0
 
     def take(self, steps: list[KeyframeStep], mapper: Mapper | None) -> None:
@@ -55,7 +55,7 @@ class MapShare:
             self._times[keyframe.id] = keyframe.t_ns
             self.move(step.update)
             self._loops += [
-                LoopNews(c.from_id, c.to_id, str(c.decision), c.reason[:_MAX_REASON]) for c in step.candidates
+                LoopUpdate(c.from_id, c.to_id, str(c.decision), c.reason[:_MAX_REASON]) for c in step.candidates
             ]
             self._loops = self._loops[-_MOST_LOOPS:]
             for keyframe_id in sorted({keyframe.id, *step.scans}):
@@ -76,8 +76,8 @@ class MapShare:
         """Hand on what is new, if the page has taken what came before."""
         if not (self._poses or self._loops) or len(self._box):
             return
-        news = MapNews(self._revision, self._poses, self._times, self._clouds, self._loops, self._left_out)
-        if self._box.put(news):
+        update = MapUpdate(self._revision, self._poses, self._times, self._clouds, self._loops, self._left_out)
+        if self._box.put(update):
             self._due_s = time.monotonic() + _MAP_S
             self._poses, self._times, self._clouds, self._loops = {}, {}, {}, []
 

@@ -20,7 +20,7 @@ from vislam.live.run_live import LiveRun
 from vislam.live.status import status_line
 from vislam.live.web import web_process
 from vislam.live.web.address import WebAddress, listening
-from vislam.live.web.news import Asked, Status, StepPicture, WebEnds
+from vislam.live.web.updates import Asked, Status, StepPicture, WebEnds
 from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.wire.mail import Inbox, Outbox
 

@@ -14,9 +14,9 @@ from typing import Any
 from vislam.core.errors import DataError
 from vislam.live.processes.child import Life
 from vislam.live.web.feed import Feed
-from vislam.live.web.news import Asked, Save
 from vislam.live.web.pages import page, sign_in
 from vislam.live.web.server import Answer, Routes, WebServer, as_json
+from vislam.live.web.updates import Asked, Save
 from vislam.live.web.web_gate import Gate
 from vislam.live.wire.mail import Inbox, Outbox
 from vislam.live.wire.publisher import PoseReader
@@ -40,8 +40,8 @@ def run(
         listener: bound and listening.
         gate: who may ask.
         owner: `Status` from the process that owns the run, `Asked` to it.
-        frames: `FrameNews` from the front process.
-        map_wire: `MapNews` and `Saved` from the map process, `Save` to it.
+        frames: `FrameUpdate` from the front process.
+        map_wire: `MapUpdate` and `Saved` from the map process, `Save` to it.
         pose_name: of the published pose in shared memory.
     """
     feed = Feed()
@@ -53,8 +53,8 @@ def run(
     life.ready()
     while not life.stopped:
         for inbox in inboxes:
-            while (news := inbox.get()) is not None:
-                feed.take(news)
+            while (update := inbox.get()) is not None:
+                feed.take(update)
         poses.show(feed)
         time.sleep(_TURN_S)
     server.shutdown()

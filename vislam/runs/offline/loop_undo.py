@@ -15,7 +15,7 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
-from vislam.core.memory import GraphNews, LoopPlace, LoopState, OfferedLoop, SlamMemory
+from vislam.core.memory import GraphRecord, LoopPlace, LoopState, OfferedLoop, SlamMemory
 from vislam.core.messages import GraphUpdate, LoopDecision
 from vislam.factors.factor_log import rig_from
 from vislam.graph import PoseGraph
@@ -82,11 +82,11 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
         session.close()
     redone = _optimise(config, info, memory)
     asked = {*undo, *redo}
-    states = {state.id: state for state in redone.news.loops}
+    states = {state.id: state for state in redone.record.loops}
     states |= {loop.state.id: loop.state for loop in changed if loop.state.id in asked and loop.state.id not in states}
     before = {loop.state.id: loop.state.decision for loop in changed}
     others = [n for n, state in states.items() if n not in asked and state.decision != before[n]]
-    SessionWriter.amend(run / "session.db", redone.update, replace(redone.news, loops=tuple(states.values())))
+    SessionWriter.amend(run / "session.db", redone.update, replace(redone.record, loops=tuple(states.values())))
     moved_m = np.linalg.norm((redone.update.T_map_body - memory.graph.T_map_body)[:, :3, 3], axis=1)
     answer = {
         "undone": sorted(loop.state.id for loop in changed if loop.state.place is LoopPlace.UNDONE),
@@ -102,7 +102,7 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
 class _Redone:
     graph: PoseGraph
     update: GraphUpdate
-    news: GraphNews
+    record: GraphRecord
     config: Config
 
 
@@ -146,7 +146,7 @@ def _optimise(config: Config, info: dict[str, Any], memory: SlamMemory) -> _Redo
     graph = PoseGraph(config.graph, noise, config.machine, rig_from(info["rig"]), config.window, suite)
     graph.initialise(first, memory.T_start)
     graph.restore(memory.graph)
-    return _Redone(graph, graph.finish(), graph.take_news(), config)
+    return _Redone(graph, graph.finish(), graph.take_record(), config)
 
 
 def _write(run: Path, log: RunLog, redone: _Redone, answer: dict[str, Any], level: Levelled) -> list[str]:

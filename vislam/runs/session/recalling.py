@@ -9,8 +9,8 @@ import numpy as np
 from vislam.core import collector
 from vislam.core.memory import (
     FrontMemory,
-    FrontNews,
     GraphMemory,
+    Learned,
     PlacesMemory,
     SlamMemory,
     StartFacts,
@@ -78,7 +78,7 @@ def recall(session: Session) -> SlamMemory | None:
             T_odom_body=last.T_odom_body,
             start=start,
             state=None if start is None else _filter_state(session, states, last.id, last.T_odom_body),
-            news=_front(newest["front"]),
+            learned=_front(newest["front"]),
         )
         first = info.get("first_state")
         return SlamMemory(
@@ -113,10 +113,10 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
     )  # fmt: skip
 
 
-def _front(data: dict[str, Any]) -> FrontNews:
+def _front(data: dict[str, Any]) -> Learned:
     camera, tilt = data["filter_camera"], data.get("tilt")
     delay, rows = data.get("depth_delay_s"), data.get("depth_rows_s")
-    return FrontNews(
+    return Learned(
         int(data["next_track_id"]),
         float(data["time_offset_sigma_s"]),
         None if data["readout_s"] is None else float(data["readout_s"]),

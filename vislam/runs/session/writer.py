@@ -16,9 +16,9 @@ from vislam.core.database import connect
 from vislam.core.errors import DataError
 from vislam.core.memory import (
     FrameEntry,
-    FrontNews,
-    GraphNews,
+    GraphRecord,
     KeyframeEntry,
+    Learned,
     LoopPlace,
     LoopState,
     StartFacts,
@@ -122,7 +122,7 @@ class SessionWriter:
         return cls.reopen(path)
 
     @classmethod
-    def amend(cls, path: Path, update: GraphUpdate, news: GraphNews) -> None:
+    def amend(cls, path: Path, update: GraphUpdate, record: GraphRecord) -> None:
         """Store in one transaction what was decided otherwise about a run that was ended, and what that moved.
 
         Raises DataError when the file is missing, not ours or damaged, StorageError when it cannot be written.
@@ -136,8 +136,8 @@ class SessionWriter:
                 check_sound(writer._db, path)
                 newest = json.loads(writer._db.execute("SELECT value FROM newest").fetchone()[0])
             with storage(path), writer._transaction():
-                writer._move(update, news)
-                changed = {**newest, "revision": update.revision, "vo_scale": news.vo_scale, **_own_news(news)}
+                writer._move(update, record)
+                changed = {**newest, "revision": update.revision, "vo_scale": record.vo_scale, **_own_record(record)}
                 writer._replace("newest", [(1, json.dumps(changed))])
         finally:
             writer._db.close()
@@ -176,7 +176,7 @@ class SessionWriter:
 
     def add(self, entry: KeyframeEntry) -> None:
         """Commit a keyframe with all that came of it, the frames since the last, and what its update changed."""
-        packet, update, news = entry.packet, entry.update, entry.news
+        packet, update, record = entry.packet, entry.update, entry.record
         keyframe = packet.keyframe
         poses = dict(zip(update.ids.tolist(), update.T_map_body, strict=True))
         T_map_body = poses.get(keyframe.id, update.T_map_odom @ entry.T_odom_body)
@@ -207,16 +207,16 @@ class SessionWriter:
             self._insert("candidates", [(None, *_candidate_row(c)) for c in entry.candidates])
             self._insert("retrieved", [(None, *astuple(found)) for found in entry.retrieved])
             self._write_frames()
-            self._move(update, news)
+            self._move(update, record)
             moved = [(*shift, checksum((edge_id, *shift)), edge_id) for edge_id, shift in entry.shifts.items()]
             self._db.executemany("UPDATE edges SET moved_rms_m = ?, moved_max_m = ?, crc_moved = ? WHERE id = ?", moved)
-            newest = {"revision": update.revision, "vo_scale": news.vo_scale, "front": _front_data(entry.front)}
-            self._replace("newest", [(1, json.dumps({**newest, **_own_news(news)}))])
+            newest = {"revision": update.revision, "vo_scale": record.vo_scale, "front": _front_data(entry.front)}
+            self._replace("newest", [(1, json.dumps({**newest, **_own_record(record)}))])
 
-    def move(self, update: GraphUpdate, news: GraphNews) -> None:
+    def move(self, update: GraphUpdate, record: GraphRecord) -> None:
         """Commit what an update without a new keyframe changed."""
         with storage(self.path), self._transaction():
-            self._move(update, news)
+            self._move(update, record)
 
     def close(self, finished: bool = False) -> None:
         """Fold the write-ahead log into the file, which is then all there is, and close it.
@@ -232,21 +232,21 @@ class SessionWriter:
                 self._db.execute("PRAGMA journal_mode=DELETE")  # so that readers leave no files beside it
             self._db.close()
 
-    def _move(self, update: GraphUpdate, news: GraphNews) -> None:
+    def _move(self, update: GraphUpdate, record: GraphRecord) -> None:
         placed = [(int(i), to_bytes(T, "<f8")) for i, T in zip(update.ids, update.T_map_body, strict=True)]
         rows = [(T, checksum((i, T)), i) for i, T in placed]
         self._db.executemany("UPDATE keyframes SET T_map_body = ?, crc_pose = ? WHERE id = ?", rows)
-        states = [(state.id, _state_row(state)) for state in news.loops]
+        states = [(state.id, _state_row(state)) for state in record.loops]
         decided = [(*row, checksum((i, *row)), i) for i, row in states]
         columns = (
             "decision = ?, reason = ?, chi2 = ?, place = ?, tie_id = ?, tie_T = ?, tie_covariance = ?, crc_decided = ?"
         )
         self._db.executemany(f"UPDATE edges SET {columns} WHERE id = ?", decided)
-        if news.window is not None:
-            said = news.window
+        if record.window is not None:
+            said = record.window
             self._replace("windows", [(said.id, *window_bytes(said), said.note, said.rest_from)])
-        self._put_states("graph", news.states)
-        self._replace("ties", [(tied.id, tied.anchor_id, to_bytes(tied.covariance, "<f8")) for tied in news.ties])
+        self._put_states("graph", record.states)
+        self._replace("ties", [(tied.id, tied.anchor_id, to_bytes(tied.covariance, "<f8")) for tied in record.ties])
 
     def _add_edges(self, edges: Iterable[LoopEdge], offered_with: int) -> None:
         """Add offered edges; an id that was used before is refused by the graph, and the first edge of it stays."""
@@ -297,15 +297,15 @@ def _start_data(start: StartFacts) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _front_data(front: FrontNews | None) -> dict[str, Any]:
-    front = front or FrontNews()
+def _front_data(front: Learned | None) -> dict[str, Any]:
+    front = front or Learned()
     arrays = {"filter_camera": front.filter_camera, "tilt": front.tilt}
     return {**asdict(front), **{name: None if array is None else array.tolist() for name, array in arrays.items()}}
 
 
-def _own_news(news: GraphNews) -> dict[str, Any]:
+def _own_record(record: GraphRecord) -> dict[str, Any]:
     """Return the own variables of sensors as an entry of `newest`; nothing where there are none."""
-    return {"own": own_data(news.own)} if news.own else {}
+    return {"own": own_data(record.own)} if record.own else {}
 
 
 def _state_row(state: LoopState) -> tuple[Any, ...]:

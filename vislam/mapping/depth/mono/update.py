@@ -14,7 +14,7 @@ from vislam.mapping.depth.mono.matching import HALF, MARGIN, PIXELS, SIDE, load_
 from vislam.mapping.depth.mono.triangulation import Vector, inverse_depth_sigma
 
 SEARCHED, CONVERGED, FAILED, FLAT = range(4)  # what became of a pixel; only the searched ones cost time
-NO_MATCH, MATCH, NO_NEWS = range(3)  # of one pixel in one frame; no news: out of view, or nothing to be learned
+NO_MATCH, MATCH, UNCHANGED = range(3)  # of one pixel in one frame; unchanged: out of view, or nothing to be learned
 _NEAREST_Z = 0.05  # of a point's z in the other camera over that in the reference: nearer is behind or beside it
 _NO_WARP = (1.0, 0.0, 0.0, 1.0)
 _SMALLEST_WARP = 1e-6  # of a square of the reference that is seen in the image
@@ -221,7 +221,7 @@ def _search(
         if scores[i] > top:
             best, top = i, scores[i]
     if inside < 3:
-        return NO_NEWS, 0.0
+        return UNCHANGED, 0.0
     if top < rules.least_score or best == 0 or best == count - 1:
         return NO_MATCH, 0.0
     before, after = scores[best - 1], scores[best + 1]

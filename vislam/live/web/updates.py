@@ -28,7 +28,7 @@ class Status:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameNews:
+class FrameUpdate:
     """A frame as vision saw it."""
 
     t_ns: int
@@ -55,7 +55,7 @@ class KeyframeCloud:
 
 
 @dataclass(frozen=True, slots=True)
-class LoopNews:
+class LoopUpdate:
     """A loop candidate that was decided about."""
 
     from_id: int
@@ -65,14 +65,14 @@ class LoopNews:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapNews:
+class MapUpdate:
     """What is new in the map since the last of these."""
 
     revision: int = 0
     T_map_body: dict[int, Array] = field(default_factory=dict)  # of keyframes that are new or moved
     t_ns: dict[int, int] = field(default_factory=dict)  # of keyframes that are new
     clouds: dict[int, KeyframeCloud] = field(default_factory=dict)
-    loops: list[LoopNews] = field(default_factory=list)
+    loops: list[LoopUpdate] = field(default_factory=list)
     left_out: int = 0  # clouds that the page was too slow for, so far
 
 
