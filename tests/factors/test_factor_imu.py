@@ -6,7 +6,7 @@ import pytest
 
 from vislam.config import GraphConfig, MachineConfig, WindowConfig
 from vislam.core.messages import ImuSpan
-from vislam.factors.preintegration import Preintegrator
+from vislam.factors.preintegration import ACCEL_BIAS_WALK_FLOOR, GYRO_BIAS_WALK_FLOOR, Preintegrator
 from vislam.graph import PoseGraph
 from vislam.imu import ImuNoise
 from worlds.lap import EUROC_NOISE, RIG, World, rmse_m
@@ -116,5 +116,5 @@ def test_bias_walk_is_floored_against_gtsams_pivot_test() -> None:
     tiny = ImuNoise(1e-4, 1e-3, 1e-9, 1e-9, 200.0)
     config = GraphConfig()
     integrator = Preintegrator(config, tiny, MACHINE)
-    assert integrator.gyroscope_random_walk == config.gyro_bias_walk_floor
-    assert integrator.accelerometer_random_walk == config.accel_bias_walk_floor
+    assert integrator.gyroscope_random_walk == GYRO_BIAS_WALK_FLOOR
+    assert integrator.accelerometer_random_walk == ACCEL_BIAS_WALK_FLOOR

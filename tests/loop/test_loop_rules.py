@@ -125,7 +125,7 @@ def test_each_rule_decides_with_its_reason(
     change: dict[str, float | None], tilt_deg: float | None, decision: LoopDecision, says: str
 ) -> None:
     tilt = None if tilt_deg is None else float(np.deg2rad(tilt_deg))
-    decided, reason = judge(replace(GOOD, **change), tilt, CONFIG)
+    decided, reason = judge(replace(GOOD, **change), tilt)
     assert decided is decision
     assert says in reason
 

@@ -104,7 +104,7 @@ def _with_pose_graph(log: FactorLog, false: set[int]) -> FactorLog:
     config = Config()
     chain = Chain(log, config.graph, config.machine)
     loops = Loops([e for e in log.edges if e.edge.id not in false], chain, config.graph, T_BODY_CAM0[:3, 3])
-    loops.choose(chain, config.batch)
+    loops.choose(chain)
     values = chain.initial()
     for _ in range(2):
         factors, _ = chain.factors(values, np.zeros(len(chain.records), np.int64), 1)

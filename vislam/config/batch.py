@@ -12,19 +12,9 @@ class BatchConfig:
 
     rounds: Count = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
     iterations: Count = 20  # most Levenberg-Marquardt steps of a round; converged earlier as a rule
-    start_gate_px: NonNegative = 20.0  # first round: poses of the run may be off, only gross outliers leave
-    start_cauchy: Positive = 3.0  # standard deviations, scale of the kernel in that round
     huber_k: Positive = 2.0  # standard deviations, in later rounds
-    gate_probability: Probability = 0.999  # chi-square of a pixel or depth that stays, in later rounds
-    max_relative_sigma: Share = 0.25  # of a landmark's distance by its own rays; farther ones lack parallax or depth
     max_observations: Count = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
-    min_seen: Whole = 12  # landmarks; a keyframe that sees fewer also gets the odometry of the run
     vision_inflation: Positive = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
-    pixel_sigma_min_px: NonNegative = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
-    pixel_sigma_max_px: NonNegative = 3.0
-    loop_probability: Probability = 0.9999  # chi-square of a true loop in the judging of all of them
-    # one camera: relative, on the steps of the run's own odometry among the loops
-    unscaled_odometry_sigma: NonNegative = 0.1
     covariances: bool = True  # of all states; costs about as much as a round
 
 

@@ -21,13 +21,9 @@ class LiveConfig:
     vision_timeout_s: NonNegative = 0.3
     drift_sigma_m: NonNegative = 0.3  # position sigma gained since vision was lost, above which the pose is invalid
     velocity_sigma_m_s: NonNegative = 0.5  # above which it is invalid
-    imu_timeout_s: NonNegative = 0.1  # without a sample for so long the pose is old: invalid
     heartbeat_s: NonNegative = 0.05  # between poses while there are no samples, so that a reader sees why
     event_s: NonNegative = 0.5  # so long a passing sensor event stays in the health word
-    # without vision, still inertial data mean rest only below this speed and its sigma
-    rest_speed_m_s: NonNegative = 0.1
     keyframe_queue: Count = 8  # keyframes that may wait for the back end; when half of that wait, fewer are made
-    crowded_spacing: Positive = 2.0  # factor on the distances between keyframes then
     map_age_s: Positive = 2.0  # older frames make the map take fewer keyframes: it would fall behind without end
     # 1 to 99: SCHED_FIFO for the fast process, where the system permits; 0: as others
     realtime_priority: Annotated[int, Range(0, 99)] = 0
@@ -40,8 +36,6 @@ class ViewConfig:
     enabled: bool = True  # off: no run.rrd
     every_frames: Count = 2  # images are logged for one frame in so many: halves the cost, and nobody sees it
     image_width_px: Count = 320  # a JPEG of this width costs 1.5 ms and 9 kB; VGA costs three times that
-    jpeg_quality: Annotated[int, Range(1, 100)] = 75
     cloud_points: Count = 4000  # per keyframe, from depth; sparse features are all kept
-    max_range_m: NonNegative = 8.0  # farther depth is noise that hides the scene
     map_every_s: Positive = 5.0  # octree and grid are written again so often at most
     map_voxels: Count = 20_000  # at most in each, larger maps get coarser ones; 16 bytes each

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from vislam.config.ranges import Count, NonNegative, Positive, Probability, Share, Whole
+from vislam.config.ranges import Count, NonNegative, Positive, Share, Whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,36 +11,17 @@ class LoopConfig:
     """Loop detection and verification."""
 
     enabled: bool = True  # off: odometry alone, which drifts
-    match_ratio: Share = 0.8  # nearest to second nearest descriptor; 0.8 keeps true matches of repeated texture out
-    match_max_distance: Whole = 64  # bits of 256; unrelated ORB descriptors are 128 apart
-    inlier_px: NonNegative = 3.0  # reprojection error of an inlier; ORB's coarse octaves are good to 2 px
     min_inliers: Whole = 12  # of PnP; 5,735 pairs of different places gave at most 7
-    guided_radius_px: NonNegative = 8.0  # search around a point's predicted place once a pose is known
-    # of a keypoint; only its ratio to the depth sigma matters, residuals set the scale
-    feature_sigma_px: Positive = 1.0
-    inverse_depth_sigma_1_m: NonNegative = 0.01  # of the difference of two inverse depths
-    epipolar_px: NonNegative = 1.5  # Sampson error of an inlier where no depth is known
     min_inliers_direction: Whole = 25  # of the essential matrix; wrong matches reached 15 in 5,735 pairs
-    min_parallax_px: NonNegative = 6.0  # median that rotation does not explain; less, and the direction is noise
-    max_plane_share: Share = 0.8  # of the matches; a plane seen twice fits two directions (one was wrong by 109 deg)
     # the fit's own covariance is several times too small (coarse octaves, depth bias, rolling shutter): with these
     # the mean squared error per degree of freedom is 1.1 on TUM fr1_desk, 0.3 on EuRoC MH_01 (motion capture), and 0.1
     # on simulated images, which are kinder than real ones
     covariance_inflation: Positive = 16.0  # of the fit's variance
     sigma_floor_m: NonNegative = 0.005
     sigma_floor_deg: NonNegative = 0.25
-    direction_floor_deg: NonNegative = 2.0  # of a direction without scale: the lever arm of the camera is not in it
-    max_sigma_any_m: NonNegative = 0.10  # a worse pose is no edge: it can be half a metre off
-    min_agreement_share: Share = 0.5  # of matches that also agree the other way round, and in depth
-    max_tilt_deg: NonNegative = 5.0  # against gravity; well above the error of a good edge and of the map's own tilt
-    max_rotation_sigma_deg: NonNegative = 2.0  # of an edge without scale
-    max_direction_sigma_deg: NonNegative = 5.0  # of its direction
     max_verifications: Whole = 5  # per keyframe, 4 to 7 ms each: bounds its time; 4 and 6 give the same accuracy
     max_odometry: Whole = 3  # candidates per keyframe that the map's poses suggest
     odometry_skip_keyframes: Whole = 5  # the newest ones are tied by visual odometry already
-    min_overlap: Share = 0.35  # share of what is seen that a candidate should see too, by the map
-    min_apart_keyframes: Whole = 3  # between odometry candidates, so that they constrain different places
-    nominal_depth_m: Positive = 3.0  # of features without depth, to guess what two keyframes share
     max_appearance: Whole = 2  # candidates per keyframe that look alike; more where the map suggests too few
     # matches that keep their distances, for views with depth to be alike; chance gives 3, rarely 4
     min_rigid: Whole = 5
@@ -48,7 +29,6 @@ class LoopConfig:
     tags: Literal["off", "16h5", "25h9", "36h10", "36h11"] = "36h11"  # AprilTag family
     tags_every: Count = 4  # so many keyframes, until a tag was seen: 3 to 5 ms each; then, or with a size, all of them
     tag_size_m: NonNegative | None = None  # side of the black square; known, a tag alone gives a relative pose
-    max_tags: Whole = 2  # candidates per keyframe that saw the same tag
     retrieved: Count = 10  # keyframes asked of the index and matched, 0.4 ms each
     island_gap: Whole = 3  # ids in one island differ by at most this
     appearance_skip_keyframes: Whole = 20  # the newest ones always look most alike
@@ -58,7 +38,6 @@ class LoopConfig:
     first_training: Whole = 20  # keyframes; trained on fewer, words find less than those that come along
     training_growth: Positive = 1.25  # keyframes, until trained again: words find less what they were not trained on
     min_training_lag: Whole = 2  # keyframes that come during a training, at least ...
-    training_lag_share: Share = 0.05  # ... and of those it is trained on; so long it takes at 10 keyframes a second
     catch_up_keyframes: Whole = 8  # of those, so many are indexed with each new one once it is done: 0.4 ms each
     training_descriptors: Count = 500_000  # at most: bounds a training, in the background, to 2 s
     vocabulary_branching: Count = 10  # children of a node
@@ -78,16 +57,11 @@ class LoopTruthConfig:
     """What counts as a true revisit, and as a wrong edge, when loops are compared with the truth."""
 
     min_overlap: Share = 0.3  # of two views by their true poses; ORB closes few loops below
-    doubtful_overlap: Share = 0.05  # between this and min_overlap a retrieved image is neither right nor wrong
     near_m: NonNegative = 1.0  # a keyframe that was proposed is truly near below this, ...
     near_deg: NonNegative = 40.0  # ... turned by less than this, and where the views overlap by min_overlap
     min_apart_s: NonNegative = 10.0  # a pair is a loop when it is this far apart in time ...
     min_apart_keyframes: Whole = 30  # ... or by so many keyframes; nearer pairs are tied by odometry anyway
     gross_m: NonNegative = 0.5  # an edge whose translation is off by more would ruin a map
     gross_deg: NonNegative = 10.0  # or whose rotation is
-    nominal_depth_m: Positive = 3.0  # of features without depth, to know what two views share
     max_truth_gap_s: NonNegative = 0.3  # true poses are interpolated over less: a few millimetres by hand or on wheels
-    resamples: Count = 1000  # of the bootstrap
-    block_keyframes: Count = 10  # drawn together, because what follows each other errs alike
-    confidence: Probability = 0.95
     seed: Whole = 0  # of the bootstrap

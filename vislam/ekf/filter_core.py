@@ -14,6 +14,18 @@ from vislam.ekf.sensor_rows import OwnVariables, Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.imu import ImuNoise
 
+RESET_REJECTS = 5  # this many rejections in a row ...
+RESET_S = 1.0  # ... over this long mean that the filter is wrong, not vision: P is inflated, counted
+# what such a soft reset adds to the sigmas of the state; the state itself stays
+_RESET_ROTATION_DEG = 3.0
+_RESET_POSITION_M = 0.3
+_RESET_VELOCITY_M_S = 1.0
+_RESET_GYRO_BIAS_RAD_S = 0.02
+_RESET_ACCEL_BIAS_M_S2 = 0.2
+ZERO_VELOCITY_SIGMA_M_S = 0.02  # a vehicle "at rest" still sways
+ZERO_RATE_SIGMA_RAD_S = 0.005  # one gyro sample at rest against the bias
+REST_SIGMA_M = 0.002  # sway against the pose at which rest began
+REST_SIGMA_DEG = 0.05
 REST_PAUSE_NS = 300_000_000  # frames at rest this far apart are of one rest: either looked back on all that is between
 
 
@@ -101,15 +113,15 @@ def scaled(sigmas: Array, noise: NoiseScale) -> Array:
     return sigmas * np.array([*noise, 1.0, 1.0, 1.0, 1.0])
 
 
-def reset_sigmas(config: EkfConfig) -> Array:
+def reset_sigmas() -> Array:
     """Return what a soft reset adds to the sigmas of the state [15]."""
     return np.repeat(
         [
-            np.deg2rad(config.reset_rotation_deg),
-            config.reset_position_m,
-            config.reset_velocity_m_s,
-            config.reset_gyro_bias_rad_s,
-            config.reset_accel_bias_m_s2,
+            np.deg2rad(_RESET_ROTATION_DEG),
+            _RESET_POSITION_M,
+            _RESET_VELOCITY_M_S,
+            _RESET_GYRO_BIAS_RAD_S,
+            _RESET_ACCEL_BIAS_M_S2,
         ],
         3,
     )

@@ -13,7 +13,6 @@ from typing import Generic
 
 import numpy as np
 
-from vislam.config import EkfConfig
 from vislam.core.geometry import interpolate
 from vislam.core.messages import Array, ImuSample, NavState, NoiseScale
 from vislam.ekf.filter_core import Core, S
@@ -22,6 +21,7 @@ from vislam.ekf.loose.kernels import pose
 from vislam.ekf.stretch import keep_track, stretch
 from vislam.imu import ImuSeries
 
+_CHECKPOINT_S = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
 _NS = 1_000_000_000
 _WAITS = "waits for an inertial sample as new"
 
@@ -41,11 +41,14 @@ class Timeline(Generic[S, M]):
     Until it is begun, samples are only kept; a state in the past is then brought to the present through them.
     """
 
-    def __init__(self, core: Core[S, M], state: S, config: EkfConfig, history_s: float, max_gap_s: float) -> None:
-        """Set up an uninitialised filter, `state` a placeholder; holes beyond `max_gap_s` get the gap's sigmas."""
+    def __init__(self, core: Core[S, M], state: S, history_s: float, max_gap_s: float) -> None:
+        """Set up an uninitialised filter of which `state` is a placeholder.
+
+        A hole in the samples longer than `max_gap_s` is bridged with the filter's gap sigmas, and counted.
+        """
         self._core = core
         self._state = state
-        self._checkpoint_ns = round(config.checkpoint_s * _NS)
+        self._checkpoint_ns = round(_CHECKPOINT_S * _NS)
         self._history_ns = round(history_s * _NS)
         self._max_gap_ns = round(max_gap_s * _NS)
         self._series = ImuSeries(extra=10)  # beside each sample, x[:10] as of the last run through it

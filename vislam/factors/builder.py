@@ -13,11 +13,21 @@ from vislam.core.messages import Array
 from vislam.factors import motion
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
-from vislam.factors.noise_models import gaussian, huber, of_vision
+from vislam.factors.noise_models import (
+    DIRECTION_FLOOR_DEG,
+    DIRECTION_SCALE_SIGMA,
+    DIRECTION_SOFT_M,
+    gaussian,
+    huber,
+    of_vision,
+)
 from vislam.factors.preintegration import Preintegrated, Preintegrator
 from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.imu import ImuNoise
+
+_SUBMAP_SPEED_SIGMA_M_S = 3.0  # of the first velocity in a submap, with loose coupling
+
 
 Label = tuple[str, int]  # names a factor that will be replaced or taken out: its kind and a number
 
@@ -143,9 +153,9 @@ class Builder:
                 T,
                 covariance,
                 lever,
-                max(step_m, config.direction_soft_m),
-                floor_rad=np.deg2rad(config.direction_floor_deg),
-                scale_sigma=config.direction_scale_sigma,
+                max(step_m, DIRECTION_SOFT_M),
+                floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG),
+                scale_sigma=DIRECTION_SCALE_SIGMA,
             )
         model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
         return pose_factor(a, b, T, model)
@@ -155,7 +165,7 @@ class Builder:
         assert self._preintegrator is not None
         walk = self._preintegrator.bias_walk_sigmas(duration_s)
         lost_m_s = self._machine.lost_speed_sigma_m_s
-        sigma_m_s = self._config.submap_speed_sigma_m_s if record.begins_submap else lost_m_s
+        sigma_m_s = _SUBMAP_SPEED_SIGMA_M_S if record.begins_submap else lost_m_s
         speed = motion.loose_velocity(record.id, guess.velocity_map_m_s, sigma_m_s)
         return [speed, motion.bias_walk(record.id, walk)]
 

@@ -12,7 +12,7 @@ from vislam.core.memory import Tie
 from vislam.core.messages import Array
 from vislam.factors.journal import LoopRecord
 from vislam.factors.keys import X, nearest_rigid
-from vislam.factors.noise_models import cauchy, conditioned, gaussian, inflated
+from vislam.factors.noise_models import DIRECTION_FLOOR_DEG, DIRECTION_SOFT_M, cauchy, conditioned, gaussian, inflated
 from vislam.factors.visual import (
     DirectionMeasurement,
     direction_as_pose,
@@ -22,6 +22,8 @@ from vislam.factors.visual import (
     pose_factor,
 )
 
+LOOP_CAUCHY_K = 2.0  # whitened norm
+LOOP_MIN_WEIGHT = 0.05  # a loop that optimisation leaves with less is taken out again
 _SCALE_SIGMA = 5.0  # relative, on the length of the way of a loop that did not measure it
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
 
@@ -38,7 +40,7 @@ class LoopModel:
         covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), config.loop_floor_m)
         self._direction: DirectionMeasurement | None = None
         if not record.has_scale:
-            floor = np.deg2rad(config.direction_floor_deg)
+            floor = np.deg2rad(DIRECTION_FLOOR_DEG)
             covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), 0.0)
             self._direction = direction_measurement(record.T_from_to, covariance, floor)
             covariance = self._direction.covariance
@@ -71,10 +73,10 @@ class LoopModel:
         if self._direction is None:
             return record.T_from_to, self.covariance
         moved = T_from_to[:3, 3] + (T_from_to[:3, :3] - np.eye(3)) @ self._lever_m
-        floor = np.deg2rad(config.direction_floor_deg)
+        floor = np.deg2rad(DIRECTION_FLOOR_DEG)
         covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), 0.0)
         return direction_as_pose(
-            record.T_from_to, covariance, self._lever_m, max(float(np.linalg.norm(moved)), config.direction_soft_m),
+            record.T_from_to, covariance, self._lever_m, max(float(np.linalg.norm(moved)), DIRECTION_SOFT_M),
             floor_rad=floor, scale_sigma=_SCALE_SIGMA,
         )  # fmt: skip
 
@@ -86,13 +88,11 @@ class LoopModel:
             tie = self.tie
         model: gtsam.noiseModel.Base = gaussian(tie.covariance, config.covariance_ratio_max)
         if robust:
-            model = cauchy(model, config.loop_cauchy_k)
+            model = cauchy(model, LOOP_CAUCHY_K)
         a, b = X(tie.from_id), X(record.to_id)
         if self._direction is None or tie is self.tie:
             return pose_factor(a, b, tie.T_from_to, model)
-        return direction_factor(
-            a, b, self._direction, lever_m=self._lever_m, soft_m=config.direction_soft_m, model=model
-        )
+        return direction_factor(a, b, self._direction, lever_m=self._lever_m, soft_m=DIRECTION_SOFT_M, model=model)
 
     def eye(self, T_map_body: Array) -> Array:
         """Return where cam0 is [3], to which the direction of a loop without scale belongs."""
@@ -104,7 +104,7 @@ class LoopModel:
             return se3_log(invert(self.record.T_from_to) @ invert(T_from) @ T_to), np.eye(6)
         d = self._direction
         residual, _, J_b = direction_residual(
-            T_from, T_to, d.R_a_b, d.direction_a, d.tangent, self._lever_m, self._config.direction_soft_m
+            T_from, T_to, d.R_a_b, d.direction_a, d.tangent, self._lever_m, DIRECTION_SOFT_M
         )
         rows = len(self.covariance)
         return residual[:rows], J_b[:rows]
@@ -118,7 +118,7 @@ class LoopModel:
 
     def weight(self, T_from: Array, T_to: Array) -> float:
         """Return the weight, 0 to 1, that the Cauchy kernel leaves the edge."""
-        k2 = self._config.loop_cauchy_k**2
+        k2 = LOOP_CAUCHY_K**2
         return k2 / (k2 + self.chi2(T_from, T_to))
 
 

@@ -11,6 +11,8 @@ from vislam.core.messages import Array
 from vislam.factors.keys import B, V, X
 from vislam.factors.noise_models import sigmas
 
+SUBMAP_SIGMA_DEG = 30.0
+
 
 def zero_velocity(k: int, sigma_m_s: float) -> gtsam.PriorFactorVector:
     """Return the factor that keyframe k stands still."""

@@ -15,6 +15,10 @@ from vislam.core.messages import Array
 if TYPE_CHECKING:
     from vislam.factors.journal import KeyframeRecord
 
+DIRECTION_FLOOR_DEG = 0.2  # mono: direction of motion
+DIRECTION_SOFT_M = 0.005  # mono: baselines shorter than this lose their say on direction
+# mono: relative, on the expected step; wide, for only the IMU knows the scale
+DIRECTION_SCALE_SIGMA = 5.0
 _ASYMMETRY = 1e-6  # relative; what honest arithmetic leaves
 
 

@@ -16,6 +16,9 @@ from vislam.core.messages import Array, ImuSpan
 from vislam.factors.keys import B, V, X
 from vislam.imu import ImuNoise
 
+# rad/s^2/sqrt(Hz); gtsam 4.3.0 throws when prior sigma / step sigma > 4096
+GYRO_BIAS_WALK_FLOOR = 2e-5
+ACCEL_BIAS_WALK_FLOOR = 3e-4  # m/s^3/sqrt(Hz)
 _BRIDGE_STEP_S = 0.005  # outages are integrated in steps of this length
 
 
@@ -38,8 +41,8 @@ class Preintegrator:
         self._max_gap_s = noise.gap_s(machine.max_gap_s)
         self._gyro_density = noise.gyroscope_noise_density
         self._accel_density = noise.accelerometer_noise_density
-        self.gyroscope_random_walk = max(noise.gyroscope_random_walk, config.gyro_bias_walk_floor)
-        self.accelerometer_random_walk = max(noise.accelerometer_random_walk, config.accel_bias_walk_floor)
+        self.gyroscope_random_walk = max(noise.gyroscope_random_walk, GYRO_BIAS_WALK_FLOOR)
+        self.accelerometer_random_walk = max(noise.accelerometer_random_walk, ACCEL_BIAS_WALK_FLOOR)
 
     def integrate(
         self, span: ImuSpan | None, t0_ns: int, t1_ns: int, bias: gtsam.imuBias.ConstantBias

@@ -11,6 +11,12 @@ from vislam.factors.journal import StartRecord
 from vislam.factors.keys import B, V, X, bias_of
 from vislam.factors.noise_models import gaussian, sigmas
 
+_TILT_SIGMA_MAX_DEG = 5.0  # first roll and pitch follow the initialisation, within these bounds
+_TILT_SIGMA_MIN_DEG = 0.05
+# rad/s; bounds of the first bias prior, so that pivots stay within what gtsam takes
+GYRO_BIAS_SIGMA_MAX = 0.05
+ACCEL_BIAS_SIGMA_MAX = 0.5  # m/s^2
+
 
 def start_factors(start: StartRecord, config: GraphConfig) -> list[gtsam.NonlinearFactor]:
     """Return the priors of keyframe 0: pose, and with an IMU velocity and biases."""
@@ -21,8 +27,8 @@ def start_factors(start: StartRecord, config: GraphConfig) -> list[gtsam.Nonline
     velocity = gaussian(start.covariance[6:9, 6:9] + 1e-6 * np.eye(3), config.covariance_ratio_max)
     factors.append(gtsam.PriorFactorVector(V(0), start.velocity_map_m_s, velocity))
     own = np.sqrt(np.diag(start.covariance))
-    gyro = np.clip(own[9:12], 1e-5, config.gyro_bias_sigma_max)
-    accel = np.clip(own[12:15], 1e-4, config.accel_bias_sigma_max)
+    gyro = np.clip(own[9:12], 1e-5, GYRO_BIAS_SIGMA_MAX)
+    accel = np.clip(own[12:15], 1e-4, ACCEL_BIAS_SIGMA_MAX)
     bias = bias_of(start.gyro_bias_rad_s, start.accel_bias_m_s2)
     factors.append(gtsam.PriorFactorConstantBias(B(0), bias, sigmas(np.concatenate([accel, gyro]))))
     return factors
@@ -40,7 +46,7 @@ def pose_covariance(start: StartRecord, config: GraphConfig) -> Array:
     R = start.T_map_body[:3, :3]
     tilt = (R @ start.covariance[:3, :3] @ R.T)[:2, :2]
     values, vectors = np.linalg.eigh(tilt)
-    low, high = np.deg2rad(config.tilt_sigma_min_deg) ** 2, np.deg2rad(config.tilt_sigma_max_deg) ** 2
+    low, high = np.deg2rad(_TILT_SIGMA_MIN_DEG) ** 2, np.deg2rad(_TILT_SIGMA_MAX_DEG) ** 2
     world = np.zeros((3, 3))
     world[:2, :2] = (vectors * np.clip(values, low, high)) @ vectors.T
     world[2, 2] = config.gauge_sigma_rad**2

@@ -23,7 +23,7 @@ from vislam.factors.journal import KeyframeRecord
 from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
 from vislam.factors.reading_counts import ReadingCounts
 from vislam.factors.reading_factor import ReadingFactor
-from vislam.factors.solvers import RELINEARIZE_OWN
+from vislam.factors.solvers import RELINEARIZE_OWN, RELINEARIZE_TRANSLATION_M
 from vislam.sensors import Suite, Variable
 
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
@@ -58,7 +58,7 @@ class _Place(NamedTuple):
         for before, after in ((self.T_earlier, now.T_earlier), (self.T_later, now.T_later)):
             change = np.abs(after - before)
             m, rad = float(change[:3, 3].max()), float(change[:3, :3].max())
-            farthest = max(farthest, m / config.relinearize_translation_m, rad / config.relinearize_rotation_rad)
+            farthest = max(farthest, m / RELINEARIZE_TRANSLATION_M, rad / config.relinearize_rotation_rad)
         return farthest
 
 

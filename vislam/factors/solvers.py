@@ -14,6 +14,13 @@ import numpy as np
 from vislam.config import GraphConfig
 from vislam.core.messages import Array
 
+RELINEARIZE_TRANSLATION_M = 0.005  # what a voxel map can see
+_RELINEARIZE_VELOCITY_M_S = 0.01
+# rad/s and m/s^2; preintegration's first-order correction is exact to far more
+_RELINEARIZE_BIAS = 0.001
+LOOP_ITERATIONS = 3  # extra Gauss-Newton steps after a loop is accepted; bounds the work of an update
+
+
 Factorization = Literal["CHOLESKY", "QR"]
 FAILURES = (RuntimeError, ValueError, IndexError, KeyError)  # what gtsam's bindings are known to raise
 
@@ -63,11 +70,11 @@ class IncrementalSolver:
         params.relinearizeSkip = config.relinearize_skip
         params.findUnusedFactorSlots = True
         thresholds = gtsam.ISAM2ThresholdMap()
-        pose = np.repeat([config.relinearize_rotation_rad, config.relinearize_translation_m], 3)
+        pose = np.repeat([config.relinearize_rotation_rad, RELINEARIZE_TRANSLATION_M], 3)
         thresholds.insert(("x", pose))
-        thresholds.insert(("v", np.full(3, config.relinearize_velocity_m_s)))
-        thresholds.insert(("l", np.full(3, config.relinearize_translation_m)))
-        thresholds.insert(("b", np.full(6, config.relinearize_bias)))
+        thresholds.insert(("v", np.full(3, _RELINEARIZE_VELOCITY_M_S)))
+        thresholds.insert(("l", np.full(3, RELINEARIZE_TRANSLATION_M)))
+        thresholds.insert(("b", np.full(6, _RELINEARIZE_BIAS)))
         for letter in "ow":
             thresholds.insert((letter, np.full(1, RELINEARIZE_OWN)))
         params.setRelinearizeThreshold(thresholds)

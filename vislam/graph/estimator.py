@@ -22,11 +22,20 @@ from vislam.factors.keys import B, V, X, nearest_rigid, poses_of
 from vislam.factors.odometry import Odometry
 from vislam.factors.priors import held_pose
 from vislam.factors.sensed import Readings
-from vislam.factors.solvers import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
+from vislam.factors.solvers import (
+    FAILURES,
+    LOOP_ITERATIONS,
+    BatchSolver,
+    Factorization,
+    IncrementalSolver,
+    Solver,
+    optimize,
+)
 from vislam.graph.segments import Link, Segment, Stand, joint_beside, summarised
 from vislam.graph.settling import BATCH_ITERATIONS, settled, short
 from vislam.sensors import Suite
 
+_FINISH_ITERATIONS = 10  # most steps of the final convergence before batch has its try
 _CONVERGED_M = 1e-5  # largest change of a step that finish takes for convergence; rad and m alike
 
 
@@ -201,7 +210,7 @@ class Estimator(Generic[L]):
                 self._enter(fresh, slots)
                 return ""
             plain = self._solver.update(_graph([edge.factor(robust=False) for edge in fresh]), gtsam.Values(), [])
-            self._solver.iterate(self._config.loop_iterations)
+            self._solver.iterate(LOOP_ITERATIONS)
             robust = _graph([edge.factor(robust=True) for edge in fresh])
             slots = self._solver.update(robust, gtsam.Values(), plain)
             self._solver.iterate(1)
@@ -307,7 +316,7 @@ class Estimator(Generic[L]):
             del self.loops[edge.id]
         try:
             self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots)
-            self._solver.iterate(self._config.loop_iterations)
+            self._solver.iterate(LOOP_ITERATIONS)
             self._take()
         except FAILURES as error:
             return self._recover(self._values, [], error)
@@ -330,7 +339,7 @@ class Estimator(Generic[L]):
         graph.
         """
         note = ""
-        for _ in range(self._config.finish_iterations):
+        for _ in range(_FINISH_ITERATIONS):
             before = self.poses.copy()
             try:
                 self._solver.iterate(1)
@@ -486,7 +495,7 @@ class Estimator(Generic[L]):
             values = optimize(self._whole(values, loops, plain)[0], values, BATCH_ITERATIONS)
         graph, labels = self._whole(values, loops, steps=steps)
         slots = solver.update(graph, values, [])
-        solver.iterate(self._config.loop_iterations)
+        solver.iterate(LOOP_ITERATIONS)
         self._adopt(solver.estimate(), np.arange(self._count), {})
         self.loops = loops
         self._begin_anew(solver, labels, slots)

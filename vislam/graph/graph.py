@@ -19,6 +19,7 @@ from vislam.factors.keys import B, L, V, X, bias_of
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.factors.noise_models import checked_covariance
 from vislam.factors.preintegration import Preintegrator
+from vislam.factors.priors import ACCEL_BIAS_SIGMA_MAX, GYRO_BIAS_SIGMA_MAX
 from vislam.graph.measurements import (
     RATIO_MAX,
     Between,
@@ -169,7 +170,7 @@ class Graph:
         measured.integrated(bias_of(np.zeros(3), np.zeros(3)))  # holes are found now
         self._take(measured)
         if not self._inertial & {i, j}:
-            self._waiting.append(ImuStart(i, _CONFIG.gyro_bias_sigma_max, _CONFIG.accel_bias_sigma_max))
+            self._waiting.append(ImuStart(i, GYRO_BIAS_SIGMA_MAX, ACCEL_BIAS_SIGMA_MAX))
         self._inertial |= {i, j}
 
     def view(self, pose: int, landmark: int, pixel_px: ArrayLike, sigma_px: float = 1.0, camera: int = 0) -> None:

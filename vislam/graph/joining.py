@@ -21,7 +21,14 @@ from vislam.core.messages import Array, Submaps
 from vislam.factors.journal import KeyframeRecord, checked_pose
 from vislam.factors.keys import nearest_rigid
 from vislam.factors.loop import LoopModel
+from vislam.factors.motion import SUBMAP_SIGMA_DEG
 
+_CONSISTENCY_MAX_SIGMA_M = 0.5  # odometry looser than this between two loops proves nothing
+_SUBMAP_TILT_SIGMA_DEG = 5.0  # roll and pitch, where gravity is known on both sides
+# new frames whose loops must agree through odometry to join two submaps: one image can deceive
+JOIN_FRAMES = 2
+_JOIN_WAITING = 20  # newest loops between submaps that are compared for that; bounds the work
+_JOIN_MAX_CONTRADICTING = 0.25  # of the loops between two submaps; more, and they wait for further ones
 _MIN_RAY_ANGLE_RAD = np.deg2rad(5.0)  # between two directions that are to fix a place
 
 RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed at j
@@ -41,7 +48,6 @@ class Waiting:
 
     def __init__(self, config: GraphConfig) -> None:
         """Start empty."""
-        self._config = config
         self._limit = chi_square_limit(config.loop_gate_probability, 6)
         self._edges: list[LoopModel] = []
 
@@ -53,7 +59,7 @@ class Waiting:
     def add(self, edge: LoopModel) -> LoopModel | None:
         """Take a loop; return the oldest when it has to leave for this one."""
         self._edges.append(edge)
-        return self._edges.pop(0) if len(self._edges) > self._config.join_waiting else None
+        return self._edges.pop(0) if len(self._edges) > _JOIN_WAITING else None
 
     def take_joined(self, submaps: Submaps) -> list[LoopModel]:
         """Remove and return the loops whose two ends are joined by now."""
@@ -69,7 +75,7 @@ class Waiting:
         pairs = [(submaps.group(e.record.from_id), submaps.group(e.record.to_id)) for e in self._edges]
         for pair in sorted({(min(p), max(p)) for p in pairs}):
             edges = [e for e, p in zip(self._edges, pairs, strict=True) if (min(p), max(p)) == pair]
-            if len({e.record.to_id for e in edges}) < self._config.join_frames:
+            if len({e.record.to_id for e in edges}) < JOIN_FRAMES:
                 continue
             found = self._place(edges, _Ends(poses, submaps, pair[1]), known)
             if found is not None:
@@ -90,14 +96,14 @@ class Waiting:
                 best = T, agreeing
         if not metric:
             best = self._place_by_directions(edges, ends)
-        if best is None or len({e.record.to_id for e in best[1]}) < self._config.join_frames:
+        if best is None or len({e.record.to_id for e in best[1]}) < JOIN_FRAMES:
             return None
         contradicting = len(edges) - len(best[1])
-        return best if contradicting <= self._config.join_max_contradicting * len(edges) else None
+        return best if contradicting <= _JOIN_MAX_CONTRADICTING * len(edges) else None
 
     def _agree(self, one: LoopModel, other: LoopModel, T: Array, ends: _Ends, known: RelativeCovariance) -> bool:
         """Return whether a loop fits where another one, which asks for the motion `T`, says that it should."""
-        config, a, b = self._config, one.record, other.record
+        a, b = one.record, other.record
         T_from, T_to = ends.of(other, T)
         if self._are_far(other, T_from, T_to):
             return False
@@ -110,7 +116,7 @@ class Waiting:
         if b.from_id != a.from_id:
             back = se3_adjoint(invert(T_to) @ T_one_from)
             uncertainty += back @ known(b.from_id, a.from_id) @ back.T
-        if np.trace(uncertainty[3:, 3:]) > 3.0 * config.consistency_max_sigma_m**2:
+        if np.trace(uncertainty[3:, 3:]) > 3.0 * _CONSISTENCY_MAX_SIGMA_M**2:
             return False  # odometry so loose proves nothing
         return other.chi2(T_from, T_to, uncertainty) < self._limit
 
@@ -119,7 +125,7 @@ class Waiting:
         if not edge.record.has_scale:
             return False
         missed_m = edge.residual(T_from, T_to)[0][3:]
-        most_m2 = 3.0 * self._config.consistency_max_sigma_m**2 + np.trace(edge.covariance[3:, 3:])
+        most_m2 = 3.0 * _CONSISTENCY_MAX_SIGMA_M**2 + np.trace(edge.covariance[3:, 3:])
         return bool(missed_m @ missed_m > self._limit * most_m2)
 
     def _place_by_directions(self, edges: list[LoopModel], ends: _Ends) -> tuple[Array, list[LoopModel]] | None:
@@ -206,9 +212,9 @@ def weak_link(
     T = np.eye(4)
     if T_odom_before is not None and T_odom_body is not None:
         T = checked_pose(invert(T_odom_before) @ T_odom_body, f"keyframe {record.id}: its motion in odom")
-    variances = np.full(3, np.deg2rad(config.submap_sigma_deg) ** 2)
+    variances = np.full(3, np.deg2rad(SUBMAP_SIGMA_DEG) ** 2)
     if has_gravity:
-        variances[:2] = np.deg2rad(config.submap_tilt_sigma_deg) ** 2
+        variances[:2] = np.deg2rad(_SUBMAP_TILT_SIGMA_DEG) ** 2
     R = (T_map_before @ T)[:3, :3]
     covariance = np.eye(6) * config.submap_sigma_m**2
     covariance[:3, :3] = R.T @ np.diag(variances) @ R

@@ -28,13 +28,15 @@ from vislam.factors.loop import LoopModel
 from vislam.factors.sensed import Covariance, Readings
 from vislam.graph.belief import LoopSet
 from vislam.graph.estimator import Estimator
-from vislam.graph.joining import Placement, Waiting, relinked, weak_link
+from vislam.graph.joining import JOIN_FRAMES, Placement, Waiting, relinked, weak_link
 from vislam.graph.restore import restored_journal, sort_loops
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.graph.travel import Travel
 from vislam.imu import ImuNoise
 from vislam.sensors import Suite
 
+_MOVED_M = 0.001  # poses that moved less are not published again
+_MOVED_DEG = 0.05
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new submap: no loop may be tested against it
 _NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
@@ -312,7 +314,7 @@ class PoseGraph:
             for model in found.agreeing:
                 self._loops.offer(model)
             kept = [m for m in found.agreeing if m.record.id in self._estimator.loops]
-            if len({m.record.to_id for m in kept}) < self._config.join_frames:
+            if len({m.record.to_id for m in kept}) < JOIN_FRAMES:
                 for model in kept:
                     self._loops.report(model, LoopDecision.REJECTED, "its witnesses against one another do not hold")
                 notes.append(self._estimator.drop(kept))
@@ -367,8 +369,8 @@ class PoseGraph:
         fresh, old = poses[ids], known[ids]
         shift = np.linalg.norm(fresh[:, :3, 3] - old[:, :3, 3], axis=1)
         chord = np.linalg.norm(fresh[:, :3, :3] - old[:, :3, :3], axis=(1, 2))  # 2 sqrt(2) sin(angle / 2)
-        limit = 2.0 * np.sqrt(2.0) * np.sin(0.5 * np.deg2rad(self._config.moved_deg))
-        moved = ids[(shift > self._config.moved_m) | (chord > limit) | everything]
+        limit = 2.0 * np.sqrt(2.0) * np.sin(0.5 * np.deg2rad(_MOVED_DEG))
+        moved = ids[(shift > _MOVED_M) | (chord > limit) | everything]
         known[moved] = poses[moved]
         self._published = known
         self._revision += 1

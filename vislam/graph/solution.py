@@ -13,8 +13,16 @@ from vislam.core.errors import DataError
 from vislam.core.memory import EdgeReport
 from vislam.core.messages import Array, LoopDecision
 from vislam.factors.keys import X
-from vislam.factors.loop import LoopModel, relative_covariance
-from vislam.factors.solvers import FAILURES, BatchSolver, Factorization, IncrementalSolver, Solver, optimize
+from vislam.factors.loop import LOOP_MIN_WEIGHT, LoopModel, relative_covariance
+from vislam.factors.solvers import (
+    FAILURES,
+    LOOP_ITERATIONS,
+    BatchSolver,
+    Factorization,
+    IncrementalSolver,
+    Solver,
+    optimize,
+)
 from vislam.graph.measurements import ImuBetween, Measurement
 from vislam.graph.settling import BATCH_ITERATIONS, short
 
@@ -92,7 +100,7 @@ class Solution:
         known = {n: self._known(loop) for n, loop in self._outside.items()}
         sure = {n: np.inf if P is None else float(np.linalg.slogdet(P)[1]) for n, P in known.items()}
         notes = [self._let_in(self._outside[n]) for n in sorted(sure, key=lambda n: (sure[n], n))]
-        torn = [m for m in self._loops.values() if m.weight(*self._ends(m)) < self._config.loop_min_weight]
+        torn = [m for m in self._loops.values() if m.weight(*self._ends(m)) < LOOP_MIN_WEIGHT]
         for loop in torn:
             self._report(loop, LoopDecision.REJECTED, "contradicted by the rest of the graph")
             del self._loops[loop.id]
@@ -116,7 +124,7 @@ class Solution:
         assert self._solver is not None
         try:
             plain = self._solver.update(_graph([loop.factor(robust=False)]), gtsam.Values(), [])
-            self._solver.iterate(self._config.loop_iterations)
+            self._solver.iterate(LOOP_ITERATIONS)
             slots = self._solver.update(_graph([loop.factor(robust=True)]), gtsam.Values(), plain)
             self._solver.iterate(1)
             self.values = self._solver.estimate()
@@ -131,7 +139,7 @@ class Solution:
         assert self._solver is not None
         try:
             self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots)
-            self._solver.iterate(self._config.loop_iterations)
+            self._solver.iterate(LOOP_ITERATIONS)
             self.values = self._solver.estimate()
         except FAILURES as error:
             return self._restart(self._measurements, self.values, True, f"gtsam failed ({short(error)}); ")
@@ -162,7 +170,7 @@ class Solution:
     def _adopt(self, solver: Solver, values: gtsam.Values) -> None:
         graph, labels = self._whole(values)
         slots = solver.update(graph, values, [])
-        solver.iterate(self._config.loop_iterations)
+        solver.iterate(LOOP_ITERATIONS)
         self.values, self._solver = solver.estimate(), solver
         self._slots = {n: slot for n, slot in zip(labels, slots, strict=True) if n is not None}
 

@@ -13,6 +13,9 @@ from vislam.core.geometry import so3_exp
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 
+_LEVEL_CUTOFF_HZ = 5.0  # low-pass on the force that levels, so that vibration does not close the gate
+_MAG_GAIN = 0.05  # 1/s, of the yaw by the magnetometer
+_TILT_SIGMA_DEG = 1.0  # that is published; twice the error on synthetic carts, whose springs are ideal
 _NO_FIELD = np.full(3, np.nan)
 
 
@@ -25,12 +28,12 @@ class Complementary:
         self._state = (R, np.array(bias, dtype=np.float64), gravity_m_s2 * R[2].copy())
         self._parameters = np.array(
             [
-                config.proportional_gain, config.integral_gain, gravity_m_s2, config.gate_m_s2, config.level_cutoff_hz,
-                config.mag_gain, config.mag_gate,
+                config.proportional_gain, config.integral_gain, gravity_m_s2, config.gate_m_s2, _LEVEL_CUTOFF_HZ,
+                _MAG_GAIN, config.mag_gate,
             ]
         )  # fmt: skip
         self._field_world: Array | None = None
-        self.tilt_sigma_rad = float(np.deg2rad(config.tilt_sigma_deg))
+        self.tilt_sigma_rad = float(np.deg2rad(_TILT_SIGMA_DEG))
 
     @property
     def R_world_body(self) -> Array:

@@ -11,6 +11,15 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.imu.low_pass import low_pass
 
+_MAG_TAU_S = 9.0  # of the heading
+_MAG_FIELD_TAU_S = 0.05  # low-pass on the field's norm and dip
+_MAG_REFERENCE_TAU_S = 20.0  # over which norm and dip of the reference follow
+_MAG_UNDISTURBED_S = 0.5  # the field is trusted after being like the reference for so long
+_MAG_NEW_S = 20.0  # another field becomes the reference after so long of turning in it
+_MAG_NEW_RATE_DEG_S = 20.0  # at least as fast as this: what the body carries along would show
+_MAG_REJECT_S = 60.0  # after so long, a disturbed field is better than a gyro alone
+_MAG_REJECT_FACTOR = 2.0  # at a gain so many times lower
+
 
 class Heading(NamedTuple):
     """What is remembered of the field; norm in uT, dip (below the horizon) in rad."""
@@ -42,9 +51,9 @@ class Magnetic(NamedTuple):
 def magnetic(config: AttitudeConfig) -> Magnetic:
     """Return what the kernel goes by."""
     return Magnetic(
-        config.mag_tau_s, config.mag_field_tau_s, config.mag_reference_tau_s, config.mag_gate,
-        np.deg2rad(config.mag_dip_gate_deg), config.mag_undisturbed_s, config.mag_new_s,
-        np.deg2rad(config.mag_new_rate_deg_s), config.mag_reject_s, config.mag_reject_factor,
+        _MAG_TAU_S, _MAG_FIELD_TAU_S, _MAG_REFERENCE_TAU_S, config.mag_gate,
+        np.deg2rad(config.mag_dip_gate_deg), _MAG_UNDISTURBED_S, _MAG_NEW_S,
+        np.deg2rad(_MAG_NEW_RATE_DEG_S), _MAG_REJECT_S, _MAG_REJECT_FACTOR,
     )  # fmt: skip
 
 

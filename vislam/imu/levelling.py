@@ -12,12 +12,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vislam.config import AttitudeConfig
 from vislam.core.geometry import so3_exp
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.imu.low_pass import low_pass
 
+_TAU_S = 3.0  # vqf: the force is averaged over it, at least
+_TAU_MAX_S = 10.0  # at most, while the body keeps its tilt
+_SPEED_CHANGE_M_S = 1.0  # a walk or a cart that starts; with the next it says what lies between the two
+_GYRO_ERROR = 0.05  # share of the rate: scale is +-6 % and cross-axis 2 % of an ITG3205 as it comes
+# a body that tilted is remembered for so long: each change of tau lets some motion through
+_SWAY_S = 60.0
+_BIAS_SIGMA_DEG_S = 0.5  # of the gyro's bias, when nothing is known
+_BIAS_MOTION_SIGMA_DEG_S = 0.1  # what motion and gravity show of it in the long run
+_BIAS_REST_SIGMA_DEG_S = 0.03  # and rest
+_BIAS_VERTICAL_VARIANCE = 1e4  # times, about the vertical, where gravity shows nothing
+_BIAS_FORGETTING_S = 100.0  # in which it may wander by 0.1 deg/s
+_BIAS_INNOVATION_DEG_S = 2.0  # no bias changes by more at once
+_REST_S = 1.5  # so long nothing may move
+_REST_TAU_S = 0.5  # low-pass from which rate and force do not differ at rest
+_REST_RATE_DEG_S = 2.0  # by more than this
+_REST_FORCE_M_S2 = 0.5  # and this
+# nor the low-passed force from the begin of rest: a cart that rolls tilts, 0.3 deg
+_REST_TILT_M_S2 = 0.05
 _FORGOTTEN_RAD_S = np.deg2rad(0.1)  # the bias wanders by so much in `bias_forgetting_s`
 _UNSEEN = 2.5  # variance of white acceleration behind the filter, over tau^2 times that of its low-passed slope
 
@@ -60,14 +77,14 @@ class Levelling(NamedTuple):
     rest_tilt_m_s2: float
 
 
-def levelling(config: AttitudeConfig, gravity_m_s2: float) -> Levelling:
-    """Return what the kernel goes by."""
+def levelling(gravity_m_s2: float) -> Levelling:
+    """Return the parameters of the kernel."""
     return Levelling(
-        gravity_m_s2, config.tau_s, config.tau_max_s, config.speed_change_m_s, config.gyro_error, config.sway_s,
-        np.deg2rad(config.bias_innovation_deg_s), config.bias_forgetting_s, np.deg2rad(config.bias_motion_sigma_deg_s),
-        np.deg2rad(config.bias_sigma_deg_s), config.bias_vertical_variance, np.deg2rad(config.bias_rest_sigma_deg_s),
-        config.rest_s, config.rest_tau_s, np.deg2rad(config.rest_rate_deg_s), config.rest_force_m_s2,
-        config.rest_tilt_m_s2,
+        gravity_m_s2, _TAU_S, _TAU_MAX_S, _SPEED_CHANGE_M_S, _GYRO_ERROR, _SWAY_S,
+        np.deg2rad(_BIAS_INNOVATION_DEG_S), _BIAS_FORGETTING_S, np.deg2rad(_BIAS_MOTION_SIGMA_DEG_S),
+        np.deg2rad(_BIAS_SIGMA_DEG_S), _BIAS_VERTICAL_VARIANCE, np.deg2rad(_BIAS_REST_SIGMA_DEG_S),
+        _REST_S, _REST_TAU_S, np.deg2rad(_REST_RATE_DEG_S), _REST_FORCE_M_S2,
+        _REST_TILT_M_S2,
     )  # fmt: skip
 
 

@@ -14,6 +14,11 @@ from vislam.core.geometry import level_rotation
 from vislam.core.messages import Array, ImuSpan
 from vislam.imu.bias_memory import BiasMemory
 
+# between the means of the window's halves: a bias stays, white noise leaves 0.0003
+_MAX_TURN_RAD_S = 0.005
+# from what was remembered for this temperature: an even turn looks like a bias
+_MAX_BIAS_CHANGE_RAD_S = 0.05
+_GRAVITY_TOLERANCE_M_S2 = 0.5  # of the measured norm: an accelerometer after calibration
 _NS = 1e-9
 _MAX_STEP_S = 0.1  # a hole in which the cart may have moved
 
@@ -71,14 +76,14 @@ def power_up(
         (
             "the mean rate changed within the window by",
             abs(gyro[:half].mean(axis=0) - gyro[half:].mean(axis=0)).max(),
-            config.max_turn_rad_s,
+            _MAX_TURN_RAD_S,
             "rad/s",
             "stand still",
         ),
         (
             "the measured force is off gravity by",
             abs(norm - gravity_m_s2),
-            config.gravity_tolerance_m_s2,
+            _GRAVITY_TOLERANCE_M_S2,
             "m/s^2",
             "calibrate the accelerometer (vislam calibrate imu)",
         ),
@@ -88,7 +93,7 @@ def power_up(
     if expected is not None:
         changed = float(np.linalg.norm(rate - expected))
         what = f"at {temperature_c:.0f} deg C the bias differs from the remembered one by"
-        checks.append((what, changed, config.max_bias_change_rad_s, "rad/s", "stand still, or forget what is kept"))
+        checks.append((what, changed, _MAX_BIAS_CHANGE_RAD_S, "rad/s", "stand still, or forget what is kept"))
     for what, got, allowed, unit, next_step in checks:
         if not got <= allowed:  # NaN is no rest either
             return Refusal(f"{what} {got:.3g} {unit}, {allowed:g} allowed; {next_step}")

@@ -10,16 +10,18 @@ from vislam.core.messages import Array
 from vislam.imu.heading import Heading, begin_heading, hold_heading, magnetic
 from vislam.imu.levelling import Level, Levelling, begin_level, level, levelling
 
+_TILT_FLOOR_DEG = 0.4  # vqf publishes it, and what motion does on top: 0.05 m/s^2 of bias is 0.3 deg
+
 
 class Vqf:
     """Owns tilt, bias and heading, each with what it remembers."""
 
     def __init__(self, config: AttitudeConfig, gravity_m_s2: float, R_world_body: Array, bias: Array) -> None:
-        """Begin with an attitude [3, 3] and a bias [3], known to `bias_sigma_deg_s` only."""
-        self._levelling, self._magnetic = levelling(config, gravity_m_s2), magnetic(config)
+        """Begin with an attitude [3, 3] and a bias [3], known to `_BIAS_SIGMA_DEG_S` of the levelling only."""
+        self._levelling, self._magnetic = levelling(gravity_m_s2), magnetic(config)
         self._level: Level = begin_level(R_world_body, bias, self._levelling)
         self._heading: Heading = begin_heading()
-        self._floor_rad = float(np.deg2rad(config.tilt_floor_deg))
+        self._floor_rad = float(np.deg2rad(_TILT_FLOOR_DEG))
 
     @property
     def R_world_body(self) -> Array:

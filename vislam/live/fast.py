@@ -26,6 +26,9 @@ from vislam.live.wire.published_pose import PublishedPose, of_base
 from vislam.sensors import Suite
 from vislam.trajectory.continuity import Continuity, in_odom
 
+_IMU_TIMEOUT_S = 0.1  # without a sample for so long the pose is old: invalid
+# without vision, still inertial data mean rest only below this speed and its sigma
+_REST_SPEED_M_S = 0.1
 _NS = 1_000_000_000
 _REST_STEP_NS = 100_000_000  # rest is asked for so often
 _LOOK_NS = 50_000_000  # and the sensors for their health
@@ -226,7 +229,7 @@ class FastPath:
         health = self._camera | self._doubt
         for _, event in self._events:
             health |= event
-        if age_ns > config.imu_timeout_s * _NS:
+        if age_ns > _IMU_TIMEOUT_S * _NS:
             health |= Health.IMU_MISSING | Health.INVALID
         if self._alone.is_field_good(now_ns):
             health |= Health.MAG_OK
@@ -275,7 +278,7 @@ class FastPath:
         if not self._started or self._ekf.dead_reckoning_s <= self._config.live.vision_timeout_s:
             return None
         state = self._ekf.state()
-        limit = self._config.live.rest_speed_m_s
+        limit = _REST_SPEED_M_S
         is_slow = float(np.linalg.norm(state.velocity_world_m_s)) < limit and self._velocity_sigma(state) < limit
         hint = Hint(t_ns, at_rest=rests and is_slow)
         self._at_rest = hint.at_rest

@@ -28,6 +28,10 @@ from vislam.loop.verification import Likeness, Verification, Verifier, judge, ti
 from vislam.loop.view import View, make_view, make_views
 from vislam.loop.words import PlaceDatabase, Vocabulary, side_by_side
 
+_MIN_OVERLAP = 0.35  # share of what is seen that a candidate should see too, by the map
+_MIN_APART_KEYFRAMES = 3  # between odometry candidates, so that they constrain different places
+_NOMINAL_DEPTH_M = 3.0  # of features without depth, to guess what two keyframes share
+_MAX_TAGS = 2  # candidates per keyframe that saw the same tag
 _PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
 _SHOWN_MATCHES = 40  # per candidate, for the picture that explains it
 
@@ -153,7 +157,7 @@ class LoopCloser:
         """
         config = self._config
         old = self._poses.ids[self._old(view)]
-        order = self._tags.candidates(view.id, int(old[-1]), config.max_tags) if len(old) else []
+        order = self._tags.candidates(view.id, int(old[-1]), _MAX_TAGS) if len(old) else []
         near = _apart(self._near(view), order, 0)
         wanted = max(config.max_appearance, config.max_verifications - len(order) - len(near))
         alike = _apart(self._alike(view), order, config.island_gap)[: wanted if config.max_appearance else 0]
@@ -208,8 +212,8 @@ class LoopCloser:
         T_map_cam = self._poses[view.id] @ T_body_cam
         return odometry_candidates(
             transform_points(T_map_cam, self._probes(view)), T_map_cam[:3, 3], self._poses.ids[old],
-            invert_many(self._poses.poses[old] @ T_body_cam), self._bounds, config.max_odometry, config.min_overlap,
-            config.min_apart_keyframes,
+            invert_many(self._poses.poses[old] @ T_body_cam), self._bounds, config.max_odometry, _MIN_OVERLAP,
+            _MIN_APART_KEYFRAMES,
         )  # fmt: skip
 
     def _probes(self, view: View) -> Array:
@@ -218,7 +222,7 @@ class LoopCloser:
             points = view.points_or_nan()[view.known]
         else:
             rays = np.column_stack([view.xy, np.ones(len(view.xy))]).astype(np.float64)
-            points = rays * self._config.nominal_depth_m
+            points = rays * _NOMINAL_DEPTH_M
         return np.asarray(points[:: max(1, len(points) // _PROBES)], dtype=np.float64)
 
     def _verify(self, view: View) -> list[tuple[Candidate, Verification]]:
@@ -242,7 +246,7 @@ class LoopCloser:
         tilt_rad = None
         if found.T_a_b is not None and self._gravity_aligned:
             tilt_rad = tilt_error_rad(found.T_a_b, self._poses[candidate.id], self._poses[view.id])
-        decision, reason = judge(found, tilt_rad, self._config)
+        decision, reason = judge(found, tilt_rad)
         self.counters[decision.value] += 1
         if decision is LoopDecision.ACCEPTED and found.T_a_b is not None and found.covariance is not None:
             edges.append(

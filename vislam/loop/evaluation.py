@@ -19,6 +19,10 @@ from vislam.core.geometry import invert, invert_many, so3_log, transform_points
 from vislam.core.messages import Array
 from vislam.loop.candidates import overlaps, view_bounds
 
+_DOUBTFUL_OVERLAP = 0.05  # between this and min_overlap a retrieved image is neither right nor wrong
+_RESAMPLES = 1000  # of the bootstrap
+_BLOCK_KEYFRAMES = 10  # drawn together, because what follows each other errs alike
+_CONFIDENCE = 0.95
 _PROBES = 64  # points per keyframe that are looked for in the other views
 RIGHT, DOUBTFUL, WRONG = 1, 0, -1  # verdicts
 
@@ -60,7 +64,7 @@ class TruePlaces:
         """Say whether two rows show the same place, by how much their views overlap."""
         if self.overlap[a, b] > self.rule.min_overlap:
             return RIGHT
-        return DOUBTFUL if self.overlap[a, b] > self.rule.doubtful_overlap else WRONG
+        return DOUBTFUL if self.overlap[a, b] > _DOUBTFUL_OVERLAP else WRONG
 
     def pose_error(self, a: int, b: int, T_a_b: Array) -> tuple[float, float]:
         """Return the error of a measured relative pose in m and degrees; a unit direction is given the true length."""
@@ -149,17 +153,17 @@ def bootstrap_interval(found: Detections, revisits: NDArray[np.bool_], rule: Loo
     Blocks, because neighbours err alike (Künsch 1989). A single wrong answer with a high score decides this figure,
     so intervals are wide, and rightly so. NaN without revisits.
     """
-    count, size = len(revisits), max(1, rule.block_keyframes)
+    count, size = len(revisits), max(1, _BLOCK_KEYFRAMES)
     if not revisits.any():
         return float("nan"), float("nan")
     rng = np.random.default_rng(rule.seed)
     blocks = -(-count // size)
     values = []
-    for starts in rng.integers(0, count, (rule.resamples, blocks)):
+    for starts in rng.integers(0, count, (_RESAMPLES, blocks)):
         drawn = ((starts[:, None] + np.arange(size)) % count).ravel()[:count]
         if revisits[drawn].any():
             again = Detections(found.score[drawn], found.verdict[drawn])
             values.append(precision_recall(again, revisits[drawn]).recall_at_full_precision)
-    tail = 50.0 * (1.0 - rule.confidence)
+    tail = 50.0 * (1.0 - _CONFIDENCE)
     low, high = np.percentile(values, [tail, 100.0 - tail])
     return float(low), float(high)

@@ -19,6 +19,13 @@ from vislam.config import Config, PublishConfig
 from vislam.core.geometry import so3_exp, so3_log, transform
 from vislam.core.messages import Array
 
+_WAY_M = 1.0  # the way over which a correction fades by e, where that is faster
+_REACH_M = 0.3  # how far a turn counts as way: the length of an arm, or of a cart
+_FADE_S = 0.1  # a correction fades no faster: news of single frames contradict each other
+_CREEP_S = 10.0  # and at rest a correction fades in so long
+_GYRO_SHARE = 0.5  # ... or by so much of what the gyroscope itself may err, where that is faster
+_AT_ONCE_M = 1.0  # a larger correction is another belief about the place: it comes at once
+_AT_ONCE_DEG = 5.0
 _NS = 1_000_000_000
 
 
@@ -61,17 +68,17 @@ class Continuity:
         """Pay back for the time and the motion since the last call, which brought the body to T [4, 4]."""
         config = self._config
         turn_rad = float(np.linalg.norm(so3_log(np.ascontiguousarray(self._T[:3, :3].T @ T[:3, :3]))))
-        way_m = float(np.linalg.norm(T[:3, 3] - self._T[:3, 3])) + config.reach_m * turn_rad
+        way_m = float(np.linalg.norm(T[:3, 3] - self._T[:3, 3])) + _REACH_M * turn_rad
         owed_m = float(np.linalg.norm(self.owed_m))
-        moving_m = min(max(config.way_share, owed_m / config.way_m) * way_m, owed_m * dt_s / config.fade_s)
-        resting_m = min(config.creep_m_s, owed_m / config.creep_s) * dt_s
+        moving_m = min(max(config.way_share, owed_m / _WAY_M) * way_m, owed_m * dt_s / _FADE_S)
+        resting_m = min(config.creep_m_s, owed_m / _CREEP_S) * dt_s
         self.owed_m = self.owed_m * _left(owed_m, moving_m + resting_m)
         owed_rad = float(np.linalg.norm(self.owed_rad))
         if np.isfinite(rate_sigma_rad_s):
-            turning_rad = config.gyro_share * rate_sigma_rad_s * dt_s
+            turning_rad = _GYRO_SHARE * rate_sigma_rad_s * dt_s
         else:
             turning_rad = config.turn_share * turn_rad
-        paid_rad = min(max(owed_rad * dt_s / config.turn_s, turning_rad), owed_rad * dt_s / config.fade_s)
+        paid_rad = min(max(owed_rad * dt_s / config.turn_s, turning_rad), owed_rad * dt_s / _FADE_S)
         self.owed_rad = self.owed_rad * _left(owed_rad, paid_rad)
 
     def _owe(self, T_before: Array, T_after: Array) -> None:
@@ -80,7 +87,7 @@ class Continuity:
         owed_m = self.owed_m + T_before[:3, 3] - T_after[:3, 3]
         shown = so3_exp(self.owed_rad) @ T_before[:3, :3]
         owed_rad = so3_log(np.ascontiguousarray(shown @ T_after[:3, :3].T))
-        far = np.linalg.norm(owed_m) > config.at_once_m or np.linalg.norm(owed_rad) > np.deg2rad(config.at_once_deg)
+        far = np.linalg.norm(owed_m) > _AT_ONCE_M or np.linalg.norm(owed_rad) > np.deg2rad(_AT_ONCE_DEG)
         if far or not config.enabled:
             owed_m, owed_rad = np.zeros(3), np.zeros(3)
         self.owed_m, self.owed_rad = owed_m, owed_rad

@@ -33,7 +33,7 @@ from vislam.window.equations import (
     optimise,
     visual,
 )
-from vislam.window.posterior import pose, scale_sigma
+from vislam.window.posterior import GAUGE_SIGMA_M, GAUGE_SIGMA_RAD, pose, scale_sigma
 from vislam.window.spans import information, jacobian_by_bias
 from vislam.window.tracks import RHO_START, TrackTable
 
@@ -116,7 +116,7 @@ def solve(
     camera = _camera(problem, config, rig)
     X, calibration = _states(problem), np.zeros(CALIBRATION)
     held = np.zeros(count, dtype=np.bool_)
-    links, gauge, room = _links(problem, noise), _gauge(problem, config), Room()
+    links, gauge, room = _links(problem, noise), _gauge(problem), Room()
     sigma, whitening, iterations = 1.0, 1.0, 0
     for tolerance in (_ROUGH, _ROUGH, _TOLERANCE):
         views = _whitened_by(selection.views, whitening)
@@ -284,15 +284,15 @@ def _links(problem: BundleProblem, noise: ImuNoise) -> Links:
     )
 
 
-def _gauge(problem: BundleProblem, config: WindowConfig) -> Prior:
+def _gauge(problem: BundleProblem) -> Prior:
     """Return the prior on frame 0: position and yaw fixed, biases loosely, tilt and velocity free."""
     up = problem.T_world_body[0, 2, :3]
     H = np.zeros((CALIBRATION + 15, CALIBRATION + 15))
     if problem.time_offset_sigma_s > 0.0:
         H[0, 0] = problem.time_offset_sigma_s**-2
     state = H[CALIBRATION:, CALIBRATION:]
-    state[:3, :3] = np.outer(up, up) / config.gauge_sigma_rad**2 + 1e-2 * np.eye(3)  # 10 rad: only keeps it solvable
-    state[3:6, 3:6] = np.eye(3) / config.gauge_sigma_m**2
+    state[:3, :3] = np.outer(up, up) / GAUGE_SIGMA_RAD**2 + 1e-2 * np.eye(3)  # 10 rad: only keeps it solvable
+    state[3:6, 3:6] = np.eye(3) / GAUGE_SIGMA_M**2
     state[6:9, 6:9] = 1e-4 * np.eye(3)  # 100 m/s
     state[9:12, 9:12] = np.eye(3) / problem.gyro_bias_sigma_rad_s**2
     state[12:, 12:] = np.eye(3) / problem.accel_bias_sigma_m_s2**2

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import WindowConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
 from vislam.window import gate
@@ -16,6 +15,8 @@ from vislam.window.equations import Camera, Solution, visual
 from vislam.window.keyframes import Keyframes
 from vislam.window.tracks import RHO_START, Selection, TrackTable
 
+_GATE_TRACK_FRACTION = 0.34  # of a track's observations beyond the gate: the whole track goes
+_GATE_PROBABILITY = 0.999  # chi-square of an observation; above it after optimisation, it is taken out
 _CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of wrong tracks, ...
 _STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expectation
 
@@ -23,10 +24,9 @@ _STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expe
 class Doubt:
     """Owns how often in a row hardly anything was as expected."""
 
-    def __init__(self, config: WindowConfig) -> None:
+    def __init__(self) -> None:
         """Start without any."""
-        self._gate = chi_square_limit(config.gate_probability, 2)
-        self._track_fraction = config.gate_track_fraction
+        self._gate = chi_square_limit(_GATE_PROBABILITY, 2)
         self._contradictions = 0  # keyframes in a row
 
     def newest(
@@ -63,7 +63,7 @@ class Doubt:
             return 0
         first = selection.views.first
         counts = np.add.reduceat(bad.astype(np.int64), first[:-1])
-        hopeless = counts > self._track_fraction * np.diff(first)
+        hopeless = counts > _GATE_TRACK_FRACTION * np.diff(first)
         hopeless |= bad[first[:-1]]  # the host's own view: without it the landmark has no bearing
         tracks.remove_rows(selection.rows[bad | np.repeat(hopeless, np.diff(first))])
         return int(hopeless.sum())

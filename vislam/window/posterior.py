@@ -11,6 +11,8 @@ from vislam.core.messages import Array, NavState
 from vislam.window.equations import trailing_covariance
 from vislam.window.messages import WindowGravity
 
+GAUGE_SIGMA_M = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
+GAUGE_SIGMA_RAD = 1e-3
 _NO_MOTION_M = 1e-3
 
 

@@ -14,6 +14,8 @@ from vislam.core.readings import Motion
 from vislam.imu import ImuNoise, Preintegrated, preintegrate
 from vislam.window.equations import STATE, Links
 
+_REINTEGRATE_GYRO_RAD_S = 0.005  # bias change after which first-order correction is not enough
+_REINTEGRATE_ACCEL_M_S2 = 0.05
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSES = 12  # errors of two poses
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
@@ -24,7 +26,6 @@ class LinkStore:
 
     def __init__(self, config: WindowConfig, noise: ImuNoise | None, machine: MachineConfig) -> None:
         """Start empty; without `noise` there is no IMU."""
-        self._config = config
         self._machine = machine
         self._noise = noise
         self._max_gap_s = machine.max_gap_s if noise is None else noise.gap_s(machine.max_gap_s)
@@ -112,8 +113,8 @@ class LinkStore:
         """Integrate again where the biases [n + 1, 6] of the keyframes moved too far for first-order correction."""
         n = len(self._spans)
         moved = np.abs(biases[:n] - self._links.bias[:n])
-        far = (moved[:, :3].max(axis=1, initial=0.0) > self._config.reintegrate_gyro_rad_s) | (
-            moved[:, 3:].max(axis=1, initial=0.0) > self._config.reintegrate_accel_m_s2
+        far = (moved[:, :3].max(axis=1, initial=0.0) > _REINTEGRATE_GYRO_RAD_S) | (
+            moved[:, 3:].max(axis=1, initial=0.0) > _REINTEGRATE_ACCEL_M_S2
         )
         for k in np.flatnonzero(far & self._links.inertial[:n]).tolist():
             self.integrate(k, biases[k])

@@ -41,10 +41,19 @@ from vislam.window.incoming import check_packet, check_state
 from vislam.window.keyframes import Keyframes
 from vislam.window.leaving import split
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
-from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma, tilt
+from vislam.window.posterior import GAUGE_SIGMA_M, GAUGE_SIGMA_RAD, Posterior, edges, nav_state, pose, scale_sigma, tilt
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import RHO_START, Selection, TrackTable
 
+_SPLIT_MIN = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
+_RESTART_SIGMA_M = 0.1  # of the state a window restarts from after a failed solution
+_RESTART_SIGMA_RAD = 0.03
+_RESTART_SPEED_SIGMA_M_S = 0.3
+_RESTART_GYRO_BIAS_SIGMA_RAD_S = 0.01
+_RESTART_ACCEL_BIAS_SIGMA_M_S2 = 0.1
+_TOLERANCE = (
+    5e-3  # relative decrease of the cost that ends Gauss-Newton steps; 1e-3 costs a step more and gains nothing
+)
 _UNKNOWN_SPEED_M_S = 0.5  # a velocity less certain than this predicts worse than odometry does
 _SURE_SPEED_M_S = 0.3  # until velocity is known so well, the window is still finding its feet:
 _SURE_KEYFRAMES = 6  # nothing is rejected, calibration waits, and landmarks start afresh with each keyframe
@@ -126,7 +135,7 @@ class SlidingWindow:
         self._full = self._start is not None and self._noise is not None  # with velocities and biases
         self._keyframes = Keyframes()
         self._calibration = Calibration(self._config, self._full, 0.0)
-        self._doubt = Doubt(self._config)
+        self._doubt = Doubt()
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
         self._prior: Prior | None = None
@@ -152,7 +161,7 @@ class SlidingWindow:
         """Return the state of the first keyframe, and set the prior on it."""
         config, x, start = self._config, np.zeros(STATE), self._start
         calibration = self._calibration = Calibration(config, self._full, packet.time_offset_s)
-        gauge = config.gauge_sigma_m, config.gauge_sigma_rad
+        gauge = GAUGE_SIGMA_M, GAUGE_SIGMA_RAD
         T = self._T_start
         if self._full and start is not None:
             T = start.T_world_body
@@ -239,7 +248,7 @@ class SlidingWindow:
             self._gravity_m_s2, self._full,
         )  # fmt: skip
         iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
-        return optimise(problem, iterations, self._config.tolerance, self._room)
+        return optimise(problem, iterations, _TOLERANCE, self._room)
 
     # ---- what leaves
 
@@ -308,7 +317,7 @@ class SlidingWindow:
         """Marginalise the oldest keyframe with what only it explains."""
         assert self._prior is not None
         keyframes, tracks = self._keyframes, self._tracks
-        given, dropped = split(tracks, keyframes.ids, self._config.split_min)
+        given, dropped = split(tracks, keyframes.ids, _SPLIT_MIN)
         selection = tracks.arrange(given, keyframes.ids)
         leaving = Leaving(selection.views, tracks.points[selection.slots])
         first, is_fixed = keyframes.linearised()
@@ -330,11 +339,11 @@ class SlidingWindow:
         ids, X = keyframes.ids, keyframes.X
         wide = np.repeat(
             [
-                config.restart_sigma_rad,
-                config.restart_sigma_m,
-                config.restart_speed_sigma_m_s,
-                config.restart_gyro_bias_sigma_rad_s,
-                config.restart_accel_bias_sigma_m_s2,
+                _RESTART_SIGMA_RAD,
+                _RESTART_SIGMA_M,
+                _RESTART_SPEED_SIGMA_M_S,
+                _RESTART_GYRO_BIAS_SIGMA_RAD_S,
+                _RESTART_ACCEL_BIAS_SIGMA_M_S2,
             ],
             3,
         )

@@ -35,6 +35,13 @@ from vislam.factors.keys import B, V, X, nearest_rigid
 from vislam.factors.sensed import Readings
 from vislam.sensors import Suite
 
+_START_GATE_PX = 20.0  # first round: poses of the run may be off, only gross outliers leave
+_START_CAUCHY = 3.0  # standard deviations, scale of the kernel in that round
+_GATE_PROBABILITY = 0.999  # chi-square of a pixel or depth that stays, in later rounds
+_MAX_RELATIVE_SIGMA = 0.25  # of a landmark's distance by its own rays; farther ones lack parallax or depth
+_MIN_SEEN = 12  # landmarks; a keyframe that sees fewer also gets the odometry of the run
+_PIXEL_SIGMA_MIN_PX = 0.2  # bounds of the noise that residuals show, from frontend.track_sigma_px on
+_PIXEL_SIGMA_MAX_PX = 3.0
 _MEDIAN_CHI2_2, _MEDIAN_CHI2_1 = 1.386, 0.455  # medians of chi-square with two degrees of freedom and with one
 _GLOBAL_S = 0.004  # a shorter readout than this counts as a global shutter: one that has none came out at 3.5 ms
 _MIN_LANDMARK_SEEN = 2  # keyframes
@@ -106,7 +113,7 @@ class _Batch:
         """Choose loops, then alternate between judging tracks and optimising."""
         config, start = self._config, gtsam.Values(self._values)
         try:
-            if undecided := self._loops.choose(self._chain, config):
+            if undecided := self._loops.choose(self._chain):
                 self._notes.append(undecided)
         except (DataError, UsageError) as error:
             self._notes.append(f"no loop was used: {error}")
@@ -139,8 +146,8 @@ class _Batch:
         """
         tracks, config, cameras = self._tracks, self._config, self._cameras()
         candidates = np.ones(len(tracks), dtype=bool) if first else self._keep
-        limit_px, limit_rho = (np.sqrt(chi_square_limit(config.gate_probability, n)) for n in (2, 1))
-        gate_px = config.start_gate_px if first else self._sigma_px * limit_px
+        limit_px, limit_rho = (np.sqrt(chi_square_limit(_GATE_PROBABILITY, n)) for n in (2, 1))
+        gate_px = _START_GATE_PX if first else self._sigma_px * limit_px
         gate_rho = np.inf if first else self._depth_factor * limit_rho
         keep = candidates
         for _ in range(3):
@@ -159,7 +166,7 @@ class _Batch:
         with np.errstate(invalid="ignore"):
             self._with_depth &= ~(np.abs(error.rho) > gate_rho)
         placed = triangulate(tracks, keep, cameras, self._sigma_px)
-        good = (placed.relative_sigma < config.max_relative_sigma) & (tracks.counts(keep) >= _MIN_LANDMARK_SEEN)
+        good = (placed.relative_sigma < _MAX_RELATIVE_SIGMA) & (tracks.counts(keep) >= _MIN_LANDMARK_SEEN)
         keep = keep & good[tracks.point]
         self._keep = _bounded(tracks, keep, config.max_observations)
         self._points = placed.points_m
@@ -169,13 +176,13 @@ class _Batch:
         estimators = gtsam.noiseModel.mEstimator
         weaker = config.vision_inflation  # the kernel bends where it would without
         cauchy, huber = (
-            estimators.Cauchy.Create(config.start_cauchy / weaker),
+            estimators.Cauchy.Create(_START_CAUCHY / weaker),
             estimators.Huber.Create(config.huber_k / weaker),
         )
         noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, cauchy if first else huber)
         count = len(self._chain.records)
         seen = np.bincount(tracks.keyframe[keep], minlength=count)
-        factors, self._tied = self._chain.factors(self._values, seen, config.min_seen)
+        factors, self._tied = self._chain.factors(self._values, seen, _MIN_SEEN)
         factors += visual_factors(tracks, keep, self._with_depth, self._T_body_cam0, noise)
         factors += self._loops.factors(self._poses())
         factors += self._readings.factors(self._values)
@@ -228,7 +235,7 @@ class _Batch:
 
     def _estimate_noise(self) -> None:
         """Take the noise of pixels and depths from the medians of their residuals, three unknowns per point counted."""
-        tracks, keep, config = self._tracks, self._keep, self._config
+        tracks, keep = self._tracks, self._keep
         if not keep.any():
             return
         error = residuals(tracks, self._points, self._cameras())
@@ -236,7 +243,7 @@ class _Batch:
         numbers = 2 * int(keep.sum()) + int(deep.sum())
         share = max(1.0 - 3.0 * len(np.unique(tracks.point[keep])) / numbers, 0.2)
         sigma = float(np.sqrt(np.median(error.px[keep] ** 2) / _MEDIAN_CHI2_2 / share))
-        self._sigma_px = float(np.clip(sigma, config.pixel_sigma_min_px, config.pixel_sigma_max_px))
+        self._sigma_px = float(np.clip(sigma, _PIXEL_SIGMA_MIN_PX, _PIXEL_SIGMA_MAX_PX))
         if deep.any():
             factor = float(np.sqrt(np.median(error.rho[deep] ** 2) / _MEDIAN_CHI2_1 / share))
             self._depth_factor = float(np.clip(factor, 0.5, 5.0))

@@ -17,7 +17,15 @@ from vislam.factors import motion
 from vislam.factors.factor_log import FactorLog
 from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
-from vislam.factors.noise_models import gaussian, huber, of_vision
+from vislam.factors.motion import SUBMAP_SIGMA_DEG
+from vislam.factors.noise_models import (
+    DIRECTION_FLOOR_DEG,
+    DIRECTION_SCALE_SIGMA,
+    DIRECTION_SOFT_M,
+    gaussian,
+    huber,
+    of_vision,
+)
 from vislam.factors.preintegration import Preintegrator
 from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
@@ -136,7 +144,7 @@ class Chain:
         factors: Factors = []
         moved = nearest_rigid(invert(values.atPose3(X(k - 1)).matrix()) @ values.atPose3(X(k)).matrix())
         if record.T_previous_body is not None and record.covariance is not None:
-            T, covariance = self._metric(record, moved, self._config.direction_scale_sigma)
+            T, covariance = self._metric(record, moved, DIRECTION_SCALE_SIGMA)
             model = gaussian(covariance, self._config.covariance_ratio_max)
             factors.append(pose_factor(X(k - 1), X(k), T, huber(model, self._config.huber_k)))
         if not has_imu and not (factors and record.has_scale):
@@ -154,15 +162,15 @@ class Chain:
         lever = self._lever_m
         step_m = float(np.linalg.norm(T_expected[:3, 3] + T_expected[:3, :3] @ lever - lever))
         return direction_as_pose(
-            T, covariance, lever, max(step_m, config.direction_soft_m),
-            floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=scale_sigma,
+            T, covariance, lever, max(step_m, DIRECTION_SOFT_M),
+            floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG), scale_sigma=scale_sigma,
         )  # fmt: skip
 
     def _weak_link(self, k: int) -> gtsam.BetweenFactorPose3:
         """Return what keeps a submap near where the run had it, should no loop tie it."""
         config = self._config
         T = nearest_rigid(invert(self.poses[k - 1]) @ self.poses[k])
-        return motion.loose_motion(k, T, np.deg2rad(config.submap_sigma_deg), config.submap_sigma_m)
+        return motion.loose_motion(k, T, np.deg2rad(SUBMAP_SIGMA_DEG), config.submap_sigma_m)
 
     def _loose(self, duration_s: float) -> tuple[float, float]:
         machine = self._machine

@@ -10,16 +10,20 @@ import numpy as np
 from vislam.batch.bundle.chain import Chain
 from vislam.batch.posegraph.auto import decide
 from vislam.batch.posegraph.problem import PoseGraphProblem
-from vislam.config import BatchConfig, GraphConfig, PoseGraphConfig
+from vislam.config import GraphConfig, PoseGraphConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.factors.factor_log import LoggedEdge
 from vislam.factors.journal import LoopRecord, loop_record
 from vislam.factors.keys import X
-from vislam.factors.noise_models import cauchy, gaussian, inflated
+from vislam.factors.loop import LOOP_CAUCHY_K, LOOP_MIN_WEIGHT
+from vislam.factors.noise_models import DIRECTION_FLOOR_DEG, DIRECTION_SOFT_M, cauchy, gaussian, inflated
 from vislam.factors.visual import direction_as_pose, pose_factor
 
+_LOOP_PROBABILITY = 0.9999  # chi-square of a true loop in the judging of all of them
+# one camera: relative, on the steps of the run's own odometry among the loops
+UNSCALED_ODOMETRY_SIGMA = 0.1
 _UNSCALED_SIGMA = 5.0  # relative, of the length of a loop without scale: wide, for its length was not measured
 
 
@@ -54,16 +58,16 @@ class Loops:
                 self.verdicts[edge.id] = verdict
         self.kept: list[LoopRecord] = []
 
-    def choose(self, chain: Chain, config: BatchConfig) -> str:
+    def choose(self, chain: Chain) -> str:
         """Decide as `vislam optimize --robust auto` does, on the run's odometry and all its loops.
 
         Odometry is never doubted. Returns what could not be decided, "" where all was.
         """
         if not self._records:
             return ""
-        edges = chain.odometry_edges(config.unscaled_odometry_sigma)
+        edges = chain.odometry_edges(UNSCALED_ODOMETRY_SIGMA)
         edges += [self._factor(record, chain.poses, robust=False) for record in self._records]
-        decided = decide(_as_problem(edges, chain.poses), PoseGraphConfig(inlier_probability=config.loop_probability))
+        decided = decide(_as_problem(edges, chain.poses), PoseGraphConfig(inlier_probability=_LOOP_PROBABILITY))
         first = len(edges) - len(self._records)
         undecided = set(decided.undecided.tolist())
         for e, record in enumerate(self._records, start=first):
@@ -85,8 +89,8 @@ class Loops:
         contradicted = []
         for record in self.kept:
             chi2 = 2.0 * self._factor(record, poses, robust=False).error(_pair(record, poses))
-            weight = self._config.loop_cauchy_k**2 / (self._config.loop_cauchy_k**2 + chi2)
-            if weight < self._config.loop_min_weight:
+            weight = LOOP_CAUCHY_K**2 / (LOOP_CAUCHY_K**2 + chi2)
+            if weight < LOOP_MIN_WEIGHT:
                 contradicted.append(record)
                 self._judge(record, False, f"contradicted by the bundle adjustment, chi2 {chi2:.1f}")
         self.kept = [record for record in self.kept if not any(record is c for c in contradicted)]
@@ -114,12 +118,12 @@ def loop_factor(
         moved = invert(poses[record.from_id]) @ poses[record.to_id]
         step_m = float(np.linalg.norm(moved[:3, 3] + moved[:3, :3] @ lever_m - lever_m))
         T, covariance = direction_as_pose(
-            T, inflated(record.covariance, 1.0, floor_rad, 0.0), lever_m, max(step_m, config.direction_soft_m),
-            floor_rad=np.deg2rad(config.direction_floor_deg), scale_sigma=_UNSCALED_SIGMA,
+            T, inflated(record.covariance, 1.0, floor_rad, 0.0), lever_m, max(step_m, DIRECTION_SOFT_M),
+            floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG), scale_sigma=_UNSCALED_SIGMA,
         )  # fmt: skip
     model: gtsam.noiseModel.Base = gaussian(covariance, config.covariance_ratio_max)
     if robust:
-        model = cauchy(model, config.loop_cauchy_k)
+        model = cauchy(model, LOOP_CAUCHY_K)
     return pose_factor(X(record.from_id), X(record.to_id), T, model)
 
 

@@ -12,7 +12,19 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, quaternion_wxyz, skew
 from vislam.core.messages import Array, NavState, NoiseScale, VoMeasurement
 from vislam.core.readings import OwnStart, Reading
-from vislam.ekf.filter_core import REST_PAUSE_NS, imu_sigmas, nominal, reset_sigmas, scaled
+from vislam.ekf.filter_core import (
+    RESET_REJECTS,
+    RESET_S,
+    REST_PAUSE_NS,
+    REST_SIGMA_DEG,
+    REST_SIGMA_M,
+    ZERO_RATE_SIGMA_RAD_S,
+    ZERO_VELOCITY_SIGMA_M_S,
+    imu_sigmas,
+    nominal,
+    reset_sigmas,
+    scaled,
+)
 from vislam.ekf.history import AtRest, Event, Outcome
 from vislam.ekf.loose import kernels, visual_motion
 from vislam.ekf.loose.measurements import (
@@ -32,6 +44,11 @@ from vislam.ekf.sensor_rows import Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.imu import ImuNoise
 from vislam.sensors import Suite
+
+# fixed R of accumulated vision; 0.005 to 0.1 err alike, below this motions fail
+_ACCUMULATED_SIGMA_M = 0.02
+_ACCUMULATED_SIGMA_DEG = 0.5  # the gate, for the sum has drifted by more than R says
+
 
 LooseMeasurement = VoMeasurement | NewKeyframe | OnWheels
 LooseEvent = Event[LooseMeasurement]
@@ -84,7 +101,7 @@ class LooseCore:
         self._vo_variance = float(config.vo_inflation) ** 2
         self._fraction = float(config.vo_shared_fraction)
         self._nothing = np.zeros((6, 6))
-        self._reset_sigmas = reset_sigmas(config)
+        self._reset_sigmas = reset_sigmas()
         self._all = np.eye(kernels.ERRORS + own)
         self._only_biases = np.diag(np.repeat([0.0, 1.0, 0.0], [9, 6, 6 + own]))
         self._not_the_past = np.eye(kernels.ERRORS + own)  # the body moves as much as its place against the clone
@@ -216,13 +233,13 @@ class LooseCore:
 
     def _apply_rest(self, state: LooseState, t_ns: int, gyro_rad_s: Array, out: Outcome) -> Ledger:
         """Use that the body is at rest; once a keyframe was taken at rest, the body is where that one is."""
-        config, ledger = self._config, state.ledger
+        ledger = state.ledger
         goes_on = ledger.rested_t_ns is not None and t_ns - ledger.rested_t_ns <= REST_PAUSE_NS
         holds = ledger.clone_rests and goes_on
-        rate_sigma = max(config.zero_rate_sigma_rad_s, self._white_rate_sigma * ledger.noise.gyro)
-        at_rest = zero_velocity(state.x, gyro_rad_s, float(config.zero_velocity_sigma_m_s), rate_sigma)
+        rate_sigma = max(ZERO_RATE_SIGMA_RAD_S, self._white_rate_sigma * ledger.noise.gyro)
+        at_rest = zero_velocity(state.x, gyro_rad_s, float(ZERO_VELOCITY_SIGMA_M_S), rate_sigma)
         if holds:
-            sway = math.radians(config.rest_sigma_deg), float(config.rest_sigma_m)
+            sway = math.radians(REST_SIGMA_DEG), float(REST_SIGMA_M)
             at_rest = where_rest_began(state.x, at_rest, *sway)
         self._correct(state, at_rest, self._all, "zero_velocity", out)
         if not out.accepted:
@@ -252,26 +269,26 @@ class LooseCore:
 
     def _apply_accumulated(self, state: LooseState, vo: VoMeasurement, out: Outcome) -> Ledger:
         """Chain the motion to the keyframe's pose, and take the sum for a measured pose in `odom`."""
-        ledger, config = state.ledger, self._config
+        ledger = state.ledger
         if not vo.has_scale or vo.T_keyframe_body is None or ledger.T_odom_keyframe is None:
             out.count("vo_no_scale")
             out.reason = "accumulated vision needs metric motion; use ekf.vision relative, a second camera or depth"
             return ledger
         T_odom_vo = ledger.T_odom_keyframe @ vo.T_keyframe_body
-        sigma_rad = np.deg2rad(config.accumulated_sigma_deg)
-        chained = absolute_pose(state.x, T_odom_vo, sigma_rad, config.accumulated_sigma_m)
+        sigma_rad = np.deg2rad(_ACCUMULATED_SIGMA_DEG)
+        chained = absolute_pose(state.x, T_odom_vo, sigma_rad, _ACCUMULATED_SIGMA_M)
         self._correct(state, chained, self._moves(vo), "vo", out)
         state.ledger = replace(ledger, T_odom_vo=T_odom_vo, vo_t_ns=vo.t_ns)
         return self._after_vo(state, vo.t_ns, ledger.shared, out)
 
     def _after_vo(self, state: LooseState, t_ns: int, shared: Array | None, out: Outcome) -> Ledger:
         """Count rejections in a row; too many for too long widen the covariance. `shared`: if it was accepted."""
-        config, ledger = self._config, state.ledger
+        ledger = state.ledger
         if out.accepted:
             return replace(ledger, rejects=0, last_vo_t_ns=t_ns, shared=shared, watch=ledger.watch.seen(t_ns))
         since = t_ns if ledger.rejects == 0 else ledger.rejects_since_ns
         rejects = ledger.rejects + 1
-        if rejects >= config.reset_rejects and t_ns - since >= config.reset_s * 1e9:
+        if rejects >= RESET_REJECTS and t_ns - since >= RESET_S * 1e9:
             state.P[np.arange(15), np.arange(15)] += self._reset_sigmas**2
             out.count("soft_resets")
             out.reason += f"; {rejects} in a row, covariance inflated"

@@ -13,7 +13,16 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, skew, so3_log
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.ekf.filter_core import REST_PAUSE_NS, reset_sigmas
+from vislam.ekf.filter_core import (
+    RESET_REJECTS,
+    RESET_S,
+    REST_PAUSE_NS,
+    REST_SIGMA_DEG,
+    REST_SIGMA_M,
+    ZERO_RATE_SIGMA_RAD_S,
+    ZERO_VELOCITY_SIGMA_M_S,
+    reset_sigmas,
+)
 from vislam.ekf.history import Outcome
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.tight import features
@@ -38,6 +47,22 @@ from vislam.imu import ImuNoise
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
 
+_MOST_POINTS = 25  # long tracks kept as points of the state; they stop the drift while little moves
+_POINT_DEPTH_RATIO = 0.1  # sigma of its distance over it that such a point may have at first
+_POINT_MISSES = 1  # frames in a row that may not see such a point before it is dropped
+_MOST_ITERATIONS = 5  # of one update at most; more than one only while velocity is badly known
+_MIN_OBSERVATIONS = 3  # of a track; two leave one equation
+_STEREO_SIGMA_PX = 0.5  # right minus left pixel: matching, without the error of the corner
+_DEPTH_SIGMA_RHO = 3e-3  # 1/m, of the inverse of a depth image
+_OUTLIER_SIGMAS = 5.0  # one observation of a track; the test of the track follows
+# sigma over inverse depth; above, a point's place is no base to linearise at
+_MAX_DEPTH_RATIO = 0.3
+_MIN_RANGE_M = 0.1
+_MAX_RANGE_M = 200.0  # beyond, nothing but rotation is seen
+# image motion between clones below which the older one is kept instead of the newer
+_STILL_PX = 1.0
+# between clones; a fast camera would leave a window too short for parallax
+_MIN_INTERVAL_S = 0.03
 _STATUS = {
     features.USED: "tracks_used",
     features.FEW: "tracks_few",
@@ -77,23 +102,23 @@ class Updater:
         self._gravity = gravity_m_s2
         self._p_body_cam = np.ascontiguousarray(rig.T_body_cams[0][:3, 3], dtype=np.float64)
         T_cam1_cam0 = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
-        sigmas = np.array([config.tight_pixel_sigma_px, config.tight_stereo_sigma_px, config.tight_depth_sigma_rho])
+        sigmas = np.array([config.tight_pixel_sigma_px, _STEREO_SIGMA_PX, _DEPTH_SIGMA_RHO])
         into_right = np.ascontiguousarray(T_cam1_cam0[:3, :3]), np.ascontiguousarray(T_cam1_cam0[:3, 3])
         self._sensor = features.Sensor(sigmas, *into_right)
         self._point_sensor = features.Sensor(sigmas * np.array([config.tight_point_inflation, 1.0, 1.0]), *into_right)
         self._bounds = features.Bounds(
-            min_rho=1.0 / config.tight_max_range_m,
-            max_rho=1.0 / config.tight_min_range_m,
-            max_ratio=float(config.tight_max_depth_ratio),
-            outlier_sigmas=float(config.tight_outlier_sigmas),
-            min_views=float(config.tight_min_observations),
+            min_rho=1.0 / _MAX_RANGE_M,
+            max_rho=1.0 / _MIN_RANGE_M,
+            max_ratio=float(_MAX_DEPTH_RATIO),
+            outlier_sigmas=float(_OUTLIER_SIGMAS),
+            min_views=float(_MIN_OBSERVATIONS),
         )
         # one metric observation and another fix a point and leave something over
-        self._least = 2 if rig.is_stereo or rig.has_depth else config.tight_min_observations
+        self._least = 2 if rig.is_stereo or rig.has_depth else _MIN_OBSERVATIONS
         most = features.ROWS_MAX * (config.tight_clones + 2)
         self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
         self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
-        self._reset_sigmas = reset_sigmas(config)
+        self._reset_sigmas = reset_sigmas()
 
     # -- a frame -----------------------------------------------------------------------------------------------------
 
@@ -112,7 +137,7 @@ class Updater:
         leaving = self._leaving(prior)
         before = x.copy()
         window, change, P = prior, np.zeros(len(prior.P)), prior.P
-        for _ in range(self._config.tight_iterations):
+        for _ in range(_MOST_ITERATIONS):
             out = Outcome()
             rows = self._rows(window, leaving, change, out)
             if not len(rows.r):
@@ -135,7 +160,7 @@ class Updater:
         window = self._watch(window, x, frame.t_ns, out)
         out.count("vision_used" if out.accepted else "vision_idle")
         out.reason = out.reason or ("" if out.accepted else "no track was ripe or passed its test")
-        return without_points(window, window.misses > self._config.tight_point_misses), out
+        return without_points(window, window.misses > _POINT_MISSES), out
 
     def _leaving(self, window: Window) -> int | None:
         """Return which clone goes: the oldest, unless the last but one is where the one before it was."""
@@ -143,8 +168,8 @@ class Updater:
         if count <= self._config.tight_clones:
             return None
         kept, candidate = window.frames[-3], window.frames[-2]
-        still = image_motion_px(kept, candidate) < self._config.tight_still_px
-        still = still or candidate.t_ns - kept.t_ns < self._config.tight_min_interval_s * 1e9
+        still = image_motion_px(kept, candidate) < _STILL_PX
+        still = still or candidate.t_ns - kept.t_ns < _MIN_INTERVAL_S * 1e9
         rests = window.rest is not None and window.rested_t_ns >= candidate.t_ns
         began_t_ns = None if window.rest is None else window.rest.t_ns
         if (still or rests) and candidate.t_ns != began_t_ns:
@@ -233,11 +258,11 @@ class Updater:
         """
         if not window.frames[-1].shows_scale:
             return window
-        free = max(self._config.tight_points - len(window.point_ids), 0)
+        free = max(_MOST_POINTS - len(window.point_ids), 0)
         if not len(rows.ids) or not free:
             return window
         ratios = depth_ratios(window, rows.points, rows.fixing, rows.H_points)
-        fit = np.flatnonzero(ratios < self._config.tight_point_depth_ratio)[:free]
+        fit = np.flatnonzero(ratios < _POINT_DEPTH_RATIO)[:free]
         if not len(fit):
             return window
         out.count("points_started", len(fit))
@@ -258,7 +283,6 @@ class Updater:
 
     def _watch(self, window: Window, x: Array, t_ns: int, out: Outcome) -> Window:
         """Inflate the covariance when frame after frame contradicts the state."""
-        config = self._config
         good = out.counts.get("tracks_used", 0) + out.counts.get("points_used", 0)
         bad = out.counts.get("tracks_gated", 0) + out.counts.get("points_gated", 0)
         if good + bad < _MIN_TESTED:
@@ -267,7 +291,7 @@ class Updater:
             return replace(window, rejects=0)
         since = t_ns if window.rejects == 0 else window.rejects_since_ns
         rejects = window.rejects + 1
-        if rejects < config.reset_rejects or t_ns - since < config.reset_s * 1e9:
+        if rejects < RESET_REJECTS or t_ns - since < RESET_S * 1e9:
             return replace(window, rejects=rejects, rejects_since_ns=since)
         out.count("soft_resets")
         out.reason = f"{rejects} frames in a row contradict the state, covariance inflated"
@@ -283,13 +307,12 @@ class Updater:
     def rest(self, window: Window, x: Array, gyro_rad_s: Array, t_ns: int) -> tuple[Window, Outcome]:
         """Use that the body is at rest: no velocity, the gyro shows its bias, the pose is that where rest began."""
         out = Outcome()
-        config = self._config
         R = pose(x, 0, 6)[:3, :3]
         H = np.zeros((6, len(window.P)))
-        H[:3, 6:9] = R.T / config.zero_velocity_sigma_m_s
-        rate_sigma = max(config.zero_rate_sigma_rad_s, self._white_rate_sigma * window.noise.gyro)
+        H[:3, 6:9] = R.T / ZERO_VELOCITY_SIGMA_M_S
+        rate_sigma = max(ZERO_RATE_SIGMA_RAD_S, self._white_rate_sigma * window.noise.gyro)
         H[3:, 9:12] = np.eye(3) / rate_sigma
-        r = np.concatenate((-R.T @ x[3:6] / config.zero_velocity_sigma_m_s, (gyro_rad_s - x[13:16]) / rate_sigma))
+        r = np.concatenate((-R.T @ x[3:6] / ZERO_VELOCITY_SIGMA_M_S, (gyro_rad_s - x[13:16]) / rate_sigma))
         if not self._passes("zero_velocity", window, H, r, out):
             return replace(window, rest=None), out
         window = replace(corrected(window, x, H, r), rested_t_ns=t_ns, watch=window.watch.seen(t_ns))
@@ -305,8 +328,7 @@ class Updater:
         return window, out
 
     def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
-        config = self._config
-        sigmas = np.repeat([np.deg2rad(config.rest_sigma_deg), config.rest_sigma_m], 3)
+        sigmas = np.repeat([np.deg2rad(REST_SIGMA_DEG), REST_SIGMA_M], 3)
         T = pose(x, 0, 6)
         H = np.zeros((6, len(window.P)))
         at = CLONES + 6 * index

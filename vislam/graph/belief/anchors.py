@@ -6,8 +6,9 @@ from bisect import bisect_left
 
 import numpy as np
 
-from vislam.config import GraphConfig
 from vislam.core.memory import Tied
+
+_ANCHOR_REACH = 10  # keyframes from one that is tied to an older one: a loop to it ties to that one, the anchor
 
 
 class Anchors:
@@ -18,9 +19,8 @@ class Anchors:
     SLAM using a reduced pose graph", ICRA 2013), whose size follows the space explored and not the time.
     """
 
-    def __init__(self, config: GraphConfig) -> None:
+    def __init__(self) -> None:
         """Start without any."""
-        self._reach = config.anchor_reach
         self._tied: dict[int, Tied] = {}
         self._ids: list[int] = []  # keys of the above, ascending
         self._fresh: list[Tied] = []  # since `take_record`
@@ -28,7 +28,7 @@ class Anchors:
     def near(self, k: int) -> Tied | None:
         """Return the tied keyframe nearest to k along the run; None when there is none in reach."""
         n = bisect_left(self._ids, k)
-        around = [c for c in self._ids[max(n - 1, 0) : n + 1] if abs(c - k) <= self._reach]
+        around = [c for c in self._ids[max(n - 1, 0) : n + 1] if abs(c - k) <= _ANCHOR_REACH]
         return self._tied[min(around, key=lambda c: abs(c - k))] if around else None
 
     def tie(self, tied: Tied) -> None:

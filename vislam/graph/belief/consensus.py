@@ -29,6 +29,9 @@ from vislam.factors.visual import pose_factor
 from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
 from vislam.graph.travel import Chain, Travel
 
+_REVIEW_LOOPS = 20  # loops after which all are weighed anew, if any was kept out; ...
+_REVIEW_DOUBTS = 3  # ... or so many that were kept out
+_REVIEW_STEPS = 4  # of a review's work per keyframe: joint marginals of a small graph, 1 to 3 ms each
 _LADDER = (11.0, 7.0, 3.0)  # evidence that a witness could give, in nats: those of the first rung are asked first
 _EXPECTED = 3.0  # half the chi-square of six degrees of freedom, what a true loop loses of it
 _SCALES = (2.0, 4.0, 8.0)  # on the sigmas of odometry, tried where it seems to be worse than it says
@@ -90,7 +93,7 @@ class Consensus:
     @property
     def is_due(self) -> bool:
         """Return whether enough loops came for another review, if there is anything to doubt."""
-        due = self._fresh >= self._config.review_loops or self._doubts >= self._config.review_doubts
+        due = self._fresh >= _REVIEW_LOOPS or self._doubts >= _REVIEW_DOUBTS
         return due and self._steps is None
 
     def doubt(self) -> None:
@@ -104,13 +107,12 @@ class Consensus:
         `scale_left` is by how much the sigmas of odometry may still be inflated, `held` tells of the id of a loop
         whether the graph holds it. Without a loop in doubt there is nothing to review.
         """
-        config = self._config
         if self._steps is None:
             if not (self.is_due and self._doubts):
                 self._fresh = 0 if self.is_due else self._fresh
                 return None
             self._begin(travel, scale_left, held)
-        return self._work(config.review_steps)
+        return self._work(_REVIEW_STEPS)
 
     def finish(self, travel: Travel, scale_left: float, held: Callable[[int], bool]) -> Verdict | None:
         """Review everything there is, at once."""

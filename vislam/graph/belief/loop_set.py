@@ -14,7 +14,7 @@ from vislam.core.memory import EdgeReport, LoopPlace, LoopState, OfferedLoop, Ti
 from vislam.core.messages import Array, LoopDecision, LoopEdge
 from vislam.factors.journal import loop_record
 from vislam.factors.keys import X
-from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.loop import LOOP_MIN_WEIGHT, LoopModel, relative_covariance
 from vislam.graph.belief.anchors import Anchors
 from vislam.graph.belief.consensus import Consensus, Verdict
 from vislam.graph.belief.gate import PendingLoops
@@ -23,6 +23,10 @@ from vislam.graph.estimator import Estimator
 from vislam.graph.segments import Segment, segments
 from vislam.graph.travel import Travel
 
+_LOOP_BATCH_M = 1.0  # a larger correction starts from a batch solution instead of incremental steps
+_LOOP_BATCH_DEG = 10.0
+_ANCHOR_VARIANCE_MAX = 4.0  # times a loop's own variance: most that the way to its anchor may add
+_VO_SCALE_MAX = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
 _DOUBTS = 100  # loops that are looked at again when a review is due
 _FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
 
@@ -43,7 +47,7 @@ class LoopSet:
         self._pending = PendingLoops(config)
         self._consensus = Consensus(config)
         self._beyond_help: set[int] = set()  # loops that a review brought in and the graph contradicted
-        self._anchors = Anchors(config)
+        self._anchors = Anchors()
         self._next_freeze = 0  # keyframe with which to look again for a segment to sum up
         self._next_doubt = 0  # where the next block of loops begins that are looked at again
         self._reports: dict[int, EdgeReport] = {}
@@ -223,7 +227,7 @@ class LoopSet:
     @property
     def _scale_left(self) -> float:
         """Return by how much the sigmas of odometry may still be inflated."""
-        return self._config.vo_scale_max / self._estimator.vo_scale
+        return _VO_SCALE_MAX / self._estimator.vo_scale
 
     def _hold(self, loop_id: int) -> bool:
         """Return whether the graph holds a loop, with a factor or in spare."""
@@ -294,7 +298,7 @@ class LoopSet:
 
     def _is_torn(self, model: LoopModel) -> bool:
         """Return whether the graph contradicts a loop that is in it."""
-        return model.weight(*self._ends(model)) < self._config.loop_min_weight
+        return model.weight(*self._ends(model)) < LOOP_MIN_WEIGHT
 
     def _remember(self, models: Sequence[LoopModel], known: Known) -> None:
         """Take note of which anchor loops tie their newer ends to, and what is known of it before they do."""
@@ -344,7 +348,7 @@ class LoopSet:
         T_map_anchor, T_map_older, T_map_newer = (self._estimator.poses[k] for k in (anchor, older, newer))
         T_anchor_older, T_older_newer = invert(T_map_anchor) @ T_map_older, invert(T_map_older) @ T_map_newer
         way = known.relative(anchor, older)
-        return model.tie_to(anchor, T_anchor_older, way, T_older_newer, most=self._config.anchor_variance_max)
+        return model.tie_to(anchor, T_anchor_older, way, T_older_newer, most=_ANCHOR_VARIANCE_MAX)
 
     def _tie_to_host(self, model: LoopModel, known: Known) -> int:
         """Tie a loop to the keyframe that the solver has for its older end; return it."""
@@ -358,8 +362,8 @@ class LoopSet:
     def _is_far(self, model: LoopModel) -> bool:
         """Return whether a loop asks for a correction beyond what incremental steps should try."""
         residual, _ = model.residual(*self._ends(model))
-        turn = float(np.linalg.norm(residual[:3])) > np.deg2rad(self._config.loop_batch_deg)
-        return turn or (model.record.has_scale and float(np.linalg.norm(residual[3:])) > self._config.loop_batch_m)
+        turn = float(np.linalg.norm(residual[:3])) > np.deg2rad(_LOOP_BATCH_DEG)
+        return turn or (model.record.has_scale and float(np.linalg.norm(residual[3:])) > _LOOP_BATCH_M)
 
     def _apply(self, verdict: Verdict, notes: list[str]) -> list[int]:
         """Do as a review of all loops says; return the ids about which it decided something else than before."""

@@ -13,6 +13,11 @@ from vislam.core.geometry import invert, invert_many, so3_log
 from vislam.factors.loop import LoopModel
 from vislam.graph.travel import Chain, Travel
 
+_WITNESS_KEYFRAMES = 10  # loops that start and end so near to another's, or ...
+_WITNESS_M = 1.0  # ... whose ends lie so near to its ends ...
+_WITNESS_DEG = 45.0  # ... looking the same way, see the same things: together they are one witness
+# on odometry sigma, for whether two loops of one witness say the same; 3 mixed them
+_WITNESS_INFLATION = 1.5
 _SEEDS = 5  # loops with most friends, around which the largest group is looked for
 
 
@@ -24,7 +29,6 @@ class Witnesses:
 
     def __init__(self, config: GraphConfig) -> None:
         """Start empty."""
-        self._config = config
         self._limit = chi_square_limit(config.loop_gate_probability, 6)
         self._loops: list[list[LoopModel]] = []
         self._ends: NDArray[np.int64] = np.zeros((16, 2), dtype=np.int64)  # of those that stand for each witness
@@ -51,12 +55,12 @@ class Witnesses:
 
     def _near(self, ends: NDArray[np.int64], travel: Travel) -> NDArray[np.bool_]:
         """Return which witnesses [W] are about the same two places: few keyframes apart, or next to one another."""
-        config, poses = self._config, travel.poses
+        poses = travel.poses
         known = self._ends[: len(self)]
-        close = np.abs(known - ends) <= config.witness_keyframes
+        close = np.abs(known - ends) <= _WITNESS_KEYFRAMES
         moved = np.linalg.norm(poses[known, :3, 3] - poses[ends, :3, 3], axis=2)
         cosine = (np.einsum("wnij,nij->wn", poses[known, :3, :3], poses[ends, :3, :3]) - 1.0) / 2.0
-        close |= (moved < config.witness_m) & (cosine > np.cos(np.deg2rad(config.witness_deg)))
+        close |= (moved < _WITNESS_M) & (cosine > np.cos(np.deg2rad(_WITNESS_DEG)))
         return np.asarray(close.all(axis=1))
 
     def _cycle_chi2(self, a: LoopModel, b: LoopModel, travel: Travel) -> float:
@@ -66,7 +70,7 @@ class Witnesses:
         rad2_j, m2_j, path_j = travel.between(ra.to_id, rb.to_id)
         own_rad2 = float(np.trace(a.covariance[:3, :3] + b.covariance[:3, :3])) / 3.0
         own_m2 = float(np.trace(a.covariance[3:, 3:] + b.covariance[3:, 3:])) / 3.0
-        k2 = self._config.witness_inflation**2
+        k2 = _WITNESS_INFLATION**2
         lever = path_i + path_j + float(np.linalg.norm(ra.T_from_to[:3, 3]))
         rad2 = k2 * (rad2_i + rad2_j) + own_rad2
         m2 = k2 * (m2_i + m2_j) + own_m2 + own_rad2 * lever**2

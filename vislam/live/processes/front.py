@@ -44,6 +44,7 @@ from vislam.runs.evidence import front_evidence
 from vislam.runs.verdict import Trust, Verdict, judge
 from vislam.sensors import Suite
 
+_CROWDED_SPACING = 2.0  # factor on the distances between keyframes then
 _LOG = logging.getLogger(__name__)
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
 _PUT_S = 0.1
@@ -184,7 +185,7 @@ class FrontProcess:
         live, waiting = self._config.live, len(self._to_back)
         is_crowded = self._pace.every > 1 or 2 * waiting >= live.keyframe_queue
         is_full = 4 * waiting >= 3 * live.keyframe_queue
-        self.front.frontend.keyframe_spacing = live.crowded_spacing ** (is_crowded + is_full)
+        self.front.frontend.keyframe_spacing = _CROWDED_SPACING ** (is_crowded + is_full)
         self._counters["crowded_frames"] += is_crowded
         self._counters["back_late_ms"] = max(self._counters["back_late_ms"], round(1e3 * self._to_back.age_s))
         step = self.front.process(frame)

@@ -8,9 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.config import LoopConfig
 from vislam.core.messages import Array, LoopDecision
 from vislam.loop.verification.verifier import Verification
+
+_MAX_SIGMA_ANY_M = 0.10  # a worse pose is no edge: it can be half a metre off
+_MIN_AGREEMENT_SHARE = 0.5  # of matches that also agree the other way round, and in depth
+_MAX_TILT_DEG = 5.0  # against gravity; well above the error of a good edge and of the map's own tilt
+_MAX_ROTATION_SIGMA_DEG = 2.0  # of an edge without scale
+_MAX_DIRECTION_SIGMA_DEG = 5.0  # of its direction
 
 
 def tilt_error_rad(T_from_to: Array, T_map_from: Array, T_map_to: Array) -> float:
@@ -22,12 +27,12 @@ def tilt_error_rad(T_from_to: Array, T_map_from: Array, T_map_to: Array) -> floa
     return float(np.arccos(np.clip(measured @ T_map_from[2, :3], -1.0, 1.0)))
 
 
-def judge(found: Verification, tilt_rad: float | None, config: LoopConfig) -> tuple[LoopDecision, str]:
+def judge(found: Verification, tilt_rad: float | None) -> tuple[LoopDecision, str]:
     """Return whether a candidate is offered to the graph, by its verification and its tilt (None: unknown), and why."""
     if found.T_a_b is None:
         return LoopDecision.REJECTED, found.reason
     seen = found.reason or f"{found.inliers} inliers, {found.supporters} with guided matching"
-    against = objection(found, tilt_rad, config)
+    against = objection(found, tilt_rad)
     if against:
         return LoopDecision.REJECTED, f"{against} ({seen})"
     if found.has_scale:
@@ -35,21 +40,21 @@ def judge(found: Verification, tilt_rad: float | None, config: LoopConfig) -> tu
     return LoopDecision.ACCEPTED, f"{seen}, direction good to {np.rad2deg(found.sigma_m):.1f} deg"
 
 
-def objection(found: Verification, tilt_rad: float | None, config: LoopConfig) -> str:
+def objection(found: Verification, tilt_rad: float | None) -> str:
     """Return what speaks against a verified pose whatever the neighbours say, or an empty string."""
-    if tilt_rad is not None and not np.rad2deg(tilt_rad) <= config.max_tilt_deg:
-        return f"its pose leans: {np.rad2deg(tilt_rad):.1f} deg off gravity, limit {config.max_tilt_deg:g}"
+    if tilt_rad is not None and not np.rad2deg(tilt_rad) <= _MAX_TILT_DEG:
+        return f"its pose leans: {np.rad2deg(tilt_rad):.1f} deg off gravity, limit {_MAX_TILT_DEG:g}"
     for name, share in (("the other way round", found.reverse_agreement), ("in depth", found.depth_agreement)):
-        if share < config.min_agreement_share:
-            return f"too few matches agree {name}: {share:.0%}, needs {config.min_agreement_share:.0%}"
-    if found.has_scale and not found.sigma_m <= config.max_sigma_any_m:
-        limit_cm = 100.0 * config.max_sigma_any_m
+        if share < _MIN_AGREEMENT_SHARE:
+            return f"too few matches agree {name}: {share:.0%}, needs {_MIN_AGREEMENT_SHARE:.0%}"
+    if found.has_scale and not found.sigma_m <= _MAX_SIGMA_ANY_M:
+        limit_cm = 100.0 * _MAX_SIGMA_ANY_M
         return f"its place is too uncertain: sigma {100.0 * found.sigma_m:.0f} cm, limit {limit_cm:g}"
     if not found.has_scale and found.covariance is not None:
         worst = np.rad2deg(np.sqrt([np.linalg.eigvalsh(found.covariance[:3, :3])[-1], found.sigma_m**2]))
-        if not (worst[0] <= config.max_rotation_sigma_deg and worst[1] <= config.max_direction_sigma_deg):
+        if not (worst[0] <= _MAX_ROTATION_SIGMA_DEG and worst[1] <= _MAX_DIRECTION_SIGMA_DEG):
             return (
                 f"its rotation and direction are too uncertain: {worst[0]:.1f} and {worst[1]:.1f} deg, "
-                f"limits {config.max_rotation_sigma_deg:g} and {config.max_direction_sigma_deg:g}"
+                f"limits {_MAX_ROTATION_SIGMA_DEG:g} and {_MAX_DIRECTION_SIGMA_DEG:g}"
             )
     return ""

@@ -19,6 +19,10 @@ from vislam.core.messages import Array
 from vislam.loop.view import View
 from vislam.vision.features import match
 
+_MATCH_RATIO = 0.8  # nearest to second nearest descriptor; 0.8 keeps true matches of repeated texture out
+MATCH_MAX_DISTANCE = 64  # bits of 256; unrelated ORB descriptors are 128 apart
+INLIER_PX = 3.0  # reprojection error of an inlier; ORB's coarse octaves are good to 2 px
+INVERSE_DEPTH_SIGMA_1_M = 0.01  # of the difference of two inverse depths
 _MIN_TOLD = 8  # matches with two points that are to be expected, before their distances are asked
 _MAX_TOLD = 64  # of them that are compared: bounds the time to 0.2 ms
 _SIGMAS = 3.0
@@ -47,7 +51,7 @@ def compare(a: View, b: View, config: LoopConfig, px: float) -> Likeness:
     to be three sigmas (Poisson) above what chance gives; twice that is enough in any case, since points that lie close
     together, as on a picture far away, tell nothing by their distances.
     """
-    pairs = match(a.descriptors, b.descriptors, config.match_ratio, config.match_max_distance)
+    pairs = match(a.descriptors, b.descriptors, _MATCH_RATIO, MATCH_MAX_DISTANCE)
     chance = config.chance_matched_share * min(len(a.xy), len(b.xy))
     least = max(config.min_inliers, chance + _SIGMAS * math.sqrt(chance))
     told_share = a.known.sum() * b.known.sum() / max(1, len(a.xy) * len(b.xy))
@@ -55,7 +59,7 @@ def compare(a: View, b: View, config: LoopConfig, px: float) -> Likeness:
         return Likeness(pairs, 0, len(pairs) >= least)
     told = pairs[a.known[pairs[:, 0]] & b.known[pairs[:, 1]]][:_MAX_TOLD]
     points_a, points_b = a.points_or_nan()[told[:, 0]], b.points_or_nan()[told[:, 1]]
-    rigid = rigid_count(points_a, points_b, config.inverse_depth_sigma_1_m, config.inlier_px * px)
+    rigid = rigid_count(points_a, points_b, INVERSE_DEPTH_SIGMA_1_M, INLIER_PX * px)
     return Likeness(pairs, rigid, rigid >= config.min_rigid or len(pairs) >= _BEYOND_DOUBT * least)
 
 

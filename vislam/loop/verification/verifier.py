@@ -19,12 +19,19 @@ from vislam.core.geometry import invert, se3_adjoint
 from vislam.core.messages import Array
 from vislam.loop.verification.epipolar import relative_direction
 from vislam.loop.verification.guided import match_guided
-from vislam.loop.verification.likeness import Likeness, compare
+from vislam.loop.verification.likeness import INLIER_PX, INVERSE_DEPTH_SIGMA_1_M, MATCH_MAX_DISTANCE, Likeness, compare
 from vislam.loop.verification.relative_pose import Matched, errors, refine
 from vislam.loop.view import View
 from vislam.vision.locate import pnp
 from vislam.vision.ransac import usac
 
+_GUIDED_RADIUS_PX = 8.0  # search around a point's predicted place once a pose is known
+# of a keypoint; only its ratio to the depth sigma matters, residuals set the scale
+_FEATURE_SIGMA_PX = 1.0
+_EPIPOLAR_PX = 1.5  # Sampson error of an inlier where no depth is known
+_MIN_PARALLAX_PX = 6.0  # median that rotation does not explain; less, and the direction is noise
+_MAX_PLANE_SHARE = 0.8  # of the matches; a plane seen twice fits two directions (one was wrong by 109 deg)
+_DIRECTION_FLOOR_DEG = 2.0  # of a direction without scale: the lever arm of the camera is not in it
 _MIN_PNP_POINTS = 6  # P3P needs four; two more let RANSAC mean something
 _PNP_TRIES = 300  # finds 12 inliers among 50 matches with 0.98; more mostly prolongs the search in vain
 _PNP_LOCAL_TRIES = 1  # OpenCV's five find the same inliers in twice the time; the pose is refined here afterwards
@@ -90,7 +97,7 @@ class Verifier:
             points, xy = b.points_or_nan()[pairs[:, 1]], a.xy[pairs[:, 0]]
         if np.count_nonzero(np.isfinite(points[:, 2])) < max(_MIN_PNP_POINTS, self._config.min_inliers):
             return None
-        threshold = self._config.inlier_px * self._px
+        threshold = INLIER_PX * self._px
         search = usac(threshold, _PNP_TRIES, self._pair_seed(a, b), _PNP_LOCAL_TRIES)
         found = pnp(points, xy.astype(np.float64), threshold, search)
         if found is None:
@@ -99,13 +106,13 @@ class Verifier:
 
     def _refine(self, a: View, b: View, T_a_b: Array, matches: int, inliers: int) -> Verification:
         config = self._config
-        radius, limit = config.guided_radius_px * self._px, config.inlier_px * self._px
-        sigma_xy = config.feature_sigma_px * self._px
+        radius, limit = _GUIDED_RADIUS_PX * self._px, INLIER_PX * self._px
+        sigma_xy = _FEATURE_SIGMA_PX * self._px
         refined, matched = None, Matched(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 2)))
         support, agreeing = matched, np.empty(0, np.bool_)
         pairs = np.empty((0, 2), np.int64)
         for _ in range(_REFINE_PASSES):
-            pairs = match_guided(a, b, T_a_b, radius, config.match_max_distance)
+            pairs = match_guided(a, b, T_a_b, radius, MATCH_MAX_DISTANCE)
             matched = Matched(
                 a.points_or_nan()[pairs[:, 0]],
                 b.points_or_nan()[pairs[:, 1]],
@@ -113,7 +120,7 @@ class Verifier:
                 b.xy[pairs[:, 1]].astype(np.float64),
             )
             support = matched.take(_agreeing(T_a_b, matched, 2.0 * limit))
-            refined = refine(T_a_b, support, sigma_xy, config.inverse_depth_sigma_1_m) if len(support) else None
+            refined = refine(T_a_b, support, sigma_xy, INVERSE_DEPTH_SIGMA_1_M) if len(support) else None
             if refined is None:
                 return Verification("the matches do not determine a pose", matches, inliers, pairs=pairs)
             T_a_b = refined.T_a_b
@@ -125,7 +132,7 @@ class Verifier:
         covariance_cam = self._covariance(refined.information, refined.variance_scale)
         adjoint = se3_adjoint(self._T_body_cam)
         covariance = adjoint @ covariance_cam @ adjoint.T
-        reverse, depth = _agreements(T_a_b, matched, limit, 3.0 * config.inverse_depth_sigma_1_m)
+        reverse, depth = _agreements(T_a_b, matched, limit, 3.0 * INVERSE_DEPTH_SIGMA_1_M)
         return Verification(
             reason="",
             matches=matches,
@@ -150,7 +157,7 @@ class Verifier:
         """Verify without points: rotation and direction only; more inliers, since wrong matches agree easily."""
         config = self._config
         xy_a, xy_b = a.xy[pairs[:, 0]].astype(np.float64), b.xy[pairs[:, 1]].astype(np.float64)
-        found = relative_direction(xy_a, xy_b, config.epipolar_px * self._px, self._pair_seed(a, b))
+        found = relative_direction(xy_a, xy_b, _EPIPOLAR_PX * self._px, self._pair_seed(a, b))
         count = 0 if found is None else int(np.count_nonzero(found.inliers))
         if found is None or count < config.min_inliers_direction:
             reason = (
@@ -158,12 +165,10 @@ class Verifier:
                 f"needs {config.min_inliers_direction} without depth"
             )
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
-        if found.parallax < config.min_parallax_px * self._px:
-            reason = (
-                f"the views are too near: parallax {found.parallax / self._px:.1f} px, needs {config.min_parallax_px:g}"
-            )
+        if found.parallax < _MIN_PARALLAX_PX * self._px:
+            reason = f"the views are too near: parallax {found.parallax / self._px:.1f} px, needs {_MIN_PARALLAX_PX:g}"
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
-        if found.plane_share > config.max_plane_share:
+        if found.plane_share > _MAX_PLANE_SHARE:
             reason = f"two directions fit, all is on one plane: {found.plane_share:.0%} of the matches"
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         R = self._T_body_cam[:3, :3]
@@ -176,7 +181,7 @@ class Verifier:
             found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3], found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3]
         )
         covariance[:3, :3] += np.eye(3) * np.deg2rad(config.sigma_floor_deg) ** 2
-        covariance[3:, 3:] += R @ across @ R.T * np.deg2rad(config.direction_floor_deg) ** 2
+        covariance[3:, 3:] += R @ across @ R.T * np.deg2rad(_DIRECTION_FLOOR_DEG) ** 2
         return Verification(
             reason="",
             matches=len(pairs),

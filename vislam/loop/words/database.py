@@ -26,6 +26,7 @@ from vislam.loop.view import View
 from vislam.loop.words.index import InvertedIndex
 from vislam.loop.words.vocabulary import Vocabulary, depth_for, train
 
+_TRAINING_LAG_SHARE = 0.05  # ... and of those it is trained on; so long it takes at 10 keyframes a second
 _THREADS = 2  # whose compiled parts run side by side; the cores of the smallest machine that is meant
 _BLOCK = 50  # keyframes that a thread takes at a time
 
@@ -159,7 +160,7 @@ class PlaceDatabase:
         return max(count + 1, int(self._config.training_growth * count))
 
     def _lag(self, count: int) -> int:
-        return max(self._config.min_training_lag, int(self._config.training_lag_share * count))
+        return max(self._config.min_training_lag, int(_TRAINING_LAG_SHARE * count))
 
     def _begin(self, count: int) -> None:
         """Begin to train on the first `count` views."""

@@ -22,7 +22,7 @@ from vislam.core.geometry import invert
 from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
-from vislam.graph.joining import RelativeCovariance, Waiting
+from vislam.graph.joining import JOIN_FRAMES, RelativeCovariance, Waiting
 from vislam.loop.closer import LoopCloser
 from vislam.runs.folder import storage
 from vislam.runs.offline.session_graph import (
@@ -262,7 +262,7 @@ def _check_joined(parts: list[SessionPart], search: _Search, loops: list[LoopMod
     for model in loops:
         pair = (search.session_of(model.record.from_id), search.session_of(model.record.to_id))
         frames.setdefault(pair, set()).add(model.record.to_id)
-    least = parts[0].config.graph.join_frames
+    least = JOIN_FRAMES
     tied, grown = {0}, True
     while grown:
         new = {b for pair, ids in frames.items() for b in pair if len(ids) >= least and tied & set(pair)} - tied

@@ -30,6 +30,7 @@ from vislam.loop.words import BagOfWords, Vocabulary, seed_vocabulary
 from vislam.runs.session import Session, StoredKeyframe
 from vislam.trajectory import Trajectory, associate, read_trajectory
 
+_NOMINAL_DEPTH_M = 3.0  # of features without depth, to know what two views share
 EVALUATION, EDGE_ERRORS = "loops_eval.json", "loops_eval.csv"
 _MAX_POINTS = 400  # of a curve that is stored
 _MAX_WORST = 20  # edges that are listed
@@ -159,7 +160,7 @@ def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> Tru
     if not kept:
         raise DataError(f"{session_path}: the truth covers none of {len(stored)} keyframes; do they use one clock?")
     ids = np.array([keyframe.id for keyframe in kept], dtype=np.int64)
-    seen = [_seen(keyframe, rig, rule.nominal_depth_m) for keyframe in kept]
+    seen = [_seen(keyframe, rig, _NOMINAL_DEPTH_M) for keyframe in kept]
     with_depth = np.array([_knows_depth(keyframe) for keyframe in kept], dtype=np.bool_)
     return true_places(ids, pairs.t_ns, pairs.reference, seen, with_depth, rig, rule)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vislam.batch.bundle.chain import Chain
-from vislam.batch.bundle.loops import loop_factor
+from vislam.batch.bundle.loops import UNSCALED_ODOMETRY_SIGMA, loop_factor
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
 from vislam.config import Config, GraphConfig
 from vislam.core.camera import Rig
@@ -152,5 +152,5 @@ def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> list[tu
 
 def _of_chain(log: FactorLog, config: Config) -> list[tuple[Array, Array]]:
     """Return odometry and its information as vision measured it: loose coupling has no window."""
-    factors = Chain(log, config.graph, config.machine).odometry_edges(config.batch.unscaled_odometry_sigma)
+    factors = Chain(log, config.graph, config.machine).odometry_edges(UNSCALED_ODOMETRY_SIGMA)
     return [measurement_of(factor) for factor in factors]

@@ -12,6 +12,27 @@ from vislam.config import VerdictConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.runs.verdict.evidence import Evidence, Moved
 
+# of the camera's clock as told: drivers that stamp on arrival are off by up to 30 ms
+_CLOCK_SIGMA_S = 0.015
+_TURN_SCALE_SIGMA = 0.004  # relative, of focal length (Kalibr: 0.2 %) and of a calibrated gyro (0.3 %)
+_FORCE_SCALE_SIGMA = 0.01  # relative, of accelerometer and of baseline or depth, all calibrated
+# white noise of inertial data, in the quietest half second; what is told does not matter, for estimators learn it.
+# Flights of EuRoC have 0.1 and 0.05; beyond these two, inertial data tell less than vision between two keyframes
+_GYRO_NOISE_DEG = 1.0  # after a second
+_ACCEL_NOISE_M_S = 0.3  # after a second
+_RATE_ERROR = 0.2  # relative, of the inertial rate against that told: clocks are good to 3 %
+_LOST_SHARE = 0.1  # of the frames that vision may lose: it finds its keyframe again, and nothing drifted ...
+_LOST_S = 1.0  # ... but not after so long: a cheap IMU alone is off by a centimetre to a decimetre then
+_DEGRADED_SHARE = 0.2  # of the frames on which vision may lean weakly
+_MISSING_SHARE = 0.1  # of the frames that may never arrive: patches are followed over twice the interval then
+_REPEATED_FRAMES = 3  # images equal to the last bit in motion: one may be a hiccup, a stuck driver sends many
+_REFUSED_SHARE = 0.1  # of visual measurements that the filter may refuse: more than outliers explain
+_CONTRADICTING_SHARE = 0.25  # of verified loops that the graph may refuse, as `graph.join_max_contradicting`
+_UNIFORM_S = 20.0  # one camera without motion that shows scale: biases have walked away by then
+_SIGMA_M = 1.0  # of the filter's position at its worst: no controller can use it
+# rms between filter and graph over what both admit: independent models would differ by 1
+_APART_SIGMAS = 3.0
+_APART_SHARE = 0.005  # of the way: closer together than this they tell the same story, whatever they admit
 _MIN_FRAMES = 30  # before shares of them mean anything
 _MIN_LOOPS = 8
 _MIN_KEYFRAMES = 10
@@ -55,9 +76,9 @@ def judge(evidence: Evidence, config: VerdictConfig) -> Verdict:
     return Verdict(state, slow + lost + reasons, tuple(_moved(evidence, config)))
 
 
-def _slow(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+def _slow(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     """Say first that the machine did not keep up: much of what else is wrong comes of that."""
-    if not _is_slow(e, c):
+    if not _is_slow(e):
         return
     unseen = e.frames_dropped + e.frames_left_out
     mapped = f", {e.map_left_out} of {e.keyframes} keyframes left out of the map" if e.map_left_out else ""
@@ -65,7 +86,7 @@ def _slow(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     longest = ", ".join(f"{what} {late_s:.1f} s" for what, late_s in waited.items() if late_s >= _SOON_S)
     waits = f"; what waited longest: {longest}" if longest else ""
     others = "other work had its core, so end that first; then " if e.core < _OWN_SHARE * e.busy else ""
-    samples = "; for samples, --live.realtime-priority 50" if _misses_samples(e, c) else ""
+    samples = "; for samples, --live.realtime-priority 50" if _misses_samples(e) else ""
     yield (
         f"the machine is too slow for its sensors: {unseen} of {e.frames_offered} frames were not looked at "
         f"({e.frames_dropped} dropped, {e.frames_left_out} left out in time), {e.samples_missed} of "
@@ -75,15 +96,15 @@ def _slow(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     )
 
 
-def _is_slow(e: Evidence, c: VerdictConfig) -> bool:
+def _is_slow(e: Evidence) -> bool:
     unseen = e.frames_dropped + e.frames_left_out
-    is_blind = e.frames_offered >= _MIN_FRAMES and unseen > c.missing_share * e.frames_offered
-    is_thin = e.keyframes >= _MIN_KEYFRAMES and e.map_left_out > c.missing_share * e.keyframes
-    return is_blind or is_thin or _misses_samples(e, c)
+    is_blind = e.frames_offered >= _MIN_FRAMES and unseen > _MISSING_SHARE * e.frames_offered
+    is_thin = e.keyframes >= _MIN_KEYFRAMES and e.map_left_out > _MISSING_SHARE * e.keyframes
+    return is_blind or is_thin or _misses_samples(e)
 
 
-def _misses_samples(e: Evidence, c: VerdictConfig) -> bool:
-    return e.samples_missed > c.missing_share * (e.samples + e.samples_missed)
+def _misses_samples(e: Evidence) -> bool:
+    return e.samples_missed > _MISSING_SHARE * (e.samples + e.samples_missed)
 
 
 def _lost(e: Evidence, c: VerdictConfig) -> Iterator[str]:
@@ -91,26 +112,26 @@ def _lost(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         yield f"only {e.coverage:.0%} of the frames have a pose ({e.start_reason or 'vision was lost'})"
 
 
-def _vision(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     if e.frames < _MIN_FRAMES:
         return
-    if e.frames_lost > c.lost_share * e.frames or e.longest_loss_s > c.lost_s:
+    if e.frames_lost > _LOST_SHARE * e.frames or e.longest_loss_s > _LOST_S:
         yield (
             f"vision lost {e.frames_lost} of {e.frames} frames, {e.longest_loss_s:.1f} s at once: look at tracking.csv "
             "for when and why"
         )
-    if e.frames_degraded > c.degraded_share * e.frames:
+    if e.frames_degraded > _DEGRADED_SHARE * e.frames:
         by_depth = f", {e.frames_by_depth} of them placed by depth alone" if e.frames_by_depth else ""
         yield (
             f"vision was weak in {e.frames_degraded} of {e.frames} frames{by_depth}: more light, texture or a sharper "
             "lens"
         )
-    if e.frames_missing > c.missing_share * (e.frames + e.frames_missing) and not _is_slow(e, c):
+    if e.frames_missing > _MISSING_SHARE * (e.frames + e.frames_missing) and not _is_slow(e):
         yield (
             f"{e.frames_missing} of {e.frames + e.frames_missing} frames never arrived: look at the camera's cable, "
             "its driver and the load of the machine"
         )
-    if e.frames_repeated >= c.repeated_frames:
+    if e.frames_repeated >= _REPEATED_FRAMES:
         yield f"{e.frames_repeated} images repeat the one before while the body moves: the camera's driver is stuck"
     if e.submaps_apart:
         yield f"{e.submaps_apart} submaps are joined with nothing: return to where the camera has been"
@@ -137,7 +158,7 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             f"the filter refused readings of {name} until so many agreed that it moved to them, {count} times: it was "
             "surer than it was right; look for stretches without sight, and for an IMU that is worse than told"
         )
-    if e.offered >= _MIN_FRAMES and e.refused > c.refused_share * e.offered:
+    if e.offered >= _MIN_FRAMES and e.refused > _REFUSED_SHARE * e.offered:
         yield f"the filter refused {e.refused} of {e.offered} visual measurements as impossible"
     for kind, (count, nis, degrees) in e.innovations.items():
         # frames that share a keyframe share its errors: no more of them are independent than there are keyframes
@@ -148,48 +169,48 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
                 f"innovations of {kind.replace('_', ' ')} are {nis / degrees:.1f} times what the noise that was told "
                 "explains: calibrate, or tell more noise"
             )
-    if e.sigma_m > c.sigma_m:
+    if e.sigma_m > _SIGMA_M:
         yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst"
-    if e.uniform_s > c.uniform_s:
+    if e.uniform_s > _UNIFORM_S:
         yield (
             f"uniform motion for {e.uniform_s:.0f} s, in which one camera's scale is held by the IMU's biases alone: "
             "accelerate now and then, or use a second camera or depth"
         )
 
 
-def _graph(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+def _graph(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     apart = e.apart
-    if apart is not None and apart.sigmas > c.apart_sigmas and apart.rms_m > c.apart_share * apart.path_m:
+    if apart is not None and apart.sigmas > _APART_SIGMAS and apart.rms_m > _APART_SHARE * apart.path_m:
         yield (
             f"filter and graph are {apart.rms_m:.2f} m apart over {apart.path_m:.0f} m of way, {apart.sigmas:.1f} "
             "times what both admit: one of them is wrong"
         )
     offered = e.loops_accepted + e.loops_contradicting
-    if offered >= _MIN_LOOPS and e.loops_contradicting > c.contradicting_share * offered:
+    if offered >= _MIN_LOOPS and e.loops_contradicting > _CONTRADICTING_SHARE * offered:
         yield f"{e.loops_contradicting} of {offered} verified loops contradict the trajectory: look at loops.csv"
 
 
 def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     if e.rotation is not None and _beyond(e.rotation, c.rotation_sigma_deg, 3, c):
         yield f"the camera is turned by {e.rotation.by:.1f} degrees against its file: calibrate ({_CALIBRATE})"
-    if e.clock is not None and _beyond(e.clock, c.clock_sigma_s, 1, c):
+    if e.clock is not None and _beyond(e.clock, _CLOCK_SIGMA_S, 1, c):
         yield f"{_clock_words(e.clock)}, beyond any driver's delay: set --init.time-offset-s, or {_CALIBRATE}"
     turns, forces = e.turns, e.forces
-    if turns is not None and _beyond(Moved(turns.scale_error, turns.scale_sigma), c.turn_scale_sigma, 1, c):
+    if turns is not None and _beyond(Moved(turns.scale_error, turns.scale_sigma), _TURN_SCALE_SIGMA, 1, c):
         yield (
             f"vision sees turns {_percent(turns.scale_error)} than the gyroscope: focal length or gyro scale is wrong: "
             "calibrate camera and gyroscope"
         )
     if forces is None:
         return
-    if _beyond(Moved(forces.scale - 1.0, forces.scale_sigma), c.force_scale_sigma, 1, c):
+    if _beyond(Moved(forces.scale - 1.0, forces.scale_sigma), _FORCE_SCALE_SIGMA, 1, c):
         yield (
             f"the accelerometer's metres are {_percent(forces.scale - 1.0)} than those of vision: check baseline or "
             "depth scale, and calibrate the accelerometer"
         )
     if _beyond(
         Moved(forces.gravity_m_s2 - e.gravity_m_s2, forces.gravity_sigma_m_s2),
-        c.force_scale_sigma * e.gravity_m_s2,
+        _FORCE_SCALE_SIGMA * e.gravity_m_s2,
         1,
         c,
     ):
@@ -198,9 +219,9 @@ def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
 
 def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     turn_deg = math.degrees(e.gyro_noise or 0.0)  # in a second, as densities are per root of it
-    if turn_deg > c.gyro_noise_deg:
+    if turn_deg > _GYRO_NOISE_DEG:
         yield f"gyroscope noise is {turn_deg:.1f} deg after a second, even at its quietest: mount it on something soft"
-    if (speed := e.accel_noise or 0.0) > c.accel_noise_m_s:
+    if (speed := e.accel_noise or 0.0) > _ACCEL_NOISE_M_S:
         yield f"accelerometer noise is {speed:.2f} m/s after a second, even at its quietest: mount it on something soft"
     off = 0.0 if e.rate_hz is None or not e.rate_told_hz else abs(e.rate_hz / e.rate_told_hz - 1.0)
     if (period_s := 0.0 if e.rate_hz is None else 1.0 / e.rate_hz) > e.max_gap_s:
@@ -210,7 +231,7 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             "(3 Hz at least), or raise --imu.max-gap-s, --ekf.max-gap-s, --window.imu-max-gap-s and "
             "--graph.imu-max-gap-s"
         )
-    elif off > c.rate_error and not _misses_samples(e, c):
+    elif off > _RATE_ERROR and not _misses_samples(e):
         yield f"inertial samples come at {e.rate_hz:.0f} Hz, told were {e.rate_told_hz:.0f}: look for what loses them"
     if e.longest_gap_s > max(e.max_gap_s, 1.5 * period_s):
         yield f"no inertial sample for {e.longest_gap_s:.2f} s: look at the cable, the bus and the load of the machine"
@@ -230,7 +251,7 @@ _TESTS: tuple[Callable[[Evidence, VerdictConfig], Iterator[str]], ...] = (
 
 def _moved(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     """Tell what was estimated significantly off, though no farther than its kind usually is: it was corrected."""
-    if e.clock is not None and _beyond(e.clock, 0.0, 1, c) and not _beyond(e.clock, c.clock_sigma_s, 1, c):
+    if e.clock is not None and _beyond(e.clock, 0.0, 1, c) and not _beyond(e.clock, _CLOCK_SIGMA_S, 1, c):
         yield f"{_clock_words(e.clock)}; corrected, --init.time-offset-s {e.clock.by:.4f} tells it from the start"
     turn = e.rotation
     if turn is not None and _beyond(turn, 0.0, 3, c) and not _beyond(turn, c.rotation_sigma_deg, 3, c):

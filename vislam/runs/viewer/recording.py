@@ -39,6 +39,10 @@ from vislam.core.messages import (
 from vislam.runs.viewer.layout import layout
 from vislam.runs.viewer.map_view import grid_cells, octree_voxels
 
+_JPEG_QUALITY = 75
+_MAX_RANGE_M = 8.0  # farther depth is noise that hides the scene
+
+
 rr.unregister_shutdown()  # at exit it waits without a limit; whoever opens a recording closes it
 
 _PAPER_GREY = 60
@@ -281,7 +285,7 @@ class RunViewer:
         scale = self._config.image_width_px / image.shape[1]
         size = (self._config.image_width_px, round(image.shape[0] * scale))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, self._config.jpeg_quality])
+        _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         return rr.EncodedImage(contents=encoded.tobytes(), media_type="image/jpeg"), scale
 
     def _cloud(self, keyframe: Keyframe) -> tuple[Array, ImageU8]:
@@ -291,14 +295,14 @@ class RunViewer:
         if image is None:
             return np.empty((0, 3)), np.empty((0, 3), np.uint8)
         if frame.depth_m is not None and self._rig is not None:
-            pixels, depth = _depth_grid(frame.depth_m, self._config.cloud_points, self._config.max_range_m)
+            pixels, depth = _depth_grid(frame.depth_m, self._config.cloud_points, _MAX_RANGE_M)
             T_body_cam = self._rig.T_body_cams[0]
             points = self._rig.cameras[0].unproject(pixels) * depth[:, None] @ T_body_cam[:3, :3].T + T_body_cam[:3, 3]
         elif keyframe.points_body_m is not None:
             pixels, points = keyframe.keypoints_px, keyframe.points_body_m
         else:
             return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-        near = np.linalg.norm(points, axis=1) <= 2.0 * self._config.max_range_m  # NaN is not near
+        near = np.linalg.norm(points, axis=1) <= 2.0 * _MAX_RANGE_M  # NaN is not near
         points, pixels = points[near], pixels[near]
         rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, image.shape[0] - 1)
         columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, image.shape[1] - 1)
