@@ -129,6 +129,7 @@ def test_layers_can_be_turned_off(page):
 
 
 def test_the_map_turns_under_the_mouse(page):
+    page.locator("#view-canvas").scroll_into_view_if_needed()
     stands = "() => window.vislamReport.view.camera.position.toArray()"
     before, box = page.evaluate(stands), page.locator("#view-canvas").bounding_box()
     page.mouse.move(box["x"] + 300, box["y"] + 200)

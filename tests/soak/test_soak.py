@@ -57,7 +57,7 @@ def test_open_loop_chain_as_far_as_gtsam_throws() -> None:
     """A healthy chain on which iSAM2 with Cholesky throws, after about 370 m."""
     rng = np.random.default_rng(3)
     sigmas = np.repeat([0.001, 0.002], 3)
-    step_m, count = 1.0, 450
+    step_m, count = 1.0, 700
     covariance = np.diag(sigmas**2)
     step = transform(np.eye(3), np.array([step_m, 0.0, 0.0]))
     config = GraphConfig(coupling="loose", vo_inflation=1.0, vo_floor_deg=0.0, vo_floor_m=0.0)
