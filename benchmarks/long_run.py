@@ -38,8 +38,7 @@ import vislam.window  # noqa: E402
 from vislam.config import GraphConfig, WindowConfig  # noqa: E402
 from vislam.core.geometry import align_points, se3_exp, transform  # noqa: E402
 from vislam.core.messages import Tracking, VoMeasurement  # noqa: E402
-from vislam.graph import PoseGraph  # noqa: E402
-from vislam.graph.replay import EdgeGraph  # noqa: E402
+from vislam.graph import Graph, PoseGraph  # noqa: E402
 from worlds.endless_lap import STEREO, LapWorld, cart_round, window_of_truth  # noqa: E402
 from worlds.lap import packet_of  # noqa: E402
 from worlds.parts import MACHINE  # noqa: E402
@@ -205,15 +204,15 @@ def chain(kilometres: float, step_m: float) -> None:
 def g2o(folder: Path, names: list[str]) -> None:
     """Replay files in key order and say how far from the optimum they end."""
     for name in names:
-        file, graph = EdgeFile(folder / f"{name}.g2o"), EdgeGraph(GraphConfig())
+        file, graph = EdgeFile(folder / f"{name}.g2o"), Graph()
         meter = Meter(f"{name} replay")
         file.replay(graph, meter)
         meter.report()
-        before = file.chi2(graph.poses)
-        how = graph.finish()
-        after = file.chi2(graph.poses)
-        best = BEST_CHI2[name] or file.optimum_from(graph.poses)
-        print(f"  chi2 {before:.6g}, after finish {after:.8g}, optimum {best:.8g}; {how}", flush=True)
+        before = file.chi2(graph.poses())
+        graph.optimise()
+        after = file.chi2(graph.poses())
+        best = BEST_CHI2[name] or file.optimum_from(graph.poses())
+        print(f"  chi2 {before:.6g}, in batch {after:.8g}, optimum {best:.8g}", flush=True)
 
 
 def main() -> None:

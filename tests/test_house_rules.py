@@ -29,17 +29,13 @@ BUDGET_PRIVATE_USES = 55  # of attributes with an underscore by tests; to 30
 
 # classes beyond the limit and how long they may be, by tens: one state machine each, whose parts share most attributes
 LONG_CLASSES = {
-    "Estimator": 470,  # ladder of solvers around one iSAM2
     "FastPath": 260,
     "Gy85": 260,  # one board's clock, queue and faults
     "LiveRun": 270,
-    "LoopSet": 410,  # decides about all loops of a run
     "Mapper": 280,  # every product of a map
-    "PoseGraph": 340,
     "Run": 320,
     "RunViewer": 290,
     "SerialBridge": 300,
-    "SlidingWindow": 330,
     "Updater": 290,
     "_Inspector": 270,
 }
@@ -52,7 +48,6 @@ MANY_ATTRIBUTES = {
     "Gy85": 23,
     "Run": 21,
     "SerialBridge": 23,
-    "SlidingWindow": 22,
     "_Batch": 23,
 }
 

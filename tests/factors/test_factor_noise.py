@@ -4,8 +4,9 @@ import pytest
 
 from vislam.config import GraphConfig
 from vislam.core.errors import DataError
+from vislam.factors.builder import of_vision
 from vislam.factors.journal import KeyframeRecord
-from vislam.factors.noise_models import cauchy, checked_covariance, conditioned, gaussian, huber, inflated, of_vision
+from vislam.factors.noise_models import cauchy, checked_covariance, conditioned, gaussian, huber, inflated
 
 
 @pytest.mark.parametrize(

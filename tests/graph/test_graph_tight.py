@@ -18,11 +18,13 @@ from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision, NavS
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel
+from vislam.factors.sensed import Readings
 from vislam.factors.window import WindowOdometry
 from vislam.graph import PoseGraph, estimator
 from vislam.graph.estimator import Estimator
 from vislam.graph.source import in_map
 from vislam.runs.session import Session, SessionWriter, recall
+from vislam.sensors import Suite
 from vislam.window.messages import WindowUpdate
 from worlds.fake_window import FakeWindow
 from worlds.lap import RIG, World, rmse_m
@@ -417,7 +419,7 @@ def test_the_journal_alone_rebuilds_the_graph(world: World, make) -> None:
     graph, _ = make(world)
     feed(graph, world, 0, 100)
     odometry = WindowOdometry(TIGHT, MACHINE)
-    again: Estimator[LoopModel] = Estimator(TIGHT, odometry)
+    again = Estimator(TIGHT, odometry, Readings(Suite(), TIGHT))
     for record in graph.journal:
         if isinstance(record, StartRecord):
             odometry.begin(record)

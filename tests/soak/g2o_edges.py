@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
 from vislam.core.messages import Array
-from vislam.graph.replay import Between, EdgeGraph
+from vislam.graph import Graph
 
 # chi-square (2 x gtsam's error) of the best known solution
 BEST_CHI2 = {
@@ -23,6 +24,16 @@ BEST_CHI2 = {
 }
 
 
+@dataclass(frozen=True)
+class Edge:
+    """A relative pose [4, 4] with its covariance [6, 6]."""
+
+    from_id: int
+    to_id: int
+    T_from_to: Array
+    covariance: Array
+
+
 class EdgeFile:
     """A g2o file; planar ones lie in the z = 0 plane of space, where their in-plane cost is unchanged."""
 
@@ -31,8 +42,8 @@ class EdgeFile:
             self.planar = "SE2" in next(lines)
         self.graph, self.values = gtsam.readG2o(str(path), not self.planar)
         self.count = self.values.size()
-        self._odometry: list[Between | None] = [None] * self.count
-        self._loops: list[list[Between]] = [[] for _ in range(self.count)]
+        self._odometry: list[Edge | None] = [None] * self.count
+        self._loops: list[list[Edge]] = [[] for _ in range(self.count)]
         for n in range(self.graph.size()):
             edge = self._between(n)
             newer = max(edge.from_id, edge.to_id)
@@ -41,29 +52,33 @@ class EdgeFile:
             else:
                 self._loops[newer].append(edge)
 
-    def _between(self, n: int) -> Between:
+    def _between(self, n: int) -> Edge:
         factor = self.graph.at(n)
         a, b = factor.keys()
         measured = factor.measured()
         own = np.asarray(factor.noiseModel().covariance())
         if not self.planar:
-            return Between(n, a, b, np.asarray(measured.matrix()), own)
+            return Edge(a, b, np.asarray(measured.matrix()), own)
         T = np.eye(4)
         T[:2, :2], T[:2, 3] = measured.matrix()[:2, :2], measured.matrix()[:2, 2]
         covariance = np.eye(6) * np.trace(own) / 3.0
         plane = [3, 4, 2]  # x, y, yaw
         covariance[np.ix_(plane, plane)] = own
-        return Between(n, a, b, T, covariance)
+        return Edge(a, b, T, covariance)
 
-    def replay(self, graph: EdgeGraph, meter=None) -> list[str]:
-        """Add all keyframes but the first; return the notes."""
+    def replay(self, graph: Graph, meter=None) -> list[str]:
+        """Add all keyframes with their edges, one at a time; return the notes."""
         notes = []
+        graph.prior(graph.add_pose(), np.eye(4), (1e-3, 1e-3))
         for k in range(1, self.count):
             odometry = self._odometry[k]
             assert odometry is not None
             if meter is not None:
                 meter.start()
-            note = graph.add(odometry, self._loops[k])
+            graph.add_pose()
+            for edge in (odometry, *self._loops[k]):
+                graph.between(edge.from_id, edge.to_id, edge.T_from_to, edge.covariance)
+            note = graph.optimise(incremental=True).note
             if meter is not None:
                 meter.stop(note)
             notes += [f"{k}: {note}"] * bool(note)

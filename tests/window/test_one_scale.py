@@ -11,7 +11,7 @@ from vislam.core.geometry import so3_exp, transform
 from vislam.core.messages import Array
 from vislam.sim.sensing import CONSUMER_IMU
 from vislam.window import SlidingWindow
-from vislam.window.one_scale import at_first_scale
+from vislam.window.keyframes import at_first_scale
 from worlds.motion import NS, T0_NS, Motion, levelled, state_error, still
 from worlds.parts import GRAVITY_M_S2, MACHINE
 from worlds.room import MONO, World, start_state

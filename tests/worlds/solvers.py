@@ -11,7 +11,7 @@ from vislam.core.memory import LoopPlace, LoopState
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel
 from vislam.factors.solvers import IncrementalSolver
-from vislam.graph import PoseGraph, estimator
+from vislam.graph import PoseGraph, ladder
 from vislam.graph.belief.consensus import Consensus, Verdict
 
 POISON = RuntimeError("\nIndeterminate linear system detected while working near variable\n8646911284551352321")
@@ -53,7 +53,7 @@ class WatchedSolvers:
                 outer.asked.append(len(keys))
                 return super().joint_covariance(keys)
 
-        monkeypatch.setattr(estimator, "IncrementalSolver", Watched)
+        monkeypatch.setattr(ladder, "IncrementalSolver", Watched)
 
     def arm_at_the_gate(self, monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
         """Let updates fail from the next test of a loop on: that comes after its keyframe and before the loop."""

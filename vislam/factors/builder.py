@@ -19,7 +19,7 @@ from vislam.factors.noise_models import (
     DIRECTION_SOFT_M,
     gaussian,
     huber,
-    of_vision,
+    inflated,
 )
 from vislam.factors.preintegration import Preintegrated, Preintegrator
 from vislam.factors.priors import start_factors
@@ -210,3 +210,15 @@ def read_guess(values: gtsam.Values, k: int, has_imu: bool) -> Guess:
     if not has_imu:
         return Guess(T, np.zeros(3), gtsam.imuBias.ConstantBias())
     return Guess(T, np.array(values.atVector(V(k))), values.atConstantBias(B(k)))
+
+
+def of_vision(record: KeyframeRecord, config: GraphConfig, vo_scale: float = 1.0) -> Array:
+    """Return the covariance [6, 6] of a keyframe's motion by vision.
+
+    How sure metric motions are, front ends measure; `vo_inflation` is for one camera, which goes by residuals alone.
+    """
+    assert record.covariance is not None
+    of_residuals = 1.0 if record.has_scale else config.vo_inflation
+    factor = vo_scale * of_residuals * (config.vo_degraded_inflation if record.degraded else 1.0)
+    floor_m = config.vo_floor_m if record.has_scale else 0.0
+    return inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)

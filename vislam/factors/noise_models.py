@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 
-from vislam.config import GraphConfig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-
-if TYPE_CHECKING:
-    from vislam.factors.journal import KeyframeRecord
 
 DIRECTION_FLOOR_DEG = 0.2  # mono: direction of motion
 DIRECTION_SOFT_M = 0.005  # mono: baselines shorter than this lose their say on direction
@@ -68,18 +63,6 @@ def inflated(covariance: Array, sigma_factor: float, floor_rad: float, floor_m: 
     out.ravel()[:21:7] += floor_rad**2
     out.ravel()[21::7] += floor_m**2
     return out
-
-
-def of_vision(record: KeyframeRecord, config: GraphConfig, vo_scale: float = 1.0) -> Array:
-    """Return the covariance [6, 6] of a keyframe's motion by vision.
-
-    How sure metric motions are, front ends measure; `vo_inflation` is for one camera, which goes by residuals alone.
-    """
-    assert record.covariance is not None
-    of_residuals = 1.0 if record.has_scale else config.vo_inflation
-    factor = vo_scale * of_residuals * (config.vo_degraded_inflation if record.degraded else 1.0)
-    floor_m = config.vo_floor_m if record.has_scale else 0.0
-    return inflated(record.covariance, factor, np.deg2rad(config.vo_floor_deg), floor_m)
 
 
 def gaussian(covariance: Array, ratio_max: float) -> gtsam.noiseModel.Gaussian:

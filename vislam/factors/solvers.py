@@ -54,6 +54,9 @@ class Solver(Protocol):
     def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
         """Return the current estimate of variables, by default of all."""
 
+    def cost(self) -> float:
+        """Return half the squared sum of whitened errors at the estimate, as kernels count them."""
+
     def joint_covariance(self, keys: list[int]) -> Array:
         """Return the joint marginal covariance of variables, in the order of `keys`."""
 
@@ -109,6 +112,10 @@ class IncrementalSolver:
         """See Solver."""
         return self._isam.calculateEstimate() if keys is None else self._isam.calculateEstimate(keys)
 
+    def cost(self) -> float:
+        """See Solver."""
+        return float(self._isam.getFactorsUnsafe().error(self._isam.calculateEstimate()))
+
     def joint_covariance(self, keys: list[int]) -> Array:
         """See Solver."""
         return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
@@ -157,6 +164,10 @@ class BatchSolver:
     def estimate(self, keys: list[int] | None = None) -> gtsam.Values:
         """See Solver; always all, for its update looks at all of them anyway."""
         return gtsam.Values(self._values)
+
+    def cost(self) -> float:
+        """See Solver."""
+        return float(self._graph.error(self._values))
 
     def joint_covariance(self, keys: list[int]) -> Array:
         """See Solver."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -78,6 +77,7 @@ class Graph:
         machine = MachineConfig(gravity_m_s2=gravity_m_s2)
         self._preintegrator = None if imu is None else Preintegrator(_CONFIG, imu, machine)
         self._count = 0
+        self._solved = 0  # poses that have a value
         self._landmarks = 0
         self._given: dict[int, Array] = {}  # first guesses, by key
         self._inertial: set[int] = set()  # poses with velocity and biases
@@ -198,6 +198,7 @@ class Graph:
         """
         fresh, guesses = self._reached()
         note = self._solution.take(fresh, guesses.new, incremental)
+        self._solved = self._count
         self._waiting = [one for one in self._waiting if all(one is not other for other in fresh)]
         decided = self._solution.decide(self._new_loops)
         self._new_loops = []
@@ -264,12 +265,12 @@ class Graph:
             reached = [(one, one.reach(guesses)) for one in left]
             fresh += [one for one, has_all in reached if has_all]
             rest = [one for one, has_all in reached if not has_all]
-            before = gtsam.Values(guesses.new).size()
+            before = guesses.new.size()
             fix_points([one for one in rest if isinstance(one, View)], guesses)
             if len(rest) == len(left) and guesses.new.size() == before:
                 break
             left = rest[::-1]  # a chain may hang on its last pose as well
-        loose = [k for k in range(self._count) if not guesses.has(X(k))]
+        loose = [k for k in range(self._solved, self._count) if not guesses.has(X(k))]
         if loose:
             raise UsageError(
                 f"{len(loose)} of {self._count} poses, first {loose[0]}, hang on nothing that has a place in map; "

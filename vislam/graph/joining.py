@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from vislam.config import GraphConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, se3_adjoint, transform
-from vislam.core.messages import Array, Submaps
+from vislam.core.messages import Array, LoopDecision, Submaps
 from vislam.factors.journal import KeyframeRecord, checked_pose
 from vislam.factors.keys import nearest_rigid
 from vislam.factors.loop import LoopModel
 from vislam.factors.motion import SUBMAP_SIGMA_DEG
+from vislam.graph.belief import LoopSet
+from vislam.graph.estimator import Estimator
+from vislam.graph.source import Source
+from vislam.graph.travel import Travel
 
 _CONSISTENCY_MAX_SIGMA_M = 0.5  # odometry looser than this between two loops proves nothing
 _SUBMAP_TILT_SIGMA_DEG = 5.0  # roll and pitch, where gravity is known on both sides
@@ -29,6 +33,7 @@ _SUBMAP_TILT_SIGMA_DEG = 5.0  # roll and pitch, where gravity is known on both s
 JOIN_FRAMES = 2
 _JOIN_WAITING = 20  # newest loops between submaps that are compared for that; bounds the work
 _JOIN_MAX_CONTRADICTING = 0.25  # of the loops between two submaps; more, and they wait for further ones
+_NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 _MIN_RAY_ANGLE_RAD = np.deg2rad(5.0)  # between two directions that are to fix a place
 
 RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed at j
@@ -185,6 +190,91 @@ class _Ends:
 
     def _older_moves(self, edge: LoopModel) -> bool:
         return self.submaps.group(edge.record.from_id) == self.moving
+
+
+class Joining:
+    """Owns which submaps are joined, and joins more as far as loops between them agree."""
+
+    def __init__(
+        self, config: GraphConfig, source: Source, estimator: Estimator, loops: LoopSet, travel: Travel
+    ) -> None:
+        """Start with one submap; `travel` is the odometry between the estimator's keyframes."""
+        self._source = source
+        self._estimator = estimator
+        self._loops = loops
+        self._travel = travel
+        self._waiting = Waiting(config)
+        self.submaps = Submaps()
+
+    @property
+    def waiting(self) -> list[LoopModel]:
+        """Return the loops between submaps that are not joined, oldest first."""
+        return self._waiting.edges
+
+    def begin(self, k: int) -> None:
+        """Let a submap begin with keyframe k."""
+        self.submaps = self.submaps.begun(k)
+
+    def restore(self, waiting: list[LoopModel]) -> None:
+        """Take over the loops that waited in an earlier run, once the submaps and the other loops are there."""
+        for model in waiting:
+            self._waiting.add(model)
+        self.count()
+
+    def count(self) -> None:
+        """Find out which submaps are joined, by the loops that the graph holds now."""
+        if len(self.submaps.groups) > 1:
+            self.submaps = self.submaps.joined_by((m.record.from_id, m.record.to_id) for m in self._loops.held)
+
+    def wait(self, model: LoopModel) -> list[int]:
+        """Let a loop between submaps that are not joined wait for other frames; return the ids of those that left."""
+        self._loops.wait(model)
+        gone = self._waiting.add(model)
+        if gone is None:
+            return []
+        self._loops.ledger.add(gone, LoopDecision.REJECTED, "too many newer ones wait")
+        return [gone.record.id]
+
+    def join(self, touched: list[int], notes: list[str]) -> list[LoopModel]:
+        """Join submaps as far as loops between them agree; return those that waited and can be gated now."""
+        loops = self._loops
+        while (found := self._waiting.place(self.submaps, self._estimator.poses, self._known)) is not None:
+            touched += [m.record.id for m in found.agreeing]
+            self._bring(found, notes)
+            witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"
+            for model in loops.accept(found.agreeing, notes, f"joins two submaps, as {witnesses} say"):
+                loops.ledger.add(model, LoopDecision.REJECTED, "though it was to join two submaps")
+            for model in found.agreeing:
+                loops.offer(model)
+            kept = [m for m in found.agreeing if m.record.id in self._estimator.loops]
+            if len({m.record.to_id for m in kept}) < JOIN_FRAMES:
+                for model in kept:
+                    loops.ledger.add(model, LoopDecision.REJECTED, "its witnesses against one another do not hold")
+                notes.append(self._estimator.drop(kept))
+            self.count()
+        ready = self._waiting.take_joined(self.submaps)
+        touched += [m.record.id for m in ready]
+        return ready
+
+    def _bring(self, found: Placement, notes: list[str]) -> None:
+        """Move a group of submaps to where loops say that it is, with the weak links that it has to others."""
+        every = np.arange(len(self._estimator.poses), dtype=np.int64)
+        ids = every[self.submaps.groups_of(every) == found.group]
+        self._estimator.look_at(every.tolist())
+        poses = self._estimator.poses.copy()
+        poses[ids] = found.T_map_moved @ poses[ids]
+        for k in relinked(self.submaps, ids):
+            self._source.relink(k, invert(poses[k - 1]) @ poses[k])
+        notes.append(self._estimator.move(ids, found.T_map_moved))
+        notes.append(
+            f"submap {found.group}, {len(ids)} keyframes with what it was joined with before, joins an older one"
+        )
+
+    def _known(self, i: int, j: int) -> Array:
+        """Return the covariance [6, 6] of T_i_j: by summed odometry, an upper bound, where that is short."""
+        if abs(i - j) <= _NEAR_KEYFRAMES and self.submaps.of(i) == self.submaps.of(j):
+            return self._travel.relative_covariance(i, j)
+        return self._loops.gate.relative_covariance(i, j)
 
 
 def _witnesses(edges: list[LoopModel]) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert
 from vislam.core.memory import EdgeReport, GraphMemory, GraphRecord, LoopPlace, WindowRecord
-from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, LoopEdge, NavState, Submaps
+from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopEdge, NavState
 from vislam.factors.builder import Step
 from vislam.factors.journal import (
     KeyframeRecord,
@@ -28,18 +28,16 @@ from vislam.factors.loop import LoopModel
 from vislam.factors.sensed import Covariance, Readings
 from vislam.graph.belief import LoopSet
 from vislam.graph.estimator import Estimator
-from vislam.graph.joining import JOIN_FRAMES, Placement, Waiting, relinked, weak_link
+from vislam.graph.joining import Joining, weak_link
+from vislam.graph.published import Published
 from vislam.graph.restore import restored_journal, sort_loops
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.graph.travel import Travel
 from vislam.imu import ImuNoise
 from vislam.sensors import Suite
 
-_MOVED_M = 0.001  # poses that moved less are not published again
-_MOVED_DEG = 0.05
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new submap: no loop may be tested against it
-_NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 
 
 class PoseGraph:
@@ -61,30 +59,21 @@ class PoseGraph:
         """
         self._config = config
         self._noise = noise
-        self._lever_m = np.array(rig.T_body_cams[0][:3, 3], dtype=np.float64)
-        self._source: Source
-        if config.coupling == "tight":
-            from vislam.window import SlidingWindow  # compiles a good deal, which loose coupling need not wait for
-
-            self._source = WindowSource(config, machine, SlidingWindow(window, rig, noise, machine))
-        else:
-            self._source = MotionSource(config, noise, machine, self._lever_m)
+        self._lever_m = _lever_m(rig)
+        self._source = _source(config, noise, machine, rig, window)
         self.readings = Readings(suite or Suite(), config)
-        self._estimator: Estimator[LoopModel] = Estimator(config, self._source.odometry, self.readings)
+        self._estimator = Estimator(config, self._source.odometry, self.readings)
         self._start: StartRecord | None = None
         self._start_t_ns: int | None = None
         self._journal: list[Record] = []
         self._keyframes: list[KeyframeRecord] = []
         self._travel = Travel()
         self._loops = LoopSet(config, self._lever_m, self._estimator, self._travel)
-        self._submaps = Submaps()
-        self._waiting = Waiting(config)
+        self._joining = Joining(config, self._source, self._estimator, self._loops, self._travel)
+        self._published = Published()
         self._T_odom_last: Array | None = None
         self._said: WindowRecord | None = None
         self._newest: NavState | None = None
-        self._published: Array = np.zeros((0, 4, 4))
-        self._T_map_odom: Array = np.eye(4)
-        self._revision = 0
 
     @property
     def ids(self) -> NDArray[np.int64]:
@@ -119,8 +108,7 @@ class PoseGraph:
         """
         if self._config.coupling != "tight":
             raise UsageError("a map is continued with tight coupling only; use --graph.coupling tight")
-        start = start_record(state, T_odom_body)
-        self._source.begin_submap(start, state)
+        self._source.begin_submap(start_record(state, T_odom_body), state)
         self._T_odom_last = self._estimator.poses[-1].copy()
 
     def hold(self, count: int | None = None) -> None:
@@ -135,31 +123,26 @@ class PoseGraph:
         """
         if self._start is None or self._keyframes:
             raise UsageError("a graph is restored once, after initialise(...) and before the first keyframe")
-        has_gravity = self._noise is not None
-        self._keyframes, self._journal = restored_journal(memory, self._config, has_gravity, self._start)
+        self._keyframes, self._journal = restored_journal(memory, self._config, self._noise is not None, self._start)
         guesses = self._source.restore(self._keyframes, memory)
         self.readings.recall(memory.own)
         for packet, record in zip(memory.packets, self._keyframes, strict=True):
             self.readings.append(record, packet.readings)
         for k in [record.id for record in self._keyframes if record.begins_submap]:
-            self._submaps = self._submaps.begun(k)
+            self._joining.begin(k)
             self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
         models = [LoopModel(r, self._config, self._lever_m) for r in self._journal if isinstance(r, LoopRecord)]
         by_place = sort_loops(memory.loops, {m.id: m for m in models})
-        held, spare = by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE]
-        steps, note = self._estimator.restore(guesses, held, spare, memory.vo_scale)
-        poses = self._estimator.poses
+        in_graph, spare = by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE]
+        steps, note = self._estimator.restore(guesses, in_graph, spare, memory.vo_scale)
         for record, step in zip(self._keyframes[1:], steps, strict=True):
             T_map_before = memory.T_map_body[record.id - 1]
             self._travel.append(*_variances(record, step), invert(T_map_before) @ step.guess.T_map_body)
-        self._loops.restore(models, by_place, memory.ties)
-        for model in by_place[LoopPlace.WAITING]:
-            self._waiting.add(model)
-        self._count_joined()
-        self._loops.restore_reports(memory.loops)
-        note = "; ".join(n for n in (note, self._loops.freeze_all()) if n)
-        self._revision, self._T_odom_last = memory.revision, memory.T_odom_body
-        self._T_map_odom = poses[-1] @ invert(memory.T_odom_body)
+        self._loops.restore(models, by_place, memory.ties, memory.loops)
+        self._joining.restore(by_place[LoopPlace.WAITING])
+        note = "; ".join(n for n in (note, self._loops.freezer.all()) if n)
+        self._published.revision, self._T_odom_last = memory.revision, memory.T_odom_body
+        self._published.place_odom(self._estimator.poses[-1], memory.T_odom_body)
         update = self._publish([], [], note, everything=True)
         self.take_record()
         return update
@@ -172,8 +155,7 @@ class PoseGraph:
 
     def take_record(self) -> GraphRecord:
         """Return what `restore` will need of the last keyframe, beside what was measured and the poses."""
-        loops = self._loops.take_states(self._waiting.edges)
-        states = self._source.take_states(self._newest)
+        states, loops = self._source.take_states(self._newest), self._loops.take_states(self._joining.waiting)
         own = self.readings.all_own(self._estimator.values)
         return GraphRecord(self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, own)
 
@@ -189,8 +171,7 @@ class PoseGraph:
             raise UsageError("the graph needs initialise(...) before the first keyframe")
         previous = self._keyframes[-1] if self._keyframes else None
         record = keyframe_record(packet, previous)
-        if T_odom_body is not None and not np.all(np.isfinite(T_odom_body)):
-            raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
+        _check_odom(record, T_odom_body)
         if previous is None:
             _check_start(record, self._start_t_ns)
         elif record.begins_submap:
@@ -213,23 +194,25 @@ class PoseGraph:
             notes = [step.note, note]
         self._keyframes.append(record)
         if record.begins_submap:
-            self._submaps = self._submaps.begun(record.id)
-            notes.append(f"keyframe {record.id} begins submap {len(self._submaps.groups) - 1} of the trajectory")
+            self._joining.begin(record.id)
+            notes.append(
+                f"keyframe {record.id} begins submap {len(self._joining.submaps.groups) - 1} of the trajectory"
+            )
         self._T_odom_last = T_odom_body
         accepted, refused = self._close(edges, notes)
         if T_odom_body is not None:
-            self._T_map_odom = self._estimator.poses[-1] @ invert(np.ascontiguousarray(T_odom_body, dtype=np.float64))
+            self._published.place_odom(self._estimator.poses[-1], T_odom_body)
         return self._publish(accepted, refused, "; ".join(n for n in notes if n))
 
     def finish(self) -> GraphUpdate:
         """Iterate to convergence and return all poses; the note tells the cost and how it was reached."""
         if not self._keyframes:
-            return GraphUpdate(self._revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
+            return GraphUpdate(self._published.revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
         before, notes = self._estimator.poses[-1].copy(), list[str]()
         decided = self._loops.finish(notes)
         notes.append(self._estimator.converge())
-        self._T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._T_map_odom
-        return self._publish(*self._loops.split(decided), "; ".join(n for n in notes if n), everything=True)
+        self._published.T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._published.T_map_odom
+        return self._publish(*self._loops.ledger.split(decided), "; ".join(n for n in notes if n), everything=True)
 
     def poses(self) -> Array:
         """Return T_map_body [M, 4, 4] of all keyframes, each as it was last read back from the solver."""
@@ -241,7 +224,8 @@ class PoseGraph:
         An error of scale that all measurements share is in it. As a variable it would keep its prior, for nothing here
         knows metres better than a floor or a baseline, and would tie all factors to one; considered, it costs nothing.
         """
-        return [self._stretched(self._state(k)) for k in range(len(self._keyframes))]
+        states = [self._source.state(one.id, one.t_ns, self._estimator) for one in self._keyframes]
+        return [_stretched(state, self._estimator.poses[0], self._config.scale_sigma) for state in states]
 
     def own(self, name: str) -> tuple[Array, Array] | None:
         """Return a sensor's own variables [V], in their order, and their sigmas [V], NaN where gtsam gives none.
@@ -266,7 +250,7 @@ class PoseGraph:
 
     def relative_covariance(self, i: int, j: int) -> Array:
         """Return the covariance [6, 6] of T_i_j, perturbed at j; from summed odometry where gtsam cannot give it."""
-        return self._loops.relative_covariance(i, j)
+        return self._loops.gate.relative_covariance(i, j)
 
     def edge_reports(self) -> list[EdgeReport]:
         """Return what became of every offered loop, by loop id, with the weight it has now."""
@@ -274,118 +258,72 @@ class PoseGraph:
 
     def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
         """Gate loops, accept them or keep them pending, and let the review work; return accepted and refused ids."""
-        here: list[LoopModel] = []
-        touched: list[int] = []
+        here, touched = list[LoopModel](), list[int]()
         self._estimator.look_at([k for e in edges for k in (e.from_id, e.to_id) if 0 <= k < len(self._keyframes)])
         for edge in edges:
             model = self._loops.admit(edge, len(self._keyframes) - 1)
             touched.append(edge.id)
-            if model is None:
-                continue
-            self._journal.append(model.record)
-            if not self._submaps.are_joined(edge.from_id, edge.to_id):
-                touched += self._wait(model)
-            else:
-                here.append(model)
-        here += self._join(touched, notes)
+            if model is not None:
+                self._journal.append(model.record)
+                if self._joining.submaps.are_joined(edge.from_id, edge.to_id):
+                    here.append(model)
+                else:
+                    touched += self._joining.wait(model)
+        here += self._joining.join(touched, notes)
         passed, pending = self._loops.test(here)
         pending += self._loops.accept(passed, notes, "inside the gate")
         touched += self._loops.keep_pending(pending) + self._loops.review(notes)
-        notes.append(self._loops.freeze())
-        return self._loops.split(touched)
-
-    def _wait(self, model: LoopModel) -> list[int]:
-        """Let a loop between submaps that are not joined wait for other frames; return the ids of those that left."""
-        self._loops.wait(model)
-        gone = self._waiting.add(model)
-        if gone is None:
-            return []
-        self._loops.report(gone, LoopDecision.REJECTED, "too many newer ones wait")
-        return [gone.record.id]
-
-    def _join(self, touched: list[int], notes: list[str]) -> list[LoopModel]:
-        """Join submaps as far as loops between them agree; return those that waited and can be gated now."""
-        while (found := self._waiting.place(self._submaps, self._estimator.poses, self._between)) is not None:
-            touched += [m.record.id for m in found.agreeing]
-            self._bring(found, notes)
-            witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"
-            for model in self._loops.accept(found.agreeing, notes, f"joins two submaps, as {witnesses} say"):
-                self._loops.report(model, LoopDecision.REJECTED, "though it was to join two submaps")
-            for model in found.agreeing:
-                self._loops.offer(model)
-            kept = [m for m in found.agreeing if m.record.id in self._estimator.loops]
-            if len({m.record.to_id for m in kept}) < JOIN_FRAMES:
-                for model in kept:
-                    self._loops.report(model, LoopDecision.REJECTED, "its witnesses against one another do not hold")
-                notes.append(self._estimator.drop(kept))
-            self._count_joined()
-        ready = self._waiting.take_joined(self._submaps)
-        touched += [m.record.id for m in ready]
-        return ready
-
-    def _bring(self, found: Placement, notes: list[str]) -> None:
-        """Move a group of submaps to where loops say that it is, with the weak links that it has to others."""
-        ids = self.ids[self._submaps.groups_of(self.ids) == found.group]
-        self._estimator.look_at(self.ids.tolist())
-        poses = self._estimator.poses.copy()
-        poses[ids] = found.T_map_moved @ poses[ids]
-        for k in relinked(self._submaps, ids):
-            self._source.relink(k, invert(poses[k - 1]) @ poses[k])
-        notes.append(self._estimator.move(ids, found.T_map_moved))
-        notes.append(
-            f"submap {found.group}, {len(ids)} keyframes with what it was joined with before, joins an older one"
-        )
-
-    def _count_joined(self) -> None:
-        """Find out which submaps are joined, by the loops that the graph holds now."""
-        if len(self._submaps.groups) > 1:
-            self._submaps = self._submaps.joined_by((m.record.from_id, m.record.to_id) for m in self._loops.held)
-
-    def _between(self, i: int, j: int) -> Array:
-        """Return the covariance [6, 6] of T_i_j: by summed odometry, an upper bound, where that is short."""
-        if abs(i - j) <= _NEAR_KEYFRAMES and self._submaps.of(i) == self._submaps.of(j):
-            return self._travel.relative_covariance(i, j)
-        return self.relative_covariance(i, j)
-
-    def _stretched(self, state: NavState) -> NavState:
-        """Return a state with the uncertainty that scale adds to its distance from the first keyframe."""
-        way = state.T_world_body[:3, 3] - self._estimator.poses[0, :3, 3]
-        by_scale = self._config.scale_sigma * np.concatenate([way, state.velocity_world_m_s])
-        covariance = state.covariance.copy()
-        covariance[3:9, 3:9] += np.outer(by_scale, by_scale)
-        return replace(state, covariance=covariance)
-
-    def _state(self, k: int) -> NavState:
-        return self._source.state(k, self._keyframes[k].t_ns, self._estimator)
+        notes.append(self._loops.freezer.step())
+        return self._loops.ledger.split(touched)
 
     def _publish(self, accepted: list[int], refused: list[int], note: str, everything: bool = False) -> GraphUpdate:
         """Return the poses that moved since they were last published, and remember them."""
-        self._count_joined()
-        poses, known = self._estimator.poses, self._published
-        read = self._estimator.take_read()
-        ids = self.ids if everything else read
-        if (grown := len(poses) - len(known)) > 0:
-            known = np.concatenate([known, np.full((grown + len(poses) // 2, 4, 4), np.inf)])
-        fresh, old = poses[ids], known[ids]
-        shift = np.linalg.norm(fresh[:, :3, 3] - old[:, :3, 3], axis=1)
-        chord = np.linalg.norm(fresh[:, :3, :3] - old[:, :3, :3], axis=(1, 2))  # 2 sqrt(2) sin(angle / 2)
-        limit = 2.0 * np.sqrt(2.0) * np.sin(0.5 * np.deg2rad(_MOVED_DEG))
-        moved = ids[(shift > _MOVED_M) | (chord > limit) | everything]
-        known[moved] = poses[moved]
-        self._published = known
-        self._revision += 1
-        newest = self._newest = self._state(len(poses) - 1) if self._noise is not None else None
+        self._joining.count()
+        poses, published = self._estimator.poses, self._published
+        moved = published.take(poses, self._estimator.take_read(), everything)
+        if self._noise is not None:
+            self._newest = self._source.state(len(poses) - 1, self._keyframes[-1].t_ns, self._estimator)
         solver, vo_scale = self._estimator.solver_name, self._estimator.vo_scale
         details = {"solver": solver, "pending": self._loops.pending, "vo_scale": vo_scale, **self._source.details}
         return GraphUpdate(
-            self._revision, moved, poses[moved], self._T_map_odom, newest, tuple(accepted), tuple(refused), note,
-            details, self._submaps,
+            published.revision, moved, poses[moved], published.T_map_odom, self._newest,
+            tuple(accepted), tuple(refused), note, details, self._joining.submaps,
         )  # fmt: skip
+
+
+def _lever_m(rig: Rig) -> Array:
+    """Return where cam0 is in the body [3]."""
+    return np.array(rig.T_body_cams[0][:3, 3], dtype=np.float64)
+
+
+def _source(
+    config: GraphConfig, noise: ImuNoise | None, machine: MachineConfig, rig: Rig, window: WindowConfig
+) -> Source:
+    """Return what feeds the graph with a kind of coupling."""
+    if config.coupling == "loose":
+        return MotionSource(config, noise, machine, _lever_m(rig))
+    from vislam.window import SlidingWindow  # compiles a good deal, which loose coupling need not wait for
+
+    return WindowSource(config, machine, SlidingWindow(window, rig, noise, machine))
+
+
+def _stretched(state: NavState, T_map_first: Array, scale_sigma: float) -> NavState:
+    """Return a state with the uncertainty that scale adds to its distance from the first keyframe."""
+    way = state.T_world_body[:3, 3] - T_map_first[:3, 3]
+    by_scale = scale_sigma * np.concatenate([way, state.velocity_world_m_s])
+    covariance = state.covariance.copy()
+    covariance[3:9, 3:9] += np.outer(by_scale, by_scale)
+    return replace(state, covariance=covariance)
 
 
 def _variances(record: KeyframeRecord, step: Step) -> tuple[float, float]:
     """Return the variances in rad^2 and m^2 of the motion to a keyframe."""
     return _UNKNOWN if record.begins_submap else (step.variance_rad2, step.variance_m2)
+
+
+def _check_odom(record: KeyframeRecord, T_odom_body: Array | None) -> None:
+    if T_odom_body is not None and not np.all(np.isfinite(T_odom_body)):
+        raise DataError(f"keyframe {record.id}: its pose in odom holds NaN or infinity")
 
 
 def _check_start(record: KeyframeRecord, start_t_ns: int | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -10,6 +10,7 @@ import numpy as np
 
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array
+from vislam.factors.builder import Label
 from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.factors.noise_models import gaussian
@@ -32,6 +33,12 @@ class Segment:
     def keyframes(self) -> range:
         """Return its keyframes."""
         return range(self.first, self.end)
+
+    @property
+    def labels(self) -> list[Label]:
+        """Return the names of the factors that tie its keyframes to one another and to others."""
+        inside = [label for k in self.keyframes for label in (("edge", k), ("tilt", k))]
+        return [*inside, ("edge", self.end), *(("loop", n) for n in self.loops)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +75,41 @@ class Summary:
 
     links: dict[tuple[int, int], Link]  # between the keyframes around it
     stands: dict[int, Stand]  # of its keyframes
+
+
+class SummedUp:
+    """Owns what is left of all segments that left a solver: nothing after a new start, which has all of them again."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.firsts: set[int] = set()  # first keyframes of segments that were tried
+        self.pinned: set[int] = set()  # keyframes on which hangs what segments know
+        self.stands: dict[int, Stand] = {}  # of keyframes that left
+        self._links: dict[tuple[int, int], tuple[Link, int]] = {}  # between anchors, with their slots
+
+    def host(self, k: int) -> int:
+        """Return the keyframe beside which keyframe k stands; k itself where the solver has it."""
+        stand = self.stands.get(k)
+        return k if stand is None else stand.host
+
+    def joined(self, summary: Summary) -> dict[tuple[int, int], Link]:
+        """Return the links of a summary, each together with those of earlier segments between the same anchors."""
+        held = self._links
+        return {p: held[p][0].with_another(link) if p in held else link for p, link in summary.links.items()}
+
+    def slots(self, pairs: Iterable[tuple[int, int]]) -> list[int]:
+        """Return the slots of links between anchors, as far as there are some."""
+        return [self._links[pair][1] for pair in pairs if pair in self._links]
+
+    def take(
+        self, segment: Segment, summary: Summary, links: dict[tuple[int, int], Link], slots: Sequence[int]
+    ) -> None:
+        """Take what is left of a segment: its links, joined with earlier ones, are in these slots of the solver."""
+        inside = {*segment.keyframes}
+        self._links = {pair: own for pair, own in self._links.items() if not {*pair} & inside}
+        self._links |= {pair: (link, slot) for (pair, link), slot in zip(links.items(), slots, strict=True)}
+        self.stands |= summary.stands
+        self.pinned |= {*segment.anchors}
 
 
 @dataclass(slots=True)

@@ -18,7 +18,6 @@ from vislam.core.readings import Motion
 from vislam.factors.builder import Builder, Guess
 from vislam.factors.journal import KeyframeRecord, StartRecord, checked_poses
 from vislam.factors.keys import B, V, X, bias_of
-from vislam.factors.loop import LoopModel
 from vislam.factors.noise_models import checked_covariances, conditioned
 from vislam.factors.odometry import MotionOdometry, Odometry
 from vislam.factors.window import WindowOdometry
@@ -84,7 +83,7 @@ class Source(Protocol):
     def relink(self, k: int, T_previous_body: Array) -> None:
         """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
 
-    def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
+    def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
         """Return the state of keyframe k in map with its covariance, NaN where nobody can tell."""
 
 
@@ -150,7 +149,7 @@ class MotionSource:
         """See Source."""
         self._odometry.relink(k, T_previous_body)
 
-    def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
+    def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
         """See Source; gtsam's covariance turned to NavState's order and axes."""
         guess, has_imu = estimator.state(k), estimator.has_imu
         covariance = np.full((15, 15), np.nan)
@@ -256,7 +255,7 @@ class WindowSource:
         """See Source."""
         self._odometry.relink(k, T_previous_body)
 
-    def state(self, k: int, t_ns: int, estimator: Estimator[LoopModel]) -> NavState:
+    def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
         """See Source; the window's state carried to the keyframe's pose in map, whose covariance is the graph's."""
         T_map_body = estimator.poses[k].copy()
         pose = estimator.joint_covariance([X(k)])

@@ -1,15 +1,50 @@
-"""What may enter a window: checks of a first state and of a keyframe, made before anything is changed."""
+"""What may enter a window: a first state and keyframes, checked before anything is changed."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from vislam.core.errors import DataError
+from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState
+from vislam.window.calibration import Calibration
+from vislam.window.equations import STATE, Prior, first_pose_prior, first_prior
+from vislam.window.posterior import GAUGE_SIGMA_M, GAUGE_SIGMA_RAD
 from vislam.window.tracks import check_observations
 
 
-def check_state(state: NavState) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The first state of a window: a full one, or where there is no IMU its pose alone."""
+
+    state: NavState | None
+    T_local_body: Array  # [4, 4]
+
+    @classmethod
+    def of(cls, state: NavState | None, T_local_body: Array | None, has_imu: bool) -> Start:
+        """Return a start that was checked; DataError on numbers that cannot be used, UsageError on a missing state."""
+        if has_imu and state is None:
+            raise UsageError("a window with an IMU starts from a full state; initialise the inertial states first")
+        if state is not None:
+            _check_state(state)
+        if T_local_body is not None and not np.isfinite(T_local_body).all():
+            raise DataError("the first pose of the window is not finite; initialise again")
+        if has_imu and state is not None:
+            return cls(state, state.T_world_body)
+        return cls(None, np.eye(4) if T_local_body is None else T_local_body.copy())
+
+    def equations(self, calibration: Calibration) -> tuple[Array, Prior]:
+        """Return the state [21] of the first keyframe and the prior on it."""
+        x, start, gauge = np.zeros(STATE), self.state, (GAUGE_SIGMA_M, GAUGE_SIGMA_RAD)
+        x[:9], x[9:12] = self.T_local_body[:3, :3].ravel(), self.T_local_body[:3, 3]
+        if start is None:
+            return x, first_pose_prior(*gauge, calibration.values, calibration.start_sigmas)
+        x[12:15], x[15:18], x[18:21] = start.velocity_world_m_s, start.gyro_bias_rad_s, start.accel_bias_m_s2
+        return x, first_prior(start, *gauge, calibration.values, calibration.start_sigmas)
+
+
+def _check_state(state: NavState) -> None:
     """Raise DataError unless a first state is finite and its covariance positive semidefinite."""
     values = [state.T_world_body, state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2]
     if not all(np.isfinite(v).all() for v in values) or not np.isfinite(state.covariance).all():

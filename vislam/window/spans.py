@@ -29,7 +29,7 @@ class LinkStore:
         self._machine = machine
         self._noise = noise
         self._max_gap_s = machine.max_gap_s if noise is None else noise.gap_s(machine.max_gap_s)
-        self._gravity_m_s2 = machine.gravity_m_s2
+        self.gravity_m_s2 = machine.gravity_m_s2
         self._spans: list[ImuSpan | None] = []
         self._motions: list[Sequence[Motion]] = []
         size = config.keyframes + 2
@@ -98,6 +98,16 @@ class LinkStore:
             links.guess_weight[k] = 1.0 / np.deg2rad(machine.rest_sigma_deg), 1.0 / machine.rest_sigma_m
             links.rest_weight[k + 1] = 1.0 / machine.rest_speed_sigma_m_s
         return inertial
+
+    def carried(self, x: Array) -> Array:
+        """Return the state [21] that the newest link, an inertial one, predicts from the state x [21] before it."""
+        links, k = self.arrays, len(self) - 1
+        out, R, dt_s = x.copy(), x[:9].reshape(3, 3), float(links.dt[k])
+        fall = np.array([0.0, 0.0, -self.gravity_m_s2])
+        out[:9] = (R @ links.dR[k]).ravel()
+        out[9:12] += dt_s * x[12:15] + 0.5 * dt_s**2 * fall + R @ links.dp[k]
+        out[12:15] += dt_s * fall + R @ links.dv[k]
+        return out
 
     def integrate(self, k: int, bias: Array) -> None:
         """Integrate link k at a bias [6]."""
@@ -170,7 +180,7 @@ class LinkStore:
             by_push[_VELOCITY], by_push[_POSITION] = np.eye(3), np.eye(3) * (0.5 * hole + after)
             out += pushed**2 * (by_push @ by_push.T)
             # a wrong attitude turns gravity into acceleration from then on; taken in all directions, to be safe
-            leak = self._gravity_m_s2 * turned
+            leak = self.gravity_m_s2 * turned
             out[_ROTATION, _ROTATION] += np.eye(3) * turned**2
             out[_VELOCITY, _VELOCITY] += np.eye(3) * (leak * (0.5 * hole + after)) ** 2
             out[_POSITION, _POSITION] += np.eye(3) * (0.5 * leak * (0.5 * hole + after) ** 2) ** 2

@@ -13,7 +13,7 @@ import numpy as np
 
 from vislam.config import MachineConfig, WindowConfig
 from vislam.core.camera import Rig
-from vislam.core.errors import DataError, UsageError
+from vislam.core.errors import UsageError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, KeyframePacket, NavState
 from vislam.core.readings import Motion
@@ -22,42 +22,30 @@ from vislam.window import gate
 from vislam.window.calibration import Calibration
 from vislam.window.doubt import Doubt
 from vislam.window.equations import (
-    STATE,
     Camera,
     Leaving,
     Prior,
     Problem,
     Room,
     Solution,
-    first_pose_prior,
-    first_prior,
-    joint_covariance,
     marginalise,
     optimise,
     touched,
     visual,
 )
-from vislam.window.incoming import check_packet, check_state
+from vislam.window.incoming import Start, check_packet
 from vislam.window.keyframes import Keyframes
-from vislam.window.leaving import split
+from vislam.window.leaving import broken_off, settled, split
 from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
-from vislam.window.posterior import GAUGE_SIGMA_M, GAUGE_SIGMA_RAD, Posterior, edges, nav_state, pose, scale_sigma, tilt
+from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import RHO_START, Selection, TrackTable
 
-_SPLIT_MIN = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
-_RESTART_SIGMA_M = 0.1  # of the state a window restarts from after a failed solution
-_RESTART_SIGMA_RAD = 0.03
-_RESTART_SPEED_SIGMA_M_S = 0.3
-_RESTART_GYRO_BIAS_SIGMA_RAD_S = 0.01
-_RESTART_ACCEL_BIAS_SIGMA_M_S2 = 0.1
-_TOLERANCE = (
-    5e-3  # relative decrease of the cost that ends Gauss-Newton steps; 1e-3 costs a step more and gains nothing
-)
 _UNKNOWN_SPEED_M_S = 0.5  # a velocity less certain than this predicts worse than odometry does
 _SURE_SPEED_M_S = 0.3  # until velocity is known so well, the window is still finding its feet:
 _SURE_KEYFRAMES = 6  # nothing is rejected, calibration waits, and landmarks start afresh with each keyframe
-_MAX_SPEED_M_S = 300.0  # a prediction that is faster is nonsense to restart from
+_SPLIT_MIN = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
+_TOLERANCE = 5e-3  # relative decrease of the cost that ends Gauss-Newton steps; 1e-3 costs a step and gains nothing
 _UNSURE_EFFORT = 5  # times the iterations
 
 
@@ -74,14 +62,12 @@ class SlidingWindow:
             )
         self._config = config
         self._rig = rig
-        self._noise = noise
-        self._gravity_m_s2 = machine.gravity_m_s2
+        self._has_imu = noise is not None
         self._measures_scale = rig.is_stereo or rig.has_depth
         self._T_cam0_cams = np.array([invert(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]])
         self._links = LinkStore(config, noise, machine)
         self._room = Room()
-        self._start: NavState | None = None
-        self._T_start: Array | None = None
+        self._start: Start | None = None
         self._scale_sigma = 0.0 if self._measures_scale else float("inf")
         self._clear()
 
@@ -92,14 +78,7 @@ class SlidingWindow:
             DataError: it is not finite, or its covariance is not positive semidefinite.
             UsageError: an IMU without a state.
         """
-        if self._noise is not None and state is None:
-            raise UsageError("a window with an IMU starts from a full state; initialise the inertial states first")
-        if state is not None:
-            check_state(state)
-        if T_local_body is not None and not np.isfinite(T_local_body).all():
-            raise DataError("the first pose of the window is not finite; initialise again")
-        self._start = state
-        self._T_start = np.eye(4) if T_local_body is None else T_local_body.copy()
+        self._start = Start.of(state, T_local_body, self._has_imu)
         self._clear()
 
     def add(
@@ -116,7 +95,7 @@ class SlidingWindow:
             DataError: something in it is not finite, not in time order, or does not fit; the window is as before.
             UsageError: `initialise` has not been called.
         """
-        if self._T_start is None:
+        if self._start is None:
             raise UsageError("the window has no first state yet; call initialise before add")
         check_packet(packet, T_odom_body, self._keyframes.newest)
         self._push(packet, T_odom_body, motions)
@@ -132,7 +111,7 @@ class SlidingWindow:
         return self._let_out(solution, posterior, rejected + doubted)
 
     def _clear(self) -> None:
-        self._full = self._start is not None and self._noise is not None  # with velocities and biases
+        self._full = self._start is not None and self._start.state is not None  # with velocities and biases
         self._keyframes = Keyframes()
         self._calibration = Calibration(self._config, self._full, 0.0)
         self._doubt = Doubt()
@@ -159,19 +138,11 @@ class SlidingWindow:
 
     def _first_state(self, packet: KeyframePacket) -> Array:
         """Return the state of the first keyframe, and set the prior on it."""
-        config, x, start = self._config, np.zeros(STATE), self._start
-        calibration = self._calibration = Calibration(config, self._full, packet.time_offset_s)
-        gauge = GAUGE_SIGMA_M, GAUGE_SIGMA_RAD
-        T = self._T_start
-        if self._full and start is not None:
-            T = start.T_world_body
-            x[12:15], x[15:18], x[18:21] = start.velocity_world_m_s, start.gyro_bias_rad_s, start.accel_bias_m_s2
-            self._prior = first_prior(start, *gauge, calibration.values, calibration.start_sigmas)
-            self._speed_sigma_m_s = float(np.sqrt(np.diag(start.covariance)[6:9].max()))
-        else:
-            self._prior = first_pose_prior(*gauge, calibration.values, calibration.start_sigmas)
-        assert T is not None
-        x[:9], x[9:12] = T[:3, :3].ravel(), T[:3, 3]
+        assert self._start is not None
+        self._calibration = Calibration(self._config, self._full, packet.time_offset_s)
+        x, self._prior = self._start.equations(self._calibration)
+        if self._start.state is not None:
+            self._speed_sigma_m_s = float(np.sqrt(np.diag(self._start.state.covariance)[6:9].max()))
         return x
 
     def _predicted(self, packet: KeyframePacket, T_odom_body: Array | None, motions: Sequence[Motion]) -> Array:
@@ -183,15 +154,9 @@ class SlidingWindow:
             motion = self._keyframes.assumed_motion(packet, dt_s, self._full)
         span = packet.imu if self._full else None
         inertial = self._links.push(span, dt_s, last[15:].copy(), motion, packet.at_rest and self._full, motions)
-        x = last.copy()
-        R = last[:9].reshape(3, 3)
         if inertial and (by_odometry is None or self._speed_sigma_m_s <= _UNKNOWN_SPEED_M_S):
-            links, k = self._links.arrays, len(self._links) - 1
-            fall = np.array([0.0, 0.0, -self._gravity_m_s2])
-            x[:9] = (R @ links.dR[k]).ravel()
-            x[9:12] += dt_s * last[12:15] + 0.5 * dt_s**2 * fall + R @ links.dp[k]
-            x[12:15] += dt_s * fall + R @ links.dv[k]
-            return x
+            return self._links.carried(last)
+        x, R = last.copy(), last[:9].reshape(3, 3)
         x[:9] = (R @ motion[:3, :3]).ravel()
         x[9:12] += R @ motion[:3, 3]
         if self._full:
@@ -218,7 +183,7 @@ class SlidingWindow:
         links, keyframes = self._links.arrays, self._keyframes
         if self._known is None or not self._sure or self._at_rest or not links.inertial[-1]:
             return 0
-        covariance = gate.predicted_covariance(self._known, keyframes.X, links, self._gravity_m_s2)
+        covariance = gate.predicted_covariance(self._known, keyframes.X, links, self._links.gravity_m_s2)
         if covariance is None:
             return 0
         return self._doubt.newest(self._tracks, keyframes, covariance, self._calibration.values, self._camera())
@@ -245,12 +210,10 @@ class SlidingWindow:
         problem = Problem(
             keyframes.X, *keyframes.linearised(), self._tracks.points[selection.slots],
             self._calibration.values, selection.views, self._camera(), self._links.arrays, self._prior,
-            self._gravity_m_s2, self._full,
+            self._links.gravity_m_s2, self._full,
         )  # fmt: skip
         iterations = self._config.iterations if self._sure else _UNSURE_EFFORT * self._config.iterations
         return optimise(problem, iterations, _TOLERANCE, self._room)
-
-    # ---- what leaves
 
     def _let_out(self, solution: Solution, posterior: Posterior, rejected: int) -> WindowUpdate:
         """Say what changed, and let the oldest keyframe go if the window is full."""
@@ -264,12 +227,13 @@ class SlidingWindow:
         calibration = self._calibration.estimate(
             posterior.calibration if moved else None, float(keyframes.applied_offset_s[-1])
         )
-        self._sure = self._sure or not self._full or self._found_its_feet()
-        settled: list[WindowEdge] = []
+        found_its_feet = len(keyframes) >= _SURE_KEYFRAMES and self._speed_sigma_m_s < _SURE_SPEED_M_S
+        self._sure = self._sure or not self._full or found_its_feet
+        final: list[WindowEdge] = []
         tilts: list[WindowGravity] = []
         states: list[tuple[int, NavState]] = []
         if len(keyframes) > self._config.keyframes:
-            settled, tilts, states = self._settle(solution, T_edges[0], P_edges[0])
+            final, tilts, states = settled(keyframes, solution, T_edges[0], P_edges[0], self._full)
             self._let_go()
             T_edges, P_edges = T_edges[1:], P_edges[1:]
         self._known = posterior.of_newest(len(keyframes)) if self._full else None
@@ -281,7 +245,7 @@ class SlidingWindow:
             ids=keyframes.ids.copy(),
             T_local_body=np.array([pose(x) for x in keyframes.X]),
             newest=newest,
-            odometry=(*settled, *self._last_edges),
+            odometry=(*final, *self._last_edges),
             tilts=tuple(tilts),
             states=tuple(states),
             calibration=calibration,
@@ -296,23 +260,6 @@ class SlidingWindow:
         self._speed_sigma_m_s = float(np.sqrt(np.diag(covariance)[6:9].max()))
         return nav_state(int(self._keyframes.t_ns[-1]), self._keyframes.X[-1], covariance)
 
-    def _found_its_feet(self) -> bool:
-        return len(self._keyframes) >= _SURE_KEYFRAMES and self._speed_sigma_m_s < _SURE_SPEED_M_S
-
-    def _settle(
-        self, solution: Solution, T: Array, P: Array
-    ) -> tuple[list[WindowEdge], list[WindowGravity], list[tuple[int, NavState]]]:
-        """Return what is final about the oldest keyframe."""
-        keyframes = self._keyframes
-        oldest, after = int(keyframes.ids[0]), int(keyframes.ids[1])
-        settled = [WindowEdge(oldest, after, T, P, True)]
-        if not self._full:
-            return settled, [], []
-        index = np.concatenate([9 * len(keyframes) + np.arange(6), np.arange(9)])
-        covariance = joint_covariance(solution.U, index)
-        state = nav_state(int(keyframes.t_ns[0]), keyframes.X[0], covariance)
-        return settled, [tilt(oldest, keyframes.X[0], covariance[:3, :3])], [(oldest, state)]
-
     def _let_go(self) -> None:
         """Marginalise the oldest keyframe with what only it explains."""
         assert self._prior is not None
@@ -324,47 +271,24 @@ class SlidingWindow:
         X_linear = np.where(is_fixed[:, None], first, keyframes.X)
         self._prior = marginalise(
             keyframes.X, first, X_linear, self._calibration.values, leaving, self._camera(), self._links.arrays,
-            self._prior, self._gravity_m_s2, self._full, self._room,
+            self._prior, self._links.gravity_m_s2, self._full, self._room,
         )  # fmt: skip
         tracks.remove_rows(np.concatenate([given, dropped]))
         keyframes.pop_front(touched(self._prior, len(keyframes) - 1, self._full), X_linear)
         self._links.pop_front()
 
     def _restart(self, packet: KeyframePacket) -> WindowUpdate:
-        """Begin again at the newest keyframe, as the last good solution predicts it, and let all others go.
-
-        Their edges leave with the covariance of that solution; the last one is as wide as the new start.
-        """
-        config, keyframes = self._config, self._keyframes
-        ids, X = keyframes.ids, keyframes.X
-        wide = np.repeat(
-            [
-                _RESTART_SIGMA_RAD,
-                _RESTART_SIGMA_M,
-                _RESTART_SPEED_SIGMA_M_S,
-                _RESTART_GYRO_BIAS_SIGMA_RAD_S,
-                _RESTART_ACCEL_BIAS_SIGMA_M_S2,
-            ],
-            3,
-        )
-        covariance = np.diag(wide**2)
-        known = {(e.from_id, e.to_id): e.covariance for e in self._last_edges}
-        dt_s = float(keyframes.t_ns[-1] - keyframes.t_ns[-2]) * 1e-9 if len(ids) > 1 else 0.0
-        x = X[-1]
-        if len(ids) > 1 and not np.abs(x[9:12] - X[-2, 9:12]).max() < _MAX_SPEED_M_S * dt_s:  # NaN too
-            x = X[-1] = X[-2]
-        settled = tuple(
-            WindowEdge(a, b, invert(pose(xa)) @ pose(xb), known.get((a, b), covariance[:6, :6]), True)
-            for a, b, xa, xb in zip(ids[:-1].tolist(), ids[1:].tolist(), X[:-1], X[1:], strict=True)
-        )
-        state = nav_state(packet.keyframe.t_ns, x, covariance)
-        self.initialise(state if self._full else None, state.T_world_body)
+        """Begin again at the newest keyframe, as the last good solution predicts it, and let all others go."""
+        config = self._config
+        state, final = broken_off(self._keyframes, self._last_edges)
+        newest = state if self._full else None
+        self.initialise(newest, state.T_world_body)
         self._push(packet, None)
         return WindowUpdate(
             ids=self._keyframes.ids.copy(),
             T_local_body=state.T_world_body[None],
-            newest=state if self._full else None,
-            odometry=settled,
+            newest=newest,
+            odometry=final,
             tilts=(),
             states=(),
             calibration=CalibrationEstimate(

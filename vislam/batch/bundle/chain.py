@@ -14,6 +14,7 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.factors import motion
+from vislam.factors.builder import of_vision
 from vislam.factors.factor_log import FactorLog
 from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
@@ -24,7 +25,6 @@ from vislam.factors.noise_models import (
     DIRECTION_SOFT_M,
     gaussian,
     huber,
-    of_vision,
 )
 from vislam.factors.preintegration import Preintegrator
 from vislam.factors.priors import start_factors
