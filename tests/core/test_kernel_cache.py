@@ -161,6 +161,7 @@ def test_a_folder_set_by_hand_is_kept_if_it_can_be_written(place: Place) -> None
     place.freeze()
     chosen = place.temporary / "chosen"
     assert place.chooses(NUMBA_CACHE_DIR=str(chosen)) == (str(chosen), "")
+    chosen.mkdir(exist_ok=True)
     chosen.chmod(0o555)
     assert place.chooses(NUMBA_CACHE_DIR=str(chosen / "below"))[0] == str(place.private)
 

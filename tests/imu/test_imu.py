@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from vislam.config import ImuConfig, InitConfig, MachineConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp, so3_log
-from vislam.core.messages import ImuSample, ImuSpan
-from vislam.imu import ImuBuffer, ImuCalibration, RestDetector, join, preintegrate, subtract_bias
+from vislam.core.messages import ImuSample, ImuSpan, NavState
+from vislam.imu import ImuBuffer, ImuCalibration, RestDetector, join, pose_after, preintegrate, subtract_bias
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, RealMotion, to_span
 from worlds.parts import GRAVITY_M_S2
 
@@ -244,3 +244,15 @@ def test_rest_on_a_real_recording(data_root) -> None:
     samples = RealMotion.euroc(data_root / "euroc_v101_imu").samples
     assert all(rest_answers(samples[-201:])[16:])
     assert not any(rest_answers(samples[4000:25000]))
+
+
+def test_a_body_that_is_thrown_falls_and_one_that_stands_does_not() -> None:
+    t_ns, zeros = T0_NS + np.arange(101, dtype=np.int64) * 10_000_000, np.zeros((101, 3))
+    velocity, none = np.array([2.0, -1.0, 3.0]), np.zeros(3)
+    thrown = NavState(T0_NS, np.eye(4), velocity, none, none, np.eye(15))
+    there = pose_after(thrown, ImuSpan(t_ns, zeros, zeros), GRAVITY_M_S2)
+    np.testing.assert_allclose(there[:3, 3], velocity + 0.5 * GRAVITY, atol=1e-9)
+    stands = NavState(T0_NS, np.eye(4), none, none, none, np.eye(15))
+    np.testing.assert_allclose(
+        pose_after(stands, ImuSpan(t_ns, zeros, zeros - GRAVITY), GRAVITY_M_S2), np.eye(4), atol=1e-9
+    )
