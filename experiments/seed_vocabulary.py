@@ -8,6 +8,7 @@ seed 0 are left out: measurements use them.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -25,16 +26,23 @@ DEPTH = 4  # 10,000 words, 360 kB
 
 def main() -> None:
     """Render, train, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "vislam" / "loop" / "words" / "seed_vocabulary.npz")
+    parser.add_argument("--seeds", type=int, nargs="+", default=WORLD_SEEDS, help="of the worlds")
+    parser.add_argument("--duration-s", type=float, help="only the first so many seconds of each world")
+    arguments = parser.parse_args()
     cv2.setNumThreads(1)
+    length = "" if arguments.duration_s is None else f",duration_s={arguments.duration_s:g}"
     sources = tuple(
-        f"sim:{world},world_seed={seed},camera_hz={rate_hz},rig=mono"
-        for seed in WORLD_SEEDS
+        f"sim:{world},world_seed={seed},camera_hz={rate_hz},rig=mono{length}"
+        for seed in arguments.seeds
         for world, rate_hz in WORLDS.items()
     )
     vocabulary, images, _ = train_vocabulary(sources, depth=DEPTH)
-    path = ROOT / "vislam" / "loop" / "words" / "seed_vocabulary.npz"
-    vocabulary.save(path)
-    print(f"{vocabulary.word_count} words from {images} images, {path.stat().st_size} bytes, {vocabulary.hash}")
+    vocabulary.save(arguments.out)
+    print(
+        f"{vocabulary.word_count} words from {images} images, {arguments.out.stat().st_size} bytes, {vocabulary.hash}"
+    )
 
 
 if __name__ == "__main__":

@@ -223,6 +223,7 @@ def overriding(settings: Sequence[str]) -> Callable[[dict], dict]:
 def main() -> None:
     """Run starts, or read results, and hold them against the bars."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plan", type=Path, default=PLAN, help="whose starts are run")
     parser.add_argument("--count", type=int, default=20, help="starts, drawn by lot; 0: all")
     parser.add_argument("--seed", type=int, default=0, help="of the lot")
     parser.add_argument("--only", nargs="*", default=[], help="sequences of the plan, or beginnings of labels")
@@ -235,7 +236,7 @@ def main() -> None:
         return
     cv2.setNumThreads(1)
     os.environ.setdefault("VISLAM_DATA", str(DATA))
-    jobs = list(unique(expand(load_plan(PLAN))))
+    jobs = list(unique(expand(load_plan(arguments.plan))))
     if arguments.only:
         jobs = [job for job in jobs if any(job.label.startswith(name) for name in arguments.only)]
     if 0 < arguments.count < len(jobs):
