@@ -258,9 +258,9 @@ def test_a_driver_is_opened_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_without_the_library_the_extra_is_named() -> None:
-    with pytest.raises(HardwareError, match=r"pip install 'vislam\[boards\]' adafruit-circuitpython-absent_chip"):
+    with pytest.raises(HardwareError, match=r"install adafruit-circuitpython-absent_chip and: .*'\.\[boards\]'"):
         open_adafruit("adafruit_absent_chip.X", BoardConfig())
-    with pytest.raises(HardwareError, match=r"no module adafruit_absent_chip\); install.*vislam\[boards\]"):
+    with pytest.raises(HardwareError, match=r"no module adafruit_absent_chip\); install.*'\.\[boards\]'"):
         check_devices("adafruit:adafruit_absent_chip.X", "none", SensorsConfig())
     with pytest.raises(UsageError, match="names no driver"):
         check_devices("adafruit:X", "none", SensorsConfig())

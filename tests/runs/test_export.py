@@ -282,7 +282,7 @@ def test_a_stamp_before_1970_cannot_be_told_in_ros(tmp_path, capsys):
 def test_without_rosbags_the_extra_is_named(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     assert run_verb(["export", str(run), "--mcap", str(tmp_path / "a.mcap")]) == 2
-    assert "vislam[bags]" in capsys.readouterr().err
+    assert ".[bags]" in capsys.readouterr().err
 
 
 @given(cut=st.integers(0, 200), at=st.integers(0, 199), byte=st.integers(0, 255), of_image=st.booleans())

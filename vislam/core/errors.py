@@ -15,6 +15,11 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text))
 
 
+def install_line(extra: str) -> str:
+    """Return the command that installs an optional part of vislam. No package index has vislam yet."""
+    return f"pip install '.[{extra}]' in a clone of vislam"
+
+
 class VislamError(Exception):
     """Root of every expected failure; the command line turns it into one line and `exit_code`.
 

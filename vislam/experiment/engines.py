@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from vislam.core.errors import UsageError
+from vislam.core.errors import UsageError, install_line
 from vislam.experiment.isolated import run_isolated
 
 _ANSWER_S = 20.0  # a scheduler that is there answers much sooner
@@ -44,7 +44,7 @@ def run_on_dask(specs: Sequence[Spec], scheduler: str, cache: Path, keep: Path |
     try:
         import distributed
     except ImportError as error:
-        raise UsageError("--engine dask needs the extra 'cluster': pip install 'vislam[cluster]'") from error
+        raise UsageError(f"--engine dask needs the extra 'cluster': {install_line('cluster')}") from error
     try:
         client = distributed.Client(scheduler, timeout=_ANSWER_S)
     except (OSError, TimeoutError, ValueError) as error:

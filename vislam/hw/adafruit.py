@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vislam.config import BoardConfig
-from vislam.core.errors import HardwareError, UsageError
+from vislam.core.errors import HardwareError, UsageError, install_line
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.body_map import BodyMap, triple
 from vislam.hw.gyro_zero import GyroZero
@@ -219,7 +219,7 @@ def _module_of(name: str) -> str:
 
 def _why_not(name: str, problem: object) -> str:
     package = f"adafruit-circuitpython-{name.split('.', maxsplit=1)[0].removeprefix('adafruit_')}"
-    return f"{name} needs its driver and Blinka ({problem}); install them: pip install 'vislam[boards]' {package}"
+    return f"{name} needs its driver and Blinka ({problem}); install {package} and: {install_line('boards')}"
 
 
 def _maker(name: str, config: BoardConfig) -> Callable[[], Any]:

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from vislam.config import SensorsConfig
-from vislam.core.errors import HardwareError
+from vislam.core.errors import HardwareError, install_line
 from vislam.core.findings import Finding, Severity, worst
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.hw.board_check import MAX_RATE_DEG_S, check_board, check_rest, check_stamps
@@ -344,7 +344,7 @@ def _port_name(path: str) -> str:
     try:
         from serial.tools import list_ports
     except ImportError:
-        return "install pyserial for its name: pip install 'vislam[hw]'"
+        return f"install pyserial for its name: {install_line('hw')}"
     return next((str(port.description) for port in list_ports.comports() if port.device == path), "unknown")
 
 

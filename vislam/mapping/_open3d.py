@@ -6,6 +6,8 @@ import ctypes
 import importlib
 from typing import Any
 
+from vislam.core.errors import install_line
+
 
 def load_open3d() -> tuple[Any, str]:
     """Return the open3d module and an empty string, or None and the reason why it cannot be used."""
@@ -13,7 +15,7 @@ def load_open3d() -> tuple[Any, str]:
         return _quiet(importlib.import_module("open3d")), ""
     except ImportError as error:
         if "libusb" not in str(error):
-            return None, f"open3d is not usable ({error}); pip install 'vislam[map]'"
+            return None, f"open3d is not usable ({error}); {install_line('map')}"
     except OSError as error:
         if "libusb" not in str(error):
             return None, f"open3d is not usable ({error})"

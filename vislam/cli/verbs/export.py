@@ -18,7 +18,7 @@ class ExportOptions:
     run: Positional[Path]
     """Run folder"""
     mcap: Path
-    """New file, NAME.mcap: poses, odometry, path, cloud, grids and tf as ROS 2 messages; needs vislam[bags]"""
+    """New file, NAME.mcap: poses, odometry, path, cloud, grids and tf as ROS 2 messages; needs the extra 'bags'"""
 
 
 OPTIONS = (ExportOptions,)

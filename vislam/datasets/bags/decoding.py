@@ -10,7 +10,7 @@ import struct
 from functools import cache
 from typing import Any
 
-from vislam.core.errors import DataError
+from vislam.core.errors import DataError, install_line
 from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.stored import DamagedError, Topic
 
@@ -39,7 +39,7 @@ def need_rosbags() -> None:
     try:
         _stores()
     except ImportError as error:
-        raise DataError(f"bags need {error.name or 'rosbags'}; install it: pip install 'vislam[bags]'") from error
+        raise DataError(f"bags need {error.name or 'rosbags'}; install it: {install_line('bags')}") from error
 
 
 def why_unreadable(topic: Topic) -> str:

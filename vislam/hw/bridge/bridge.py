@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vislam.config import SerialConfig
-from vislam.core.errors import HardwareError
+from vislam.core.errors import HardwareError, install_line
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.bridge.behind import Behind
 from vislam.hw.bridge.clock import DeviceClock
@@ -370,7 +370,7 @@ def load_pyserial() -> Any:
     try:
         import serial as module
     except ImportError as error:
-        raise HardwareError("a serial port needs pyserial; install it: pip install 'vislam[hw]'") from error
+        raise HardwareError(f"a serial port needs pyserial; install it: {install_line('hw')}") from error
     return module
 
 

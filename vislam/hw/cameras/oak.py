@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.config import OakConfig
 from vislam.core.camera import Camera, Rig
-from vislam.core.errors import DataError, HardwareError
+from vislam.core.errors import DataError, HardwareError, install_line
 from vislam.core.messages import Array, Frame
 from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_imu, rigid
 from vislam.hw.cameras.library_camera import LibraryCamera, named
@@ -195,9 +195,9 @@ def depthai() -> Any:
     try:
         import depthai as module
     except (ImportError, OSError) as error:
-        raise HardwareError(f"oak needs depthai ({error}); pip install 'vislam[oak]'") from error
+        raise HardwareError(f"oak needs depthai ({error}); {install_line('oak')}") from error
     if not hasattr(module.node, "Camera"):
-        raise HardwareError("oak needs depthai 3, an older one is installed; pip install 'vislam[oak]'")
+        raise HardwareError(f"oak needs depthai 3, an older one is installed; {install_line('oak')}")
     return module
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vislam.config import PicamConfig
-from vislam.core.errors import HardwareError
+from vislam.core.errors import HardwareError, install_line
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.webcam import Setting
 from vislam.hw.source import CapturedImage
@@ -129,7 +129,7 @@ def picamera2() -> Any:
     except (ImportError, OSError) as error:  # OSError: a system library of it is missing
         raise HardwareError(
             f"picam needs picamera2 ({error}); on Raspberry Pi OS: sudo apt install python3-picamera2, in an "
-            "environment that sees the system's packages; elsewhere: pip install 'vislam[pi]'"
+            f"environment that sees the system's packages; elsewhere: {install_line('pi')}"
         ) from error
     return module
 

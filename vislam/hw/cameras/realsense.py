@@ -11,7 +11,7 @@ import numpy as np
 
 from vislam.config import BridgeClockConfig, RealsenseConfig
 from vislam.core.camera import Rig
-from vislam.core.errors import HardwareError
+from vislam.core.errors import HardwareError, install_line
 from vislam.core.messages import Frame
 from vislam.hw.bridge.clock import DeviceClock
 from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_imu, rigid
@@ -223,7 +223,7 @@ def pyrealsense2() -> Any:
     try:
         import pyrealsense2 as module
     except (ImportError, OSError) as error:
-        raise HardwareError(f"realsense needs pyrealsense2 ({error}); pip install 'vislam[realsense]'") from error
+        raise HardwareError(f"realsense needs pyrealsense2 ({error}); {install_line('realsense')}") from error
     return module
 
 

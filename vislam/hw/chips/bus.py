@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vislam.core.errors import HardwareError
+from vislam.core.errors import HardwareError, install_line
 from vislam.hw.timing import Clock
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def _load_smbus2() -> Any:
     try:
         import smbus2.smbus2 as module
     except ImportError as error:
-        raise HardwareError("sensors on I2C need smbus2; install it: pip install 'vislam[hw]'") from error
+        raise HardwareError(f"sensors on I2C need smbus2; install it: {install_line('hw')}") from error
     return module
 
 

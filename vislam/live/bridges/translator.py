@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from vislam.config import LiveConfig
-from vislam.core.errors import UsageError
+from vislam.core.errors import UsageError, install_line
 from vislam.live.processes.child import Life
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import PoseListener, send_address, socket_path
@@ -90,7 +90,7 @@ def run(life: Life, at: str, rate_hz: float, open_wire: Callable[[], Wire]) -> N
 
 def _require(package: str, extra: str, option: str) -> None:
     if find_spec(package) is None:
-        raise UsageError(f"{option} needs {package}; install it: pip install 'vislam[{extra}]'")
+        raise UsageError(f"{option} needs {package}; install it: {install_line(extra)}")
 
 
 def _open_ros2(domain: int, allow_remote: bool) -> Wire:

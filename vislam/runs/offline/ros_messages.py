@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.core.errors import DataError, UsageError
+from vislam.core.errors import DataError, UsageError, install_line
 from vislam.core.geometry import quaternion_xyzw_from_rotation
 from vislam.core.messages import Array
 from vislam.mapping.drive.grid import GridImage
@@ -34,7 +34,7 @@ class RosMessages:
         try:
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise UsageError("--mcap needs rosbags, of the extra 'bags': pip install 'vislam[bags]'") from error
+            raise UsageError(f"--mcap needs rosbags, of the extra 'bags': {install_line('bags')}") from error
         self.store = get_typestore(Stores.ROS2_HUMBLE)
 
     def pose(self, t_ns: int, T_frame_body: Array, frame: str) -> bytes:

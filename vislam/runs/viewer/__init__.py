@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vislam.config import ViewConfig
 from vislam.core.camera import Rig
+from vislam.core.errors import install_line
 from vislam.core.messages import (
     Array,
     Frame,
@@ -110,5 +111,5 @@ def open_viewer(
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] not in ("rerun", "rerun_bindings"):
             raise
-        return NullViewer("rerun-sdk is not installed; pip install 'vislam[view]' adds run.rrd")
+        return NullViewer(f"rerun-sdk, which writes run.rrd, is not installed; {install_line('view')}")
     return RunViewer(path, rig, config or ViewConfig())
