@@ -2,12 +2,13 @@
 
 import hashlib
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
-import textwrap
 from dataclasses import asdict, replace
-from pathlib import Path
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from session_entries import editing
 from vislam.cli import run_verb
 from vislam.config import BatchConfig, Config, load
 from vislam.core.errors import DataError, UsageError
+from vislam.core.memory import FrameEntry
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.offline.optimize_run import optimize
@@ -32,13 +34,20 @@ def simulated():
     return simulate("stereo", duration_s=8.0, true_loops=0)
 
 
-@pytest.fixture
-def folder(simulated, tmp_path):
+@pytest.fixture(scope="module")
+def stored(simulated, tmp_path_factory):
     """A run folder with a session, truth and metrics."""
-    store(simulated.log, tmp_path / "session.db", {"config": asdict(Config())}).close()
+    folder = tmp_path_factory.mktemp("stored")
+    store(simulated.log, folder / "session.db", {"config": asdict(Config())}).close()
     stamps = np.array([k.packet.keyframe.t_ns for k in simulated.log.keyframes])
-    write_tum(Trajectory(stamps, simulated.truth), tmp_path / "trajectory_truth.tum")
-    (tmp_path / "metrics.json").write_text(json.dumps({"name": "simulated", "accuracy": {"graph": {}}}))
+    write_tum(Trajectory(stamps, simulated.truth), folder / "trajectory_truth.tum")
+    (folder / "metrics.json").write_text(json.dumps({"name": "simulated", "accuracy": {"graph": {}}}))
+    return folder
+
+
+@pytest.fixture
+def folder(stored, tmp_path):
+    shutil.copytree(stored, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
@@ -81,24 +90,16 @@ def test_another_process_gives_the_same_bytes(folder):
     assert "report.html" in second
 
 
-def test_a_killed_run_can_be_optimised_up_to_its_last_keyframe(tmp_path):
-    here = Path(__file__).resolve().parent
-    path = tmp_path / "session.db"
-    script = textwrap.dedent(f"""
-        import sys, time; sys.path[:0] = [{str(here)!r}, {str(here.parent)!r}]
-        from pathlib import Path
-        from worlds.session import simulate, store
-        from vislam.core.memory import FrameEntry
-        log = simulate("stereo", duration_s=8.0, true_loops=0).log
-        writer = store(log, Path({str(path)!r}), upto=20)
+def test_a_killed_run_can_be_optimised_up_to_its_last_keyframe(simulated, tmp_path):
+    def killed() -> None:
+        writer = store(simulated.log, tmp_path / "session.db", upto=20)
         writer.add_frame(FrameEntry(10**12, 19, None))
-        print("committed", flush=True)
-        time.sleep(60)
-    """)
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
-        while "committed" not in process.stdout.readline():
-            assert process.poll() is None
-        process.send_signal(signal.SIGKILL)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    child = get_context("fork").Process(target=killed)
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
     assert run_verb(["optimize", str(tmp_path), "--rounds", "2"]) == 0
     assert len(read_tum(tmp_path / "trajectory_batch.tum")) == 20
     assert json.loads((tmp_path / "metrics.json").read_text())["batch"]["batch"]["keyframes"] == 20

@@ -42,7 +42,7 @@ def solved(seed: int, axes: np.ndarray, offset_s: float = OFFSET_S, seconds: flo
 
 def test_errors_are_as_large_as_their_sigmas() -> None:
     ratios = []
-    for seed in range(8):
+    for seed in range(5):
         found = solved(seed, np.array([0.5, 0.4, 0.6]))
         assert found is not None
         turn = (Rotation.from_matrix(found.R_body_cam) * R_BODY_CAM.inv()).as_rotvec()

@@ -88,7 +88,7 @@ def test_a_focal_length_is_found_from_a_fifth_too_much_with_the_readout(rolling:
 def test_a_coefficient_that_the_model_lacks_bends_the_rest() -> None:
     """On MH_01 the missing k3 moved the principal point by 11 px and turned the camera by 0.8 deg."""
     bent = replace(RADTAN, coefficients=(-0.35, 0.25, 0.0006, -0.0005, -0.12))
-    segments = [waved(seed, bent, 0.02) for seed in range(6)]
+    segments = [waved(seed, bent, 0.02) for seed in range(4)]
     pair = [find_lens(segments, replace(GUESS, coefficients=(0.0,) * n), None) for n in (4, 5)]
     short, full = (found for found in pair if found is not None)
     assert len(short.shared.camera.coefficients) == 4
@@ -97,9 +97,6 @@ def test_a_coefficient_that_the_model_lacks_bends_the_rest() -> None:
     errors = full.shared.values[:GYRO] - [470.0, 468.0, 325.0, 234.0, *bent.coefficients, 0.02]
     assert np.all(np.abs(errors) < 4.0 * known.sigmas[:GYRO])
     assert short.sigma_px > 1.1 * full.sigma_px
-    names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "readout_s"]
-    assert list(waving._named(full.shared.camera, known.sigmas)) == names
-    assert list(waving._named(short.shared.camera, certainty(short).sigmas)) == [*names[:8], names[9]]
 
 
 def test_a_wide_lens_is_found_as_an_equidistant_one() -> None:
@@ -147,7 +144,7 @@ def test_a_gyroscope_joins_in(rolling: Solution) -> None:
 
 
 def test_without_turning_the_focal_length_stays_open() -> None:
-    found = find_lens([waved(seed, RADTAN, turns=0.0) for seed in range(40, 45)], GUESS, None)
+    found = find_lens([waved(seed, RADTAN, turns=0.0) for seed in range(40, 43)], GUESS, None)
     assert found is None or certainty(found).sigmas[0] > 0.01 * 470.0
 
 

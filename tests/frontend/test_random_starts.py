@@ -14,7 +14,7 @@ from vislam.imu import ImuBuffer
 from worlds.parts import GRAVITY_M_S2
 from worlds.start import KINDS, Start, initialiser
 
-_STARTS = {"static": 4, "moving": 10, "gentle": 2, "rotation": 3, "uniform": 3, "accelerating": 3}
+_STARTS = {"static": 2, "moving": 6, "gentle": 1, "rotation": 2, "uniform": 2, "accelerating": 2}
 
 
 def is_wrong(start: Start, found: Initialisation) -> bool:
@@ -28,7 +28,7 @@ def is_wrong(start: Start, found: Initialisation) -> bool:
     return scale > max(0.05, 3.0 * found.scale_sigma) or tilt > max(np.deg2rad(2.0), 3.0 * tilt_sigma)
 
 
-def test_twenty_five_random_starts() -> None:
+def test_random_starts() -> None:
     """Motion that shows scale is started from, motion that does not is refused with its reason; none is wrong."""
     scale, sigmas, seconds, refused = [], [], [], []
     for kind in KINDS:
@@ -53,7 +53,7 @@ def test_twenty_five_random_starts() -> None:
                 assert found.is_settled and given[0].scale_sigma <= 0.1
     print(f"scale {np.round(100 * np.array(scale), 2)} %, sigmas {np.round(100 * np.array(sigmas), 2)} %")
     print(f"after {seconds} s; refused {refused}")
-    assert len(scale) >= 8
+    assert len(scale) >= 5
     assert np.median(np.abs(scale)) < 0.02
     assert np.median(seconds) <= 2.0
     assert np.max(seconds) <= 3.0
@@ -89,7 +89,7 @@ def test_the_search_is_a_state_machine_that_counts_its_refusals() -> None:
 @pytest.mark.parametrize("sigma", [0.15, 0.3])
 def test_tracks_that_are_better_than_told_start_as_well(sigma: float) -> None:
     """The told noise of a pixel is a bound for a class of trackers; what counts is what this one does."""
-    for seed in range(4):
+    for seed in range(2):
         start = Start("moving", seed, duration_s=5.0, pixel_sigma=sigma, told_sigma=1.0)
         found, answers = start.run(initialiser(start))
         assert found.is_settled and found.last is not None, answers[-1].reason
@@ -102,8 +102,8 @@ def test_a_start_that_the_next_second_contradicts_is_taken_back() -> None:
     """An accelerometer that felt motion half too strongly until shortly after the start: its scale does not last."""
     search, start = None, None
     taken_back, wrong = 0, 0
-    for seed in (1, 3, 5, 6):
-        start = Start("moving", seed, duration_s=8.0, shaken=(1.8, 1.6))
+    for seed in (1, 3, 5):
+        start = Start("moving", seed, duration_s=6.0, shaken=(1.8, 1.6))
         search = initialiser(start, InitConfig(mono_window_s=3.0))
         found, answers = start.run(search)
         retaken = [answer for answer in answers if answer.takes_back]

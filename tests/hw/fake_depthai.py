@@ -48,6 +48,7 @@ class World:
         self.is_calibrated = True  # depthai 3.12 and later
         self.platform = "RVC2"
         self.links: list[tuple[str, str]] = []
+        self.queues: dict[str, Queue] = {}  # of the cameras, the newest ones
 
     def now(self) -> timedelta:
         return timedelta(microseconds=(time.monotonic_ns() - self.epoch_ns) // 1000)
@@ -274,6 +275,7 @@ class Queue:
     def __init__(self, world: World, socket: str, size: tuple[int, int]) -> None:
         self.world, self.socket, self.size = world, socket, size
         self.number = (time.monotonic_ns() - world.began_ns) // world.period_ns + 5
+        world.queues[socket] = self
 
     def get(self, timeout: timedelta) -> "Image | None":
         world = self.world

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from vislam.config import BoardConfig, Gy85Config, SensorCalibration
-from vislam.core.errors import HardwareError
 from vislam.core.messages import MagSample
 from vislam.hw.chips import I2cBus, SettingsLostError
 from vislam.hw.chips.akm import AK8963, Akm
@@ -102,7 +101,7 @@ def turning(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[floa
 
 @pytest.mark.parametrize("kind", ["LSM6DSOX", "GY-85"])
 def test_a_host_put_aside_anywhere_dates_no_field_wrongly(kind: Any) -> None:
-    for at in range(1, 400, 3):
+    for at in range(1, 400, 5):
         clock = Stalled(at, 300_000_000)
         gy85 = kind == "GY-85"
         make = emulated_gy85 if gy85 else partial(emulated_board, kind, magnetometer="LIS3MDL")
@@ -195,5 +194,3 @@ def test_what_is_no_magnetometer_is_not_taken_for_one() -> None:
         virtual.chips[0x1C] = other
         again = FifoBoard(BoardConfig(bus=virtual.path, mag=True), clock)
         assert again.magnetometer_name is None
-        with pytest.raises(HardwareError, match="no magnetometer answers"):
-            again._mag.start(I2cBus(virtual.path, 0.02))

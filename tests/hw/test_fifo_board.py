@@ -245,7 +245,7 @@ def test_temperature_drift_is_told_and_its_known_part_taken_off() -> None:
         return rate, force, field, 25.0 + (t_ns - 1_000_000_000_000) * 1e-9
 
     with fifo_board(truth=warming) as (driver, virtual, clock):
-        per_c = np.array(inertial_chip(virtual)._sense._error.bias_per_c)
+        per_c = np.array(inertial_chip(virtual).error.bias_per_c)
         first, _ = gathered(driver, clock, 2.0)
         assert driver.temperature_c == pytest.approx(26.5, abs=1.1)
         driver.zeroed_at(driver.temperature_c, per_c)
@@ -264,7 +264,7 @@ def test_power_up_finds_bias_and_level_as_on_a_gy85() -> None:
         return (0.0, 0.0, 0.0), (0.17, -0.34, 9.80185), (20.0, 0.0, -42.0), 30.0
 
     with fifo_board("LSM6DSOX", truth=level) as (driver, virtual, clock):
-        error = inertial_chip(virtual)._sense._error
+        error = inertial_chip(virtual).error
         bias = np.array(error.bias) + 5.0 * np.array(error.bias_per_c)
         samples, _ = gathered(driver, clock, 3.0)
         t_ns = np.array([s.t_ns for s in samples], dtype=np.int64)
@@ -359,10 +359,9 @@ def test_stamps_increase_whatever_the_questions_find() -> None:
 
 
 @pytest.mark.parametrize("kind", ["LSM6DSOX", "MPU-6050", "GY-85"])
-@pytest.mark.parametrize("stall_ms", [150, 300])
-def test_a_host_put_aside_anywhere_blames_no_chip(kind: Any, stall_ms: int) -> None:
+def test_a_host_put_aside_anywhere_blames_no_chip(kind: Any) -> None:
     for at in range(1, 300):
-        clock = Stalled(at, stall_ms * 1_000_000)
+        clock = Stalled(at, (150 if at % 2 else 300) * 1_000_000)
         make = emulated_gy85 if kind == "GY-85" else partial(emulated_board, kind, magnetometer="none")
         with emulated_bus(make(still, clock.now_ns)) as bus:
             fifo, gy85 = BoardConfig(bus=bus.path), Gy85Config(bus=bus.path, mag=False, self_test=False)

@@ -20,6 +20,7 @@ from vislam.hw.chips.fifo_imu import divided, next_of
 from vislam.hw.emulator import (
     EmulatedBus,
     FifoChip,
+    SensorError,
     SteppedClock,
     VirtualBmi270,
     VirtualIcm20948,
@@ -60,7 +61,7 @@ def alone(
     """Yield a driver, its virtual chip at the usual address, their bus and the clock that transfers move on."""
     clock = SteppedClock()
     chip = virtual(still, clock.now_ns, **{k: options.pop(k) for k in ("who_am_i",) if k in options})
-    address = 0x6A if virtual is VirtualLsm6dsox else 0x69 if virtual is VirtualIcm20948 else 0x68
+    address = 0x6A if issubclass(virtual, VirtualLsm6dsox) else 0x69 if virtual is VirtualIcm20948 else 0x68
     bus = EmulatedBus({address: chip}, clock=clock, **options)
     with emulated_bus(bus):
         made = driver(I2cBus(bus.path, 0.02), setup)
@@ -131,11 +132,9 @@ def test_what_is_written_to_an_lsm6dsox_is_what_the_data_sheet_says() -> None:
 
 def test_the_oscillator_s_own_error_is_taken_from_the_chip() -> None:
     clock = SteppedClock()
-    chip = VirtualLsm6dsox(still, clock.now_ns)
-    bus = EmulatedBus({0x6A: chip}, clock=clock)
     for raw, share in ((0x7F, 0.1905), (0x80, -0.192), (0xFF, -0.0015)):
-        chip.power_cycle()
-        chip._rate = 1.0 + share
+        chip = VirtualLsm6dsox(still, clock.now_ns, SensorError(rate_error=share))
+        bus = EmulatedBus({0x6A: chip}, clock=clock)
         with emulated_bus(bus):
             driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
             driver.configure(clock)
@@ -183,11 +182,19 @@ def test_an_overrun_of_an_lsm6dsox_leaves_the_newest_512_words() -> None:
         assert not found.is_overrun, "told once"
 
 
+class Dumb(VirtualLsm6dsox):
+    """Keeps what is written, and does nothing of it."""
+
+    def _write_register(self, register: int, value: int) -> None:
+        self.registers[register] = value
+
+
 def test_a_chip_that_never_leaves_its_reset_is_refused() -> None:
-    with alone(lsm6dsox.Lsm6dsox, VirtualLsm6dsox, is_configured=False) as (driver, chip, _, clock):
-        chip._write_register = chip.registers.__setitem__
-        with pytest.raises(HardwareError, match="does not come out of its reset"):
-            driver.configure(clock)
+    with (
+        alone(lsm6dsox.Lsm6dsox, Dumb, is_configured=False) as (driver, _, _, clock),
+        pytest.raises(HardwareError, match="does not come out of its reset"),
+    ):
+        driver.configure(clock)
 
 
 def test_a_transfer_that_breaks_off_is_a_bus_error() -> None:

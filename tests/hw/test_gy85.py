@@ -74,8 +74,7 @@ def test_axes_that_name_one_twice_are_refused() -> None:
 
 def test_calibration_undoes_the_errors_of_a_raw_board() -> None:
     with board(truth=driving, grade="raw", magnetometer="none") as (_, virtual, _):
-        gyro_error = virtual.chips[0x68]._sense._error  # type: ignore[attr-defined]
-        accel_error = virtual.chips[0x53]._sense._error  # type: ignore[attr-defined]
+        gyro_error, accel_error = virtual.chips[0x68].error, virtual.chips[0x53].error
 
     def inverse(error):  # type: ignore[no-untyped-def]
         matrix = error.matrix()
@@ -193,7 +192,7 @@ def test_power_up_on_the_board_as_on_the_cart() -> None:
         return ImuSpan(t_ns, np.array([s.gyro_rad_s for s in samples]), np.array([s.accel_m_s2 for s in samples]))
 
     with board(truth=begins_to_turn) as (driver, virtual, clock):
-        error = virtual.chips[0x68]._sense._error  # type: ignore[attr-defined]
+        error = virtual.chips[0x68].error
         bias = np.array(error.bias) + 5.0 * np.array(error.bias_per_c)
         standing, _ = collect(driver, clock, 3.0)
         found = power_up(span(standing), PowerUpConfig(), 9.81, driver.temperature_c)
@@ -210,20 +209,25 @@ def test_power_up_on_the_board_as_on_the_cart() -> None:
 
 @given(st.lists(st.integers(1, 4), min_size=3, max_size=40), st.integers(0, 2**31))
 def test_a_track_interpolates_between_samples_in_order(groups: list[int], seed: int) -> None:
+    """Each sample counts one up, so what a time between two gives is a straight line that never falls."""
     rng = np.random.default_rng(seed)
-    track, asked_ns, done = SampleTrack(400.0, keep=256), 10**12, 0
+    track, asked_ns, done, newest = SampleTrack(400.0, keep=256), 10**12, 0, []
     for count in groups:
         asked_ns += count * 2_500_000 + int(rng.integers(-400_000, 400_000))
         values = (done + np.arange(count))[:, None] * np.ones(3)
         track.add(values, asked_ns, asked_ns + 200_000)
         done += count
-    times, values = list(track._times), [float(v[0]) for v in track._values]
-    assert (np.diff(times) > 0).all()
-    assert values == list(range(done))
-    assert times[-1] <= asked_ns + 200_000
-    assert track.at(times[0] - 1) is None
-    for t_ns in np.sort(rng.integers(times[0], times[-1], 20)):
-        value = track.at(int(t_ns))
-        assert value is not None
-        np.testing.assert_allclose(value, np.interp(t_ns - times[0], np.array(times) - times[0], values), atol=1e-9)
-    assert track.at(times[-1] + 1) is None
+        assert track.newest_ns is not None
+        newest.append((track.newest_ns, done - 1))
+    (first_ns, first), (last_ns, last) = newest[0], newest[-1]
+    assert (np.diff([t_ns for t_ns, _ in newest]) > 0).all()
+    assert last_ns <= asked_ns + 200_000
+    assert track.at(first_ns - round(groups[0] * 3e6)) is None
+    t_ns = np.arange(first_ns, last_ns, 500_000)
+    given = np.array([track.at(int(t)) for t in t_ns], dtype=np.float64)
+    assert (np.diff(given, axis=0) >= 0.0).all() and given[0] == pytest.approx(first)
+    for end_ns, value in newest[1:-1]:
+        nearest = int(np.argmin(np.abs(t_ns - end_ns)))
+        assert given[nearest] == pytest.approx(value, abs=0.5)
+    assert track.at(last_ns) == pytest.approx(last)
+    assert track.at(last_ns + 1) is None

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vislam.config import Gy85Config
+from vislam.hw.emulator import VirtualAdxl345
 from vislam.hw.health import Health
 from worlds.gy85 import FIELD_UT, board, collect, driving, errors, still
 
@@ -199,7 +200,7 @@ def test_temperature_drift_is_told_and_its_known_part_taken_off() -> None:
         return rate, force, field, 25.0 + (t_ns - 1_000_000_000_000) * 1e-9
 
     with board(truth=warming) as (driver, virtual, clock):
-        per_c = np.array(virtual.chips[0x68]._sense._error.bias_per_c)  # type: ignore[attr-defined]
+        per_c = np.array(virtual.chips[0x68].error.bias_per_c)
         first, _ = collect(driver, clock, 2.0)
         assert driver.temperature_c == pytest.approx(26.0, abs=1.1)
         driver.zeroed_at(driver.temperature_c, per_c)
@@ -215,7 +216,9 @@ def test_temperature_drift_is_told_and_its_known_part_taken_off() -> None:
 
 def test_a_failed_self_test_stays_in_the_health_word() -> None:
     with board() as (driver, virtual, clock):
-        virtual.chips[0x53]._self_test_g = (0.0, 0.0, 0.0)  # type: ignore[attr-defined]
+        weak = VirtualAdxl345(still, clock.now_ns, self_test_g=(0.0, 0.0, 0.0))
+        weak.write(bytes([0x2C, *virtual.chips[0x53].registers[0x2C:0x3A]]))
+        virtual.chips[0x53] = weak
         results = {t.chip: t.passed for t in driver.run_self_tests()}
         assert results["ADXL345"] is False
         collect(driver, clock, 0.5)

@@ -84,7 +84,7 @@ def test_pairs_are_stamped_by_depthais_clock_put_on_the_hosts(world: World) -> N
 
 def test_an_image_without_a_partner_is_left_out(world: World) -> None:
     with closing(OakStream(CAMERA)) as stream:
-        left, right = stream._queues
+        left, right = (world.queues[name] for name in ("CAM_B", "CAM_C"))
         world.lost.append(("CAM_C", left.number + 2))
         right.number = left.number
         gone = left.number + 2

@@ -6,6 +6,7 @@ import pytest
 from vislam.config import DriveConfig, MapConfig
 from vislam.core.errors import DataError
 from vislam.mapping.drive.drive import Drive, DriveMap
+from vislam.mapping.octree import ColumnStore
 from vislam.mapping.octree.occupancy import Octree
 
 CELL = 0.1
@@ -194,14 +195,15 @@ def test_an_updated_grid_is_the_one_made_from_scratch():
     yard = Yard(48, 24)
     yard.things.append((range(4, 9), range(10, 20), 3, 7))
     occupancy = yard.occupancy()
-    drive = DriveMap(CONFIG)
+    drive, columns = DriveMap(CONFIG), ColumnStore()
     drive.update(occupancy)
-    assert drive._store.update(occupancy) == 0
+    columns.update(occupancy)
+    assert columns.update(occupancy) == 0
     rng = np.random.default_rng(1)
     for _ in range(6):
         x, y = rng.integers(-20, 60, 2)
         see(occupancy, np.array([[x, y, z] for z in range(-1, 4)]))
-        assert 1 <= drive._store.update(occupancy) <= 4  # not the 18 and more of the map
+        assert 1 <= columns.update(occupancy) <= 4  # not the 18 and more of the map
         same(drive.update(occupancy), DriveMap(CONFIG).update(occupancy))
     other = Yard(30, 40).occupancy()  # a rebuilt map that takes the place of the old one, and is smaller
     same(drive.update(other), DriveMap(CONFIG).update(other))

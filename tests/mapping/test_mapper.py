@@ -2,6 +2,7 @@ import hashlib
 import sys
 import threading
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -44,6 +45,12 @@ def digest_of(occupancy):
 SEEN = [keyframe(k) for k in range(10)]
 TRUE = [pose(k) for k in range(10)]
 DRIFTED = [T @ se3_exp(np.array([0.0, 0.0, 0.01 * k, 0.03 * k, -0.02 * k, 0.0])) for k, T in enumerate(TRUE)]
+
+
+@cache
+def from_scratch():
+    """The digest of the map whose keyframes are all where they were."""
+    return digest(mapper_at(TRUE))
 
 
 def test_the_room_is_found_and_the_rest_is_unknown():
@@ -111,7 +118,7 @@ def test_the_oldest_submap_takes_a_joined_one_in_in_the_middle_of_a_correction()
     mapper.move(replace(update(range(8), TRUE[:8]), submaps=JOINED))
     mapper.move(replace(update([8, 9], TRUE[8:]), submaps=JOINED))
     mapper.finish()
-    assert digest(mapper) == digest(mapper_at(TRUE))
+    assert digest(mapper) == from_scratch()
 
 
 def test_a_submap_apart_is_written_into_a_folder_of_its_own(tmp_path):
@@ -137,7 +144,7 @@ def test_a_correction_below_the_limit_is_still_exact_at_the_end():
     mapper.move(update(range(10), TRUE))
     assert mapper.counters["keyframes_integrated_again"] == 0
     mapper.finish()
-    assert digest(mapper) == digest(mapper_at(TRUE))
+    assert digest(mapper) == from_scratch()
 
 
 def test_a_correction_is_followed_in_bounded_slices_while_the_old_map_stays_in_use():
@@ -154,7 +161,7 @@ def test_a_correction_is_followed_in_bounded_slices_while_the_old_map_stays_in_u
     assert done == [3, 6, 9]
     mapper.move(nothing)
     assert mapper.counters["rebuilds"] == 1
-    assert digest(mapper) == digest(mapper_at(TRUE))
+    assert digest(mapper) == from_scratch()
     mapper.move(nothing)
     assert mapper.counters["keyframes_integrated_again"] == 10
 
@@ -170,12 +177,12 @@ def test_keyframes_and_corrections_that_arrive_during_a_rebuild_are_not_lost():
         mapper.move(update([0, 1, 2], [T @ se3_exp(np.full(6, 0.02 * (9 - k))) for T in TRUE[:3]]))
     for _ in range(30):
         mapper.move(update([], []))
-    assert digest(mapper) == digest(mapper_at(TRUE))
+    assert digest(mapper) == from_scratch()
     mapper.finish()
-    assert digest(mapper) == digest(mapper_at(TRUE))
+    assert digest(mapper) == from_scratch()
 
 
-@pytest.mark.parametrize("moved", [[0], [9], [4, 5], [8, 9], [0, 3, 6], list(range(10))])
+@pytest.mark.parametrize("moved", [[0], [8, 9], [0, 3, 6], list(range(10))])
 def test_only_keyframes_that_moved_cast_rays_again_and_the_map_is_that_from_scratch(moved):
     poses = [DRIFTED[k] if k in moved else TRUE[k] for k in range(10)]
     mapper = mapper_at(poses)

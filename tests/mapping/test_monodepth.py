@@ -10,6 +10,7 @@ from vislam.config import MonoDepthConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp, transform
 from vislam.mapping.depth.mono import DepthFilter
+from vislam.mapping.depth.mono.depth_filter import rules
 from vislam.mapping.depth.mono.matching import CODES, SIDE, grey_noise, load_patch, load_warped
 from vislam.mapping.depth.mono.prior import flat_prior, points_prior
 from vislam.mapping.depth.mono.update import CONVERGED, FAILED, FLAT, match_sigma_px, patch_warp
@@ -29,6 +30,12 @@ def frames():
 @pytest.fixture(scope="module")
 def truth():
     return frame(0, WIDTH)[1]
+
+
+@pytest.fixture(scope="module")
+def plain(frames):
+    """A filter that saw all frames, for tests that only look at it."""
+    return filtered(frames)
 
 
 def filtered(frames, config=CONFIG, change=lambda image: image, prior=None):
@@ -78,8 +85,8 @@ def test_converges_and_knows_how_well(fusion, frames, truth):
     assert (np.sqrt(filter_.belief.variance[known]) < CONFIG.converged * filter_.belief.rho[known]).all()
 
 
-def test_smoothing_lowers_the_error_and_keeps_the_edges(frames, truth):
-    filter_ = filtered(frames)
+def test_smoothing_lowers_the_error_and_keeps_the_edges(plain, truth):
+    filter_ = plain
     depth = filter_.depth_m()
     both = (depth > 0.0) & filter_.known
     rough = np.abs(1.0 / filter_.belief.rho[both] - truth[both])
@@ -88,8 +95,8 @@ def test_smoothing_lowers_the_error_and_keeps_the_edges(frames, truth):
     assert (smooth > 0.1 * truth[both]).mean() < 0.01
 
 
-def test_the_number_of_threads_changes_nothing(frames):
-    one, three = filtered(frames), filtered(frames, replace(CONFIG, threads=3))
+def test_the_number_of_threads_changes_nothing(frames, plain):
+    one, three = plain, filtered(frames, replace(CONFIG, threads=3))
     for a, b in zip(one.belief, three.belief, strict=True):
         assert np.array_equal(a, b)
 
@@ -219,14 +226,15 @@ def test_noise_is_read_off_an_image_whatever_is_drawn_on_it():
 
 
 def test_with_photometric_sigmas_nine_errors_in_ten_lie_within_two_of_them(frames, truth):
-    filter_ = filtered(frames, replace(CONFIG, model_sigma_px=0.5))
+    config = replace(CONFIG, model_sigma_px=0.5)
+    filter_ = filtered(frames, config)
     known = filter_.known
     sigmas = np.abs(filter_.belief.rho - 1.0 / truth)[known] / np.sqrt(filter_.belief.variance[known])
     assert 0.85 < (sigmas < 2.0).mean() < 0.995
-    rules = filter_._rules
-    strong, weak = (match_sigma_px(along, 1.0, rules) for along in (400.0, 9.0))
+    of_image = rules(config, grey_noise(frames[0]))
+    strong, weak = (match_sigma_px(along, 1.0, of_image) for along in (400.0, 9.0))
     assert 0.5 < strong < weak < 1.0
-    assert match_sigma_px(9.0, 1.0, rules._replace(model_sigma_px=-1.0)) == rules.sigma_px
+    assert match_sigma_px(9.0, 1.0, of_image._replace(model_sigma_px=-1.0)) == of_image.sigma_px
 
 
 def test_the_next_keyframe_takes_the_depth_over(frames, truth):

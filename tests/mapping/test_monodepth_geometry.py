@@ -100,8 +100,8 @@ def test_gaussian_fusion_is_the_weighted_mean(a, sigma_a, b, sigma_b):
 def test_beta_fusion_has_the_moments_of_the_exact_posterior(rho, sigma, a, b, measured, sigma_measured):
     spread = 3.0
     new, variance, new_a, new_b = fuse_beta(rho, sigma**2, a, b, measured, sigma_measured**2, spread)
-    x = np.linspace(rho - 9 * sigma, rho + 9 * sigma, 4001)[:, None]
-    share = np.linspace(0.0, 1.0, 801)[None, 1:-1]
+    x = np.linspace(rho - 9 * sigma, rho + 9 * sigma, 1001)[:, None]
+    share = np.linspace(0.0, 1.0, 201)[None, 1:-1]
     prior = np.exp(-0.5 * ((x - rho) / sigma) ** 2) * share ** (a - 1.0) * (1.0 - share) ** (b - 1.0)
     seen = np.exp(-0.5 * ((measured - x) / sigma_measured) ** 2) / (np.sqrt(2 * np.pi) * sigma_measured)
     posterior = prior * (share * seen + (1.0 - share) / spread)

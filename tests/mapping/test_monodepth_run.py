@@ -46,7 +46,7 @@ import os, pathlib, signal, sys
 sys.path.insert(0, sys.argv[1])
 from test_monodepth_run import run
 def stop(done, total, note):
-    if done == total // 2:
+    if done == 3 * total // 4:
         os.kill(os.getpid(), signal.SIGKILL)
 run(sys.argv[2], pathlib.Path(sys.argv[3]), stop)
 """
@@ -60,7 +60,7 @@ def run(source, out, progress=None):
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mono") / "recording"
-    world = open_world("handheld-room", rig="mono", duration_s=10.0, camera_hz=10.0, image_width_px=320)
+    world = open_world("handheld-room", rig="mono", duration_s=7.0, camera_hz=10.0, image_width_px=256)
     record(world, folder)
     return folder
 

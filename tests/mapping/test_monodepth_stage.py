@@ -1,6 +1,7 @@
 """Depth from one camera through the stage and into the map, on the simulated table."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -56,8 +57,13 @@ def _between(n, drift=None):
     return seen
 
 
+DRIFT = (0.004, -0.003, 0.002, 0.01, -0.01, 0.005)
+
+
+@cache
 def _follow(drift=None):
     stage, late = MonoDepth(CONFIG, RIG), []
+    drift = None if drift is None else np.array(drift)
     for n in range(4):
         keyframe = _keyframe(n, drift=drift)
         late.append(stage.add(keyframe, _body(n * EVERY), _between(n, drift) if n else []))
@@ -76,9 +82,8 @@ def test_a_keyframe_gets_its_depth_when_it_has_been_followed_long_enough():
 
 
 def test_odometry_between_keyframes_is_bent_to_what_the_graph_found():
-    drift = np.array([0.004, -0.003, 0.002, 0.01, -0.01, 0.005])
     _, straight = _follow()
-    _, bent = _follow(drift)
+    _, bent = _follow(DRIFT)
     both = (straight[3].depth_m > 0.0) & (bent[3].depth_m > 0.0)
     assert both.sum() > 0.9 * (straight[3].depth_m > 0.0).sum()
     assert np.median(np.abs(bent[3].depth_m[both] / straight[3].depth_m[both] - 1.0)) < 0.0005

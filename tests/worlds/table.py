@@ -71,6 +71,7 @@ def view(T_world_cam, width, seed, world=None):
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8), depth
 
 
+@cache
 def frame(i, width):
     """The i-th frame of the motion."""
     return view(pose(i), width, i)

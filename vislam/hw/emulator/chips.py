@@ -18,13 +18,14 @@ class Chip:
 
     Attributes:
         registers: [256].
+        error: of what it senses (of the gyroscope, where it is two sensors).
         is_frozen: the chip hangs: it answers, and its data never change.
     """
 
     def __init__(self, truth: Truth, now_ns: NowNs, error: SensorError = IDEAL, seed: int = 0) -> None:
         """Take the motion, the host's clock and the errors, and power up."""
         self._truth, self._now_ns = truth, now_ns
-        self._sense = Sensing(error, seed)
+        self.error, self._sense = error, Sensing(error, seed)
         self._rate = 1.0 + error.rate_error
         self.registers = bytearray(256)
         self.is_frozen = False
