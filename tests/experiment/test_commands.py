@@ -17,6 +17,8 @@ from vislam.experiment.programs import ProgramError
 from vislam.runs.sources import open_source
 from vislam.trajectory import read_tum
 
+pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
+
 # reads a EuRoC folder and stands still; knows nothing of vislam
 PEER = """
 import pathlib, sys

@@ -9,13 +9,15 @@ import sys
 import time
 
 import pytest
-from tiny import PLAN, write_plan
+from tiny import PLAN, jobs_here, write_plan
 
 from vislam.cli import run_verb
 from vislam.experiment.recordings import open_cached
 from vislam.experiment.store import ResultStore
 
-PATIENCE_S = 240.0
+pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
+
+PATIENCE_S = 1800.0
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,8 @@ def compared(folder):
     _, said = first.communicate(timeout=PATIENCE_S)
     with ResultStore(folder / "r.db") as store:
         kept = len(store)
-    assert run_verb(arguments(folder, "--workers", "2")) == 0
+    with jobs_here():
+        assert run_verb(arguments(folder, "--workers", "2")) == 0
     return first.returncode, said, kept
 
 

@@ -19,8 +19,9 @@ from vislam.experiment.isolated import run_isolated
 from vislam.experiment.jobs import expand
 from vislam.experiment.plan import load_plan
 from vislam.experiment.store import ResultStore
+from vislam.experiment.worker import run_job
 
-PATIENCE_S = 240.0  # a busy machine is no failure; nothing waits so long otherwise
+PATIENCE_S = 1800.0  # a busy machine is no failure; nothing waits so long otherwise
 
 
 @pytest.fixture
@@ -70,12 +71,12 @@ def test_a_killed_job_says_by_what(specs, tmp_path):
 def test_an_error_of_the_pipeline_is_a_result(specs, tmp_path):
     spec = json.loads(json.dumps(specs[0]))
     spec["source"] = "points:laps,tracks=0,duration_s=3"
-    blind = run_isolated(spec, str(tmp_path))
+    blind = run_job(spec, tmp_path / "blind", tmp_path)
     assert blind["status"] == "failed"
     assert blind["reason"].startswith("TrackingLostError: ")
     assert blind["run"]["frames"] > 0  # what was measured on the way stays
     spec["source"] = "points:/no/such/recording"
-    assert run_isolated(spec, str(tmp_path))["reason"].startswith("DataError: ")
+    assert run_job(spec, tmp_path / "none", tmp_path)["reason"].startswith("DataError: ")
     spec["environment"] = {**spec["environment"], "code_sha256": "other"}
     other = run_isolated(spec, str(tmp_path))
     assert other["status"] == "mismatch"
@@ -84,7 +85,7 @@ def test_an_error_of_the_pipeline_is_a_result(specs, tmp_path):
 
 def test_closing_the_local_engine_stops_what_runs(specs, tmp_path):
     done = []
-    with closing(run_locally(specs, 2, tmp_path, None)) as finished:
+    with closing(run_locally(specs[:2], 2, tmp_path, None)) as finished:
         for spec, result in finished:
             done.append((spec["key"], result["status"]))
             break
@@ -104,14 +105,6 @@ def test_no_job_outlives_the_process_that_asked_for_it(specs, tmp_path):
     asker.kill()
     asker.wait()
     until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE, "the orphan to end")
-
-
-def test_run_folders_are_kept_only_when_asked_for(specs, tmp_path):
-    kept = tmp_path / "kept"
-    result = run_isolated(specs[0], str(tmp_path), str(kept))
-    assert result["status"] == "ok"
-    assert (kept / specs[0]["key"][:24] / "trajectory_graph.tum").is_file()
-    assert not [p for p in tmp_path.iterdir() if p.name.startswith("vislam-job-")]
 
 
 def start_dask_worker(address, name, folder):
@@ -148,7 +141,7 @@ def cluster(tmp_path):
 
 
 def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, cluster, tmp_path):
-    address, workers = cluster
+    (address, workers), specs = cluster, specs[:2]
     finished = []
     with ResultStore(tmp_path / "r.db") as store:
         thread, _ = in_thread(lambda: finished.extend(run_on_dask(specs, address, tmp_path, None)))
@@ -164,9 +157,11 @@ def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, cluste
         assert len(store) == len(specs) == len(finished)
         assert {spec["key"] for spec, _ in finished} == {spec["key"] for spec in specs}
         assert [result["status"] for _, result in finished] == ["ok"] * len(specs)
-    alone = run_isolated(specs[0], str(tmp_path))
+    alone = run_isolated(specs[0], str(tmp_path), str(tmp_path / "kept"))
     for output, entry in next(result for spec, result in finished if spec is specs[0])["outputs"].items():
         assert entry["sha256"] == alone["outputs"][output]["sha256"]  # where a job runs does not matter
+    assert (tmp_path / "kept" / specs[0]["key"][:24] / "trajectory_graph.tum").is_file()  # as only this one asked
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith("vislam-job-")]
 
 
 def test_a_cluster_that_is_not_there_is_one_line(specs, tmp_path, monkeypatch):

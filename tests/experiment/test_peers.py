@@ -17,6 +17,8 @@ from vislam.experiment.commands import identity
 from vislam.experiment.plan import load_plan
 from vislam.trajectory import read_tum
 
+pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
+
 # plays pyorbslam3: it follows along x by a metre a frame and saves what it was asked; the driver is the real one
 ORBSLAM3 = """
 import enum

@@ -1,5 +1,6 @@
 """Plans and what they mean run by run."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -245,6 +246,14 @@ def test_a_missing_plan_is_one_line(tmp_path):
         load_plan(tmp_path / "none.toml")
 
 
+def some(sources):
+    """Of sources that differ in an option's value alone the first, the last and one between."""
+    alike = {}
+    for source in sorted(sources):
+        alike.setdefault(re.sub(r"=[-+.\de]+", "=", source), []).append(source)
+    return {group[n] for group in alike.values() for n in (0, len(group) // 2, -1)}
+
+
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "experiments").glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_plans_are_valid(path):
     plan = load_plan(path, {"VISLAM_DATA": "/data"})
@@ -253,7 +262,7 @@ def test_shipped_plans_are_valid(path):
     repeated = plan.members >= 6 or len(plan.seeds) >= 2  # one run of something chaotic says little
     assert repeated or plan.name == "starts"  # many starts of one recording are an ensemble of their own
     assert len({job.label for job in jobs}) == len(jobs) > 0
-    for source in {job.source for job in jobs}:
+    for source in some({job.source for job in jobs}):
         scheme, name, options = split_source(source)
         if scheme == "eqvio:":
             open_source(",".join([f"{scheme}{name}", *(part for part in options.split(",") if "_s=" in part)]))

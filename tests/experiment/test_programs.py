@@ -16,6 +16,8 @@ from vislam.experiment.programs import ProgramError, identity, load, run_program
 from vislam.sim import open_points
 from vislam.trajectory import read_tum
 
+pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
+
 STILL = """
 import numpy as np
 from vislam.trajectory import Trajectory

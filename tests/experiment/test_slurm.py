@@ -17,6 +17,8 @@ from vislam.experiment.jobs import expand
 from vislam.experiment.plan import load_plan
 from vislam.experiment.slurm import run_on_slurm
 
+pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
+
 # runs the tasks of the array one after the other, as a cluster with one slot would, and forgets it then
 SBATCH = """
 import os, pathlib, re, subprocess, sys
@@ -73,11 +75,11 @@ def compare(folder, capsys, out, *more):
 
 
 def test_a_cluster_gives_the_bytes_that_this_machine_gives(cluster, tmp_path, capsys):
-    write_plan(tmp_path, PLAN.replace("[0, 1]", "[0]"))
+    write_plan(tmp_path, PLAN.replace("[0, 1]", "[0]").partition('\n[[estimators]]\nname = "slow')[0])
     here = compare(tmp_path, capsys, "here")
     there = compare(tmp_path, capsys, "there", "--engine", "slurm", "--sbatch=--partition=cpu --mem=4G")
     assert here[0] == there[0] == 0
-    assert there[1]["new"] == 2
+    assert there[1]["new"] == 1
     assert (cluster / "asked.txt").read_text() == "--parsable --partition=cpu --mem=4G"
     tables = [list(csv.DictReader((tmp_path / out / "runs.csv").open())) for out in ("here", "there")]
     ours, theirs = ([row["sha256"] for row in rows] for rows in tables)
@@ -135,7 +137,7 @@ def test_the_array_has_the_time_of_its_jobs_unless_one_asks_otherwise(answers, s
     answers(GONE)
     (script,) = scripts(specs, "", tmp_path)
     assert "#SBATCH --array=0-3\n" in script
-    assert "#SBATCH --time=10\n" in script  # 300 s and five minutes
+    assert "#SBATCH --time=35\n" in script  # half an hour and five minutes
     (script,) = scripts(specs, "--time=60", tmp_path / "else")
     assert "--time" not in script
 

@@ -21,6 +21,8 @@ from vislam.sim import open_points
 from vislam.trajectory import read_tum
 from vislam.trajectory.states import read_states_csv
 
+pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
+
 # knows the truth, errs by what it says, times what it is told to; its first pose is sure
 HONEST = """
 import numpy as np
