@@ -85,7 +85,7 @@ def error(state: NavState, seconds: float = 12.0) -> float:
 
 def test_wheels_hold_the_drift_without_vision() -> None:
     free, wheels, floor = [], [], []
-    for seed in range(6):
+    for seed in range(3):
         free.append(error(drive(replace(CART, slip_sigma_m_s=None), seed)[1]))
         ekf, state = drive(CART, seed)
         wheels.append(error(state))
@@ -98,7 +98,7 @@ def test_wheels_hold_the_drift_without_vision() -> None:
 
 def test_the_filter_on_wheels_knows_its_error() -> None:
     nees = []
-    for seed in range(20):
+    for seed in range(10):
         _, state = drive(CART, seed, 6.0)
         e = state.T_world_body[:3, 3] - cart(6.0)[0][:3, 3]
         nees.append(e @ np.linalg.solve(state.covariance[3:6, 3:6], e))

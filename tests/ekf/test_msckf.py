@@ -49,7 +49,7 @@ def test_follows_a_flight_with_outliers(rig: Rig) -> None:
 
 def test_rolling_shutter_is_accounted_for() -> None:
     """30 ms of readout; taken for a global shutter, the same images mislead. Seed 0."""
-    flight = Flight.make(0, 8.0, readout_s=0.03)
+    flight = Flight.make(0, 8.0, readout_s=0.03, tracks=100)
     known = end_error_m(flight, flight.filter(tight_readout_s=0.03))
     ignored = end_error_m(flight, flight.filter())
     print(f"known {known:.4f} m, ignored {ignored:.4f} m")

@@ -16,7 +16,7 @@ from vislam.core.messages import Array
 from worlds.flight import Flight
 from worlds.motion import NS, T0_NS
 
-RUNS = int(os.environ.get("VISLAM_RUNS", "4"))
+RUNS = int(os.environ.get("VISLAM_RUNS", "3"))
 NAMES = ("orientation", "position", "velocity", "gyro bias", "accel bias")
 
 

@@ -15,7 +15,7 @@ from vislam.sensors import Sensor, Suite
 from worlds import monte_carlo as mc
 from worlds.sensed_paths import KINDS, Beacon, Fix, Height, SensedRun, Speed, made
 
-RUNS, FIRST_SEED = 16, 7000
+RUNS, FIRST_SEED = 9, 7000
 
 
 def normalised(error: Array, covariance: Array) -> float:
@@ -91,7 +91,7 @@ def test_own_variables_are_found(kind: str) -> None:
 def test_a_scale_that_is_wrong_and_taken_for_known_is_inconsistent(kind: str) -> None:
     """Why own variables are part of the state: with the scale taken for exact the same readings mislead."""
     honest, sure = [], []
-    for i in range(6):
+    for i in range(4):
         run = SensedRun.make(FIRST_SEED + i, 10.0, {"speed": Speed()}, {"speed": 20})
         for values, known in ((honest, run.starts), (sure, [OwnStart("speed", np.ones(1), np.zeros(1))])):
             run.starts = known

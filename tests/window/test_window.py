@@ -184,7 +184,7 @@ def test_inertial_data_bridges_lost_vision_and_vision_bridges_lost_inertial_data
 def test_what_other_sensors_tell_of_motion_stands_in_for_lost_vision(rig: Rig) -> None:
     """Six seconds blind: speed stays known, what was lost is found again, and the window knows how well."""
     told_sigma, alone_sigma, squares, count = [], [], 0.0, 0
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         packets, truths = World(Motion.random(seed), rig, seed, duration_s=14.0, tracks=50).packets()
         blind = range(30, 60)
@@ -192,9 +192,11 @@ def test_what_other_sensors_tell_of_motion_stands_in_for_lost_vision(rig: Rig) -
         seen = [replace(p, observations=nothing) if k in blind else p for k, p in enumerate(packets)]
         scale = 1.0 + 0.005 * rng.normal()
         for tells, sigmas in ((True, told_sigma), (False, alone_sigma)):
+            if not tells and seed:
+                continue  # one that hears nothing is enough to compare with
             window = SlidingWindow(HONEST, rig, EUROC_NOISE, MACHINE)
             window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed + 1000)))
-            for k, p in enumerate(seen):
+            for k, p in enumerate(seen if tells else seen[: blind.stop]):
                 ways = (
                     [told_way(truths[k - 1][0], truths[k][0], 0.01, scale, 0.005, rng)] if tells and k in blind else []
                 )
@@ -206,7 +208,7 @@ def test_what_other_sensors_tell_of_motion_stands_in_for_lost_vision(rig: Rig) -
                     index = np.ix_([0, 1, *range(6, 15)], [0, 1, *range(6, 15)])
                     squares += float(error @ np.linalg.solve(update.newest.covariance[index], error))
                     count += len(error)
-    known, alone = np.mean(told_sigma), np.mean(alone_sigma)
+    known, alone = np.mean(told_sigma), alone_sigma[0]
     print(f"speed known to {known:.3f} m/s, without {alone:.3f}; NEES {squares / count:.2f}")
     assert known < 0.5 * alone
     low, high = chi2.ppf([0.0005, 0.9995], count)
