@@ -3,7 +3,9 @@ import numpy as np
 import pytest
 
 from vislam.sim import WORLD_NAMES
+from vislam.sim.scene.render import Renderer
 from vislam.sim.worlds.table import WORLDS
+from worlds.recordings import frame_seconds
 
 LIMITS = {  # speed m/s, acceleration m/s2, rate rad/s, length m, seconds, rest at the start s
     "workshop-cart": (1.2, 2.0, 1.4, (50.0, 60.0), (60.0, 80.0), 2.0),
@@ -88,7 +90,7 @@ def nearest_revisit(world, i: int, gap_s: float) -> int:
     poses = world.truth().T_world_body
     distance = np.linalg.norm(poses[:, :3, 3] - poses[i, :3, 3], axis=1)
     distance += 2.0 * (1.0 - np.einsum("nj,j->n", poses[:, :3, 0], poses[i, :3, 0]))
-    times = world._frame_s
+    times = frame_seconds(world)
     distance[np.abs(times - times[i]) < gap_s] = np.inf
     return int(np.argmin(distance))
 
@@ -107,7 +109,7 @@ def test_places_are_recognised_and_not_confused(painted, name, start, others):
 def test_the_corridor_is_walked_again_for_five_metres_and_only_there(painted):
     world = painted("corridor-loop")
     places = world.truth().T_world_body[:, :3, 3]
-    times = world._frame_s
+    times = frame_seconds(world)
     apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
     apart[np.abs(times[:, None] - times[None]) < 15.0] = np.inf
     again = np.flatnonzero(apart.min(axis=1) < 0.5)
@@ -126,8 +128,9 @@ def turned_about_the_middle(poses: np.ndarray, quarters: int) -> np.ndarray:
 def test_the_aliased_halls_are_the_same_pixels_but_for_a_number_and_the_fourth_is_rearranged(painted):
     world = painted("aliased-halls", rig="mono", image_noise=False, exposure_changes=False)
     pose = world.truth().T_world_body[150] @ world.rig.T_body_cams[0]  # in the second hall, its shelf in view
+    renderer = Renderer(world.rig.cameras[0])
     first, second, third, fourth = (
-        world._renderers[0].render(world.scene, turned_about_the_middle(pose, k))[0].astype(float) for k in (3, 0, 1, 2)
+        renderer.render(world.scene, turned_about_the_middle(pose, k))[0].astype(float) for k in (3, 0, 1, 2)
     )
     for other in (first, third):
         assert np.median(np.abs(other - second)) <= 2.0  # soft shadows are not turned with the hall
