@@ -10,28 +10,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from session_entries import editing
 from vislam.config import BatchConfig
 from vislam.runs.offline.optimize_run import optimize
 from vislam.sensors.toml import load_sensor_setup
-from worlds.sensed_drive import drive
+from worlds.sensed_drive import driven as sensed
 
-SENSORS = """
-[sensors.gnss]
-kind = "position"
-sigma_m = 0.02
-sigma_up_m = 0.05
-lever_sigma_m = 0.3
-simulated_hz = 5.0
-[sensors.height]
-kind = "height"
-simulated_hz = 2.0
-"""
 CONFIG = BatchConfig()
 
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return drive(tmp_path_factory.mktemp("driven"), SENSORS)
+    """A copy, for a batch writes into its run."""
+    levered = sensed(tmp_path_factory, "levered")
+    folder = tmp_path_factory.mktemp("driven") / "levered"
+    shutil.copytree(levered.sensors.parent, folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -61,13 +55,13 @@ def test_without_their_file_the_batch_says_so_and_goes_by_the_rest(
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(driven / "run", run)
-    config = driven / "cart.toml"
-    aside = config.rename(config.with_suffix(".aside"))
-    try:
-        without = optimize(run, CONFIG)
-    finally:
-        aside.rename(config)
-    assert [w for w in without["warnings"] if "goes without the readings of gnss, height" in w and "cart.toml" in w]
+    with editing(run / "session.db") as database:
+        moved = "UPDATE info SET value = replace(value, 'cart.toml', 'moved.toml') WHERE key = 'config'"
+        assert database.execute(moved).rowcount == 1
+    without = optimize(run, CONFIG)
+    assert [
+        w for w in without["warnings"] if "goes without the readings of gnss, height, wheels" in w and "moved.toml" in w
+    ]
     assert without["sensors"] == {}
     rmse_m = [found["accuracy"]["se3"]["ate_rmse_m"] for found in (entry, without)]
     print("ATE with and without [m]:", rmse_m)

@@ -12,38 +12,25 @@ from vislam.cli import run_verb
 from vislam.core.errors import UsageError
 from vislam.sensors.toml import load_sensor_setup
 from worlds.calibration import refusal
-from worlds.sensed_drive import drive
-
-SENSORS = """
-[sensors.wheels]
-kind = "wheels"
-simulated_hz = 20.0
-[sensors.gnss]
-kind = "position"
-sigma_m = 0.02
-sigma_up_m = 0.05
-lever_sigma_m = 0.3
-simulated_hz = 5.0
-[sensors.height]
-kind = "height"
-simulated_hz = 2.0
-"""
+from worlds.sensed_drive import OF
+from worlds.sensed_drive import driven as sensed
 
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return drive(tmp_path_factory.mktemp("driven"), SENSORS)
+    return sensed(tmp_path_factory, "levered").sensors.parent
 
 
 @pytest.fixture(scope="module")
-def known(driven: Path) -> Path:
-    assert run_verb(["calibrate", "sensors", str(driven / "run"), "--out", str(driven / "calibration")]) == 0
-    return driven / "calibration"
+def known(driven: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("known") / "calibration"
+    assert run_verb(["calibrate", "sensors", str(driven / "run"), "--out", str(out)]) == 0
+    return out
 
 
 def test_the_next_run_begins_with_what_this_one_found(driven: Path, known: Path, tmp_path: Path) -> None:
     before = load_sensor_setup(driven / "cart.toml").suite
-    (tmp_path / "cart.toml").write_text(SENSORS + (known / "sensors.toml").read_text())
+    (tmp_path / "cart.toml").write_text(OF["levered"] + (known / "sensors.toml").read_text())
     after = load_sensor_setup(tmp_path / "cart.toml").suite
     metrics = json.loads((driven / "run" / "metrics.json").read_text())["sensors"]
     report = json.loads((known / "sensors.json").read_text())

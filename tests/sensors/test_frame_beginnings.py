@@ -27,8 +27,8 @@ from vislam.sensors.kinds import (
 from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD, wrapped
 from vislam.sensors.simulated import Faults, drawn_readings
 
-SEEDS = range(40)
-FEWER = range(15)  # of what searches
+SEEDS = range(20)
+FEWER = range(8)  # of what searches
 ROOM = {"1": (0.0, 0.0, 2.5), "2": (8.0, 0.0, 2.2), "3": (8.0, 6.0, 0.5), "4": (0.0, 6.0, 2.0)}
 FLAT = {name: (x, y, 1.0) for name, (x, y, _) in ROOM.items()}
 

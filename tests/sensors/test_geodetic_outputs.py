@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.cli import run_verb
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, NavState
 from vislam.runs.geodetic_outputs import (
@@ -29,27 +28,12 @@ from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.measuring_frame import about_up
 from vislam.sensors.toml import load_sensor_setup
 from vislam.trajectory import Trajectory, read_tum
-
-SOURCE = "points:workshop-cart,rig=stereo,duration_s=12,camera_hz=10,tracks=100"
-QUIET = ["--map.no-enabled", "--view.no-enabled"]
-DATUM = Geodetic(-36.8, 179.9999, 40.0)  # the drawn frame is some km off, so the path lies elsewhere
-FIXES = (
-    '[sensors.gnss]\nkind = "position"\nsigma_m = 0.02\nsigma_up_m = 0.04\nsimulated_hz = 5.0\n'
-    f"gnss = {{datum = [{DATUM.latitude_deg}, {DATUM.longitude_deg}, {DATUM.height_m}]}}\n"
-)
-HEIGHTS = '[sensors.baro]\nkind = "height"\nsimulated_hz = 5.0\n'
-
-
-def run(out: Path, sensors: str) -> Path:
-    path = out.parent / f"{out.name}.toml"
-    path.write_text(sensors)
-    assert run_verb(["run", SOURCE, "--out", str(out), "--sensors.file", str(path), *QUIET]) == 0
-    return out
+from worlds.sensed_drive import DATUM, Driven, driven
 
 
 @pytest.fixture(scope="module")
-def with_fixes(tmp_path_factory) -> Path:
-    return run(tmp_path_factory.mktemp("geodetic") / "run", HEIGHTS + FIXES)
+def with_fixes(tmp_path_factory) -> Driven:
+    return driven(tmp_path_factory, "clean")
 
 
 def table_of(path: Path) -> tuple[Array, list[Geodetic]]:
@@ -65,19 +49,19 @@ def sigmas_of(path: Path) -> Array:
         return np.array([[float(row[name]) for name in SIGMA_COLUMNS] for row in csv.DictReader(file)])
 
 
-def true_enu(out: Path) -> tuple[Array, Array]:
+def true_enu(run: Driven) -> tuple[Array, Array]:
     """Stamps [N] and east, north, up [N, 3] of the truth, by the frame that was drawn for the run."""
-    setup = load_sensor_setup(out.parent / f"{out.name}.toml")
+    setup = load_sensor_setup(run.sensors)
     at = setup.suite.own("gnss")
     rng = np.random.default_rng([0, list(setup.simulated_hz).index("gnss")])
     yaw, *shift = setup.suite.starts[at] + setup.suite.sigmas[at] * rng.normal(size=at.stop - at.start)
-    truth = read_tum(out / "trajectory_truth.tum")
+    truth = read_tum(run.out / "trajectory_truth.tum")
     return truth.t_ns, truth.positions_m @ so3_exp(np.array([0.0, 0.0, yaw])).T + shift
 
 
 @pytest.mark.parametrize("by", TABLES)
-def test_latitude_and_longitude_are_those_of_the_truth(with_fixes: Path, by: str) -> None:
-    stamps, places = table_of(with_fixes / TABLES[by])
+def test_latitude_and_longitude_are_those_of_the_truth(with_fixes: Driven, by: str) -> None:
+    stamps, places = table_of(with_fixes.out / TABLES[by])
     local = LocalFrame(DATUM)
     enu = np.array([local.enu(place) for place in places])
     true_t_ns, true_m = true_enu(with_fixes)
@@ -86,7 +70,7 @@ def test_latitude_and_longitude_are_those_of_the_truth(with_fixes: Path, by: str
     error = np.linalg.norm(enu - wanted, axis=1)[settled]
     assert len(error) > 60
     assert np.sqrt(np.mean(error**2)) < 0.05
-    most = sigmas_of(with_fixes / TABLES[by])[settled]
+    most = sigmas_of(with_fixes.out / TABLES[by])[settled]
     share = np.abs(enu - wanted)[settled] / most
     print(by, "rms of error over most sigma", np.sqrt(np.mean(share**2, axis=0)), "sigmas", np.median(most, axis=0))
     assert np.sqrt(np.mean(share**2)) < 1.0  # they are the most that a sigma can be
@@ -112,26 +96,26 @@ def test_no_sigma_is_larger_however_body_and_frame_hang_together() -> None:
         assert alone[0] == pytest.approx(np.sqrt(np.diag(joint))[:3])
 
 
-def test_the_datum_and_the_line_are_in_the_folder(with_fixes: Path) -> None:
-    sensors = json.loads((with_fixes / "metrics.json").read_text())["sensors"]
+def test_the_datum_and_the_line_are_in_the_folder(with_fixes: Driven) -> None:
+    sensors = with_fixes.metrics["sensors"]
     datum = {"latitude_deg": DATUM.latitude_deg, "longitude_deg": DATUM.longitude_deg, "height_m": DATUM.height_m}
     assert sensors["gnss"]["datum"] == datum
-    assert "datum" not in sensors["baro"]
-    session = Session(with_fixes / "session.db")
+    assert "datum" not in sensors["wheels"]
+    session = Session(with_fixes.out / "session.db")
     assert session.info()["datum"] == {"sensor": "gnss", **datum}
     session.close()
-    collection = json.loads((with_fixes / LINES).read_text())
+    collection = json.loads((with_fixes.out / LINES).read_text())
     assert collection["type"] == "FeatureCollection"
     for feature, (by, name) in zip(collection["features"], TABLES.items(), strict=True):
         assert feature["properties"] == {"estimator": by}
         assert feature["geometry"]["type"] == "LineString"
-        _, places = table_of(with_fixes / name)
+        _, places = table_of(with_fixes.out / name)
         first = feature["geometry"]["coordinates"][0]
         assert first == [places[0].longitude_deg, places[0].latitude_deg, places[0].height_m]
 
 
-def test_without_a_datum_nothing_is_added(tmp_path) -> None:
-    out = run(tmp_path / "run", HEIGHTS)
+def test_without_a_datum_nothing_is_added(tmp_path_factory) -> None:
+    out = driven(tmp_path_factory, "without").out
     assert not any((out / name).exists() for name in (LINES, *TABLES.values()))
     session = Session(out / "session.db")
     assert "datum" not in session.info()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +13,8 @@ from vislam.cli import run_verb
 from vislam.config import load
 from vislam.core.geometry import invert
 from vislam.core.readings import Reading
-from vislam.runs import execute
-from vislam.runs.folder import prepare
+from vislam.runs import execute, resume
+from vislam.runs.folder import prepare, read_setup
 from vislam.runs.further_sensors import drawn
 from vislam.runs.sources import open_source
 from vislam.sensors.simulated import drawn_readings
@@ -24,13 +22,10 @@ from vislam.sensors.toml import SensorSetup, load_sensor_setup
 from vislam.sensors.true_path import bodies_on
 from vislam.trajectory import read_tum
 from worlds.mini_recording import imu_rows, write_camera, write_imu
+from worlds.sensed_drive import FIXES, SOURCE, WHEELS, Driven, drive, driven, settings
 
-SOURCE = "points:workshop-cart,rig=stereo,duration_s=16,camera_hz=10,tracks=100"
-BLIND = "points:cart-drive,rig=stereo,duration_s=80,camera_hz=10,tracks=100,outage_begin_s=12,outage_length_s=60"
+BLIND = "points:cart-drive,rig=stereo,duration_s=40,camera_hz=10,tracks=100,outage_begin_s=12,outage_length_s=24"
 QUIET = ["--map.no-enabled", "--view.no-enabled"]
-FILES = ("trajectory_ekf.tum", "trajectory_graph.tum", "states_ekf.csv", "states_graph.csv")
-WHEELS = '[sensors.wheels]\nkind = "wheels"\n'
-FIXES = '[sensors.gnss]\nkind = "position"\nsigma_m = 0.02\nsigma_up_m = 0.05\n'
 ANCHORS = {1: (-7.0, -5.0, 0.1), 2: (7.0, -5.0, 2.5), 3: (7.0, 5.0, 0.3), 4: (-7.0, 5.0, 2.8)}
 RANGES = (
     '[sensors.uwb]\nkind = "range"\nsigma_m = 0.05\n'
@@ -39,70 +34,34 @@ RANGES = (
 SECOND_NS = 10**9
 
 
-@dataclass
-class Result:
-    """What a run left."""
-
-    out: Path
-
-    @property
-    def metrics(self) -> dict:
-        return json.loads((self.out / "metrics.json").read_text())
-
-    @property
-    def ate_m(self) -> dict[str, float]:
-        return {name: entry["ate_rmse_m"] for name, entry in self.metrics["accuracy"].items()}
-
-    @property
-    def bytes(self) -> list[bytes]:
-        return [(self.out / name).read_bytes() for name in FILES]
-
-
-def run(out: Path, sensors: Path | None, source: str = SOURCE) -> Result:
-    told = [] if sensors is None else ["--sensors.file", str(sensors)]
-    assert run_verb(["run", source, "--out", str(out), *told, *QUIET]) == 0
-    return Result(out)
-
-
-def simulated(folder: Path) -> Path:
-    path = folder / "cart.toml"
-    path.write_text(f"{WHEELS}simulated_hz = 20.0\n{FIXES}simulated_hz = 5.0\n")
-    return path
-
-
 def write_table(path: Path, columns: tuple[str, ...], readings: list[Reading]) -> None:
     rows = [",".join([str(r.t_ns), *(repr(float(value)) for value in r.values)]) for r in readings]
     path.write_text("\n".join([",".join(["t_ns", *columns]), *rows]) + "\n")
 
 
-def with_files(folder: Path, tables: dict[str, str], readings: dict[str, list[Reading]]) -> Path:
-    """Write readings as tables, and a file of sensors that names them."""
-    path = folder / "files.toml"
-    path.write_text("".join(f'{text}file = "{name}.csv"\n' for name, text in tables.items()))
-    for name, sensor in load_sensor_setup(path).sensors.items():
+def with_files(folder: Path, tables: dict[str, str], readings: dict[str, list[Reading]]) -> Driven:
+    """Write readings as tables, and run with a file of sensors that names them."""
+    text = "".join(f'{text}file = "{name}.csv"\n' for name, text in tables.items())
+    (folder / "kinds.toml").write_text(text)
+    for name, sensor in load_sensor_setup(folder / "kinds.toml").sensors.items():
         write_table(folder / f"{name}.csv", sensor.columns, readings[name])
-    return path
+    return drive(folder, text)
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory) -> Path:
-    return simulated(tmp_path_factory.mktemp("told"))
+def clean(tmp_path_factory) -> Driven:
+    return driven(tmp_path_factory, "clean")
 
 
 @pytest.fixture(scope="module")
-def readings(told) -> dict[str, list[Reading]]:
-    setup = load_sensor_setup(told)
+def without(tmp_path_factory) -> Driven:
+    return driven(tmp_path_factory, "without")
+
+
+@pytest.fixture(scope="module")
+def readings(clean) -> dict[str, list[Reading]]:
+    setup = load_sensor_setup(clean.sensors)
     return dict(zip(setup.simulated_hz, drawn(open_source(SOURCE), setup, 0), strict=True))
-
-
-@pytest.fixture(scope="module")
-def clean(told, tmp_path_factory) -> Result:
-    return run(tmp_path_factory.mktemp("runs") / "clean", told)
-
-
-@pytest.fixture(scope="module")
-def without(tmp_path_factory) -> Result:
-    return run(tmp_path_factory.mktemp("runs") / "without", None)
 
 
 # ---- what they add
@@ -124,8 +83,8 @@ def true_own(setup: SensorSetup, out: Path) -> dict[str, np.ndarray]:
     return own
 
 
-def test_own_variables_are_found_within_four_sigmas(told, clean):
-    true = true_own(load_sensor_setup(told), clean.out)
+def test_own_variables_are_found_within_four_sigmas(clean):
+    true = true_own(load_sensor_setup(clean.sensors), clean.out)
     sensors = clean.metrics["sensors"]
     assert set(sensors) == {"wheels", "gnss"}
     for name, entry in sensors.items():
@@ -176,17 +135,11 @@ def test_every_reading_is_accounted_for_in_filter_and_graph(clean, readings):
 # ---- again
 
 
-def test_two_runs_give_identical_bytes(told, clean, tmp_path):
-    assert run(tmp_path / "again", told).bytes == clean.bytes
-
-
 def test_the_same_readings_from_files_give_identical_bytes(clean, readings, tmp_path):
-    assert (
-        run(tmp_path / "files", with_files(tmp_path, {"wheels": WHEELS, "gnss": FIXES}, readings)).bytes == clean.bytes
-    )
+    assert with_files(tmp_path, {"wheels": WHEELS, "gnss": FIXES}, readings).bytes == clean.bytes
 
 
-def test_an_interrupted_run_is_resumed_with_its_sensors(told, clean, tmp_path):
+def test_an_interrupted_run_is_resumed_with_its_sensors(clean, tmp_path):
     out = tmp_path / "ended"
     prepare(out, overwrite=False)
 
@@ -194,21 +147,16 @@ def test_an_interrupted_run_is_resumed_with_its_sensors(told, clean, tmp_path):
         if done == total // 2:
             raise KeyboardInterrupt
 
-    config = load(None, {"view.enabled": False, "map.enabled": False, "sensors.file": str(told)})
     with pytest.raises(KeyboardInterrupt):
-        execute(open_source(SOURCE), config, out, SOURCE, [], stop)
-    results = []
-    for name in ("a", "b"):
-        shutil.copytree(out, tmp_path / name)
-        assert run_verb(["run", "--resume", str(tmp_path / name)]) == 0
-        results.append(Result(tmp_path / name))
-    metrics = results[0].metrics
+        execute(open_source(SOURCE), load(None, settings(clean.sensors)), out, SOURCE, [], stop)
+    source, config, base = read_setup(out)
+    metrics = resume(open_source(source, config.seed, config.calibration), config, out, source, [], base=base)
+    result = Driven(out, clean.sensors)
     assert metrics["resumed"]
     assert metrics["frames"] == metrics["frames_expected"]
-    assert results[0].bytes == results[1].bytes
-    print(results[0].ate_m, clean.ate_m)
-    assert results[0].ate_m["graph"] < clean.ate_m["graph"] + 0.01
-    true = true_own(load_sensor_setup(told), results[0].out)
+    print(result.ate_m, clean.ate_m)
+    assert result.ate_m["graph"] < clean.ate_m["graph"] + 0.01
+    true = true_own(load_sensor_setup(clean.sensors), out)
     for name, entry in metrics["sensors"].items():
         assert entry["begun"]
         off = np.array(entry["graph"]["values"]) - true[name]
@@ -237,11 +185,19 @@ def test_settings_and_files_that_cannot_be_are_told_in_one_line(text, code, mess
     assert len(error.splitlines()) == 1
 
 
-def test_nothing_can_be_drawn_on_a_recording_without_truth(told, tmp_path, capsys):
+def test_nothing_can_be_drawn_on_a_recording_without_truth(clean, tmp_path, capsys):
     root = tmp_path / "recording" / "mav0"
     write_camera(root, "cam0", 5)
     write_imu(root, imu_rows(60))
-    arguments = ["run", f"euroc:{root.parent}", "--out", str(tmp_path / "run"), "--sensors.file", str(told), *QUIET]
+    arguments = [
+        "run",
+        f"euroc:{root.parent}",
+        "--out",
+        str(tmp_path / "run"),
+        "--sensors.file",
+        str(clean.sensors),
+        *QUIET,
+    ]
     assert run_verb(arguments) == 3
     error = capsys.readouterr().err.strip()
     assert "has no truth on which sensors can be drawn; give them files" in error
@@ -277,13 +233,12 @@ def backwards(readings):
 
 
 def stopped(readings):
-    return {
-        name: [r for r, h in zip(said, in_time(said, 0.0, 8.0), strict=True) if h] for name, said in readings.items()
-    }
+    said = readings["wheels"]
+    return readings | {"wheels": [r for r, h in zip(said, in_time(said, 0.0, 8.0), strict=True) if h]}
 
 
 def twice(readings):
-    return {name: [r for one in said for r in (one, one)] for name, said in readings.items()}
+    return readings | {"wheels": [r for one in readings["wheels"] for r in (one, one)]}
 
 
 def jumping_back(readings):
@@ -297,26 +252,23 @@ def jumping_back(readings):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("fault", "seen_at", "count"),
+    ("of_gnss", "of_wheels", "seen"),
     [
-        (leap, ("ekf", "gnss_gated"), 1),
-        (leap_for_long, ("ekf", "gnss_gated"), 15),
-        (backwards, ("sensor wheels", "slipped"), 50),
-        (stopped, None, 0),
-        (twice, ("ekf", "wheels_refused"), 200),
-        (jumping_back, ("ekf", "gnss_gated"), 5),
+        (leap, backwards, {("ekf", "gnss_gated"): 1, ("sensor wheels", "slipped"): 50}),
+        (leap_for_long, twice, {("ekf", "gnss_gated"): 15, ("ekf", "wheels_refused"): 200}),
+        (jumping_back, stopped, {("ekf", "gnss_gated"): 5}),
     ],
 )
-def test_a_fault_costs_what_it_spoils_and_is_counted(fault, seen_at, count, clean, without, readings, tmp_path):
+def test_faults_cost_what_they_spoil_and_are_counted(of_gnss, of_wheels, seen, clean, without, readings, tmp_path):
     tables = {"wheels": WHEELS, "gnss": FIXES}
-    spoilt = run(tmp_path / "spoilt", with_files(tmp_path, tables, fault(readings)))
+    spoilt = with_files(tmp_path, tables, of_wheels(of_gnss(readings)))
     metrics = spoilt.metrics
-    print(fault.__name__, spoilt.ate_m, clean.ate_m, without.ate_m, metrics["problems"])
+    print(of_gnss.__name__, of_wheels.__name__, spoilt.ate_m, clean.ate_m, without.ate_m, metrics["problems"])
     print({k: v for k, v in metrics["counters"]["ekf"].items() if k.startswith(("gnss", "wheels"))})
     for name, more_m in (("ekf", 0.02), ("graph", 0.01)):
         assert spoilt.ate_m[name] < max(clean.ate_m[name], without.ate_m[name]) + more_m
-    if seen_at is not None:
-        assert metrics["counters"][seen_at[0]][seen_at[1]] >= count
+    for (of, name), count in seen.items():
+        assert metrics["counters"][of][name] >= count
 
 
 @pytest.mark.slow
@@ -327,31 +279,28 @@ def test_ranges_of_zero_change_nothing(without, tmp_path):
     t_ns = np.arange(int(truth.t_ns[0]) + SECOND_NS // 10, int(truth.t_ns[-1]) - SECOND_NS // 10, SECOND_NS // 10)
     own = np.zeros(len(sensor.variables))  # the anchors stand in the world of the truth
     good = drawn_readings("uwb", sensor, bodies_on(truth, t_ns), own, seed=1)
-    ate_m = []
     zeros = changed(good, 10.0, 12.0, lambda values: np.array([values[0], 0.0]))
-    for name, said in (("good", good), ("zeros", zeros)):
-        (tmp_path / f"{name}_files").mkdir()
-        result = run(tmp_path / name, with_files(tmp_path / f"{name}_files", {"uwb": RANGES}, {"uwb": said}))
-        ate_m.append(result.ate_m)
+    result = with_files(tmp_path, {"uwb": RANGES}, {"uwb": zeros})
     metrics = result.metrics
-    print(ate_m, without.ate_m, metrics["sensors"], metrics["problems"], metrics["counters"]["sensor uwb"])
+    print(result.ate_m, without.ate_m, metrics["sensors"], metrics["problems"], metrics["counters"]["sensor uwb"])
     assert metrics["sensors"]["uwb"]["begun"]
-    told = metrics["counters"]["sensor uwb"]["unusable"] + metrics["counters"]["ekf"]["uwb_gated"]
-    assert told >= 20
+    counted = metrics["counters"]["sensor uwb"]["unusable"] + metrics["counters"]["ekf"]["uwb_gated"]
+    assert counted >= 20
     for name in ("ekf", "graph"):
-        assert ate_m[1][name] < ate_m[0][name] + 0.01
+        assert result.ate_m[name] < without.ate_m[name] + 0.01
 
 
-# ---- a minute without camera
+# ---- without camera
 
 
 @pytest.mark.slow
-def test_a_cart_goes_on_by_its_wheels_through_a_minute_without_camera(tmp_path):
-    """Inertial data alone leave tens of metres; wheels that were calibrated on the way there, a few centimetres."""
-    (tmp_path / "cart.toml").write_text(f"{WHEELS}simulated_hz = 20.0\n")
-    blind = run(tmp_path / "blind", None, BLIND).ate_m
-    wheeled = run(tmp_path / "wheeled", tmp_path / "cart.toml", BLIND).ate_m
-    print("ATE [m]: without wheels", blind, "with", wheeled)
+def test_a_cart_goes_on_by_its_wheels_where_the_camera_sees_nothing(tmp_path):
+    """Inertial data alone leave metres; wheels that were calibrated on the way there, a few centimetres."""
+    blind, wheeled = (tmp_path / name for name in ("blind", "wheeled"))
+    blind.mkdir()
+    wheeled.mkdir()
+    alone, led = drive(blind, "", BLIND).ate_m, drive(wheeled, f"{WHEELS}simulated_hz = 20.0\n", BLIND).ate_m
+    print("ATE [m]: without wheels", alone, "with", led)
     for name in ("ekf", "graph"):
-        assert wheeled[name] < 0.3
-        assert blind[name] > 10.0 * wheeled[name]
+        assert led[name] < 0.1
+        assert alone[name] > 10.0 * led[name]

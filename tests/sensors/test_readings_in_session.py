@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -164,6 +165,13 @@ def test_a_session_that_lacks_a_table_of_its_format_is_refused(tmp_path) -> None
         Session(tmp_path / "session.db")
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("sound") / "session.db"
+    stored(path, World(4.0, seed=6), end=6)
+    return path
+
+
 @pytest.mark.parametrize(
     "statement",
     [
@@ -185,9 +193,9 @@ def test_a_session_that_lacks_a_table_of_its_format_is_refused(tmp_path) -> None
         """UPDATE newest SET value = replace(value, '"sensor": "fixes"', '"sensor": 7')""",
     ],
 )
-def test_what_makes_no_sense_of_other_sensors_is_damage(statement: str, tmp_path) -> None:
+def test_what_makes_no_sense_of_other_sensors_is_damage(statement: str, sound: Path, tmp_path) -> None:
     world, path = World(4.0, seed=6), tmp_path / "session.db"
-    stored(path, world, end=6)
+    shutil.copy(sound, path)
     with editing(path) as db:
         assert db.execute(statement).rowcount > 0
     restore: Callable[[], object] = lambda: graph_of(world, LOOSE, True, Suite(SENSORS)).restore(  # noqa: E731

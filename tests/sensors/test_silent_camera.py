@@ -1,4 +1,4 @@
-"""A camera that gives no images for a minute or two: filter and graph go on by wheels and IMU."""
+"""A camera that gives no images for a minute: filter and graph go on by wheels and IMU."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def test_what_is_seen_after_a_minute_without_sight_is_judged_by_a_speed_that_is_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("silent_s", [60.0, 120.0])
-def test_filter_and_graph_go_on_by_wheels_while_the_camera_is_silent(silent_s: float) -> None:
+def test_filter_and_graph_go_on_by_wheels_while_the_camera_is_silent() -> None:
+    silent_s = 60.0
     run = Silent(silent_s)
     graph = run.slam.back.graph
     states = graph.states()

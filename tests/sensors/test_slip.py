@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vislam.cli import run_verb
 from vislam.core.errors import UsageError
 from vislam.pipeline.slip_watch import SlipWatch
 from vislam.runs.report.run_files import read_run
@@ -17,10 +14,9 @@ from vislam.runs.report.sensor_section import sensors_section
 from vislam.sensors.kinds import Wheels
 from vislam.sensors.simulated import Faults, slipping
 from vislam.sensors.toml import load_sensor_setup
+from worlds.sensed_drive import WHEELS, drive, driven
 
-SOURCE = "points:workshop-cart,rig=stereo,duration_s=16,camera_hz=10,tracks=100"
-WHEELS = '[sensors.wheels]\nkind = "wheels"\nsimulated_hz = 20.0\n'
-SLIPS = "simulated_slips = [[8.0, 9.5], [11.0, 13.0]]\n"
+SLIPPING = f"{WHEELS}simulated_hz = 20.0\nsimulated_slips = [[8.0, 9.5], [11.0, 13.0]]\n"
 STEP_NS = 50_000_000
 
 
@@ -94,33 +90,13 @@ def test_slips_that_cannot_be_are_refused(table: str, why: str, tmp_path: Path) 
         load_sensor_setup(tmp_path / "cart.toml")
 
 
-@dataclass
-class Result:
-    """What a run left."""
-
-    out: Path
-
-    @property
-    def metrics(self) -> dict:
-        return json.loads((self.out / "metrics.json").read_text())
-
-    def ate_m(self, by: str) -> float:
-        return self.metrics["accuracy"][by]["ate_rmse_m"]
-
-
-def run(folder: Path, name: str, table: str) -> Result:
-    (folder / f"{name}.toml").write_text(table)
-    told = ["--sensors.file", str(folder / f"{name}.toml"), "--map.no-enabled", "--view.no-enabled"]
-    assert run_verb(["run", SOURCE, "--out", str(folder / name), *told]) == 0
-    return Result(folder / name)
-
-
 @pytest.mark.slow
-def test_two_slips_cost_filter_and_graph_little_and_are_told(tmp_path: Path) -> None:
-    clean, slipped = run(tmp_path, "clean", WHEELS), run(tmp_path, "slipped", WHEELS + SLIPS)
-    print({by: (clean.ate_m(by), slipped.ate_m(by)) for by in ("ekf", "live", "graph")})
+def test_two_slips_cost_filter_and_graph_little_and_are_told(tmp_path: Path, tmp_path_factory) -> None:
+    clean, without = (driven(tmp_path_factory, name) for name in ("clean", "without"))
+    slipped = drive(tmp_path, SLIPPING)
+    print(slipped.ate_m, without.ate_m)
     for by in ("ekf", "live", "graph"):
-        assert slipped.ate_m(by) < clean.ate_m(by) + 0.005
+        assert slipped.ate_m[by] < without.ate_m[by] + 0.005
     assert "slip" not in clean.metrics["sensors"]["wheels"]
     entry = slipped.metrics["sensors"]["wheels"]
     assert entry["slip"]["times"] == 2
