@@ -11,8 +11,8 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera
 from vislam.core.geometry import se3_exp
 from vislam.core.messages import Array, Frame
-from vislam.frontend.depth_lag import DepthLag
-from vislam.frontend.rgbd import ImageDepth
+from vislam.frontend.exposures import DepthLag
+from vislam.frontend.view import ImageDepth
 from vislam.vision.shutter import Shutter
 
 CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=160.0, cy=120.0)

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from vislam.config import FrontEndConfig
 from vislam.core.messages import Array, Frame
 from vislam.frontend.keyframes import Departure, keyframe_reason
-from vislam.frontend.rgbd import ImageDepth
-from vislam.frontend.stereo import StereoDepth, _triangulate
+from vislam.frontend.view import ImageDepth, StereoDepth, _triangulate
 from vislam.vision.features import detect_corners
 from worlds.corner import World
 

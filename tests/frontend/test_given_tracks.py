@@ -16,9 +16,8 @@ from vislam.core.messages import Array, Frame, Keyframe, Observations, Tracking
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.intake import Intake
 from vislam.frontend.metric import MetricFrontEnd
-from vislam.frontend.rgbd import ImageDepth
-from vislam.frontend.stereo import StereoDepth
 from vislam.frontend.tracker import Tracker, given_rows
+from vislam.frontend.view import ImageDepth, StereoDepth
 from vislam.sim import PointRecording, open_points
 from vislam.vision.two_view import RotationPrior, direction_given_rotation, refine_two_view
 

@@ -9,7 +9,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.core.messages import Keyframe, Tracking, VoMeasurement
 from vislam.frontend import make_frontend
-from vislam.frontend.depth_lag import DepthLag
+from vislam.frontend.exposures import DepthLag
 from vislam.frontend.local_surfaces import LocalSurfaces
 from vislam.vision.shutter import Shutter
 from worlds.corner import World, path

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vislam.core.messages import Frame, ImuSample
-from vislam.frontend.feed import CameraFeed
+from vislam.frontend.intake import CameraFeed
 from vislam.imu import ConditionWatch
 
 _NS = 1_000_000_000

@@ -9,13 +9,11 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
-from vislam.frontend.attempt import Attempt
-from vislam.frontend.depth import DepthReading
+from vislam.frontend.attempt import Attempt, MotionPredictor
 from vislam.frontend.exposures import Exposures
 from vislam.frontend.keyframes import Exposed
-from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.tracker import Tracker, given_rows
-from vislam.frontend.view import View, spread
+from vislam.frontend.view import DepthReading, View, spread
 from vislam.vision.landmarks import Landmarks, move
 
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition

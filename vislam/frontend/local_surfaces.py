@@ -16,8 +16,8 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, Frame, ImageF32, Keyframe, VoMeasurement
-from vislam.frontend.depth_lag import DepthLag
-from vislam.frontend.prediction import body_motion
+from vislam.frontend.exposures import DepthLag
+from vislam.frontend.result import body_motion
 from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
 from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
 

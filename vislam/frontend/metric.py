@@ -23,9 +23,8 @@ from vislam.frontend.local_surfaces import LocalSurfaces
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.placing import Placer
 from vislam.frontend.result import CommonErrors, TrackResult, metric_motion, too_few
-from vislam.frontend.rgbd import ImageDepth
 from vislam.frontend.second_camera import SecondCamera
-from vislam.frontend.view import View, stereo_views
+from vislam.frontend.view import ImageDepth, View, stereo_views
 from vislam.vision.two_view import epipolar_distances
 
 

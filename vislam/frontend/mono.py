@@ -14,11 +14,10 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations
 from vislam.core.quantiles import median
-from vislam.frontend.attempt import confirmed, failure, weakness
+from vislam.frontend.attempt import MotionPredictor, confirmed, failure, weakness
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
-from vislam.frontend.prediction import MotionPredictor
 from vislam.frontend.result import CommonErrors, TrackResult, too_few, unscaled_motion
 from vislam.frontend.tracker import Tracker
 from vislam.vision.refine import refine_pose

@@ -9,8 +9,8 @@ from vislam.core.geometry import invert, se3_log
 from vislam.core.messages import Array, Frame, Keyframe
 from vislam.frontend.attempt import Attempt, confirmed, failure
 from vislam.frontend.blind_keyframe import BlindKeyframe
-from vislam.frontend.depth import DepthReading
 from vislam.frontend.keyframe_tracks import KeyframeTracks
+from vislam.frontend.view import DepthReading
 from vislam.vision.landmarks import metric_points, move
 from vislam.vision.locate import pnp_ransac, recognise
 from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose

@@ -9,11 +9,10 @@ import numpy as np
 
 from vislam.config import FrontEndConfig
 from vislam.core.camera import Rig
-from vislam.core.geometry import se3_adjoint, transform
+from vislam.core.geometry import invert, se3_adjoint, transform
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
-from vislam.frontend.prediction import body_motion
 from vislam.vision.two_view import TwoViewEstimate
 
 _NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement that says nothing
@@ -156,3 +155,8 @@ def scaled_motion(vo: VoMeasurement) -> Array:
     if vo.has_scale:
         return vo.T_keyframe_body
     return transform(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]), np.zeros(3))
+
+
+def body_motion(T_cam_a_b: Array, T_body_cam0: Array) -> Array:
+    """Return the body's motion [4, 4] when its camera moved by T_cam_a_b [4, 4]."""
+    return T_body_cam0 @ T_cam_a_b @ invert(T_body_cam0)

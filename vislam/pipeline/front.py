@@ -147,7 +147,7 @@ class Front:
 
     def process(self, frame: Frame) -> FrontStep:
         """Track one frame, correct the filter with it, and hand over keyframes that are ready."""
-        self.watch.add(frame)
+        self.watch.feed.add(frame)
         frame = self.camera_clock.in_imu_time(frame)
         imu = self._imu
         since = Since() if imu is None else imu.since(self._last_frame_t_ns, frame.t_ns, self.camera_clock)

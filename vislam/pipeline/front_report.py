@@ -10,10 +10,10 @@ import numpy as np
 from vislam.config import EkfConfig, InitConfig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import StartFacts
-from vislam.core.messages import Array, Frame, ImuSpan, NavState, Tracking
+from vislam.core.messages import Array, ImuSpan, NavState, Tracking
 from vislam.frontend import TrackResult, knows_scale
 from vislam.frontend.camera_clock import CameraClock
-from vislam.frontend.feed import CameraFeed
+from vislam.frontend.intake import CameraFeed
 from vislam.frontend.pixel_noise import NoiseUsed
 from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.frontend.uniform_motion import UniformMotion
@@ -72,12 +72,8 @@ class RunWatch:
         self._knows_scale = knows_scale
         self._lost_since_ns: int | None = None
 
-    def add(self, frame: Frame) -> None:
-        """Take a frame as the camera gave it; `note` has to follow."""
-        self.feed.add(frame)
-
     def note(self, track: TrackResult, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
-        """Take what became of the frame.
+        """Take what became of the frame that `feed` has.
 
         Args:
             track: what vision made of it.

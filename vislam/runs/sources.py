@@ -115,9 +115,10 @@ def measured_inertial(uri: str) -> MeasuredInertial:
 def without_idle_cameras(recording: Recording, config: Config) -> Recording:
     """Return a recording that reads cam0 alone where nobody looks at the others: mono, and without a map."""
     from vislam.datasets.stream import FileRecording
-    from vislam.frontend import mode_for
+    from vislam.frontend import knows_scale, mode_for
 
-    if isinstance(recording, FileRecording) and mode_for(config.frontend, recording.rig) == "mono":
+    is_one = not knows_scale(mode_for(config.frontend, recording.rig))  # one camera, by that it knows no scale
+    if isinstance(recording, FileRecording) and is_one:
         recording.cameras_read = 1 if not config.map.enabled else len(recording.rig.cameras)
     return recording
 

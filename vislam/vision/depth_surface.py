@@ -1,7 +1,7 @@
 """The surface that one depth image shows: a small organised map of planes, one per pixel, with how sure each is.
 
 The inverse depth of a plane is linear in the image, so a plane through a neighbourhood is one linear fit whose noise is
-the same everywhere for sensors that measure disparity (sigma_z = c z^2, see `frontend.rgbd`).
+the same everywhere for sensors that measure disparity (sigma_z = c z^2, see `frontend.view.ImageDepth`).
 """
 
 from __future__ import annotations

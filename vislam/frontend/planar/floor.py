@@ -17,7 +17,7 @@ from vislam.core.camera import Camera
 from vislam.core.errors import UsageError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, ImageU8, ImuSpan
-from vislam.frontend.prediction import gyro_rotation
+from vislam.frontend.attempt import gyro_rotation
 from vislam.vision.features import detect_corners, detect_harris, noise_grey
 
 _FLOOR_ROWS, _COLUMNS = 2, 4  # regions of the floor; above the horizon there is one row

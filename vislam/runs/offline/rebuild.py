@@ -23,7 +23,7 @@ from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
 from vislam.core.up import Up
 from vislam.factors.factor_log import rig_from
-from vislam.frontend import mode_for
+from vislam.frontend import knows_scale, mode_for
 from vislam.mapping.cloud.store import packed_labels
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.mapper import Mapper
@@ -68,7 +68,7 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         level = stored_level(info)
         placed = _poses(session, run, poses, level.T_level_map)
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
-        one_camera = ran.map.mono_depth.enabled and mode_for(ran.frontend, rig) == "mono"
+        one_camera = ran.map.mono_depth.enabled and not knows_scale(mode_for(ran.frontend, rig))
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
         labels = _Labels(ran.map, config, info, ScanExtractor(config, rig, one_camera))
         mapper = Mapper(config, rig, one_camera, labels.classes)
